@@ -1,9 +1,10 @@
 """Print what look-ahead of the linear observer makes of default controllers, which do not know of it.
 
-`python benchmarks/look_ahead.py [--necks NECK...] [--kinds KIND...]`: each controller is designed with its defaults, on
+`python benchmarks/look_ahead.py [--necks NECK...] [--kinds KIND...] [--known]`: each is designed with its defaults, on
 the family of `mpc_following.py` and on its `oe` of 0 kg alone, and closed over the observer of that `oe`, which tells
 the angle of the measurement's instant or, over `sensor_delay` = 50 ms, that of now. Steps of 10 deg of pitch and of
-roll at 0 and 1 kg, the worst of both; `moved` is how far all motors together go in three seconds at rest.
+roll at 0 and 1 kg, the worst of both; `moved` is how far all motors go in three seconds at rest. With `--known` the
+designs count the look-ahead: 50 ms less dead time, which is `least_delay` = 30 ms where the plant's own is shorter.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference,
 from tests.foreign_necks.necks import CHOOSING
 
 DELAYS = (0.0, 0.05)
+# The designs' own `least_delay` less the look-ahead [s].
+KNOWN = 0.08 - DELAYS[1]
 REST_S = 3.0
 
 
@@ -59,7 +62,9 @@ def main() -> None:
     everywhere = (*CHOOSING, *OURS)
     parser.add_argument("--necks", nargs="+", choices=everywhere, default=everywhere, help=", ".join(everywhere))
     parser.add_argument("--kinds", nargs="+", default=["pi", "pid", "lqg", "hinf", "ncf"], help="of controllers")
+    parser.add_argument("--known", action="store_true", help="designs that know of the look-ahead")
     wanted = parser.parse_args()
+    settings = {"least_delay": KNOWN} if wanted.known else {}
     print("| neck | kind | designed on | kg | overshoot [%] | steady rms [deg] | moved [rad] | 50 ms ahead | | |")
     print("|---" * 10 + "|")
     rows = defaultdict(list)
@@ -68,7 +73,7 @@ def main() -> None:
         model = load(Path(OUT) / f"{name}-0-oe.npz")
         both = [replace(on, observer=KalmanSettings(sensor_delay=delay).design(model).block()) for delay in DELAYS]
         for kind, (what, plant) in product(wanted.kinds, (("family", on.family), ("oe", model))):
-            controller = design_controller(kind, plant)
+            controller = design_controller(kind, plant, **settings)
             for payload in JUDGED:
                 found = np.array([numbers(item, controller, payload) for item in both])
                 rows[kind, what].append(found)

@@ -1,11 +1,12 @@
 """Print how fast and how closely `mpc` with its defaults follows on necks that nobody tuned to.
 
-`python benchmarks/mpc_following.py [--necks NECK...] [--set KEY=VALUE...] [--told] [--seed N]`: designed on the family
+`python benchmarks/mpc_following.py [--necks NECK...] [--set KEY=VALUE...] [--told|--inclined] [--seed N]`: on a family
 of 80 s of Eq. 22 at 0, 0.5 and 1 kg, with the observer's defaults, sequential order, judged on the true angle. Steps of
 10 deg of pitch and of roll; a circle of 12 deg at 1.2 rad/s, rms of the worse axis after the first turn, without and
 with preview. `python benchmarks/leave_one_neck_out.py mpc.taut_pole` (and the other `mpc.` settings) chooses by the
 same runs. With `payload_tautness` the observer is over a `greybox` of the same recordings and estimates the payload,
-which `--told` tells instead. Families and models are kept in `build/mpc_following`.
+which `--told` tells instead. `--inclined` prints what is left to schedule over the inclination: steps of 5 deg of pitch
+from 0, 5, 10 and 15 deg. Families and models are kept in `build/mpc_following`.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import numpy as np
 
 from softneck.core import Vector, load
 from softneck.design import MpcController, MpcSettings
+from softneck.design.linear._rise import rise_time
 from softneck.estimation import KalmanSettings
 from softneck.identification import Family, FamilySettings, GreyBox, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference, metrics, run_loop
@@ -42,6 +44,7 @@ TILT, TURN, CIRCLE_S = math.radians(12.0), 1.2, 20.0
 # Three seconds of rise, then one turn.
 SETTLED = 3.0 + 2.0 * math.pi / TURN
 PREVIEW = 0.6
+INCLINATIONS, INCLINED = (0.0, 5.0, 10.0, 15.0), math.radians(5.0)
 # An overshoot of so much counts as much as twice the error [%].
 _COSTLY = 10.0
 
@@ -197,6 +200,26 @@ def told(settings: MpcSettings, payload: float) -> MpcSettings:
     return replace(settings, payload_tautness=0.0, minimum_tautness=type(least)(least + more))
 
 
+def inclined(on: Specimen, controller: MpcController, payload: float, seed: int = 0) -> list[tuple[float, float]]:
+    """Return overshoot [%] and rise [s] of a step of 5 deg of pitch from each inclination."""
+    found = []
+    for least in INCLINATIONS:
+        reference = inclination_step(math.radians(least))
+        result = run(on, controller, reference, AT + STEP_S, payload, seed)
+        y = (result.angle("pitch")[result.time >= AT] - math.radians(least)) / INCLINED
+        found.append((100.0 * (float(y.max()) - 1.0), rise_time(y, result.sample_time)))
+    return found
+
+
+def inclination_step(least: float) -> Reference:
+    """Return a reference that goes to `least` [rad] at the start and steps from there at `AT`."""
+
+    def reference(time: float, /) -> tuple[float, float, float]:
+        return least + (INCLINED if time >= AT else 0.0), 0.0, 0.0
+
+    return reference
+
+
 def scores(on: Specimen, candidates: list[Any]) -> Vector:
     """Return the mean score of each candidate's settings over the payloads, which are told: less is better."""
     found: dict[tuple[str, float], float] = {}
@@ -216,12 +239,21 @@ def main() -> None:
     parser.add_argument("--necks", nargs="+", choices=everywhere, default=everywhere, help=", ".join(everywhere))
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings other than the defaults")
     parser.add_argument("--told", action="store_true", help="tell the payload, in the place of an estimate")
+    parser.add_argument("--inclined", action="store_true", help="steps of 5 deg from several inclinations instead")
     parser.add_argument("--seed", type=int, default=0, help="of the sensor's noise (0)")
     options = parser.parse_args()
     changed = {
         key: None if value == "None" else float(value) for key, value in (item.split("=") for item in options.set)
     }
     settings = MpcSettings(**changed)  # type: ignore[arg-type]
+    if options.inclined:
+        print("| neck | kg | " + " | ".join(f"from {least:g} deg: overshoot [%], rise [s]" for least in INCLINATIONS)
+              + " |\n" + "|---" * (2 + len(INCLINATIONS)) + "|")  # fmt: skip
+        for name, payload in itertools.product(options.necks, JUDGED):
+            on = neck(name)
+            cells = [f"{over:.0f}, {rise:.2f}" for over, rise in inclined(on, settings.design(on.family), payload)]
+            print(f"| `{name}` | {payload:g} | " + " | ".join(cells) + " |", flush=True)
+        return
     print("| neck | kg | overshoot [%] | rise [s] | steady rms [deg] | circle [deg] | with preview [deg] |")
     print("|---|---|---|---|---|---|---|")
     for name in options.necks:

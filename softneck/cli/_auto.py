@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import CheckFailedError, SettingsError, refuse_existing
+from softneck.core import CheckFailedError, DataError, SettingsError, refuse_existing
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
@@ -46,10 +46,12 @@ def identify_auto(
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
     from softneck.identification import choose, refit
+    from softneck.identification.models._fitting import check_training
     from softneck.identification.models._validity import with_tolerance
     from softneck.identification.selection._auto import REFITTED
     from softneck.plots import write_page
-    from softneck.signals import read_recording
+    from softneck.signals import concatenate, read_recording
+    from softneck.signals.quality._poor_excitation import stands_still
 
     path, overwrite = target(output, "models/auto.npz", force=force)
     # Linear kinds are what `design` and `observer` take; the best of the others is the better plant for loops.
@@ -60,6 +62,10 @@ def identify_auto(
         refuse_existing(html, force=force)
     parts = [read_recording(source, robot=robot) for source in recordings]
     head, tail, other = _split(parts, train)
+    check_training(head)
+    still = stands_still(tail, concatenate(parts))
+    if still is not None:
+        raise DataError(f"{recordings[-1]}: {still}. Record motion to the end, or hold out other rows by --train.")
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
     other, sort = _other(choice)
@@ -99,8 +105,7 @@ def _refuse_useless(path: Path, why: str | None) -> None:
     """Raise CheckFailedError where the best of all kinds is no model."""
     if why is not None:
         raise CheckFailedError(
-            f"{path}: no kind made a model of the rows held out: {why}. Record again: `softneck info REC` says what is "
-            "poor in this recording."
+            f"{path}: no kind is a model of the rows held out: {why}. `softneck info REC` says what it lacks."
         )
 
 

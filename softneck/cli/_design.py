@@ -85,10 +85,9 @@ def _linear(path: Path, robot: str | None, *, any_fit: bool) -> Any:
         least = min((fit for fit in held_out.get("fit", {}).values() if fit is not None), default=100.0)
         poor = diverged or least < _LEAST_FIT
     if poor and not any_fit:
-        what = "diverges" if diverged else f"has a fit of {percent(least)} %"
+        what = "diverges" if diverged else f"fits {percent(least)} %"
         raise SettingsError(
-            f"{path}: over the rows held out its free run {what}; below {_LEAST_FIT:g} % more of the motion is "
-            "unexplained than explained, and no margin is to be believed. Identify a better model, or go on by "
-            "--any-fit."
+            f"{path}: its free run over the rows held out {what}; {_LEAST_FIT:g} % is the least to design on. Identify "
+            "a better model, or go on by --any-fit."
         )
     return thing

@@ -57,8 +57,8 @@ if TYPE_CHECKING:
 @click.option(
     "--sensitivities",
     is_flag=True,
-    help="Add outputs of the next sample (pitch_next, roll_next) and their directional derivatives; plants with "
-    "--backend compiled.",
+    help="Add outputs of the next sample (pitch_next, motor_setpoint_1_next, ..) and their directional derivatives; "
+    "with --backend compiled.",
 )
 @robot_option
 @force_option

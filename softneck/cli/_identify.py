@@ -89,7 +89,7 @@ def command(
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
     from softneck.identification.models._validity import with_tolerance
-    from softneck.signals.quality._poor_excitation import poor_excitation
+    from softneck.signals.quality._poor_excitation import poor_excitation, stands_still
 
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
@@ -136,6 +136,7 @@ def command(
         raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
     why = None if held_out is None else useless(held_out)
     if why is not None:
+        why = (tail and stands_still(tail, whole)) or why
         raise CheckFailedError(
             f"{path}: no model of the rows held out: {why}. Try another kind or settings, or record longer; "
             "`softneck identify auto` compares kinds."

@@ -260,9 +260,10 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, A
         if job.html is not None:
             job.texts[job.html] = (_preview(job, guess.layout, guess, None), job.force)
         job.write()
-        raise DataError(
-            f"{job.log}: not found: {'; '.join(guess.missing)}. Fill it into {proposal}, then use --layout {proposal}."
-        )
+        for line in guess.missing[1:]:
+            note(f"not found either: {line}")
+        note(f"the layout, as far as it goes, is in {proposal}: fill in what is MISSING, and use --layout {proposal}")
+        raise DataError(f"{job.log}: not found: {guess.missing[0]}.")
     facts = {"layout_file": str(proposal), "layout": tomllib.loads(guess.text), "reasons": list(guess.lines),
              "doubts": [doubt.as_dict() for doubt in guess.doubts]}  # fmt: skip
     if guess.layout.robot.hash != whose.hash:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import SettingsError, atomic_write
+from softneck.core._budget import settings_text
 
 from .shared._console import print_json
 from .shared._groups import NearGroup
@@ -72,7 +73,7 @@ def _moved(source: Path, folder: Path) -> str:
     from softneck.robot import Robot
 
     Robot.read(source)  # which says what is wrong with it
-    text = source.read_text(encoding="utf-8")
+    text = settings_text(source)
     table = tomllib.loads(text)
     there = source.parent.resolve() != folder.resolve()
     named = [(part, key) for part, key in (("plant", "neck"), ("drives", "file")) if key in table.get(part, {})]

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from ._errors import FileFormatError, SettingsError
 
-# [bytes] Of TOML that people write (the reader takes 2 s for 4 MB), and of JSON that commands write.
-MOST_TOML, MOST_JSON = 2**20, 2**24
+# [bytes] Of TOML that people write (the reader takes 2 s for 4 MB), of JSON that commands write, and of an EDS.
+MOST_TOML, MOST_JSON, MOST_EDS = 2**20, 2**24, 2**22
 # [bytes] Of a log as it lies on the disk: a day of 12 columns at 100 Hz is 1 GB of text. Of what an archive unpacks to.
 MOST_LOG, MOST_UNPACKED = 2**30, 2 * 2**30
 # Of one table or variable (1 GB as doubles); a neck has 15 columns, and 10,000 names take a screen of a minute to read.
@@ -98,9 +98,14 @@ def require_table(path: Path, *, zeros: bool = False) -> None:
     """Raise FileFormatError if a text is no table: too large, too wide, or of bytes that are 0 unless `zeros`."""
     require_size(path)
     _require_memory(path, _TEXT_GROWS * path.stat().st_size)
+    require_lines(path, zeros=zeros, columns=True)
+
+
+def require_lines(path: Path, *, zeros: bool = False, columns: bool = False) -> None:
+    """Raise FileFormatError if a text has a line that is too long, too many `columns`, or zeros unless allowed."""
     with path.open("rb") as file:
         part = file.read(_WINDOW)
-        for line in part.splitlines():
+        for line in part.splitlines() if columns else ():
             require_numbers(path, 1, 1 + max(line.count(mark) for mark in (b",", b";", b"\t", b" ")))
         while part:
             if not zeros and b"\0" in part:

@@ -64,7 +64,7 @@ def _begun(target: Path) -> tuple[Path, int]:
     """Return a new temporary file and the descriptor that holds its lock; the umask decides who may read it."""
     while True:
         path = target.with_name(f".{target.stem[:40]}{_MARK}{secrets.token_hex(4)}{target.suffix}")
-        held = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_CLOEXEC, 0o666)
+        held = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
         fcntl.flock(held, fcntl.LOCK_EX)
         # Between the two lines another process may have taken it for one that was left.
         if path.exists():

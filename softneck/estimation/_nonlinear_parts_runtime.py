@@ -52,10 +52,10 @@ def nonlinear_move(
 
 def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, before: np.ndarray) -> float:
     """Return the fastest motion of late, from what it was and the outputs of now and of the sample before."""
-    moved = p.setup[NONLINEAR_KEEP] * fastest
+    motion = p.setup[NONLINEAR_KEEP] * fastest
     for i in range(p.outputs):
-        moved = max(moved, abs(angles[i] - before[i]))
-    return moved
+        motion = max(motion, abs(angles[i] - before[i]))
+    return motion
 
 
 def nonlinear_tell(

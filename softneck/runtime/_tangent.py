@@ -35,6 +35,16 @@ def tangent_shifted(rows, to, start, count, moved):
                 rows[to + i, r] = rows[start + i, r]
 """
 
+_PRODUCT = """
+def tangent_product(matrix, rows, start, moved):
+    made = np.zeros((matrix.shape[0], moved))
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            for r in range(moved):
+                made[i, r] += matrix[i, j] * rows[start + j, r]
+    return made
+"""
+
 _MEMBER = """
 def member_tangent(
     arrays, member, parameters, state, inputs, outputs, state_rows, inputs_rows, outputs_rows, moved
@@ -54,7 +64,7 @@ def with_tangent(text: str) -> str:
     derivation = _Derivation(Program(text))
     derivation.rows_of_step()
     members = [_MEMBER] if derivation.calls_members else []
-    return "\n\n".join([text, _SHIFTED, *members, *derivation.texts])
+    return "\n\n".join([text, _SHIFTED, _PRODUCT, *members, *derivation.texts])
 
 
 class _Derivation:

@@ -15,19 +15,33 @@ from softneck.core import SettingsError
 
 # Draws of random numbers are taken as they come: nothing moves them.
 RANDOM = re.compile(r"(m\d+_)*random_\w+")
+_MEMBERS_NAME = re.compile(r"^(m\d+_)+")
 # Of arrays: what makes a new one. Of numbers: what is a step in any case, and has no derivative.
 MAKERS = ("empty", "zeros", "ones", "empty_like", "zeros_like")
 STEPS = ("int", "bool", "len", "floor", "ceil", "round", "isfinite", "isnan", "isinf")
-# What searches data for its nearest points: set membership.
-SEARCHES = ("slant_bounds", "nlsm_bounds")
+# `low, high = f(..., w)` of a search among data is derived by the text's own `f_slopes(..., w, low, high, slopes)`.
+SLOPES = "_slopes"
 
 # A member that is not in the text: what is known of it is that its outputs and state follow from state and inputs.
 MEMBER_STEP = "member_step"
+MEMBER_START = "member_initialise"
 _MEMBER = """
 def member_step(arrays, member, parameters, state, inputs, outputs):
     state[0] = state[0] + inputs[0]
     outputs[0] = state[0]
 """
+
+# What has no derivative yet, by one of its functions, and why.
+_WITHOUT = {
+    "qp_solve": "it solves a quadratic program by iterations that are not differentiated.",
+    "adaptive_update": "it learns its plant while it runs, with a covariance that is not differentiated.",
+    "scheduled_arrays": "it interpolates whole matrices, which are not differentiated.",
+    "kalman_predict": "it carries a covariance, which is not differentiated; the steady filter has a derivative.",
+    "payload_start": "it carries several models and their spread, which are not differentiated.",
+    "neck_substeps": "the virtual neck's integration is not differentiated; a model identified on it is.",
+}
+# All choices of dimensions are tried for so many products in one function.
+_MOST_PRODUCTS = 6
 
 # Argument -> number of its dimensions, for those that depend on state or inputs.
 Pattern = tuple[tuple[str, int], ...]
@@ -53,17 +67,16 @@ class Program:
         self.has_members = stub is not None and isinstance(stub.body[-1], ast.Raise)
         if self.has_members:
             self.functions |= {node.name: node for node in ast.parse(_MEMBER).body if isinstance(node, ast.FunctionDef)}
+        for name in self.functions:
+            reason = _WITHOUT.get(_MEMBERS_NAME.sub("", name))
+            if reason is not None:
+                raise TangentError(reason)
         self._done: dict[tuple[str, Pattern], Activity] = {}
         self._open: set[tuple[str, Pattern]] = set()
 
     def activity(self, name: str, pattern: Pattern) -> Activity:
         """Return the activity of a function whose arguments of `pattern` depend on state or inputs."""
         key = (name, pattern)
-        if pattern and name.endswith(SEARCHES):
-            raise TangentError(
-                "set membership (kinds `nlsm`, `online_nlsm` and `residual`) searches its data and has no derivative "
-                f"(`{name}`)."
-            )
         if key in self._open:
             raise TangentError(f"{name}: a function that calls itself has no known derivative.")
         if key not in self._done:
@@ -73,6 +86,11 @@ class Program:
             finally:
                 self._open.discard(key)
         return self._done[key]
+
+    def searched(self, node: ast.AST) -> str | None:
+        """Return the name of this text's own search that `node` calls: one with slopes of its own."""
+        name = self.called(node)
+        return name if name is not None and name + SLOPES in self.functions else None
 
     def called(self, node: ast.AST) -> str | None:
         """Return the name of this text's own function that `node` calls, draws of random numbers aside."""
@@ -115,6 +133,19 @@ class Activity:
     def written(self) -> dict[str, int]:
         """The arguments that depend on state or inputs, those that the function makes so among them."""
         return {name: self.ranks.get(name, 1) for name in self.parameters if name in self.active}
+
+    @property
+    def makes_vector(self) -> bool:
+        """Whether the function returns an array."""
+        return self.node.returns is not None and ast.unparse(self.node.returns) == "np.ndarray"
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """The types of the several results that the function returns; none for one result."""
+        returns = self.node.returns
+        if isinstance(returns, ast.Subscript) and isinstance(returns.slice, ast.Tuple):
+            return tuple(map(ast.unparse, returns.slice.elts)) if ast.unparse(returns.value) == "tuple" else ()
+        return ()
 
     @property
     def stores(self) -> set[str]:
@@ -202,6 +233,8 @@ class Activity:
                 return not quiet and any(self.is_active(value) for value in node.args)
             return self.is_active(function.value) or any(self.is_active(value) for value in node.args)
         name = self.program.called(node)
+        if self.program.searched(node):
+            return self.is_active(node.args[-1])
         if name is not None:
             pattern = self.pattern(node, name)
             return bool(pattern) and self.program.activity(name, pattern).result
@@ -234,15 +267,18 @@ class Activity:
             self.result |= self.is_active(statement.value)
         if isinstance(statement, ast.Assign):
             for target in statement.targets:
-                for one, value in pairs(target, statement.value):
+                for place, (one, value) in enumerate(pairs(target, statement.value)):
                     self._bind(one, value)
+                    if value is None and self.is_active(statement.value) and self._is_number(statement.value, place):
+                        self._mark(one, True)
+                        self.ranks[ast.unparse(one)] = 0
         elif isinstance(statement, ast.AugAssign):
             self._mark(statement.target, self.is_active(statement.value))
             rank = self.rank(statement.value)
             if isinstance(statement.target, ast.Name) and rank is not None:  # a number is never spread over an array
                 self.ranks.setdefault(statement.target.id, rank)
         for call in calls(statement):
-            name = self.program.called(call)
+            name = None if self.program.searched(call) else self.program.called(call)
             pattern = self.pattern(call, name) if name else ()
             if not name or not pattern:
                 continue
@@ -251,6 +287,14 @@ class Activity:
             for parameter, value in zip(names, call.args, strict=True):
                 if parameter in written and self.rank(value) != 0:
                     self._mark(value, True)
+
+    def _is_number(self, call: ast.expr, place: int) -> bool:
+        """Return whether one of several results of a call may be moved: no whole number, no test."""
+        name = self.program.called(call)
+        if name is None or self.program.searched(call) or not isinstance(call, ast.Call):
+            return True
+        kinds = self.program.activity(name, self.pattern(call, name)).numbers
+        return not kinds or kinds[place] == "float"
 
     def _bind(self, target: ast.expr, value: ast.expr | None) -> None:
         if value is None:
@@ -272,12 +316,13 @@ class Activity:
             self.active.add(self.root(target.id))
 
     def _choose_products(self) -> None:
-        """Find how many dimensions each `np.dot` has: the one choice with which all dimensions fit."""
+        """Find how many dimensions each `np.dot` has: the one choice with which all fit, or vectors where many do."""
         nodes = [part for part in ast.walk(self.node) if is_numpy(part, "dot")]
-        if not nodes or len(nodes) > 6:
+        if not nodes:
             return
+        vectors = (1,) * len(nodes)
         fitting = []
-        for choice in product((0, 1), repeat=len(nodes)):
+        for choice in product((0, 1), repeat=len(nodes)) if len(nodes) <= _MOST_PRODUCTS else [vectors]:
             self.products = dict(zip(map(id, nodes), choice, strict=True))
             ranks = dict(self.ranks)
             for _ in range(2):
@@ -287,9 +332,10 @@ class Activity:
                         if rank is not None:
                             self.ranks[statement.targets[0].id] = rank
             if self._fits(nodes):
-                fitting.append(self.products)
+                fitting.append(choice)
             self.ranks = ranks
-        self.products = fitting[0] if len(fitting) == 1 else {}
+        chosen = fitting[0] if len(fitting) == 1 else vectors if vectors in fitting else ()
+        self.products = dict(zip(map(id, nodes), chosen, strict=False))
 
     def _fits(self, nodes: list[ast.AST]) -> bool:
         dots = all(self.rank(value) in (None, 1, 2) for node in nodes for value in node.args)  # type: ignore[attr-defined]

@@ -15,10 +15,10 @@ from ._tangent_activity import Activity, is_numpy
 Terms = list[tuple[str, str]]
 _KEPT = re.compile(r"_[a-z]\d+|-?\d+(\.\d*)?(e-?\d+)?")
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
-# f(x): its derivative, with v for f(x).
+# f(x): its derivative, with v for f(x). A root of zero is moved by nothing: it has no finite slope.
 _SLOPES = {
     "sin": "math.cos({x})", "cos": "-math.sin({x})", "tan": "1.0 + {v} * {v}", "tanh": "1.0 - {v} * {v}",
-    "exp": "{v}", "log": "1.0 / {x}", "sqrt": "0.5 / {v}", "atan": "1.0 / (1.0 + {x} * {x})",
+    "exp": "{v}", "log": "1.0 / {x}", "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0", "atan": "1.0 / (1.0 + {x} * {x})",
     "arctan": "1.0 / (1.0 + {x} * {x})", "asin": "1.0 / math.sqrt(1.0 - {x} * {x})",
     "acos": "-1.0 / math.sqrt(1.0 - {x} * {x})",
 }  # fmt: skip

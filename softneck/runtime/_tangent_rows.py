@@ -10,8 +10,9 @@ import ast
 import re
 from typing import Protocol
 
-from ._tangent_activity import MAKERS, Activity, Pattern, is_numpy, pairs, viewed
-from ._tangent_lowering import Lowering, Terms, inner
+from ._tangent_activity import MEMBER_START, SLOPES, Activity, Pattern, pairs
+from ._tangent_lowering import Terms, inner
+from ._tangent_vectors import Vectors, is_copy, linear, loops, names
 
 _PLACE = re.compile(r"«(\w+)»")
 _ROW = re.compile(r"<(\w+)>")
@@ -29,7 +30,7 @@ class Derived(Protocol):
         ...
 
 
-class Rows(Lowering):
+class Rows(Vectors):
     """Writes the derivative in rows of one function."""
 
     def __init__(self, activity: Activity, derived: Derived) -> None:
@@ -41,6 +42,8 @@ class Rows(Lowering):
         self._stored: set[str] = set()
         self._whole: ast.expr | None = None
         assigned = {n.id for n in ast.walk(activity.node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
+        if "moved" in assigned:
+            raise self.fail(activity.node, "a variable of its own is called `moved`.")
         self._given = {name for name, rank in activity.written.items() if rank == 0 and name not in assigned}
         self._taken = {name for name, rank in activity.written.items() if rank == 0 and name in assigned}
 
@@ -52,7 +55,8 @@ class Rows(Lowering):
         self._block(act.node.body)
         self._flush()
         kept = self._rows_of_numbers()
-        arguments = [*act.parameters, *(f"{p}_rows" for p in act.written), *(["result_rows"] if act.result else [])]
+        result = ["result_rows"] if act.result and not act.makes_vector else []
+        arguments = [*act.parameters, *(f"{p}_rows" for p in act.written), *result]
         head = [f"def {name}({', '.join([*arguments, 'moved'])}):"]
         own = [f"_own = np.empty(({len(kept)}, moved))"] if kept else []
         body = []
@@ -118,7 +122,21 @@ class Rows(Lowering):
             self.lines.append(ast.unparse(node))
 
     def _return(self, node: ast.Return) -> None:
-        if self.activity.result and node.value is not None:
+        if self.activity.result and self.activity.numbers and isinstance(node.value, ast.Tuple):
+            self._whole, texts = node.value, []
+            for place, one in enumerate(node.value.elts):
+                text, terms = self.value(one)
+                texts.append(self.kept(text))
+                self._waiting.append(f"result_rows[{place}, _r] = {linear(terms)}")
+            self._flush()
+            self.lines.append(f"return {', '.join(texts)}")
+        elif self.activity.result and self.activity.makes_vector and node.value is not None:
+            made, value = self.name("v"), self._hoisted(node.value)
+            self._flush()
+            self.lines += [f"{made} = {ast.unparse(value)}", f"{made}_rows = np.empty(({made}.shape[0], moved))"]
+            self._fill(node, f"{made}_rows", "0", f"{made}.shape[0]", value)
+            self.lines.append(f"return {made}, {made}_rows")
+        elif self.activity.result and node.value is not None:
             self._whole = node.value
             text, terms = self.value(node.value)
             text = self.kept(text)
@@ -138,17 +156,38 @@ class Rows(Lowering):
         else:
             one = [pair for target in node.targets for pair in pairs(target, node.value)]
         if not any(act.is_active(target) for target, _ in one):
-            self.lines.append(ast.unparse(node))
+            called = act.program.called(node.value)
+            call = node.value if isinstance(node.value, ast.Call) else None
+            pattern = act.pattern(call, called) if called and call else ()
+            callee = act.program.activity(called, pattern) if called and pattern else None
+            if callee is not None and called and call and callee.stores & set(callee.written):
+                self._whole = node.value  # nothing moves what it returns, but perhaps what it writes into
+                said = ", ".join(ast.unparse(target) for target, _ in one)
+                self.lines.append(f"{said} = {self.call(call, called)[0]}")
+            else:
+                self.lines.append(ast.unparse(node))
             return
         if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add | ast.Sub) and not act.is_active(node.value):
             self.lines.append(ast.unparse(node))
             return
+        if act.program.searched(node.value) and isinstance(node.value, ast.Call):
+            self._search([target for target, _ in one], node.value)
+            return
+        if one[0][1] is None and isinstance(node.value, ast.Call):
+            self._numbers(node, [target for target, _ in one], node.value)
+            return
         if len(one) > 1:
-            self._several(node, one)
+            read = {name.id for _, value in one if value is not None for name in names(value)}
+            if read & {ast.unparse(target) for target, _ in one}:
+                self._several(node, one)
+                return
+            for target, value in one:  # none is read behind a target: one after the other is the same
+                if value is not None:
+                    self._assign(ast.Assign([target], value, lineno=0))
             return
         target, value = one[0]
         if value is None:
-            raise self.fail(node, "the derivative of several results of a call is not known.")
+            raise self.fail(node, "the derivative of this assignment is not known.")
         self._whole = value
         if act.rank(target) == 0:
             self._number(target, *self.value(value))
@@ -167,6 +206,31 @@ class Rows(Lowering):
             values.append((target, self.kept(text), [("1.0", f"«{moved}»")]))
         for target, text, terms in values:
             self._number(target, text, terms)
+
+    def _numbers(self, node: ast.stmt, targets: list[ast.expr], call: ast.Call) -> None:
+        """Assign the several numbers that a call returns."""
+        name = self.activity.program.called(call)
+        if name is None:
+            raise self.fail(node, "the derivative of several results of a call is not known.")
+        self._whole = call
+        value, terms = self.call(call, name)
+        for place, target in enumerate(targets):
+            self._number(target, f"{value}[{place}]", [("1.0", f"{rows}[{place}, _r]") for _, rows in terms])
+
+    def _search(self, targets: list[ast.expr], call: ast.Call) -> None:
+        """Write a search and what its slopes make of the one vector that moves it."""
+        given = [ast.unparse(value) for value in call.args]
+        if any(self.activity.is_active(value) for value in call.args[:-1]) or not isinstance(call.args[-1], ast.Name):
+            raise self.fail(call, "a search is moved by its last argument alone, a name.")
+        self._flush()
+        slopes, found = self.name("g"), [ast.unparse(target) for target in targets]
+        self.lines += [f"{', '.join(found)} = {ast.unparse(call)}", f"{slopes} = np.zeros((2, {given[-1]}.shape[0]))"]
+        self.lines.append(f"{self.activity.program.searched(call)}{SLOPES}({', '.join([*given, *found, slopes])})")
+        for place, target in enumerate(found):
+            self._stored.add(target)
+            self.lines += ["for _r in range(moved):", f"    «{target}» = 0.0"]
+            self.lines.append(f"    for _i in range({given[-1]}.shape[0]):")
+            self.lines.append(f"        «{target}» += {slopes}[{place}, _i] * {self._rows(call.args[-1])}[_i, _r]")
 
     def _number(self, target: ast.expr, text: str, terms: Terms) -> None:
         if self.activity.is_active(target) and isinstance(target, ast.Name | ast.Subscript):
@@ -188,6 +252,8 @@ class Rows(Lowering):
     def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
         """Write a call of the derivative of one of the text's own functions."""
         act = self.activity
+        if name == MEMBER_START:
+            return self._start(node)
         pattern = act.pattern(node, name)
         callee = act.program.activity(name, pattern)
         back = self._derived.back(name, pattern)
@@ -207,17 +273,44 @@ class Rows(Lowering):
                 self._stored.add(one)
                 rows.append(f"<{one}>")
             else:
+                value = self._hoisted(value)
+                if is_copy(value) and isinstance(value, ast.Call) and isinstance(value.func, ast.Attribute):
+                    rows.append(f"{self._rows(value.func.value)}.copy()")
+                else:
+                    value = self._named(value)
+                    rows.append(self._rows(value))
                 given.append(ast.unparse(value))
-                rows.append(self._rows(value))
         self._flush()
         made = self._derived.rows(name, tuple(callee.written.items()))
         if not callee.result:
-            self.lines.append(f"{made}({', '.join([*given, *rows, 'moved'])})")
-            return "", []
+            said = f"{made}({', '.join([*given, *rows, 'moved'])})"
+            if callee.node.returns is None or ast.unparse(callee.node.returns) == "None":
+                self.lines.append(said)
+                return "", []
+            value = self.name("v")
+            self.lines.append(f"{value} = {said}")
+            return value, []
+        if callee.numbers:
+            value, moved = self.name("v"), self.name("m")
+            self.lines.append(f"{moved} = np.empty(({len(callee.numbers)}, moved))")
+            self.lines.append(f"{value} = {made}({', '.join([*given, *rows, moved, 'moved'])})")
+            return value, [("1.0", moved)]
+        if callee.makes_vector:
+            value = self.name("v")
+            self.lines.append(f"{value}, {value}_rows = {made}({', '.join([*given, *rows, 'moved'])})")
+            return value, []
         value, one = self.name("v"), self.name("d")
         self._stored.add(one)
         self.lines.append(f"{value} = {made}({', '.join([*given, *rows, f'<{one}>', 'moved'])})")
         return value, [("1.0", f"«{one}»")]
+
+    def _start(self, node: ast.Call) -> tuple[str, Terms]:
+        """Write a member's start, which nothing but parameters decides."""
+        self._flush()
+        self.lines.append(ast.unparse(node))
+        rows, first, count = self._stretch(node.args[3])
+        self.lines += loops(count, f"{rows}[{first} + _i, _r] = 0.0")
+        return "", []
 
     def _gradient(self, node: ast.Call, callee: Activity, back: str) -> tuple[str, Terms]:
         """Write a call in reverse, and what all directions make of its gradient."""
@@ -243,141 +336,6 @@ class Rows(Lowering):
         arguments = [*map(ast.unparse, node.args), "1.0", *gradients]
         self.lines += [f"{value} = {back}({', '.join(arguments)})", *lines]
         return value, [("1.0", f"«{one}»")]
-
-    # Arrays
-
-    def _array(self, node: ast.stmt, target: ast.expr, value: ast.expr) -> None:
-        act = self.activity
-        if isinstance(target, ast.Name) and not isinstance(node, ast.AugAssign):
-            self._flush()
-            self.lines.append(ast.unparse(node))
-            if is_numpy(value, *MAKERS) and isinstance(value, ast.Call):
-                self.lines.append(f"{target.id}_rows = {made_rows(value)}")
-            elif is_numpy(value, "sort") and isinstance(value, ast.Call):
-                self._sorted(target.id, value.args[0])
-            elif viewed(value) is not None or is_copy(value):
-                copied = is_copy(value) and isinstance(value, ast.Call)
-                base = value.func.value if copied and isinstance(value.func, ast.Attribute) else value  # type: ignore[union-attr]
-                self.lines.append(f"{target.id}_rows = {self._rows(base)}{'.copy()' if copied else ''}")
-            else:
-                rows = f"{target.id}_rows"
-                self.lines.append(f"{rows} = np.empty(({target.id}.shape[0], moved))")
-                self._fill(node, rows, "0", f"{target.id}.shape[0]", value)
-            return
-        if act.rank(target) != 1:
-            raise self.fail(node, "the derivative of whole matrices is not known.")
-        self._flush()
-        rows, first, count = self._stretch(target)
-        first, count = self.kept(first, "i"), self.kept(count, "i")
-        source = value.func.value if is_copy(value) else value  # type: ignore[union-attr]
-        base = viewed(source)
-        same = base is not None and act.root(base.id) == act.root(getattr(viewed(target), "id", ""))
-        if same and isinstance(source, ast.Subscript | ast.Name):
-            other, start, _ = self._stretch(source)
-            if other != rows:
-                raise self.fail(node, "parts of one array are shifted under one name.")
-            self.lines.append(f"tangent_shifted({rows}, {first}, {start}, {count}, moved)")
-        elif any(act.root(n.id) == act.root(getattr(viewed(target), "id", "")) for n in names(value)):
-            aside = self.name("w")
-            self.lines.append(f"{aside} = np.empty(({count}, moved))")
-            self._fill(node, aside, "0", count, value)
-            self.lines += loops(count, f"{rows}[{first} + _i, _r] = {aside}[_i, _r]")
-        else:
-            self._fill(node, rows, first, count, value)
-        self.lines.append(ast.unparse(node))
-
-    def _sorted(self, name: str, value: ast.expr) -> None:
-        """Write the rows of a sorted vector: those of its entries, in their new order."""
-        order = self.name("o")
-        self.lines += [f"{order} = np.argsort({ast.unparse(value)})"]
-        self.lines += [f"{name}_rows = np.empty(({name}.shape[0], moved))"]
-        self.lines += loops(f"{name}.shape[0]", f"{name}_rows[_i, _r] = {self._rows(value)}[{order}[_i], _r]")
-
-    def _fill(self, node: ast.stmt, rows: str, first: str, count: str, value: ast.expr) -> None:
-        """Write the loops that fill rows with what a vector is moved by."""
-        terms = self._vector(node, value)
-        self.lines += loops(count, f"{rows}[{first} + _i, _r] = {linear(terms)}")
-
-    def _vector(self, node: ast.stmt, value: ast.expr) -> Terms:
-        """Return the terms of entry `_i` of a vector."""
-        act = self.activity
-        if not act.is_active(value):
-            return []
-        if is_copy(value):
-            return self._vector(node, value.func.value)  # type: ignore[union-attr]
-        if isinstance(value, ast.Name | ast.Subscript):
-            rows, start, _ = self._stretch(value)
-            return [("1.0", f"{rows}[{self.kept(start, 'i')} + _i, _r]")]
-        if isinstance(value, ast.UnaryOp) and isinstance(value.op, ast.USub):
-            return self.times(self._vector(node, value.operand), "-1.0")
-        if isinstance(value, ast.BinOp) and isinstance(value.op, ast.Add | ast.Sub):
-            right = self._vector(node, value.right)
-            right = self.times(right, "-1.0") if isinstance(value.op, ast.Sub) else right
-            return self.sum(self._vector(node, value.left), right)
-        if isinstance(value, ast.BinOp) and isinstance(value.op, ast.Mult | ast.Div):
-            left, right = value.left, value.right
-            if act.is_active(right) and isinstance(value.op, ast.Mult):
-                left, right = right, left
-            if act.rank(right) == 0 and not act.is_active(right):
-                factor = self.kept(ast.unparse(right))
-                return self.times(
-                    self._vector(node, left), factor if isinstance(value.op, ast.Mult) else f"1.0 / {factor}"
-                )
-        raise self.fail(node, "the derivative of this array is not known.")
-
-    def _rows(self, node: ast.expr) -> str:
-        """Return the rows of an array or of a part of it."""
-        if isinstance(node, ast.Name):
-            return f"{node.id}_rows"
-        if isinstance(node, ast.Subscript):
-            return f"{self._rows(node.value)}[{ast.unparse(node.slice)}]"
-        raise self.fail(node, "what this is moved by stands nowhere.")
-
-    def _stretch(self, node: ast.expr) -> tuple[str, str, str]:
-        """Return the rows that a vector is a part of, where it begins there, and its length."""
-        if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Slice) and node.slice.step is None:
-            low = ast.unparse(node.slice.lower) if node.slice.lower is not None else "0"
-            high = f"{ast.unparse(node.value)}.shape[0]" if node.slice.upper is None else ast.unparse(node.slice.upper)
-            return self._rows(node.value), low, high if low == "0" else f"{high} - ({low})"
-        return self._rows(node), "0", f"{ast.unparse(node)}.shape[0]"
-
-    def _flush(self) -> None:
-        if self._waiting:
-            self._loops.append(self._waiting)
-            self.lines += ["for _r in range(moved):", *inner(self._waiting)]
-            self._waiting = []
-
-
-def linear(terms: Terms) -> str:
-    """Return the sum of terms."""
-    shown = [{"1.0": place, "-1.0": f"-{place}"}.get(partial, f"{partial} * {place}") for partial, place in terms]
-    return " + ".join(shown) or "0.0"
-
-
-def loops(count: str, line: str) -> list[str]:
-    """Return the loops over the entries of a vector and over directions."""
-    return [f"for _i in range({count}):", "    for _r in range(moved):", f"        {line}"]
-
-
-def is_copy(node: ast.expr) -> bool:
-    """Return whether `node` is `array.copy()`."""
-    function = node.func if isinstance(node, ast.Call) else None
-    return isinstance(function, ast.Attribute) and function.attr == "copy" and not is_numpy(node)
-
-
-def names(node: ast.expr) -> list[ast.Name]:
-    """Return the names in an expression."""
-    return [part for part in ast.walk(node) if isinstance(part, ast.Name)]
-
-
-def made_rows(node: ast.Call) -> str:
-    """Return the rows of a new array."""
-    name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
-    shape = node.args[0]
-    sizes = list(map(ast.unparse, shape.elts)) if isinstance(shape, ast.Tuple) else [ast.unparse(shape)]
-    if name.endswith("_like"):
-        sizes = [f"{sizes[0]}.shape[0]"]
-    return f"np.{'empty' if name.startswith('empty') else 'zeros'}(({', '.join([*sizes, 'moved'])}))"
 
 
 def without_unused(lines: list[str]) -> list[str]:

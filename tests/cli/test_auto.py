@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from softneck.core import load
 from softneck.identification.selection import _auto
 from softneck.signals import write_recording
 
-from ..data import neck_recording
+from ..data import neck_recording, recording_from
 from .conftest import Call
 
 
@@ -31,6 +32,16 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     assert load("best.npz").kind in ("rls", "play")
     assert "Which kind of model" in Path("why.html").read_text()
     assert call("identify", "auto", recording, "-o", "best.npz").code == 2
+
+
+def test_rows_held_out_that_stand_still_are_refused_before_anything_is_trained(call: Call) -> None:
+    P = np.zeros((800, 3))
+    P[50:] = [3.0, -1.0, 0.5]
+    write_recording("step.csv", recording_from(P, noise=0.0))
+    said = call("identify", "auto", "step.csv", "-o", "n.npz")
+    assert said.code == 2
+    assert "step.csv: the rows held out stand still: pitch moves by 0.0 % of what it does in all rows" in said.error
+    assert not Path("n.npz").exists()
 
 
 @pytest.mark.slow
@@ -67,7 +78,7 @@ def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(
     for more in ((), ("--json",)):
         said = call("identify", "auto", recording, "-o", f"best{len(more)}.npz", *more)
         assert said.code == 1
-        assert "no kind made a model of the rows held out: its free run diverges" in said.err.splitlines()[-1]
+        assert "no kind is a model of the rows held out: its free run diverges" in said.err.splitlines()[-1]
     assert json.loads(said.out)["model"] == "best1.npz"
 
 
@@ -110,5 +121,7 @@ def test_three_rows_are_one_line(call: Call, monkeypatch: pytest.MonkeyPatch) ->
     )
     said = call("identify", "auto", "r.csv", "-o", "m.npz")
     assert said.code == 2
-    assert "nlsm: no run has four samples in a row: too few to identify from" in said.error
+    assert "2 rows are too few to identify from; at least 100 are needed" in said.error
+    for kind in ("rls", "nlsm"):
+        assert "too few" in call("identify", kind, "r.csv", "-o", "m.npz").error
     assert not Path("m.npz").exists()

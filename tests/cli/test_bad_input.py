@@ -278,11 +278,11 @@ def test_a_guess_that_lacks_something_is_written_as_far_as_it_goes(call: Call, t
     said = call("import", "log.csv", "--guess", "-o", "r.csv", "--json")
     assert (said.code, said.out) == (2, "")
     last = said.err.splitlines()[-1]
-    assert last.startswith("softneck: log.csv: not found: roll: candidates are 'wind'")
-    assert last.endswith("Fill it into r.layout.toml, then use --layout r.layout.toml.")
+    assert last.startswith("softneck: log.csv: not found: roll: is it 'wind'? Write `roll = { column = 'wind'")
+    assert "fill in what is MISSING, and use --layout r.layout.toml" in said.err.splitlines()[-2]
     assert {path.name for path in tmp_path.iterdir()} == {"log.csv", "r.layout.toml"}
     text = (tmp_path / "r.layout.toml").read_text()
-    assert "# MISSING roll: candidates are 'wind'" in text
+    assert "# MISSING roll: is it 'wind'?" in text
     filled = text.replace("[channels]", '[channels]\nroll = { column = "wind", unit = "rad" }')
     (tmp_path / "r.layout.toml").write_text(filled)
     assert call("import", "log.csv", "--layout", "r.layout.toml", "-o", "r.csv").code == 0

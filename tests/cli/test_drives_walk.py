@@ -11,7 +11,8 @@ import pytest
 
 from softneck.cli import main
 from softneck.drives.simulated import _drives
-from softneck.drives.simulated._wire import Wire, WireHabits
+from softneck.drives.simulated._habits import WireHabits
+from softneck.drives.simulated._wire import Wire
 from softneck.signals import read_recording
 
 from ..drives.conftest import Project

@@ -185,12 +185,15 @@ def test_what_a_killed_process_left_is_swept_by_the_next_write_and_nothing_else_
         assert target.read_text() == "old"
         assert len(list(tmp_path.iterdir())) == 2
     (tmp_path / ".hidden-softneck.npz").write_text("somebody's")
+    (tmp_path / "seen-softneck-1.npz").write_text("somebody's")
     with atomic_write(tmp_path / "one") as one:
         one.write_text("still at work")
         with atomic_write(tmp_path / "two") as two:  # a file of any other name in that folder
             two.write_text("")
         assert one.read_text() == "still at work"
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".hidden-softneck.npz", "model.npz", "one", "two"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        ".hidden-softneck.npz", "model.npz", "one", "seen-softneck-1.npz", "two",
+    ]  # fmt: skip
 
 
 def test_a_temporary_that_is_swept_while_it_begins_begins_again(
@@ -223,3 +226,15 @@ def test_many_processes_may_write_one_file_at_once(tmp_path: Path) -> None:
     assert [run.wait() for run in runs] == [0, 0, 0]
     assert (tmp_path / "a").read_text() in {letter * 1000 for letter in "xyz"}
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_link_that_waits_under_the_temporary_s_name_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a folder that others may write to: what it points to is not ours."""
+    monkeypatch.setattr("secrets.token_hex", lambda _size: "00000000")
+    (tmp_path / "theirs").write_text("somebody's")
+    (tmp_path / ".a-softneck-00000000").symlink_to("theirs")
+    with pytest.raises(OutputFileError, match="a: cannot be written: File exists"), atomic_write(tmp_path / "a"):
+        pytest.fail("the body must not run")
+    assert (tmp_path / "theirs").read_text() == "somebody's"

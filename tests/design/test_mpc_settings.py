@@ -78,6 +78,21 @@ def test_saved_and_loaded_it_is_the_same(soft: MpcController, tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("look_ahead", "samples"), [(0.04, 2), (0.05, 2), (0.3, 5)])
+def test_what_the_observer_is_ahead_is_dead_time_that_nobody_sees(look_ahead: float, samples: int) -> None:
+    """What a perfect predictor tells is the plant with so much less dead time, in whole samples, none below zero."""
+    late, tf = bake_off_neck(), bake_off_neck().pitch
+    # Five samples are asked for, four are there.
+    least = 5 - samples
+    numbers = np.append(np.asarray(tf.den[0][0])[:2], np.zeros(least))
+    sooner = control.TransferFunction(tf.num[0][0], numbers, TS)
+    known = MpcSettings(bandwidth=6.0, least_delay=0.1, look_ahead=look_ahead).design(late)
+    seen = MpcSettings(bandwidth=6.0, least_delay=0.0).design(LinearNeck(pitch=sooner, roll=sooner))
+    for name, mine, its in zip(rt.MpcArrays.names(), known.arrays, seen.arrays, strict=True):
+        # The same numbers from the same steps.
+        np.testing.assert_allclose(mine, its, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
 def test_the_tuning_keeps_what_it_was_asked() -> None:
     asked = MpcSettings(max_sensitivity=1.4).design(bake_off_neck())
     assert max(asked.design["sensitivity"]) <= 1.4

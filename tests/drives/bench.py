@@ -15,7 +15,7 @@ from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._virtual import VirtualRun, simulated_plant
 from softneck.drives.simulated import SimulatedDrive
-from softneck.drives.simulated._wire import Wire, WireHabits
+from softneck.drives.simulated._habits import WireHabits
 from softneck.plant import NeckParameters
 
 T = 0.01
@@ -39,6 +39,10 @@ class Script:
     def step(self, measured: Measurement) -> tuple[float, ...] | None:
         self.steps += 1
         return self.wanted if self.act is None else self.act(measured)
+
+    @property
+    def reference(self) -> tuple[float, ...]:
+        return getattr(self.act, "reference", ())
 
     def finished(self, index: int) -> bool:
         return index >= self.rows
@@ -69,14 +73,11 @@ class Bench:
     ) -> None:
         self.file = replace(file or default_drives(profile), ramps=FAST)
         count = len(self.file.drives)
-        self.neck = simulated_plant(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed)
-        if habits is not None:
-            self.neck._on_bus.wire = Wire(habits, self.neck.settings.cycle)
-            for drive in self.neck.drives:
-                drive._sdo._plain = habits.plain_sdo
+        self.neck = simulated_plant(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed, habits=habits)
         self.link = VirtualLink(self.neck)
         self.pilot = Script(rows, count)
-        settings = self.file.master_settings(TS, guarding=guarding)
+        late = self.file.nodes if habits is not None and habits.mode_when == "enabled" else ()
+        settings = self.file.master_settings(TS, guarding=guarding, late_modes=late)
         settings = replace(settings, bus=replace(settings.bus, off=off))
         self.master = Master(settings if change is None else change(settings), self.pilot)
         for entry, drive in zip(self.file.drives, self.neck.drives, strict=True):
@@ -86,7 +87,7 @@ class Bench:
                 *pdo_writes(entry, self.file.profile),
                 *drive_changes,
             ]
-            configure(drive, writes)
+            configure(drive, [write for write in writes if not (late and write.index == 0x6060)])
         self.link.send([nmt_frame(Command.START, 0)])
         self.link.drain()
         self.run = VirtualRun(self.link, self.master)

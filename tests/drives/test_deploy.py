@@ -34,6 +34,7 @@ from softneck.drives.master._measured import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
+from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._servo_runtime import (
     SERVO_DEMAND,
     SERVO_POSITION,
@@ -41,7 +42,6 @@ from softneck.drives.simulated._servo_runtime import (
     SERVO_TARGET,
     SERVO_ZERO,
 )
-from softneck.drives.simulated._wire import WireHabits
 from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 
@@ -234,6 +234,39 @@ def test_no_zero_is_taken_for_one_where_homing_did_not_end(what: str, latency: f
     # Nor does a mark stay that would let a run start from it.
     with pytest.raises(CheckFailedError, match=r"node 1: homed: no\. Run `softneck drives zero`"):
         preflight(link, file, homed=True).require()
+
+
+@pytest.mark.parametrize(("creep", "zeroed"), [(0.15, True), (0.25, False), (-0.25, False)])
+def test_a_winch_that_creeps_faster_than_still_is_not_zeroed(creep: float, zeroed: bool) -> None:
+    """The zero itself fits at any of these: what refuses it is that the winch turns (`still`: 0.2 rad/s)."""
+    file, link = default_drives(), virtual()
+    report, axis = preflight(link, file), link.neck.drives[1].axis
+    position, per_radian = axis.getters[(0x6064, 0)], file.drives[1].scale.counts_per_radian
+    begun: list[float] = []
+
+    def crept() -> int:
+        if axis.values[(0x6060, 0)] == 6 and not begun:
+            begun.append(link.now)
+        return position() + round(creep * per_radian * (link.now - begun[0] if begun else 0.0))
+
+    axis.getters[(0x6064, 0)] = crept
+    if zeroed:
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
+        return
+    with pytest.raises(CheckFailedError, match=r"node 2: homing did not end .* -?0\.2\d+ rad/s"):
+        zero(link, file, lambda: link.newest, guarding=report.guarding)
+
+
+def test_a_winch_that_pulls_slowly_is_not_still() -> None:
+    """Pulled at less than twice `still`, a tendon is not tight before it is."""
+    pulled = []
+    for speed in (0.35, 2.0):
+        file, link = default_drives(), virtual()
+        file = replace(file, zero=replace(file.zero, speed=speed, timeout=60.0))
+        report = preflight(link, file)
+        pulled.append(zero(link, file, lambda link=link: link.newest, guarding=report.guarding).pulled)
+    # A slower pull comes to rest with less swing: a tenth of a radian is a hundredth of a millimetre of stretch.
+    assert pulled[0] == pytest.approx(pulled[1], abs=0.1)
 
 
 def test_another_slow_loop_is_found_while_zeroing() -> None:

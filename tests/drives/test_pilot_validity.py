@@ -42,6 +42,25 @@ def test_a_pilot_knows_how_far_the_motors_are_from_the_model_s_training() -> Non
     assert max(seen[22:]) < 0.2
 
 
+def test_a_pilot_tells_what_its_outputs_are_wanted_to_be() -> None:
+    """The supervisor compares the loop with it, in the order of the outputs, without the co-contraction."""
+    asked = ["pitch_reference", "roll_reference", "pitch", "roll"]
+    plant = BlockPart(model().block())
+    made = LoopPilot(
+        Loop(
+            plant=plant,
+            controller=Ports("controller", asked, NAMES),
+            reference=lambda t: (t, -2.0 * t, 0.5),
+            duration=1.0,
+        )
+    )
+    made.start()
+    for index in range(3):
+        made.step(Measurement(index, sample_of((0.0, 0.0)), True, (0.0, 0.0, 0.0)))
+        t = index * made.sample_time
+        assert made.reference == (t, -2.0 * t)
+
+
 def test_what_is_no_model_has_none() -> None:
     plant = Ports("plant", NAMES, ["pitch", "roll", *(f"motor_position_{j}" for j in (1, 2, 3))])
     made = pilot(plant)  # pyright: ignore[reportArgumentType]

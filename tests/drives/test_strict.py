@@ -19,8 +19,9 @@ from softneck.drives.bus._sdo import load_eds
 from softneck.drives.master import Phase
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
 from softneck.drives.simulated._frame import CanFrame
+from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._sdo import SdoServer
-from softneck.drives.simulated._wire import Wire, WireHabits, frame_bits
+from softneck.drives.simulated._wire import Wire, frame_bits
 from softneck.plant import NeckParameters
 
 from .bench import Bench
@@ -310,6 +311,8 @@ SWITCHES: dict[str, tuple[Any, ...]] = {
     "queue": (0, 4),
     "bitrate": (0.0, 500e3, 1e6),
     "plain_sdo": (False, True),
+    "mode_when": ("always", "off", "enabled"),
+    "quirks": ((), ("write_only", "one_abort", "plain_pdo")),
     "profile": ("ipos2015", "ds402"),
 }
 
@@ -317,13 +320,15 @@ SWITCHES: dict[str, tuple[Any, ...]] = {
 def test_every_pair_stands_in_the_covering_array() -> None:
     rows = covering({"fault": tuple(SCENARIOS), **SWITCHES})
     assert all_pairs({"fault": tuple(SCENARIOS), **SWITCHES}) == set().union(*map(pairs_of, rows))
-    # At least a row for each fault with each of the three latencies; all products would be 72 for each.
+    # At least a row for each fault with each of the three latencies; all products would be 432 for each.
     assert 3 * len(SCENARIOS) <= len(rows) <= 4 * len(SCENARIOS)
 
 
 def play(row: dict[str, Any]) -> None:
     scenario = SCENARIOS[row["fault"]]
-    habits = WireHabits(**{name: row[name] for name in ("sdo_latency", "queue", "bitrate", "plain_sdo")})
+    named = ("sdo_latency", "queue", "bitrate", "plain_sdo", "mode_when")
+    given: dict[str, Any] = {name: row[name] for name in named} | dict.fromkeys(row["quirks"], True)
+    habits = WireHabits(**given)
     bench = Bench(off=scenario.others_off, change=scenario.change, profile=row["profile"], habits=habits).start()
     assert bench.phase is Phase.RUNNING
     scenario.play(bench)

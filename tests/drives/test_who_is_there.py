@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from softneck.cli._main import run
@@ -20,27 +19,22 @@ from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.master import Frame
 from softneck.drives.running._bus_loop import Session, run_session
 from softneck.drives.running._stop import wait
-from softneck.drives.simulated import SimulatedDrive
-from softneck.drives.simulated._axis import Axis
+from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._profiles import PROFILES, Profile, ds402
-from softneck.drives.simulated._servo_runtime import SERVO_SIZE
 from softneck.plant import NeckParameters
 
 from .bench import FAST
 
 
-def linked(file: DrivesFile) -> VirtualLink:
-    return VirtualLink(simulated_neck(file, NeckParameters.paper(), sample_time=0.02))
+def linked(file: DrivesFile, habits: WireHabits | None = None) -> VirtualLink:
+    return VirtualLink(simulated_neck(file, NeckParameters.paper(), sample_time=0.02, habits=habits))
 
 
 def with_twin() -> VirtualLink:
     """Two drives with number 2, of serial numbers 11 and 12."""
-    link = linked(default_drives())
-    twin = SimulatedDrive(Axis(2, PROFILES["ipos2015"](), np.zeros(SERVO_SIZE), peak_current=10.0, slow_loop=1e-3))
-    twin.tick(0.0)
+    link = linked(default_drives(), WireHabits(twin=2))
     link.neck.drives[1].axis.values[(0x1018, 4)] = 11
-    twin.axis.values[(0x1018, 4)] = 12
-    link.neck.drives = (*link.neck.drives, twin)
+    link.neck._on_bus.twins[0].axis.values[(0x1018, 4)] = 12
     return link
 
 

@@ -26,7 +26,12 @@ from .conftest import Running
 TS = 0.02
 MOTORS = [f"motor_setpoint_{j}" for j in (1, 2, 3)]
 NEXT = ["pitch_next", "roll_next"]
-KINDS = ("rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble", "guarded")
+KINDS = (
+    "rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble", "guarded", "nlsm",
+    "residual", "online_nlsm",
+)  # fmt: skip
+# Controllers and observers: their outputs follow the inputs of a sample at once.
+LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "ncf", "custom", "kalman_steady", "nonlinear")
 pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
 )
@@ -229,9 +234,47 @@ def test_an_fmu_without_says_so(tmp_path: Path, running: Any) -> None:
         assert "--sensitivities" in fmu.log[-1][1]
 
 
+@pytest.mark.parametrize("name", slow_but(LAWS, ("pi", "nonlinear")))
+def test_controllers_and_observers_have_them_too(name: str, tmp_path: Path, running: Any) -> None:
+    block = load(ROOT / "tests" / "golden" / f"{name}.npz").block()
+    build_compiled_fmu(block, tmp_path / "Law.fmu", sensitivities=True)
+    assert validate_fmu(str(tmp_path / "Law.fmu")) == []
+    model = fmpy.read_model_description(str(tmp_path / "Law.fmu"))
+    ahead = [v.name for v in model.modelVariables if v.name.endswith("_next")]
+    assert ahead[0] == ("motor_setpoint_1_next" if block.role == "controller" else "pitch_next")
+    numbers = [port.name for port in block.inputs if not port.boolean]
+    rng, values, said = np.random.default_rng(0), np.zeros(len(numbers)), [0.0]
+    with running(tmp_path / "Law.fmu") as fmu:
+        fmu.begin()
+        references = [fmu.references[one] for one in ahead]
+        for k in range(30):
+            values += rng.normal(0.0, 0.003, len(numbers))
+            fmu.set(**{p.name: 1.0 for p in block.inputs if p.boolean}, **dict(zip(numbers, values, strict=True)))
+            if k == 29:
+                exact = [fmu.fmu.getDirectionalDerivative(references, [fmu.references[one]], [1.0]) for one in numbers]
+                near = []
+                for one, value in zip(numbers, values, strict=True):
+                    sides = []
+                    for sign in (1.0, -1.0):
+                        fmu.set(**{one: value + sign * 1e-6})
+                        sides.append(np.array(fmu.get(*ahead)))
+                    fmu.set(**{one: value})
+                    near.append((sides[0] - sides[1]) / 2e-6)
+                # Rounding of differences: 1e-16 / 1e-6 of set-points below 10, with room; gates take squares of moves.
+                np.testing.assert_allclose(exact, near, rtol=1e-6, atol=1e-7)
+                assert np.abs(exact).max() > 0.1
+                said = fmu.get(*ahead)
+            fmu.fmu.doStep(k * TS, TS)
+        assert fmu.get(*(one.removesuffix("_next") for one in ahead)) == said
+
+
 @pytest.mark.parametrize(
-    ("name", "words"), [("nlsm", "has no derivative"), ("pi", "only plants"), ("kalman", "only plants")]
-)
+    ("name", "words"),
+    [
+        ("mpc", "quadratic program"), ("kalman", "covariance"), ("adaptive", "learns its plant"),
+        ("scheduled", "interpolates whole matrices"),
+    ],
+)  # fmt: skip
 def test_kinds_without_are_refused(name: str, words: str, tmp_path: Path) -> None:
     block = load(ROOT / "tests" / "golden" / f"{name}.npz").block()
     with pytest.raises(SettingsError, match=words):

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import os
+import resource
 import struct
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
-from softneck.core import load, read_certificate, write_certificate
+from softneck.core import FileFormatError, load, read_certificate, write_certificate
 from softneck.core._certificate import certificate_contents
 from softneck.cosim import load_loop, load_ssp, load_study
 from softneck.cosim.parts._fmu_part import FmuPart
-from softneck.cosim.studies._store import read_description
+from softneck.cosim.parts._ours import block_of
+from softneck.cosim.studies._store import read_description, read_runs
+from softneck.drives.bus._objects import require_eds
 from softneck.drives.bus._read import load_drives
+from softneck.drives.bus._sdo import load_eds
 from softneck.drives.commissioning._moves import read_moves
 from softneck.drives.logs._cycle import Cycle
 from softneck.drives.logs._frame_log import BlfSink, CandumpSink, FrameLog
@@ -26,11 +35,13 @@ from softneck.drives.logs._log_file import read_run_log
 from softneck.drives.logs._run_log import _Entry, _McapSink
 from softneck.drives.master import Frame
 from softneck.drives.supervision._baseline import load_baseline
+from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
 from softneck.robot._file import preset_text
 from softneck.signals import read_layout, read_recording, write_recording
 from softneck.signals.importing._table_format import sniff
+from softneck.signals.importing.formats import _sheets
 from softneck.tuning._requirements import read_tune_requirements
 from softneck.verification import read_requirements
 
@@ -72,18 +83,16 @@ class Target:
         read: reads one.
         seeds: writes whole ones to paths that it is given names for.
         zipped: whether members are changed too, with all sums of the archive right.
-        share: of the inputs of another target; spreadsheets are read by a process of their own.
     """
 
     suffix: str
     read: Callable[[Path], Any]
     seeds: Sequence[Callable[[Path], Any]]
     zipped: bool = False
-    share: float = 1.0
 
 
-def columns() -> dict[str, np.ndarray]:
-    recording = neck_recording(40)
+def columns(rows: int = 40) -> dict[str, np.ndarray]:
+    recording = neck_recording(rows)
     made = {"t": recording.time}
     made |= {f"s{j + 1}": recording.set_points[:, j] for j in range(3)}
     return {**made, "pitch": recording.outputs[:, 0], "roll": recording.outputs[:, 1]}
@@ -132,6 +141,16 @@ def fmu(path: Path) -> None:
         file.writestr("binaries/linux64/A.so", b"none")
 
 
+def our_fmu(path: Path) -> None:
+    """One that runs Python, without the binaries: it is read back as the block that it was made of."""
+    whole = path.with_name("whole.fmu")
+    build_fmu(load(ROOT.joinpath(*GOLDEN, "pi.npz")).block(), whole, force=True)
+    with zipfile.ZipFile(whole) as given, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as kept:
+        for name in ("modelDescription.xml", "resources/block.json", "resources/arrays.npy"):
+            kept.writestr(name, given.read(name))
+    whole.unlink()
+
+
 def ssp(path: Path) -> None:
     inside = path.with_name("A.fmu")
     fmu(inside)
@@ -159,6 +178,66 @@ xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" name="a" version=
 <ssd:DefaultExperiment startTime="0" stopTime="1"/><ssd:Annotations><ssc:Annotation type="softneck">
 <Master stepSize="0.02" order="jacobi"/></ssc:Annotation></ssd:Annotations></ssd:SystemStructureDescription>"""
 
+# All of what an EDS may say, but not the objects that a run needs.
+SMALL_EDS = """[FileInfo]\nFileName=a.eds\n[Comments]\nLines=1\nLine1=a\n[DeviceInfo]\nVendorName=a\nBaudRate_1000=1
+[DummyUsage]\nDummy0001=1\nDummy0002=1\nDummy0003=1\nDummy0004=1\nDummy0005=1\nDummy0006=1\nDummy0007=1
+[1000]\nParameterName=a\nObjectType=0x7\nDataType=0x0007\nAccessType=ro\nDefaultValue=$NODEID+0x192\nPDOMapping=0
+LowLimit=0\nHighLimit=0xFFFF\n[1018]\nParameterName=b\nObjectType=0x9\nSubNumber=2\n[1018sub0]\nParameterName=c
+DataType=0x0005\nAccessType=ro\nDefaultValue=1\n[1018sub1]\nParameterName=d\nDataType=0x0007\nAccessType=ro
+[2000]\nParameterName=e\nObjectType=0x8\nDataType=0x0003\nAccessType=rw\nCompactSubObj=3\n[2000Name]\nNrOfEntries=2
+1=f\n2=g\n"""
+
+
+def sheet(path: Path) -> None:
+    """As the reader, but that a fork tries a file first: a process of its own would take most of the time."""
+    with mock.patch.object(_sheets, "_try", tried):
+        sniff(path)
+
+
+def tried(path: Path) -> None:
+    import python_calamine as calamine
+
+    child = os.fork()
+    if not child:
+        data = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[5]) * resource.getpagesize()
+        most = data + _sheets._LEAST_ROOM
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # where memory ends it says so
+        try:
+            book = calamine.CalamineWorkbook.from_path(path)
+            for name in book.sheet_names:
+                book.get_sheet_by_name(name)
+        except MemoryError:
+            os._exit(2)
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code < 0 or code == 2:
+        raise FileFormatError(f"{path}: its sheets would fill the memory.")
+
+
+def eds(path: Path) -> None:
+    """Whether it fits is another question, with a line of its own."""
+    dictionary = load_eds("ipos2015", path)
+    with contextlib.suppress(FileFormatError):
+        require_eds(dictionary, "ipos2015", path.name)
+
+
+def runs(path: Path) -> None:
+    made = {"run": [0, 1, 2], "sample": [0, 1, 2], "seed": [5, 6, 7], "plant.payload": [0.0, 0.1, 0.2],
+            "rise_s": [0.4, None, 0.5], "holds": [True, None, False], "error": ["", "a", ""],
+            "seconds": [0.1] * 3}  # fmt: skip
+    pq.write_table(pa.table(made), path)
+
+
+def runs_beside(path: Path) -> Any:
+    """A study's runs lie beside its description."""
+    (path.parent / "study.json").write_text('{"study": {"loop": {}, "runs": 3}}', encoding="utf-8")
+    path.replace(path.with_name("runs.parquet"))
+    return read_runs(path.parent)
+
+
 GOLDEN = ("tests", "golden")
 MOVED = {"motor": 0, "node": 1, "outcome": "pulled", "way": 1, "phase": [0], "time": [0.0], "counts": [0],
          "current": [0.0], "outputs": [[0.0, None]], "captures": []}  # fmt: skip
@@ -175,7 +254,7 @@ TARGETS: dict[str, Target] = {
             lambda path: log_writers.write_text(path, columns(), sep=",", decimal="."),
         ],
     ),
-    "sheet": Target(".xlsx", sniff, [lambda path: log_writers.write_sheet(path, columns())], zipped=True, share=0.02),
+    "sheet": Target(".xlsx", sheet, [lambda path: log_writers.write_sheet(path, columns(12))], zipped=True),
     "mat": Target(
         ".mat",
         sniff,
@@ -198,6 +277,7 @@ TARGETS: dict[str, Target] = {
     "candump": Target(".log", lambda path: list(FrameLog(path)), [frames(CandumpSink)]),
     "blf": Target(".blf", lambda path: list(FrameLog(path)), [frames(BlfSink)]),
     "fmu": Target(".fmu", lambda path: FmuPart(path, role="plant"), [fmu], zipped=True),
+    "our_fmu": Target(".fmu", block_of, [our_fmu], zipped=True),
     "ssp": Target(".ssp", load_ssp, [ssp], zipped=True),
     "loop": Target(".toml", load_loop, [text(LOOP)]),
     "study": Target(
@@ -207,6 +287,8 @@ TARGETS: dict[str, Target] = {
     ),
     "robot": Target(".toml", Robot.read, [text(preset_text(name)) for name in ("arm", "trunk4")]),
     "drives": Target(".toml", load_drives, [copy("examples", "drives", "drives.toml")]),
+    "eds": Target(".eds", eds, [copy("softneck", "drives", "bus", "eds", "ipos2015.eds"), text(SMALL_EDS)]),
+    "runs": Target(".parquet", runs_beside, [runs]),
     "layout": Target(
         ".toml",
         read_layout,

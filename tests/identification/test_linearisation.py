@@ -114,8 +114,6 @@ def test_at_a_state_the_motors_stay() -> None:
         ("oe", {"motor_1": 1.0}, r"`motor_1` is not a set-point; `at` takes motor_setpoint_1, "),
         ("oe", [1.0, 2.0], r"`at`"),
         ("oe", [1.0, math.nan, 0.0], r"`at`"),
-        ("nlsm", None, r"set membership .* has no derivative"),
-        ("residual", None, r"set membership .* has no derivative"),
     ],
 )
 def test_what_it_cannot_use_is_refused(name: str, at: object, match: str) -> None:

@@ -2,7 +2,8 @@
 
 Plays the cases of `tests/drives/processes.py` in the guest of `machine.py`: host, drives and inclinometer as processes
 of their own over vcan0, then over two emulated SJA1000 controllers (kvaser_pci) at 1 Mbit/s on one emulated bus, the
-master on can0 and the drives on can1. Prints a table; exit code 1 if an end state was not exact.
+master on can0 and the drives on can1. Before that the tests that need sockets of AF_CAN are run there: ours, and those
+with python-canopen's masters and slaves. Prints a table; exit code 1 if an end state was not exact or a test failed.
 
 Without KVM the machine is slow: the cycle is longer and waiting is more patient then, and the output says so. States
 are exact all the same; times are those of the guest's clock.
@@ -45,8 +46,14 @@ play() {{
     {python} {script} --bus socketcan:${{1%%/*}} --drives-bus socketcan:${{1##*/}} --link ${{1%%/*}} \\
         --profile $2 --project {project}/$2 --fork --attempts=2 --realtime {relaxed} "${{@:3}}"
 }}
+{tests}
 {plays}
 """
+TESTED = "GUEST-TESTS"
+TESTS = f"""cd {{sources}}
+{{python}} -m pytest -q -p no:cacheprovider -n 0 -k socketcan tests/drives/test_socketcan.py tests/drives/test_others.py
+echo {TESTED} $?
+cd /run/softneck"""
 
 
 def prepare(folder: Path, period: float) -> None:
@@ -92,6 +99,7 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=1)
     parser.add_argument("--buses", nargs="*", default=list(CASES), help="master's/drives' interface")
     parser.add_argument("--no-kvm", action="store_true")
+    parser.add_argument("--tests", choices=("too", "only", "not"), default="too", help="those that need AF_CAN")
     parser.add_argument("--period", type=float, help="of the cycle [s]")
     parser.add_argument("--seconds", type=float, default=3600.0, help="the guest is given up then [s]")
     chosen = parser.parse_args()
@@ -99,7 +107,8 @@ def main() -> None:
     kvm = has_kvm() and not chosen.no_kvm
     period = chosen.period or (0.01 if kvm else 0.02)
     relaxed = f"--period {period}" if kvm else f"--period {period} --patience 10"
-    cases = {bus: chosen.cases or CASES[bus] for bus in chosen.buses}
+    cases = {bus: chosen.cases or CASES[bus] for bus in chosen.buses} if chosen.tests != "only" else {}
+    tests = "" if chosen.tests == "not" else TESTS.format(sources=ROOT, python=sys.executable)
     BUILD.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=BUILD) as name:
         folder = Path(name)
@@ -109,7 +118,7 @@ def main() -> None:
             for bus, names in cases.items()
         )
         script = GUEST.format(
-            path=os.environ["PATH"], sources=ROOT, cache=BUILD / "cache", project=folder,
+            path=os.environ["PATH"], sources=ROOT, cache=BUILD / "cache", project=folder, tests=tests,
             python=sys.executable, script=SCRIPT, relaxed=relaxed, plays=plays,
         )  # fmt: skip
         print(f"cycle {1e3 * period:g} ms{'' if kvm else ', patience 10: an emulated machine'}", flush=True)
@@ -117,8 +126,9 @@ def main() -> None:
     rows = table(lines)
     good, wanted = sum(row["exact"] for row in rows), chosen.repeat * sum(map(len, cases.values()))
     ended = any(line.startswith(END) for line in lines)
-    print(f"{good} of {wanted} cases exact")
-    sys.exit(0 if ended and good == wanted else 1)
+    tested = chosen.tests == "not" or f"{TESTED} 0" in lines
+    print(f"{good} of {wanted} cases exact; tests of AF_CAN: {'passed' if tested else 'FAILED'}")
+    sys.exit(0 if ended and good == wanted and tested else 1)
 
 
 if __name__ == "__main__":

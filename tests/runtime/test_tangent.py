@@ -27,7 +27,8 @@ from softneck.runtime._tangent import with_tangent
 
 from ..data import ROOT
 
-KINDS = ("rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble")
+KINDS = ("rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble", "nlsm", "residual")
+LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "ncf", "custom", "kalman_steady", "nonlinear", "online_nlsm")
 
 
 def block_of(name: str) -> Block:
@@ -110,10 +111,50 @@ def test_compiled_it_is_the_same() -> None:
         np.testing.assert_allclose(a, b, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["nlsm", "residual"])
-def test_set_membership_is_refused_by_name(name: str) -> None:
-    with pytest.raises(SettingsError, match=r"set membership .* searches its data and has no derivative"):
-        load_tangent(block_of(name).runtime)
+@pytest.mark.parametrize("name", LAWS)
+def test_controllers_and_observers_have_derivatives_too(name: str) -> None:
+    block = load(ROOT / "tests" / "golden" / f"{name}.npz").block()
+    step, tangent = load_runtime(block.runtime, compiled=False).step, load_tangent(block.runtime, compiled=False)
+    start, rng = block.initial_state(), np.random.default_rng(0)
+    x, y, q = start.values.copy(), np.zeros(len(block.outputs)), start.parameters
+    numbers = [i for i, port in enumerate(block.inputs) if not port.boolean]
+    u = np.array([float(port.boolean) for port in block.inputs])
+    for k in range(13):
+        # Slowly: far from all limits, which a moment later would be a corner.
+        u[numbers] += rng.normal(0.0, 0.003, len(numbers))
+        if k in (1, 12):
+            X, U = rng.standard_normal((x.size, 4)), np.zeros((u.size, 4))
+            U[numbers] = rng.standard_normal((len(numbers), 4))
+            # Counters, flags and random numbers stay; a small variance has a curvature of 1e6.
+            X[(x == np.round(x)) | (np.abs(x) > 1e3) | (name == "nonlinear")] = 0.0
+
+            def run(h: float, d: int, x: Vector = x, u: Vector = u, X: Matrix = X, U: Matrix = U) -> Vector:
+                moved, out = x + h * X[:, d], np.zeros(len(block.outputs))
+                step(block.arrays, q, moved, u + h * U[:, d], out)
+                return np.concatenate([moved, out])
+
+            found, ahead, out, Y = X.copy(), x.copy(), np.zeros(y.size), np.zeros((y.size, 4))
+            tangent(block.arrays, q, ahead, u.copy(), out, found, U, Y, 4)
+            np.testing.assert_array_equal(np.concatenate([ahead, out]), run(0.0, 0))
+            for d in range(4):
+                slope = (run(1e-6, d) - run(-1e-6, d)) / 2e-6
+                # Curvature of steep integrals, 1e-12 of it, and rounding of 1e-16 / 1e-6.
+                np.testing.assert_allclose(np.concatenate([found[:, d], Y[:, d]]), slope, rtol=1e-6, atol=1e-6)
+        step(block.arrays, q, x, u.copy(), y)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mpc", "quadratic program"),
+        ("kalman", "covariance"),
+        ("adaptive", "learns its plant"),
+        ("scheduled", "matrices"),
+    ],
+)
+def test_kinds_without_derivative_say_why(name: str, words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        load_tangent(load(ROOT / "tests" / "golden" / f"{name}.npz").block().runtime)
 
 
 # Small texts: one thing each.
@@ -204,6 +245,18 @@ while total > 0.2:
     total *= 0.5
 outputs[1] += max(total, -10.0, x[2] - 20.0)
 """,
+    "vectors": """
+state[:] = turned(turned(state) - 0.5 * state)
+start, line = state[:1], state[1:]
+line[:] = inputs[0] * inputs[1] + start[0]
+one, two, yes = both(inputs[0], state)
+usable = told(state, two)
+weights = np.array([2.0, 0.5])
+w = inputs * weights
+low, high = nearest(2.0, w)
+outputs[0] = one * two + low if usable and yes else 0.0
+outputs[1] = state[0] + one * high
+""",
     "calls": """
 fill(state, inputs[0] * inputs[1], outputs)
 outputs[1] = poly(state, inputs, 4) + scaled(2.0 * state[0], inputs[1]) * half(inputs)
@@ -214,6 +267,29 @@ def fill(x: np.ndarray, a: float, out: np.ndarray) -> None:
     for i in range(x.shape[0]):
         x[i] = x[i] * a
     out[0] = a + x[2]
+
+def turned(x: np.ndarray) -> np.ndarray:
+    if x[0] > 100.0:
+        return x
+    y = np.dot(np.array([[1.0, 2.0, 0.0], [0.0, 0.5, 1.0], [3.0, 0.0, 1.0]]), 2.0 * x)
+    return y + 0.5 * x
+
+def both(a: float, x: np.ndarray) -> tuple[float, float, bool]:
+    x[0] += a * x[1]
+    return a * x[1], a + x[0], a > 0.0
+
+def told(x: np.ndarray, a: float) -> bool:
+    x[1] = a * x[1]
+    return a > -1e9
+
+def nearest(gamma: float, w: np.ndarray) -> tuple[float, float]:
+    d = gamma * math.hypot(w[0] - 0.1, w[1] - 3.0)
+    return 1.0 - d, 2.0 + d
+
+def nearest_slopes(gamma: float, w: np.ndarray, low: float, high: float, slopes: np.ndarray) -> None:
+    slopes[1, 0] = gamma * gamma * (w[0] - 0.1) / (high - 2.0)
+    slopes[1, 1] = gamma * gamma * (w[1] - 3.0) / (high - 2.0)
+    slopes[0] = -slopes[1]
 
 def scaled(a: float, b: float) -> float:
     if a > b:
@@ -251,6 +327,12 @@ def test_everything_a_step_is_written_in_is_differentiated(body: str, seed: int)
     z = rng.uniform(0.2, 1.0, 5)
     # h^2 of the third derivative, below 30 here, and rounding of 1e-16 / h.
     np.testing.assert_allclose(derivative(f, z, d), differences(f, z, d, 1e-5), rtol=1e-7, atol=1e-8)
+
+
+def test_a_root_of_zero_is_moved_by_nothing() -> None:
+    f = functions("d = inputs[0] - state[0]\noutputs[0] = math.sqrt(d * d * d * d + 0.0 * state[1]) + inputs[1]")
+    z = np.array([0.5, 0.0, 0.0, 0.5, 0.0])
+    np.testing.assert_array_equal(derivative(f, z, np.eye(5))[3], [0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def test_sums_and_whole_layers_are_differentiated_in_reverse() -> None:

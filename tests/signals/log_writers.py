@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pandas as pd
+from mcap.writer import CompressionType
 from mcap_ros2.writer import Writer
 from scipy.io import savemat
 
@@ -158,13 +159,16 @@ uint32 nanosec"""
 )
 
 
-def write_mcap(path: Path, columns: Columns, *, late: float = 0.0, quaternion: bool = False) -> None:
+def write_mcap(
+    path: Path, columns: Columns, *, late: float = 0.0, quaternion: bool = False,
+    compression: CompressionType = CompressionType.ZSTD, piece: int = 2**20,
+) -> None:  # fmt: skip
     """A bag of ROS 2: set-points on a topic without a stamp, positions and angles on stamped ones.
 
     Set-points come `late` [s] before the angles, as on a bus where a controller writes first.
     """
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size=piece, compression=compression)
         array = writer.register_msgdef("std_msgs/Float64MultiArray", "float64[] data")
         joints = writer.register_msgdef("sensor_msgs/JointState", _STAMPED.format("string[] name\nfloat64[] position"))
         tilt = writer.register_msgdef("neck_msgs/Tilt", _STAMPED.format("float64 pitch\nfloat64 roll"))

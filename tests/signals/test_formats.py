@@ -162,12 +162,30 @@ def test_one_axis_is_a_robot_of_one_output(tmp_path: Path, axis: str, weights: l
     pd.DataFrame(table).to_csv(tmp_path / "log.csv", index=False)
     guess = guess_layout(tmp_path / "log.csv")
     assert guess.missing == ()
+    # A neck has two: what is missing is said, asked in a terminal and marked in the layout.
+    assert [(doubt.about, doubt.taken) for doubt in guess.doubts] == [("outputs", f"{axis} only")]
+    assert any(line.startswith(f"not sure: outputs: {axis} only") for line in guess.lines)
+    assert f"NOT SURE: outputs: {axis} only" in guess.text
     r = import_log(tmp_path / "log.csv", guess.layout).recording
     assert r.robot.outputs.names == (axis,)
     found = r.robot.weights()
     assert found is not None
     np.testing.assert_allclose(found, [weights], atol=1e-4)  # the paper prints 0.866
     np.testing.assert_allclose(r.channels[axis], NECK.channels[axis], rtol=1e-12)
+
+
+def test_a_column_without_a_title_is_an_angle_or_an_index_by_its_numbers(tmp_path: Path) -> None:
+    table = pd.DataFrame({"": np.arange(len(columns()["t"])), **named(columns())})
+    table.to_csv(tmp_path / "whole.csv", index=False)
+    whole = guess_layout(tmp_path / "whole.csv")
+    assert any("because it counts the rows" in line for line in whole.lines)
+    table.drop(columns="").rename(columns={"pitch": ""}).to_csv(tmp_path / "log.csv", index=False)
+    guess = guess_layout(tmp_path / "log.csv")
+    assert guess.layout.robot.outputs.names == ("pitch", "roll")
+    assert [doubt.about for doubt in guess.doubts] == ["pitch"]
+    found, expected = (import_log(tmp_path / f"{name}.csv", one.layout).recording.outputs
+                       for name, one in (("log", guess), ("whole", whole)))  # fmt: skip
+    np.testing.assert_array_equal(found, expected)
 
 
 LAYOUT = """

@@ -291,10 +291,10 @@ def test_what_is_missing_is_named_with_its_candidates(tmp_path: Path) -> None:
     frame.to_csv(tmp_path / "log.csv", index=False)
     guess = guess_layout(tmp_path / "log.csv")
     assert len(guess.missing) == 1
-    assert guess.missing[0].startswith("roll: candidates are 'yaw'; a line such as `roll = { column = 'yaw'")
+    assert guess.missing[0].startswith("roll: is it 'yaw'? Write `roll = { column = 'yaw'")
     assert any("no set-points were logged, so the positions are the inputs" in line for line in guess.lines)
     assert parse_layout(guess.text) == guess.layout
-    assert "# MISSING roll: candidates are 'yaw'" in guess.text
+    assert "# MISSING roll: is it 'yaw'?" in guess.text
 
 
 def test_angles_that_fall_with_the_motors_are_doubted(tmp_path: Path) -> None:

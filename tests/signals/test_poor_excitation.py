@@ -8,7 +8,7 @@ import pytest
 from softneck.core import DataError
 from softneck.identification import Network, NeuralStateSpace, OutputError, Play
 from softneck.signals import Recording, redefinition_matrix, signal
-from softneck.signals.quality._poor_excitation import explained, independent_motions, poor_excitation
+from softneck.signals.quality._poor_excitation import explained, independent_motions, poor_excitation, stands_still
 
 from ..data import neck_recording, recording_from
 
@@ -60,6 +60,25 @@ def test_nothing_is_said_of_a_good_recording() -> None:
     assert independent_motions(GOOD) == 3
     # Eq. 22 has little co-contraction, and enough of it.
     assert poor_excitation(recording_from(signal("eq22", duration=30.0).set_points, noise=5e-4)) == ()
+
+
+def test_rows_held_out_that_stand_still_are_named() -> None:
+    """One step at the start, and the rest of it at rest."""
+    P = np.zeros((800, 3))
+    P[50:] = [3.0, -1.0, 0.5]
+    step = recording_from(P, noise=0.0)
+    _, rest = step.split(0.7)
+    said = stands_still(rest, step)
+    assert said is not None
+    assert said.startswith("the rows held out stand still: pitch moves by ")
+    # A motion of a twentieth is enough, whatever its size in degrees.
+    pitch = step.channels["pitch"].copy()
+    pitch[560:] += 0.051 * pitch.std() * np.sqrt(2.0) * np.sin(np.arange(240) * np.pi / 10.0)
+    roll = step.channels["roll"] + pitch
+    moved = step.with_channels(pitch=pitch, roll=roll)
+    assert stands_still(moved.split(0.7)[1], moved) is None
+    _, tail = GOOD.split(0.7)
+    assert stands_still(tail, GOOD) is None
 
 
 def test_what_motors_explain_is_what_is_left_of_the_variance_without_noise() -> None:

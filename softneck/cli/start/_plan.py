@@ -9,6 +9,7 @@ from math import isclose
 from pathlib import Path
 
 from softneck.core import SettingsError
+from softneck.core._budget import MOST_TOML, settings_text
 
 from ._step import Step, Unmet
 
@@ -92,7 +93,8 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
 
 def _lacks_clock(layout: Path) -> bool:
     """Return whether a layout is a proposal whose sample time is still open; told it, it is made again."""
-    return "MISSING the sample time" in layout.read_text(encoding="utf-8", errors="replace")
+    with layout.open(encoding="utf-8", errors="replace") as file:
+        return "MISSING the sample time" in file.read(MOST_TOML)
 
 
 def _of_one_sample_time(recordings: list[str]) -> Iterator[Step]:
@@ -162,7 +164,7 @@ def _controller(asked: Asked) -> Iterator[Step]:
 def observed() -> bool:
     """Return whether `tune` found the loop better with an observer."""
     try:
-        return "observer" in tomllib.loads(Path(_TUNED_LOOP).read_text(encoding="utf-8"))
+        return "observer" in tomllib.loads(settings_text(_TUNED_LOOP))
     except (OSError, ValueError) as error:
         raise SettingsError(f"{_TUNED_LOOP}: is not the loop that `softneck tune` wrote ({error}).") from error
 
@@ -173,7 +175,7 @@ def _loops() -> Iterator[Step]:
     yield Step(stage="loop", command=command, makes=("loop.toml", *files), reads=(_TUNED_LOOP, "robot.toml"))
     page, certificate = "build/loop.html", "loop.certificate.json"
     command = ("softneck", "simulate", "loop.toml", "-o", "results/loop.csv", "--html", page, "--force")
-    if "limits" in tomllib.loads(Path("loop.toml").read_text(encoding="utf-8")):
+    if "limits" in tomllib.loads(settings_text("loop.toml")):
         command += ("--certificate", certificate)
     yield Step(stage="loop", command=command, makes=("results/loop.csv", page), reads=("loop.toml", *_FMUS))
     yield Step(stage="study", command=("softneck", "study", "study.toml", "-o", "build/study", "--force"),

@@ -10,6 +10,7 @@ from typing import Any
 import tomli_w
 
 from softneck.core import FileFormatError, SettingsError
+from softneck.core._budget import settings_text
 
 from ._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
 
@@ -46,7 +47,7 @@ def _text(package: str, name: str) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = tomllib.loads(settings_text(path))
     except (ValueError, RecursionError) as error:
         raise FileFormatError(f"{path}: is not a TOML file ({error}).") from error
     if not all(isinstance(table.get(part), dict) for part in ("plant", "controller", "reference")):

@@ -18,6 +18,7 @@ from typing import Any
 import click
 
 from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SoftneckError, atomic_write, file_hash
+from softneck.core._budget import MOST_JSON, settings_text
 
 from ..shared._console import note
 from ._step import STAGES, Step, Unmet
@@ -54,7 +55,7 @@ class Sitting:
         if not path.is_file():
             return cls(as_json=as_json)
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(settings_text(path, MOST_JSON))
             steps = {str(key): dict(entry) for key, entry in content["steps"].items()}
             answers = dict(content["asked"])
             known = content["format"] == _FORMAT and all(isinstance(e["reads"], dict) for e in steps.values())

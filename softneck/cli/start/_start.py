@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -20,15 +21,17 @@ from ._sitting import FILE, Sitting
 from ._step import STAGES, Step
 
 _PATH = click.Path(path_type=Path)
-_NEXT = (
-    "Record next: 60 s or more of `mixed`, in which every motor moves by itself and all together (on drives `softneck "
-    "drives record mixed`), and start again with this log too."
+_NEXT = "Record 60 s of `mixed` and start with that."
+_MIXED = (
+    "in `mixed` every motor moves by itself and all move together: `softneck drives record mixed` plays it on drives"
 )
-
+# [characters] Of the line that ends a sitting, `softneck: ` and all: two of a terminal of 80.
+_LINE = 160 - len("softneck: ")
 _OWN_REQUIREMENTS = (
-    "State what else shall hold in a file, as `softneck tune --print-requirements` has it, and give it by "
-    "--requirements."
+    "requirements of your own: `softneck tune --print-requirements` shows the form; give them by --requirements"
 )
+# Sentences end where the next begins with a capital; `0.5 %.` within one does not.
+_FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+[`A-Z]|$)")
 
 
 @click.command("start", epilog="Example: softneck start log.csv -o my_neck --yes")
@@ -75,7 +78,7 @@ def command(
                 _before(step, sitting, guided=guided)
                 sitting.do(step)
         except SoftneckError as error:
-            raise _advised(error, sitting, folder) from error
+            raise _advised(error, sitting, folder, paths) from error
         facts = _facts(sitting, folder)
     _tell(facts, as_json=as_json)
 
@@ -147,16 +150,32 @@ def _lacks(sitting: Sitting) -> list[str]:
     return [f"{file.stem}: {line}" for file, line in found]
 
 
-def _advised(error: SoftneckError, sitting: Sitting, folder: Path) -> SoftneckError:
-    """Return the error with the step that it ended, and with what to do next."""
-    stage = next(reversed(sitting.ran), "import").partition(":")[0]
-    said = f"{stage}: {error}"
+def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[str, ...]) -> SoftneckError:
+    """Return the error with the step that it ended; what else to do is noted before it, so that it stays short."""
+    if not sitting.ran:
+        return error
+    stage = next(reversed(sitting.ran)).partition(":")[0]
+    said = str(error)
+    for log in logs:
+        said = said.replace(log, Path(log).name)
     if stage == "identification":  # what the recordings lack was said before it
-        return CheckFailedError(f"{said} {_NEXT}")
-    advice = f"Paths are those in {folder}. Mended, the same command goes on here."
+        note(_MIXED)
+        first = _FIRST_SENTENCE.match(said)
+        return CheckFailedError(_shortened(f"{stage}: {first[1] if first else said}", _NEXT))
     if stage == "tune":
-        advice = f"{_OWN_REQUIREMENTS} {advice}"
-    return type(error)(f"{said} {advice}") if sitting.ran else error
+        note(_OWN_REQUIREMENTS)
+    note(f"paths are those in {folder}; once that is mended the same command goes on")
+    return type(error)(_shortened(f"{stage}: {said}"))
+
+
+def _shortened(said: str, advice: str = "") -> str:
+    """Return what was said and an advice in one line that people read; what does not fit is noted before it."""
+    line = " ".join([said, *advice.split()])
+    if len(line) <= _LINE:
+        return line
+    note(said)
+    room = _LINE - len(f" ... {advice}")
+    return f"{said[:room].rpartition(' ')[0]} ... {advice}".rstrip()
 
 
 @contextlib.contextmanager

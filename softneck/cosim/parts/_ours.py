@@ -43,10 +43,21 @@ def python_block(path: Path, folder: Path, description: Description) -> Block | 
 
     Raises:
         SettingsError: it was made by another version of softneck.
+        FileFormatError: what lies in it is damaged.
     """
-    file = folder / "resources" / "block.json"
-    if not description.annotation.role or not file.is_file():
+    if not description.annotation.role or not (folder / "resources" / "block.json").is_file():
         return None
+    try:
+        return _stored(path, folder, description)
+    except SettingsError:
+        raise
+    except Exception as error:  # json, numpy and Block raise whatever damaged bytes lead to
+        said = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        raise FileFormatError(f"{path}: what softneck left in it is damaged ({said}).") from error
+
+
+def _stored(path: Path, folder: Path, description: Description) -> Block:
+    file = folder / "resources" / "block.json"
     facts = json.loads(file.read_text(encoding="utf-8"))
     runtime = facts.get("module_of_runtime", "")
     flat = np.load(folder / "resources" / "arrays.npy", allow_pickle=False)

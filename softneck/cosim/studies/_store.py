@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from softneck import __version__
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
-from softneck.core._budget import MOST_JSON, settings_text
+from softneck.core._budget import MOST_JSON, require_numbers, settings_text
 
 from ._study import Study
 from ._vary import Vary
@@ -149,13 +149,20 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
         FileFormatError: the folder holds no study.
     """
     import pandas as pd
+    import pyarrow as pa
     import pyarrow.parquet as pq
 
     read_description(Path(folder))
     files = _files(Path(folder))
     if not files:
         return pd.DataFrame({"run": pd.Series(dtype="int64")})
-    return _frame(read_tables(files, pq.read_schema(files[0])))
+    try:
+        columns = pq.read_schema(files[0])
+    except (pa.ArrowException, ValueError, OSError) as error:
+        raise FileFormatError(f"{files[0]}: cannot be read ({_first_line(error)}).") from error
+    if "run" not in columns.names or not pa.types.is_integer(columns.field("run").type):
+        raise FileFormatError(f"{files[0]}: does not hold the runs of a study.")
+    return _frame(read_tables(files, columns))
 
 
 def read_tables(files: Sequence[Path], columns: pa.Schema, chosen: list[str] | None = None) -> pa.Table:
@@ -163,15 +170,28 @@ def read_tables(files: Sequence[Path], columns: pa.Schema, chosen: list[str] | N
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    empty = columns.empty_table().select(chosen or columns.names)
     try:
-        table = pa.concat_tables([empty, *(pq.read_table(file, columns=chosen) for file in files)])
-    except (pa.ArrowInvalid, KeyError) as error:
-        raise FileFormatError(f"{files[0].parent}: holds runs that cannot be read ({error}).") from error
+        empty, parts = columns.empty_table().select(chosen or columns.names), []
+        for path in files:
+            with pq.ParquetFile(path) as file:
+                require_numbers(path, file.metadata.num_rows, file.metadata.num_columns)
+                read = file.read(columns=chosen)
+                parts.append(read.select(chosen) if chosen else read)  # in the file's order until here
+        table = pa.concat_tables([empty, *parts])
+        table.validate(full=True)
+        if table.column("run").null_count:
+            raise ValueError("a run without a number")
+    except (pa.ArrowException, KeyError, ValueError, OSError, ArithmeticError, MemoryError) as error:
+        said = _first_line(error)
+        raise FileFormatError(f"{files[0].parent}: holds runs that cannot be read ({said}).") from error
     first = {}
     for place, run in enumerate(table.column("run").to_pylist()):
         first.setdefault(run, place)
     return table.take(pa.array([first[run] for run in sorted(first)], type=pa.int64()))
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
 def _files(folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_whole
 from softneck.estimation import AxisPlant
 
+from ..plants._coupled_axis import AnyAxis
 from ..plants._step_and_load import StepAndLoad
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import AxisController, ReferenceFilter, assemble
@@ -321,7 +322,7 @@ def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
     return replace(plant, numerator=factor * plant.numerator)
 
 
-def slowest_time(plant: AxisPlant) -> float:
+def slowest_time(plant: AnyAxis) -> float:
     """Return the time constant [s] of the slowest pole."""
     radius = float(np.abs(np.roots(plant.denominator)).max(initial=1e-9))
     return -plant.sample_time / math.log(max(radius, 1e-9))

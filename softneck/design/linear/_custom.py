@@ -10,13 +10,16 @@ from typing import Any, ClassVar
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError
-from softneck.estimation._axis import AxisPlant
+from softneck.robot import Robot
 
+from ..plants._coupled import coupled_plant
+from ..plants._coupled_axis import AnyAxes
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._assembly import AxisController, ReferenceFilter, assemble_whole
-from ._axis_loop import conditioning_gain, delayed_form, error_feedback, innovations_gain
+from ._assembly import AxisController
+from ._axis_loop import conditioning_gain, error_feedback, innovations_gain
 from ._axis_settings import AxisDesign, AxisSettings
 from ._controller import LinearController
+from ._whole import WholeDesign, whole_controller
 
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
@@ -52,51 +55,38 @@ class CustomSettings(AxisSettings):
         if isinstance(self.controller, Mapping) and set(self.controller) != set(names):
             given = ", ".join(map(str, self.controller)) or "none"
             raise SettingsError(f"`controller` must be given for {' and '.join(names)}; got {given}.")
-        if not isinstance(self.controller, Mapping) and self.controller.noutputs > 1:
-            return self._whole(uncertain)
+        if self._is_whole():
+            axes = [self._prepared(uncertain.axis(name)).samples for name in names]
+            count = max(len(samples) for samples in axes)
+            plants = [tuple(samples[min(k, len(samples) - 1)] for samples in axes) for k in range(count)]
+            return self._whole(uncertain.robot, plants, self.redefinition(uncertain))
         return AxisSettings._designed(self, uncertain)
 
-    def _whole(self, uncertain: UncertainPlant) -> LinearController:
+    def design(self, plant: Any) -> LinearController:
+        """Return the controller for `plant`, whatever `uncertain_plant` takes, or a `control` system of any size."""
+        whole: Any = coupled_plant(plant)
+        if whole is None or (whole.robot.is_neck and not self._is_whole()):
+            return AxisSettings.design(self, plant)
+        if isinstance(self.controller, Mapping):
+            raise SettingsError(
+                f"outputs that answer to each other need one `controller` of {' and '.join(whole.names)}."
+            )
+        samples = [tuple(row.delayed(self.least_delay) for row in whole.rows)]
+        return self.of_robot(whole)._whole(whole.robot, samples, whole.redefinition)
+
+    def _is_whole(self) -> bool:
+        return not isinstance(self.controller, Mapping) and self.controller.noutputs > 1
+
+    def _whole(self, robot: Robot, samples: Sequence[AnyAxes], redefinition: tuple[Matrix, Matrix]) -> LinearController:
         """Return the controller of all outputs at once."""
-        names, K = uncertain.names, self.controller
+        names, K = robot.outputs.names, self.controller
         if K.noutputs != len(names):
             raise SettingsError(f"`controller` has {K.noutputs} outputs; {' and '.join(names)} ask for {len(names)}.")
-        _require_sample_time(K, uncertain.sample_time)
-        law, time = _law(K, names), self.reference_time or 0.0
-        axes = {name: self._prepared(uncertain.axis(name)) for name in names}
-        count = max(len(axis.samples) for axis in axes.values())
-        for k in range(count):
-            plants = [axis.samples[min(k, len(axis.samples) - 1)] for axis in axes.values()]
-            radius = _closed_radius(law, plants, self.extra_delay)
-            if radius >= 1.0:
-                raise SettingsError(
-                    f"the loop is not stable around sample {k} of {count} (spectral radius {radius:.4f}); design the "
-                    "controller for less."
-                )
-        limits = self.limits(uncertain.robot)
-        found = {
-            name: {
-                "gains": {"reference_time_s": time},
-                "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
-                "states": len(law[0]),
-                "samples": count,
-                "imported": True,
-            }
-            for name, axis in axes.items()
-        }
-        return LinearController(
-            kind=self.KIND,
-            sample_time=uncertain.sample_time,
-            arrays=assemble_whole(
-                law,
-                filters=[ReferenceFilter(time)] * (len(names) + 1),
-                redefinition=self.redefinition(uncertain),
-                constants=limits.constants(uncertain.sample_time),
-            ),
-            limits=limits,
-            order=self.order,
-            design={"settings": self._stored(), "extra_delay": self.extra_delay, **found},
+        _require_sample_time(K, samples[0][0].sample_time)
+        made = WholeDesign(
+            law=_law(K, names), samples=samples, redefinition=redefinition, gains={}, notes={"imported": True}
         )
+        return whole_controller(self, made, robot, filtered=False)
 
     def _of(self, name: str) -> Any:
         return self.controller[name] if isinstance(self.controller, Mapping) else self.controller
@@ -191,17 +181,3 @@ def _law(K: Any, names: Sequence[str]) -> tuple[Matrix, ...]:
         B, D = B[:, order], D[:, order]
         Br, By, Dr, Dy = B[:, :m], B[:, m:], D[:, :m], D[:, m:]
     return A, Br, By, C, Dr, Dy, innovations_gain(A, Br, C, Dr)
-
-
-def _closed_radius(law: tuple[Matrix, ...], plants: Sequence[AxisPlant], extra_delay: int) -> float:
-    """Return the spectral radius of the loop of all axes with their exact delays; below 1 is stable."""
-    from scipy.linalg import block_diag
-
-    A, _, By, C, _, Dy, _ = law
-    forms = [delayed_form(plant, extra_delay) for plant in plants]
-    Ap, Bp, Cp = (
-        np.asarray(block_diag(*parts))
-        for parts in ([f[0] for f in forms], [f[1][:, None] for f in forms], [f[2][None, :] for f in forms])
-    )
-    whole = np.block([[Ap + Bp @ Dy @ Cp, Bp @ C], [By @ Cp, A]])
-    return float(np.abs(np.linalg.eigvals(whole)).max())

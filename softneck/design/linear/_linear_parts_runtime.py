@@ -83,6 +83,20 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     x.x[:] = np.dot(p.align, known)
 
 
+def linear_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
+    """Correct the aligned state until it asks for exactly the held set-points: a blend of alignments does not."""
+    v = np.dot(p.T, x.held)
+    inside = x.x
+    # With r at the angle, as `linear_align` has it.
+    asked = np.dot(p.C, inside) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
+    for i in range(p.outputs):
+        row = p.C[i]
+        size = np.dot(row, row)
+        if size > 0.0:
+            # Rows of C belong to one axis each, so the other axis' answer stays.
+            inside += row * ((v[i] - asked[i]) / size)
+
+
 def linear_finite(inputs: np.ndarray) -> bool:
     """Return whether references, angles and motor positions are numbers: all inputs but the two flags."""
     total = 0.0  # one that is none makes the sum none

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, require_positive
+from softneck.core import Matrix, SettingsError, require_between, require_positive
 
+from ..plants._coupled import CoupledPlant, coupled_plant
+from ..plants._coupled_axis import AnyAxes, realised, times
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
 from ._axis_loop import delayed_form
 from ._axis_settings import AxisDesign, AxisSettings, scaled, slowest_time
+from ._controller import LinearController
+from ._whole import WholeDesign, fastest, whole_controller
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +34,8 @@ class LqgSettings(AxisSettings):
             the largest whose loops keep `max_sensitivity` on all samples.
         control_weight: weight of the input against the angle, in units of the plant's static gain.
         input_noise: white noise on the input against that of the angle, in the same units.
+        coupled: whether an identified model (`subspace`) is taken with all that each motor does to each output: one
+            filter and one regulator for all. A `control` system of any size is always.
     """
 
     KIND: ClassVar[str] = "lqg"
@@ -37,6 +43,7 @@ class LqgSettings(AxisSettings):
     load_rate: float | None = None
     control_weight: float = 0.1
     input_noise: float = 10.0
+    coupled: bool = False
 
     def __post_init__(self) -> None:
         AxisSettings.__post_init__(self)
@@ -44,6 +51,66 @@ class LqgSettings(AxisSettings):
             require_positive("load_rate", self.load_rate, "rad/s")
         require_between("control_weight", self.control_weight, 1e-4, 1e4)
         require_between("input_noise", self.input_noise, 0.0, 1e4)
+
+    def design(self, plant: Any) -> LinearController:
+        """Return the controller for `plant`, whatever `uncertain_plant` takes, or a `control` system of any size."""
+        whole: Any = coupled_plant(plant, asked=self.coupled)
+        return AxisSettings.design(self, plant) if whole is None else self.of_robot(whole)._whole(whole)
+
+    def _whole(self, plant: CoupledPlant) -> LinearController:
+        """Return the controller of a coupled plant."""
+        if self.controller_order:
+            raise SettingsError("a controller of a coupled plant is not reduced; leave `controller_order` out.")
+        nominal: AnyAxes = tuple(row.delayed(self.least_delay) for row in plant.rows)
+        spread = {1.0, 1.0 - self.gain_spread, 1.0 + self.gain_spread}
+        samples = [times(nominal, gain) for gain in sorted(spread, key=lambda gain: (gain != 1.0, gain))]
+        lag = max(slowest_time(row) + row.delay * row.sample_time for row in nominal)
+
+        def built(rate: float) -> WholeDesign:
+            return WholeDesign(
+                law=self._law(nominal, rate), samples=samples, redefinition=plant.redefinition,
+                gains={"load_rate_rad_s": rate}, notes={},
+            )  # fmt: skip
+
+        def keeps(rate: float) -> bool:
+            try:
+                return built(rate).worst(self.extra_delay) <= self.max_sensitivity
+            except SettingsError:
+                return False
+
+        rate = self.load_rate
+        if rate is None:
+            rate = fastest(keeps, 0.02 / lag, 100.0 / lag)
+            if rate is None:
+                raise SettingsError(
+                    f"not even a load_rate of {0.02 / lag:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
+                    f"{len(samples)} samples; raise `max_sensitivity`, or give `load_rate` and see what is lost."
+                )
+        made = built(rate)
+        made.notes["worst_sensitivity"] = made.worst(self.extra_delay)
+        return whole_controller(self, made, plant.robot, filtered=True)
+
+    def _law(self, plants: AnyAxes, rate: float) -> tuple[Matrix, ...]:
+        """Return A, Br, By, C, Dr, Dy and L; each output counts in its static gain."""
+        gains = np.array([plant.static_gain for plant in plants])
+        A, B, C = realised(plants, self.extra_delay)
+        F, M = self._gains(A, B, C / gains[:, None], rate * plants[0].sample_time)
+        A, Br, By, C, Dr, Dy, L = _law(A, B, C / gains[:, None], F, M)
+        # The law is in outputs over their gains.
+        return A, Br / gains, By / gains, C, Dr / gains, Dy / gains, L
+
+    def _gains(self, A: Matrix, B: Matrix, C: Matrix, walk: float) -> tuple[Matrix, Matrix]:
+        """Return F of the regulator and M of the filter for a load that walks by `walk` a sample."""
+        from scipy.linalg import solve_discrete_are
+
+        try:
+            X = solve_discrete_are(A, B, C.T @ C, self.control_weight * np.eye(B.shape[1]))
+            M = _filter(A, B, C, walk**2, self.input_noise**2)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise SettingsError(
+                "the Riccati equations of the LQG design have no solution; raise `control_weight` or `input_noise`."
+            ) from error
+        return np.linalg.solve(self.control_weight * np.eye(B.shape[1]) + B.T @ X @ B, B.T @ X @ A), M
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.load_rate is not None:
@@ -54,56 +121,49 @@ class LqgSettings(AxisSettings):
         )
 
     def _built(self, axis: UncertainAxis, rate: float) -> AxisDesign:
-        from scipy.linalg import solve_discrete_are
-
         gain, dt = axis.nominal.static_gain, axis.sample_time
-        A, B, C = delayed_form(scaled(axis.nominal, 1.0 / gain), self.extra_delay)
-        try:
-            X = solve_discrete_are(A, B[:, None], np.outer(C, C), np.array([[self.control_weight]]))
-            M = _filter(A, B, C, (rate * dt) ** 2, self.input_noise**2)
-        except (np.linalg.LinAlgError, ValueError) as error:
-            raise SettingsError(
-                "the Riccati equations of the LQG design have no solution; raise `control_weight` or `input_noise`."
-            ) from error
-        F = B @ X @ A / (self.control_weight + B @ X @ B)
-        return AxisDesign(_controller(A, B, C, F, M, gain), {"load_rate_rad_s": rate}, {"feedback": F.tolist()})
+        A, b, c = delayed_form(scaled(axis.nominal, 1.0 / gain), self.extra_delay)
+        B, C = b[:, None], c[None, :]
+        F, M = self._gains(A, B, C, rate * dt)
+        A, Br, By, C, Dr, Dy, L = _law(A, B, C, F, M)
+        # The law is for the plant over its gain.
+        made = AxisController(A=A, Br=Br, By=By, C=C / gain, Dr=float(Dr[0, 0]) / gain, Dy=float(Dy[0, 0]) / gain,
+                              L=gain * L)  # fmt: skip
+        return AxisDesign(made, {"load_rate_rad_s": rate}, {"feedback": F[0].tolist()})
 
 
-def _filter(A: Matrix, B: Vector, C: Vector, walk: float, noise: float) -> Vector:
-    """Return the gain M (n + 1,) with which the filter corrects plant and load; the angle's noise has variance 1."""
+def _filter(A: Matrix, B: Matrix, C: Matrix, walk: float, noise: float) -> Matrix:
+    """Return the gain M (n + inputs, outputs) with which the filter corrects plant and loads.
+
+    The noise of the outputs has variance 1.
+    """
     from scipy.linalg import solve_discrete_are
 
-    n = A.shape[0]
-    whole, out = _with_load(A, B), np.append(C, 0.0)
-    Q = np.zeros((n + 1, n + 1))
-    Q[:n, :n] = noise * np.outer(B, B)
-    Q[n, n] = walk
-    P = solve_discrete_are(whole.T, out[:, None], Q, np.eye(1))
-    return P @ out / (1.0 + out @ P @ out)
+    n, inputs = B.shape
+    whole, out = _with_load(A, B), np.hstack([C, np.zeros((len(C), inputs))])
+    Q = np.zeros((n + inputs, n + inputs))
+    Q[:n, :n] = noise * B @ B.T
+    Q[n:, n:] = walk * np.eye(inputs)
+    P = solve_discrete_are(whole.T, out.T, Q, np.eye(len(C)))
+    return np.linalg.solve(np.eye(len(C)) + out @ P @ out.T, out @ P).T
 
 
-def _with_load(A: Matrix, B: Vector) -> Matrix:
-    return np.block([[A, B[:, None]], [np.zeros((1, A.shape[0])), np.ones((1, 1))]])
+def _with_load(A: Matrix, B: Matrix) -> Matrix:
+    n, inputs = B.shape
+    return np.block([[A, B], [np.zeros((inputs, n)), np.eye(inputs)]])
 
 
-def _controller(A: Matrix, B: Vector, C: Vector, F: Vector, M: Vector, gain: float) -> AxisController:
-    """Return `v = (N r - [F 1] xi_filtered)/gain`, `xi_filtered = xi + M (y - C xi)`, xi+ = Aa xi_filtered + Ba v.
+def _law(A: Matrix, B: Matrix, C: Matrix, F: Matrix, M: Matrix) -> tuple[Matrix, ...]:
+    """Return A, Br, By, C, Dr, Dy, L of `v = N r - [F 1] xi_filtered`.
 
-    L = Ba: beyond the limits the filter goes on with what the motors were told.
+    With xi_filtered = xi + M (y - C xi) and xi+ = Aa xi_filtered + Ba v. L = Ba: beyond the limits the filter goes on
+    with what the motors were told.
     """
-    n = A.shape[0]
-    Aa, Ba, Ca = _with_load(A, B), np.append(B, 0.0)[:, None], np.append(C, 0.0)[None, :]
-    Fa, M = np.append(F, 1.0)[None, :], M[:, None]
-    # The state at rest under an input of 1: what the reference asks for.
+    n, inputs = B.shape
+    Aa, Ba = _with_load(A, B), np.vstack([B, np.zeros((inputs, inputs))])
+    Ca, Fa = np.hstack([C, np.zeros((len(C), inputs))]), np.hstack([F, np.eye(inputs)])
+    # The states at rest under inputs of 1, and the inputs that bring the outputs to what is asked.
     at_rest = np.linalg.solve(np.eye(n) - A, B)
-    N = 1.0 + float(F @ at_rest)
-    kept = np.eye(n + 1) - M @ Ca
-    return AxisController(
-        A=(Aa - Ba @ Fa) @ kept,
-        Br=N * Ba,
-        By=(Aa - Ba @ Fa) @ M,
-        C=-Fa @ kept / gain,
-        Dr=N / gain,
-        Dy=float((-Fa @ M)[0, 0]) / gain,
-        L=gain * Ba,
-    )
+    N = (np.eye(inputs) + F @ at_rest) @ np.linalg.inv(C @ at_rest)
+    kept = np.eye(n + inputs) - M @ Ca
+    return (Aa - Ba @ Fa) @ kept, Ba @ N, (Aa - Ba @ Fa) @ M, -Fa @ kept, N, -Fa @ M, Ba

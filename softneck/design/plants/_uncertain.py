@@ -248,7 +248,8 @@ def _of_system(system: Any, axis: str) -> Any:
     if _INPUTS[axis] not in inputs or axis not in outputs:
         raise SettingsError(
             f"the system's signals are {', '.join(inputs)} to {', '.join(outputs)}; a design needs theta_i, phi_i to "
-            "pitch, roll. Rename them with `system.update_names(inputs=..., outputs=...)`."
+            "pitch, roll. Rename them with `system.update_names(inputs=..., outputs=...)`; `lqg`, `mpc` and "
+            "`custom` take systems of any size."
         )
     return system[outputs.index(axis), inputs.index(_INPUTS[axis])]
 

@@ -62,9 +62,10 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     made = {
         "constants": constants,
         "model_A": np.vstack([padded(plant, n)[0] for plant in plants]),
-        "model_B": np.array([padded(plant, n)[1] for plant in plants]),
+        # One input behind the other.
+        "model_B": np.array([padded(plant, n)[1].T.ravel() for plant in plants]),
         "observer": observer_gains(poles, tuning.trust),
-        "rest": np.array([rest_states(plant, n) for plant in plants]),
+        "rest": np.array([rest_states(plant, n).T.ravel() for plant in plants]),
         "delays": np.array([float(plant.delay) for plant in plants]),
         # Files are as they were where nothing asks for tautness.
         "disturbances": disturbances if disturbances[:, -1].any() else disturbances[:, :-1].copy(),

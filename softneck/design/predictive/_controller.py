@@ -201,7 +201,9 @@ class MpcController(Shown):
         items = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in rt.MpcArrays.names()}
         if not all(np.isfinite(item).all() for item in items.values()):
             raise FileFormatError("the controller's arrays are not finite; design it again.")
-        rt.MpcArrays.lengths(items)
+        found = rt.MpcArrays.lengths(items)
+        if found["entries"] not in (found["n"], found["n"] * found["outputs"]):
+            raise FileFormatError("its array `model_B` is of other inputs; design the controller again.")
         return cls(
             sample_time=float(header["sample_time"]),
             arrays=tuple(items.values()),
@@ -261,7 +263,8 @@ def _limits(c: MpcController) -> list[str]:
     if not c.robot.is_neck:
         return lines
     a = rt.MpcArrays(c.arrays)
-    gains = [float(a.rest[axis, 0]) for axis in range(2)]
+    n = a.model_A.shape[1]
+    gains = [float(a.rest[axis, axis * n if a.rest.shape[1] > n else 0]) for axis in range(2)]
     if c.angle_limit is not None:
         T_inverse = np.linalg.inv(a.T)
         for axis, name in enumerate(("pitch", "roll")):

@@ -1,7 +1,8 @@
 """What a predictive controller knows and remembers, and how it moves on: models, disturbances, references, past inputs.
 
 Each scenario s has, for each axis, a model `x+ = A x + B v(k - d)`, `y = x[0] + o` that runs on the inputs alone; the
-models stand behind each other, i = outputs s + axis. Its output disturbance o follows what was measured: `o+ = o + r`,
+models stand behind each other, i = outputs s + axis. v is the redefined input of the axis, of a coupled plant those of
+all axes: B and `rest` have n columns for each. The output disturbance o follows what was measured: `o+ = o + r`,
 `r+ = a r` with a the plant's slowest pole, which is what a load makes of the angle that comes on at the plant's input.
 
 Of another robot than the neck all this is in units in which it has a neck's size (see `_scale`): `mpc_inputs` and
@@ -79,9 +80,9 @@ class MpcArrays(Arrays):
     _theta = f"{_m} * S * (n + 2) + {_m} * L + motors + 2"
     constants = array("numbers", "see MPC_TS to MPC_NUMBERS")
     model_A = array(f"{_m} * S * n, n", "A of each model, below each other")
-    model_B = array(f"{_m} * S, n", "B of each model")
+    model_B = array(f"{_m} * S, entries", "B of each model, one input behind the other")
     observer = array(f"{_m} * S, 3", "gains on o and r, and the pole a")
-    rest = array(f"{_m} * S, n", "x at rest under an input of one")
+    rest = array(f"{_m} * S, entries", "x at rest under inputs of one")
     delays = array(f"{_m} * S", "d, dead times [samples]")
     disturbances = array(
         "channels, columns", "of each measured one: gains on the outputs, pole of its filter, where asked for tautness"
@@ -273,7 +274,7 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
         for axis in range(p.outputs):
             i = p.outputs * s + axis
             for j in range(p.n):
-                x.models[i, j] = p.rest[i, j] * v[axis]
+                x.models[i, j] = mpc_driven(p, p.rest, i, j, v)
             x.offsets[i, 0] = 0.0
             x.offsets[i, 1] = 0.0
             if measured:
@@ -310,10 +311,20 @@ def mpc_filter(p: MpcArrays, x: MpcState) -> None:
         x.filtered[i] = a * x.filtered[i] + (1.0 - a) * asked
 
 
-def mpc_model(p: MpcArrays, i: int, u: float, now: np.ndarray, after: np.ndarray) -> None:
-    """Fill `after` with A x + B u of model i at x = `now`."""
+def mpc_driven(p: MpcArrays, gains: np.ndarray, i: int, j: int, v: np.ndarray) -> float:
+    """Return what the inputs v do to state j of model i by `gains`: those of all axes where the plant is coupled."""
+    if p.entries == p.n:
+        return gains[i, j] * v[i % p.outputs]
+    total = 0.0
+    for axis in range(p.outputs):
+        total += gains[i, axis * p.n + j] * v[axis]
+    return total
+
+
+def mpc_model(p: MpcArrays, i: int, v: np.ndarray, now: np.ndarray, after: np.ndarray) -> None:
+    """Fill `after` with A x + B v of model i at x = `now`."""
     for j in range(p.n):
-        total = p.model_B[i, j] * u
+        total = mpc_driven(p, p.model_B, i, j, v)
         for k in range(p.n):
             total += p.model_A[i * p.n + j, k] * now[k]
         after[j] = total
@@ -326,7 +337,7 @@ def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
         now[:] = x.models[i]
         # The inputs of the dead time are given, oldest first.
         for back in range(int(p.delays[i]), 0, -1):
-            mpc_model(p, i, x.past[back - 1, i % p.outputs], now, after)
+            mpc_model(p, i, x.past[back - 1], now, after)
             now[:] = after
         theta.models[i] = now
         theta.offsets[i, 0] = x.offsets[i, 0]
@@ -359,9 +370,11 @@ def mpc_predict(p: MpcArrays, x: MpcState) -> None:
     now = np.empty(p.n)
     for i in range(p.outputs * p.S):
         back = int(p.delays[i])
-        u = x.past[back - 1, i % p.outputs] if back > 0 else v[i % p.outputs]  # v(k - d); without dead time v of now
         now[:] = x.models[i]
-        mpc_model(p, i, u, now, x.models[i])
+        if back > 0:
+            mpc_model(p, i, x.past[back - 1], now, x.models[i])  # v(k - d)
+        else:
+            mpc_model(p, i, v, now, x.models[i])  # without dead time v of now
         # o first: r of now moves it (o+ = o + r, r+ = a r).
         x.offsets[i, 0] += x.offsets[i, 1]
         x.offsets[i, 1] *= p.observer[i, 2]

@@ -7,16 +7,21 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Protocol, TypeVar
 
-from softneck.core import SettingsError
-from softneck.estimation import AxisPlant, axis_plant
+import numpy as np
+
+from softneck.core import Matrix, SettingsError
+from softneck.estimation import axis_plant
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.robot._neck_default import NeckCount, NeckDefault
+from softneck.robot._redefined import redefinition_of
 
-from ..plants._uncertain import UncertainPlant
+from ..plants._coupled import CoupledPlant, coupled_plant
+from ..plants._coupled_axis import AnyAxis, CoupledAxis, times
+from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._disturbance import with_payload
-from ._scale import refuse_what_is_for_necks
-from ._scenarios import samples_of
-from ._tuning import Pair, scaled
+from ._scale import SizedPlant, refuse_what_is_for_necks
+from ._scenarios import Timing, samples_of, timed
+from ._tuning import Pair
 
 # What stands for the defaults of an identified neck where the plant is one's own or another robot's.
 _BELIEVED: dict[str, Any] = {
@@ -28,11 +33,9 @@ _HORIZON = 0.6
 _LONGEST = 200
 
 
-class _Settings(Protocol):
+class _Settings(Timing, Protocol):
     """What is read of `MpcSettings` here."""
 
-    @property
-    def least_delay(self) -> float: ...
     @property
     def taut_pole(self) -> float: ...
 
@@ -62,7 +65,7 @@ def settings_for(settings: S, model: HasTransferFunctions) -> S:
     return settings
 
 
-def settings_of_robot(settings: S, plant: UncertainPlant) -> S:
+def settings_of_robot(settings: S, plant: UncertainPlant | CoupledPlant) -> S:
     """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks.
 
     Raises:
@@ -101,26 +104,50 @@ def predicted_plants(settings: _Settings, model: HasTransferFunctions) -> Pair:
     return plants
 
 
-def taken_of_neck(settings: Any, model: HasTransferFunctions) -> dict[str, float]:
-    """Return what of the paper's neck, and not of this plant, a design takes where nobody says otherwise."""
+def with_taken(made: S, settings: Any, model: HasTransferFunctions) -> S:
+    """Return a controller that says what of the paper's neck, and not of this plant, it takes for nobody said other."""
     plants = [axis_plant(model, axis) for axis in robot_of(model).outputs.names]
     late = [plant.delayed(settings.least_delay) for plant in plants]
     changed = {"least_delay": any(item.delay > plant.delay for item, plant in zip(late, plants, strict=True))}
     for name in ("small_move_pole", "taut_pole"):
         pole = float(getattr(settings, name))
         changed[name] = pole > 0.0 and any(plant.faster(pole) is not plant for plant in plants)
-    return {
-        name: float(getattr(settings, name))
-        for name, changes in changed.items()
-        if changes and isinstance(getattr(settings, name), NeckDefault)
-    }
+    taken = {name: float(getattr(settings, name)) for name, changes in changed.items()
+             if changes and isinstance(getattr(settings, name), NeckDefault)}  # fmt: skip
+    return replace(made, design={**made.design, "assumed": taken})
 
 
-def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> AxisPlant:
-    plant = axis_plant(model, axis).delayed(settings.least_delay)
+def plant_of(model: Any, *, coupled: bool) -> Any:
+    """Return what is to be predicted of a model or a `control` system: one plant for each axis, or a coupled one."""
+    whole = coupled_plant(model, asked=coupled)
+    if whole is not None:
+        return whole
+    # A system, or a list of them, is of a neck whose axes do not answer to each other.
+    return model if hasattr(model, "tf") else uncertain_plant(model)
+
+
+def weighed(plant: UncertainPlant | CoupledPlant) -> tuple[Matrix, Matrix]:
+    """Return T of another robot's plant, or of a coupled one, and its inverse."""
+    if isinstance(plant, CoupledPlant):
+        return plant.redefinition
+    return redefinition_of(np.asarray(plant.weights), plant.names)
+
+
+def families(nominal: Pair, small_move_pole: float) -> list[Pair]:
+    """Return what the neck may be: as identified, and faster."""
+    if small_move_pole == 0.0:
+        return [nominal]
+    fast = tuple(plant.faster(small_move_pole) for plant in nominal)
+    return [nominal] if fast == nominal else [nominal, fast]
+
+
+def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> AnyAxis:
+    if isinstance(model, SizedPlant) and isinstance(model.axes[axis].nominal, CoupledAxis):
+        return timed(model.axes[axis].nominal, settings)
+    plant = timed(axis_plant(model, axis), settings)
     if settings.taut_pole == 0.0:
         return plant
     # Recordings in which tendons hang say less than a taut neck does, none says more.
     ratios = [abs(sample.static_gain / plant.static_gain) for sample in samples_of(model, axis)]
-    (taut,) = scaled((plant.faster(settings.taut_pole),), max([1.0, *ratios]))
+    (taut,) = times((plant.faster(settings.taut_pole),), max([1.0, *ratios]))
     return taut

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.estimation import AxisPlant
 
+from ..plants._coupled_axis import AnyAxis, CoupledAxis, inputs_of
 from . import _mpc_state_runtime as rt
 
 # Rounding of a Cholesky factor; beyond it H has no inverse worth the name.
@@ -20,7 +20,7 @@ _LARGEST_CONDITION = 1e12
 class Scenario:
     """What the neck may be: a plant for each axis and how much this counts in the cost."""
 
-    axes: tuple[AxisPlant, ...]
+    axes: tuple[AnyAxis, ...]
     weight: float
 
 
@@ -151,21 +151,25 @@ class Matrices:
     kinds: Matrix
 
 
-def padded(plant: AxisPlant, n: int) -> tuple[Matrix, Vector]:
-    """Return A (n, n) and B (n,) of the observable form, with states that nothing reaches behind its own."""
+def padded(plant: AnyAxis, n: int) -> tuple[Matrix, Matrix]:
+    """Return A (n, n) and B (n, inputs) with the output first and states that nothing reaches behind its own.
+
+    Of a plant that its own redefined input moves alone there is one input, of a coupled one those of all axes.
+    """
     A, B, _ = plant.observable_form()
-    whole, column = np.zeros((n, n)), np.zeros(n)
-    whole[: plant.order, : plant.order], column[: plant.order] = A, B
-    return whole, column
+    B = plant.B if isinstance(plant, CoupledAxis) else B[:, None]
+    whole, columns = np.zeros((n, n)), np.zeros((n, B.shape[1]))
+    whole[: plant.order, : plant.order], columns[: plant.order] = A, B
+    return whole, columns
 
 
-def rest_states(plant: AxisPlant, n: int) -> Vector:
-    """Return (n,) the states at rest under an input of one."""
+def rest_states(plant: AnyAxis, n: int) -> Matrix:
+    """Return (n, inputs) the states at rest under inputs of one."""
     A, B = padded(plant, n)
     return np.linalg.solve(np.eye(n) - A, B)
 
 
-def disturbance_pole(plant: AxisPlant, time: float | None = None) -> float:
+def disturbance_pole(plant: AnyAxis, time: float | None = None) -> float:
     """Return a of the output disturbance: the plant's slowest pole, by its size, or that of a time constant [s]."""
     if time is not None:
         return float(np.clip(np.exp(-plant.sample_time / time), 0.1, 0.999))
@@ -204,13 +208,14 @@ def expression(problem: Problem) -> dict[str, Any]:
     for s, scenario in enumerate(p.scenarios):
         ends, paths = [], []
         for axis, plant in enumerate(scenario.axes):
-            A, B = padded(plant, n)
+            A, _ = padded(plant, n)
+            B = np.vstack([inputs_of(plant, axis, m), np.zeros((n - plant.order, m))])
             level, rate = offset[m * s + axis]
             a = disturbance_pole(plant, p.disturbance_time)
             x = theta[(m * s + axis) * n : (m * s + axis + 1) * n]
             path = []
             for i, v in enumerate(inputs):
-                x = ca.mtimes(ca.DM(A), x) + ca.DM(B) * v[axis]
+                x = ca.mtimes(ca.DM(A), x) + ca.mtimes(ca.sparsify(ca.DM(B)), v[:m])
                 path.append(x[0] + level + rate * (1.0 - a ** (plant.delay + 1 + i)) / (1.0 - a))
             errors = [path[i] - wanted[axis][plant.delay + i] for i in range(N - 1)]
             cost += scenario.weight * p.output_weight[axis] * sum(e**2 for e in errors)
@@ -298,7 +303,11 @@ def _terminal(p: Problem, scenario: Scenario, ends: list[Any], motors: Any, comm
     P = terminal_matrix(p, scenario)
     n = p.order
     goal = ca.mtimes(ca.DM(p.T_inverse), ca.vertcat(*(end[2] for end in ends), common))
-    parts = [x - ca.DM(rest_states(plant, n)) * v for x, plant, v in ends]
+    goals = ca.vertcat(*(end[2] for end in ends))
+    parts = [
+        x - ca.mtimes(ca.DM(rest_states(plant, n)), goals if isinstance(plant, CoupledAxis) else v)
+        for x, plant, v in ends
+    ]
     error = ca.vertcat(*parts, motors - goal)
     return ca.bilin(ca.DM(P), error, error)
 
@@ -313,9 +322,9 @@ def terminal_matrix(p: Problem, scenario: Scenario) -> Matrix:
     Q = np.zeros_like(A)
     for axis, plant in enumerate(scenario.axes):
         a, b = padded(plant, n)
-        place = slice(axis * n, (axis + 1) * n)
-        A[place, place], A[place, at:] = a, np.outer(b, p.T[axis])
-        B[place] = np.outer(b, p.T[axis])
+        place, moved = slice(axis * n, (axis + 1) * n), p.T[:m] if isinstance(plant, CoupledAxis) else p.T[[axis]]
+        A[place, place], A[place, at:] = a, b @ moved
+        B[place] = b @ moved
         Q[axis * n, axis * n] = p.output_weight[axis]
     B[at:] = np.eye(M)
     # Of the scenarios' weights, which sum to one, each carries its part of co-contraction and moves.

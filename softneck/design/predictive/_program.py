@@ -188,17 +188,19 @@ def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = 
 
 def _predicted(a: rt.MpcArrays, theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
     """Return predicted angles and references (N, outputs) of the nominal plant from theta on."""
-    n, N, m = a.model_B.shape[1], set_points.shape[0], a.T.shape[0] - 1
+    n, N, m = a.model_A.shape[1], set_points.shape[0], a.T.shape[0] - 1
+    coupled = a.model_B.shape[1] > n
     now = {name: theta[place] for name, place in rt.MpcTheta.parts(a).items()}
     inputs = set_points @ a.T.T
     angles, reference = np.zeros((N, m)), np.zeros((N, m))
     for axis in range(m):
-        A, B = a.model_A[axis * n : (axis + 1) * n], a.model_B[axis]
+        A, B = a.model_A[axis * n : (axis + 1) * n], a.model_B[axis].reshape(-1, n).T
+        v = inputs[:, :m] if coupled else inputs[:, axis : axis + 1]
         pole, delay = a.observer[axis, 2], int(a.delays[axis])
         level, rate = now["offsets"].reshape(-1, 2)[axis]
         x = now["models"].reshape(-1, n)[axis]
         reference[:, axis] = now["wanted"].reshape(m, -1)[axis, delay : delay + N]
         for i in range(N):
-            x = A @ x + B * inputs[i, axis]
+            x = A @ x + B @ v[i]
             angles[i, axis] = x[0] + level + rate * (1.0 - pole ** (delay + 1 + i)) / (1.0 - pole)
     return angles, reference

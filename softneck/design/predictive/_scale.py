@@ -18,9 +18,12 @@ from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.runtime._bundle import sized
+from softneck.signals import redefinition_matrix
 
 from ..linear._loop_settings import stricter_limits
 from ..linear._ports import LIMITS, MAX_REFERENCE, ControllerLimits, robot_limits
+from ..plants._coupled import CoupledPlant
+from ..plants._coupled_axis import CoupledAxis
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from . import _mpc_state_runtime as rt
 
@@ -59,19 +62,19 @@ class Scale:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SizedPlant:
-    """Another robot's plant in such units; what a predictive design works on.
+    """Another robot's plant in such units, or a coupled one; what a predictive design works on.
 
     Attributes:
         axes: output -> what its axis may be.
         robot: whose plant it is.
         redefinition: T (outputs + 1, motors) and its inverse.
-        scale: the units.
+        scale: the units; None for a neck's own.
     """
 
     axes: Mapping[str, UncertainAxis]
     robot: Robot
     redefinition: tuple[Matrix, Matrix]
-    scale: Scale
+    scale: Scale | None
 
     @property
     def uncertain(self) -> bool:
@@ -81,6 +84,8 @@ class SizedPlant:
     def lever(self, motor_per_output: float) -> Matrix:
         """Return (motors, outputs) how much an output loosens each tendon, from that of one at angle 0 [rad/rad]."""
         weights = self.robot.weights()
+        if self.scale is None:
+            return motor_per_output * redefinition_matrix()[:-1].T
         shape = np.zeros_like(self.redefinition[0][:-1]) if weights is None else weights
         return motor_per_output * shape.T * self.scale.outputs / self.scale.motors
 
@@ -122,8 +127,12 @@ def limits_of(settings: Any, robot: Robot) -> ControllerLimits:
     return limits
 
 
-def sized_plant(plant: UncertainPlant, limits: ControllerLimits, redefinition: tuple[Matrix, Matrix]) -> SizedPlant:
-    """Return another robot's plant as one of a neck's size."""
+def sized_plant(
+    plant: UncertainPlant | CoupledPlant, limits: ControllerLimits, redefinition: tuple[Matrix, Matrix]
+) -> SizedPlant:
+    """Return another robot's plant as one of a neck's size; a coupled neck as it is."""
+    if plant.robot.is_neck:
+        return SizedPlant(axes=plant.axes, robot=plant.robot, redefinition=redefinition, scale=None)
     T, inverse = (part.copy() for part in redefinition)
     robot, m = plant.robot, len(plant.names)
     numbers = limits.constants(plant.sample_time)[1:]
@@ -136,15 +145,18 @@ def sized_plant(plant: UncertainPlant, limits: ControllerLimits, redefinition: t
     references = np.split(numbers[2 * T.shape[1] :], 2)
     bounds = np.concatenate([low / unit, high / unit, *(part / np.append(outputs, unit) for part in references)])
     axes = {
-        name: UncertainAxis(_scaled(axis.nominal, gain), tuple(_scaled(sample, gain) for sample in axis.samples))
-        for (name, axis), gain in zip(plant.axes.items(), (inputs / outputs).tolist(), strict=True)
+        name: UncertainAxis(_scaled(axis.nominal, i, gains), tuple(_scaled(item, i, gains) for item in axis.samples))
+        for i, ((name, axis), gains) in enumerate(zip(plant.axes.items(), inputs / outputs[:, None], strict=True))
     }
     scale = Scale(motors=unit, outputs=outputs, inputs=inputs, bounds=bounds)
     return SizedPlant(axes=axes, robot=robot, redefinition=(T, inverse), scale=scale)
 
 
-def _scaled(plant: Any, gain: float) -> Any:
-    return replace(plant, numerator=gain * plant.numerator)
+def _scaled(plant: Any, axis: int, gains: Vector) -> Any:
+    """Return an axis with its gains from the redefined inputs of all axes times `gains`."""
+    if isinstance(plant, CoupledAxis):
+        return replace(plant, B=gains * plant.B)
+    return replace(plant, numerator=float(gains[axis]) * plant.numerator)
 
 
 def runtime_of(arrays: tuple[Matrix, ...]) -> str:

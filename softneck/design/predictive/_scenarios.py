@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from softneck.core import SettingsError
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import robot_of
 
+from ..plants._coupled_axis import AnyAxis
 from ._prediction import Scenario
 from ._scale import SizedPlant
 from ._tuning import Pair
@@ -21,20 +23,38 @@ _NOMINAL_WEIGHT = 0.5
 _JUDGES = 12
 
 
-def sample_pairs(model: Any, least_delay: float) -> list[Pair]:
+class Timing(Protocol):
+    """What is read of `MpcSettings` here."""
+
+    @property
+    def least_delay(self) -> float: ...
+    @property
+    def look_ahead(self) -> float: ...
+    @property
+    def extra_delay(self) -> int: ...
+
+
+def timed(plant: AnyAxis, timing: Timing) -> Any:
+    """Return a plant with the dead time that the controller sees: at least so much, less what the observer is ahead."""
+    late = plant.delayed(timing.least_delay)
+    # Whole samples: a dead time that is counted too long costs speed, one too short stability. 1e-9: of rounding.
+    return replace(late, delay=max(0, late.delay - math.floor(timing.look_ahead / plant.sample_time + 1e-9)))
+
+
+def sample_pairs(model: Any, timing: Timing) -> list[Pair]:
     """Return samples of a family, axes joined by the order of their static gains; none for a single model."""
     if not hasattr(model, "samples") or (isinstance(model, SizedPlant) and not model.uncertain):
         return []
     axes = []
     for axis in robot_of(model).outputs.names:
-        plants = [plant.delayed(least_delay) for plant in samples_of(model, axis)]
+        plants = [timed(plant, timing) for plant in samples_of(model, axis)]
         axes.append(sorted(plants, key=lambda plant: plant.static_gain))
     count = min(_JUDGES, *(len(plants) for plants in axes))
     picks = [np.linspace(0, len(plants) - 1, count).round().astype(int) for plants in axes]
     return [tuple(plants[i] for plants, i in zip(axes, chosen, strict=True)) for chosen in zip(*picks, strict=True)]
 
 
-def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, extra_delay: int) -> list[Scenario]:
+def chosen_scenarios(model: Any, nominal: Pair, count: int, timing: Timing) -> list[Scenario]:
     """Return the nominal plant and `count` samples, from the lowest to the highest gain.
 
     Raises:
@@ -42,14 +62,15 @@ def chosen_scenarios(model: Any, nominal: Pair, count: int, least_delay: float, 
     """
     if count == 0:
         return [Scenario(nominal, 1.0)]
-    pairs = sample_pairs(model, least_delay)
+    pairs = sample_pairs(model, timing)
     if not pairs:
         raise SettingsError("scenarios are samples of a family; give a FAMILY (`softneck family`), or `scenarios=0`.")
     picks = np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round().astype(int))
     weight = (1.0 - _NOMINAL_WEIGHT) / picks.size
     others = []
     for pair in (pairs[i] for i in picks):
-        others.append(Scenario(tuple(replace(plant, delay=plant.delay + extra_delay) for plant in pair), weight))
+        delayed = tuple(replace(plant, delay=plant.delay + timing.extra_delay) for plant in pair)
+        others.append(Scenario(delayed, weight))
     return [Scenario(nominal, _NOMINAL_WEIGHT), *others]
 
 

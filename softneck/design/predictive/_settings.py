@@ -23,18 +23,19 @@ from softneck.core._shown import Shown
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
 from softneck.robot._neck_default import NeckCount, NeckDefault
-from softneck.robot._redefined import redefinition_of
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import LIMITS, ControllerLimits, require_limits
+from ..plants._coupled import CoupledPlant
+from ..plants._coupled_axis import radius, sensitivity, times
 from ..plants._uncertain import uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance, effects
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
-from ._predicted import predicted_plants, settings_for, settings_of_robot, taken_of_neck
+from ._predicted import families, plant_of, predicted_plants, settings_for, settings_of_robot, weighed, with_taken
 from ._prediction import Problem, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
@@ -47,13 +48,10 @@ from ._tuning import (
     keeps_bounds,
     move_weight,
     observer_trust,
-    radius,
     reference_time,
     require_rise,
     require_solvable,
     rise,
-    scaled,
-    sensitivity,
     slowness,
     spaced_starts,
 )  # fmt: skip
@@ -126,6 +124,8 @@ class MpcSettings(Shown):
         taut_pole: an identified neck is predicted as it moves while its tendons are taut: its slowest pole at least as
             fast as this [1/s], its static gain the largest of its family. 0 for as identified. Slack tendons make fits
             slow and low. A `LinearNeck` of one's own is taken as it is.
+        look_ahead: by how much the observer of the loop runs ahead of its sensor [s]: so much dead time is behind it.
+        coupled: whether an identified model (`subspace`) is predicted with all that each motor does to each output.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
@@ -166,6 +166,8 @@ class MpcSettings(Shown):
     least_delay: float = NeckDefault(0.1)
     small_move_pole: float = NeckDefault(5.293)
     taut_pole: float = NeckDefault(9.0)
+    look_ahead: float = 0.0
+    coupled: bool = False
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
@@ -199,6 +201,7 @@ class MpcSettings(Shown):
         require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
+        require_between("look_ahead", self.look_ahead, 0.0, 1.0, "s")
         for name in ("small_move_pole", "taut_pole"):
             require_between(name, getattr(self, name), 0.0, 1000.0, "1/s")
         require_one_of("order", self.order, ORDERS)
@@ -213,43 +216,48 @@ class MpcSettings(Shown):
         """Samples of the horizon at which the motors move."""
         return spaced_starts(self.horizon, self.moves)
 
-    def design(self, model: HasTransferFunctions) -> MpcController:
+    def design(self, model: Any) -> MpcController:
         """Return the controller for `model`, a linear model of any robot with its `tf`, or for a `Family`.
+
+        A discrete `control` system is taken as well, with all that each of its inputs does to each of its outputs.
 
         Raises:
             SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
                 robustness that nothing keeps.
         """
-        robot, settings = robot_of(model), settings_for(self, model)
+        plant = plant_of(model, coupled=self.coupled)
+        robot, settings = robot_of(plant), settings_for(self, plant)
         limits = limits_of(settings, robot)
-        if robot.is_neck:
-            made = settings._designed(model, limits)
-            return replace(made, design={**made.design, "assumed": taken_of_neck(settings, model)})
-        uncertain = uncertain_plant(model)
-        T = redefinition_of(np.asarray(uncertain.weights), uncertain.names)
-        return settings_of_robot(settings, uncertain)._designed(sized_plant(uncertain, limits, T), limits)
+        if robot.is_neck and not isinstance(plant, CoupledPlant):
+            return with_taken(settings._designed(plant, limits), settings, plant)
+        whole = plant if isinstance(plant, CoupledPlant) else uncertain_plant(plant)
+        settings = settings if robot.is_neck else settings_of_robot(settings, whole)
+        return settings._designed(sized_plant(whole, limits, weighed(whole)), limits)
 
     def _designed(self, model: HasTransferFunctions, limits: ControllerLimits) -> MpcController:
         nominal = predicted_plants(self, model)
-        Ts = nominal[0].sample_time
-        samples = sample_pairs(model, self.least_delay)
+        samples = sample_pairs(model, self)
         bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
         if self.rise_s is not None and self.bandwidth is None:
             bandwidth = self._risen(model, nominal, bandwidth)
         arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
-        per_motor = to_si(limits.robot.motors.unit)[0]
+        unit, taut = to_si(limits.robot.motors.unit)[0], self.minimum_tautness
         if self.tightening:
             # A dead time is known to a sample, and `least_delay` makes those of all samples one.
-            plants = [self._delayed(pair, late) for pair in [*self._families(nominal), *samples] for late in (0, 1)]
+            plants = [
+                self._delayed(pair, late)
+                for pair in [*families(nominal, self.small_move_pole), *samples]
+                for late in (0, 1)
+            ]
             arrays, found["back_off_rad"] = tightened(arrays, plants, trial_of(self, limits, self._lever(model)))
         return MpcController(
-            sample_time=Ts,
+            sample_time=nominal[0].sample_time,
             arrays=arrays,
             **{name: getattr(limits, name) for name in LIMITS[:4]},
             robot=limits.robot,
             angle_limit=self.angle_limit,
-            minimum_tautness=None if self.minimum_tautness is None else per_motor * self.minimum_tautness,
+            minimum_tautness=None if taut is None else unit * taut,
             disturbances=self.disturbances,
             order=self.order,
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
@@ -265,7 +273,8 @@ class MpcSettings(Shown):
         if not keeps(low):
             raise SettingsError(
                 f"not even a bandwidth of {low:g} rad/s keeps Ms <= {self.max_sensitivity:g} "
-                f"({self.worst_sensitivity:g} on the samples of a family); raise these bounds."
+                f"({self.worst_sensitivity:g} on the samples of a family); raise them, or give "
+                "`bandwidth`, with which less of what is measured is believed."
             )
         for _ in range(_HALVINGS):
             middle = math.sqrt(low * high)
@@ -299,7 +308,7 @@ class MpcSettings(Shown):
             trust=FULL_TRUST, reference_time=self.reference_time or 0.0, preview=round(self.preview / Ts),
             budget=self.budget, disturbances=effects(self.disturbances, robot_of(model)),
         )  # fmt: skip
-        if isinstance(model, SizedPlant):
+        if isinstance(model, SizedPlant) and model.scale is not None:
             coast = max(1, round(_COAST * slowness(problem.scenarios[0].axes) / Ts))
             measured = tuning.disturbances / np.append(model.scale.outputs, [1.0, 1.0])
             tuning = replace(tuning, scale=model.scale, coast=coast, disturbances=measured)
@@ -311,7 +320,7 @@ class MpcSettings(Shown):
 
     def _problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
         nominal = predicted_plants(self, model)
-        scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self.least_delay, self.extra_delay)
+        scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self)
         if isinstance(model, SizedPlant):
             T, inverse = model.redefinition
         else:
@@ -350,15 +359,8 @@ class MpcSettings(Shown):
             return model.lever(self.tautness_lever)
         return self.tautness_lever * redefinition_matrix(np.array(self.tendon_angles))[:2].T
 
-    def _families(self, nominal: Pair) -> list[Pair]:
-        """Return what the neck may be: as identified, and faster."""
-        if self.small_move_pole == 0.0:
-            return [nominal]
-        fast = tuple(plant.faster(self.small_move_pole) for plant in nominal)
-        return [nominal] if fast == nominal else [nominal, fast]
-
     def _bounds(self, nominal: Pair, samples: list[Pair]) -> list[tuple[Pair, float]]:
-        bounds = [(pair, self.max_sensitivity) for pair in self._families(nominal)]
+        bounds = [(pair, self.max_sensitivity) for pair in families(nominal, self.small_move_pole)]
         return bounds + [(pair, self.worst_sensitivity) for pair in samples]
 
     def _frequencies(self, nominal: Pair) -> Vector:
@@ -371,14 +373,14 @@ class MpcSettings(Shown):
         self, arrays: tuple[Any, ...], nominal: Pair, samples: list[Pair]
     ) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Return the arrays with observer and filter, and what was found."""
-        families, w = self._families(nominal), self._frequencies(nominal)
+        moved, w = families(nominal, self.small_move_pole), self._frequencies(nominal)
         bounds = self._bounds(nominal, samples)
         arrays = with_gains(arrays, observer_trust(arrays, bounds, self.extra_delay, w))
         time = self.reference_time
         if self.rise_s is not None:
             time = filter_for_rise(arrays, nominal, self.extra_delay, self.rise_s)
         elif time is None:
-            spread = [scaled(pair, 1.0 + s) for pair in families for s in (-self.gain_spread, 0.0, self.gain_spread)]
+            spread = [times(pair, 1.0 + s) for pair in moved for s in (-self.gain_spread, 0.0, self.gain_spread)]
             time = reference_time(
                 arrays, [*spread, *samples], self.extra_delay, overshoot=self.overshoot_pct / 100.0
             )  # fmt: skip
@@ -387,11 +389,11 @@ class MpcSettings(Shown):
         found = {
             "observer_bandwidth_rad_s": observer_bandwidth(MpcArrays(arrays).observer[0], nominal[0].sample_time),
             "reference_time_s": time,
-            "sensitivity": [sensitivity(parts, pair, self.extra_delay, w) for pair in families],
+            "sensitivity": [sensitivity(parts, pair, self.extra_delay, w) for pair in moved],
             "worst_sensitivity": max(
                 (sensitivity(parts, pair, self.extra_delay, w) for pair in samples), default=None
             ),
-            "spectral_radius": max(radius(parts, pair, self.extra_delay) for pair in families),
+            "spectral_radius": max(radius(parts, pair, self.extra_delay) for pair in moved),
             "dead_time_s": [(plant.delay + self.extra_delay) * plant.sample_time for plant in nominal],
             "starts": list(self.starts),
         }  # fmt: skip

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
-from softneck.estimation import AxisPlant
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.runtime import load_runtime
 
 from ..linear._ports import LIMITS, ControllerLimits
+from ..plants._coupled_axis import AnyAxis, inputs_of
 from . import _mpc_state_runtime as rt
 from ._arrays import with_back_off
 from ._scale import runtime_of, units_of
@@ -190,7 +190,7 @@ def closed_loop(
     flags = 2 * m + 1 + n
     inputs = np.zeros(flags + 2 + (m if H > 0 else 0) + int(a.constants[rt.MPC_DISTURBANCES]))
     inputs[flags : flags + 2] = 1.0
-    necks = [_Axis(plant) for plant in plants]
+    necks = [_Axis(plant, inputs_of(plant, axis, m)) for axis, plant in enumerate(plants)]
     dead = max(plant.delay for plant in plants)
     line, angles, motors = np.zeros((dead + 1, n)), np.zeros((levels.size, m)), np.zeros((levels.size, n))
     for k in range(levels.size):
@@ -201,22 +201,23 @@ def closed_loop(
             inputs[flags + 2 : flags + 2 + m] = outputs * wanted[k + H]
         runtime.step(arrays, parameters, state, inputs, out)
         line = np.vstack([out / unit, line[:-1]])
-        for axis, neck in enumerate(necks):
-            neck.advance(float((a.T @ line[0])[axis]))
+        for neck in necks:
+            neck.advance((a.T @ line[0])[:m])
     return angles, motors
 
 
 class _Axis:
     """One axis of a plant behind its dead time."""
 
-    def __init__(self, plant: AxisPlant) -> None:
-        self.A, self.B, self.C = plant.observable_form()
+    def __init__(self, plant: AnyAxis, B: Matrix) -> None:
+        self.A, _, self.C = plant.observable_form()
+        self.B = B
         self.x: Vector = np.zeros(plant.order)
-        self.line = [0.0] * plant.delay
+        self.line: list[Vector] = [np.zeros(B.shape[1])] * plant.delay
         self.y = 0.0
 
-    def advance(self, v: float) -> None:
-        """Move on by a sample under the input `v`."""
+    def advance(self, v: Vector) -> None:
+        """Move on by a sample under the redefined inputs `v` of all axes."""
         self.line.append(v)
-        self.x = self.A @ self.x + self.B * self.line.pop(0)
+        self.x = self.A @ self.x + self.B @ self.line.pop(0)
         self.y = float(self.C @ self.x)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,11 +10,12 @@ from softneck.core import Matrix, SettingsError, Vector, require_between
 from softneck.estimation import AxisPlant
 from softneck.robot._neck_default import NeckDefault
 
+from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
 from ._arrays import with_filter, with_gains
 from ._lti import system
 
 # One plant for each output.
-Pair = tuple[AxisPlant, ...]
+Pair = AnyAxes
 
 # Decades of the move weight that are searched, relative to errors of the input.
 _WEIGHTS = (-6.0, 6.0)
@@ -31,11 +31,12 @@ _MOST_UNKNOWNS = 120
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 
 
-def move_weight(plant: AxisPlant, bandwidth: float) -> float:
+def move_weight(plant: AnyAxis, bandwidth: float) -> float:
     """Return the weight on moves of an axis' input with which the slowest pole of its LQR is as fast as `bandwidth`.
 
     The error is weighted by one over the squared static gain, so that both count in rad of the input.
     """
+    plant = plant.lag() if isinstance(plant, CoupledAxis) else plant
     low, high = _WEIGHTS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -60,64 +61,6 @@ def _slowest(plant: AxisPlant, weight: float) -> float:
     P = solve_discrete_are(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     return float(np.abs(np.linalg.eigvals(A - B @ K)).max())
-
-
-def sensitivity(
-    parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int, frequency: Vector
-) -> float:
-    """Return Ms: the largest singular value of (I - G C)^-1 at the angles, over `frequency` [rad/s]."""
-    A, B, C, D = parts
-    m = len(plants)
-    z = np.exp(1j * frequency * plants[0].sample_time)
-    values, V = np.linalg.eig(A)
-    if np.linalg.cond(V) < 1e8:
-        left, right = C @ V, np.linalg.solve(V, B[:, m:].astype(complex))
-        K = np.einsum("on,kn,ni->koi", left, 1.0 / (z[:, None] - values), right) + D[:, m:]
-    else:
-        eye = np.eye(A.shape[0])
-        K = np.array([C @ np.linalg.solve(point * eye - A, B[:, m:]) + D[:, m:] for point in z])
-    G = np.array([plant.response(frequency, extra_delay=extra_delay) for plant in plants]).T
-    S = np.linalg.inv(np.eye(m) - G[:, :, None] * K)
-    return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
-
-
-def closed(
-    parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int
-) -> tuple[Matrix, Matrix, Matrix]:
-    """Return A, B (from all references) and C (to all angles) of the loop with its dead time in full."""
-    from scipy.linalg import block_diag
-
-    A, B, C, D = parts
-    m = len(plants)
-    sides = [_realised(plant, plant.delay + extra_delay) for plant in plants]
-    Ap, Bp, Cp = (np.asarray(block_diag(*items)) for items in zip(*sides, strict=True))
-    top = np.hstack([Ap + Bp @ D[:, m:] @ Cp, Bp @ C])
-    bottom = np.hstack([B[:, m:] @ Cp, A])
-    return (
-        np.vstack([top, bottom]),
-        np.vstack([Bp @ D[:, :m], B[:, :m]]),
-        np.hstack([Cp, np.zeros((m, A.shape[0]))]),
-    )
-
-
-def _realised(plant: AxisPlant, delay: int) -> tuple[Matrix, Matrix, Matrix]:
-    """Return A, B (n + delay, 1), C (1, n + delay) of a plant behind a chain of samples."""
-    A0, B0, C0 = plant.observable_form()
-    n = plant.order
-    A, B = np.zeros((n + delay, n + delay)), np.zeros((n + delay, 1))
-    A[:n, :n] = A0
-    if delay == 0:
-        B[:n, 0] = B0
-    else:
-        A[:n, n + delay - 1] = B0
-        A[n + 1 :, n : n + delay - 1] = np.eye(delay - 1)
-        B[n, 0] = 1.0
-    return A, B, np.concatenate([C0, np.zeros(delay)])[None, :]
-
-
-def radius(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: Pair, extra_delay: int) -> float:
-    """Return the spectral radius of the loop."""
-    return float(np.abs(np.linalg.eigvals(closed(parts, plants, extra_delay)[0])).max())
 
 
 def keeps_bounds(
@@ -269,8 +212,3 @@ def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
     for i in range(moves):
         starts[-1 - i] = min(starts[-1 - i], horizon - 1 - i)
     return tuple(starts)
-
-
-def scaled(pair: Pair, factor: float) -> Pair:
-    """Return both plants with their gain times `factor`."""
-    return tuple(replace(plant, numerator=factor * plant.numerator) for plant in pair)

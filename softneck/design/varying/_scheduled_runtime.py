@@ -18,6 +18,7 @@ from softneck.design.linear._linear_parts_runtime import (
     LinearState,
     linear_align,
     linear_control,
+    linear_exactly,
     linear_finite,
     linear_motors,
 )
@@ -76,7 +77,7 @@ def step(
     now = scheduled_arrays(p, x.inclination)
     if not started or not active:
         linear_align(now, x, inputs[first : first + p.outputs])
-        scheduled_exactly(now, x, inputs[first : first + p.outputs])
+        linear_exactly(now, x, inputs[first : first + p.outputs])
     x.started = 1.0
     if active:
         linear_control(now, parameters, x, inputs)
@@ -123,17 +124,3 @@ def scheduled_arrays(p: ScheduledArrays, tilt: float) -> LinearArrays:
         p.T_inverse,
         p.constants,
     )
-
-
-def scheduled_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
-    """Correct the aligned state until it asks for exactly the held set-points: a blend of alignments does not."""
-    v = np.dot(p.T, x.held)
-    inside = x.x
-    # With r at the angle, as `linear_align` has it.
-    asked = np.dot(p.C, inside) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
-    for i in range(p.outputs):
-        row = p.C[i]
-        size = np.dot(row, row)
-        if size > 0.0:
-            # Rows of C belong to one axis each, so the other axis' answer stays.
-            inside += row * ((v[i] - asked[i]) / size)

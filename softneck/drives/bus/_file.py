@@ -252,8 +252,15 @@ class DrivesFile(Shown):
         """Cycles between two signs of life of ours: five of them fit into the guarding time."""
         return max(1, math.floor(self.guarding.time / 5.0 / self.cycle + 1e-9))
 
-    def master_settings(self, sample_time: float, *, guarding: str = "life") -> MasterSettings:
+    def master_settings(
+        self, sample_time: float, *, guarding: str = "life", late_modes: tuple[int, ...] = ()
+    ) -> MasterSettings:
         """Return the master's settings for controllers of `sample_time` [s].
+
+        Args:
+            sample_time: of the controller [s].
+            guarding: "life" or "heartbeat".
+            late_modes: nodes that take their mode in Operation Enabled alone.
 
         Raises:
             SettingsError: the bus period does not divide the sample time.
@@ -281,7 +288,9 @@ class DrivesFile(Shown):
             raise_per_mille = [math.copysign(1e-3 * 0.06, scale.counts_per_radian) for scale in scales]
             n = [unit * neck.torque_constant * neck.efficiency * scale.gear / neck.winch_radius
                  for unit, scale in zip(raise_per_mille, scales, strict=True)]  # fmt: skip
-        bus = BusSettings(nodes=self.nodes, cycle=self.cycle, guarding=guarding, guard_cycles=self.guard_cycles)
+        bus = BusSettings(
+            nodes=self.nodes, cycle=self.cycle, guarding=guarding, guard_cycles=self.guard_cycles, late_modes=late_modes
+        )
         return MasterSettings(
             counts_per_radian=tuple(k),
             newton_per_unit=tuple(n),

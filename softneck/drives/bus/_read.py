@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -181,8 +182,9 @@ def _value(where: str, value: Any, factor: float) -> Any:
             words = {bool: "true or false", int: "a whole number", str: "a text"}
             raise SettingsError(f"{where} must be {words[wanted]}; got {value!r}.")
         return value
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise SettingsError(f"{where} must be a number; got {value!r}.")
+    # Whole numbers may be larger than any float.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
+        raise SettingsError(f"{where} must be a number; got {str(value)[:20]}.")
     return factor * value
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import re
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softneck.core import FileFormatError, SoftneckError
+from softneck.core._budget import MOST_EDS, settings_text
 
 from ..master import Frame
 from ._link import Link
@@ -19,17 +21,24 @@ if TYPE_CHECKING:
 
 # A drive answers within some slow-loop samples; 0.3 s is canopen's own patience.
 _ANSWER_TIME = 0.3
+# Which of these a drive tells only hardware can say; that it took the value it did say, and none of them is a guard.
+_MAY_BE_UNTOLD = frozenset({0x6060, 0x6098, 0x60C2, 0x60FF})
 # canopen logs each abort as an error; here an abort becomes one line for the user.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
+
+
+# An object has subindices up to FEh (CiA 301, 7.4.1).
+_MOST_ENTRIES = 254
+_ENTRIES = re.compile(r"^\s*NrOfEntries\s*[=:]\s*\+?(\d+)", re.IGNORECASE | re.MULTILINE)
 
 
 class SdoError(SoftneckError):
     """A drive refused an object or did not answer."""
 
-    def __init__(self, message: str, *, aborted: bool = False) -> None:
-        """Say what happened; `aborted` tells a refusal from silence."""
+    def __init__(self, message: str, *, aborted: bool = False, code: int = 0) -> None:
+        """Say what happened; `aborted` tells a refusal from silence, `code` is the drive's reason."""
         super().__init__(message)
-        self.aborted = aborted
+        self.aborted, self.code = aborted, code
 
 
 def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
@@ -43,6 +52,9 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
 
     source = path or Path(__file__).parent / "eds" / f"{profile}.eds"
     try:
+        many = [int(said) for said in _ENTRIES.findall(settings_text(source, MOST_EDS))]
+        if any(count > _MOST_ENTRIES for count in many):  # each of them is looked for
+            raise ValueError(f"NrOfEntries of {max(many)}, where an object has {_MOST_ENTRIES} at most")
         dictionary = canopen.import_od(str(source))
     except Exception as error:  # canopen raises what its parser meets: KeyError, ValueError, configparser's
         raise FileFormatError(
@@ -54,13 +66,18 @@ def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
 
 
 class Objects:
-    """The objects of one drive."""
+    """The objects of one drive.
+
+    Attributes:
+        node: its number.
+        untold: objects that took a value and cannot be read.
+    """
 
     def __init__(self, link: Link, node: int, dictionary: ObjectDictionary) -> None:
         """Talk to `node` over `link`, with names and types of `dictionary`."""
         from canopen.sdo.client import SdoClient
 
-        self.node = node
+        self.node, self.untold = node, set[str]()
         self._client = SdoClient(0x600 + node, 0x580 + node, dictionary)
         # The network below has put the answer into the queue before canopen looks, or there is none.
         self._client.RESPONSE_TIMEOUT = 0.0
@@ -108,9 +125,15 @@ class Objects:
         self._call(index, subindex, put, value=value)
 
     def written(self, index: int, subindex: int, value: int) -> int:
-        """Write a number and return what the drive says that it has now."""
+        """Write a number and return what the drive says that it has now: what was written where it may keep silent."""
         self.write(index, subindex, value)
-        return self.read(index, subindex)
+        try:
+            return self.read(index, subindex)
+        except SdoError as error:
+            if not error.aborted or index not in _MAY_BE_UNTOLD:
+                raise
+            self.untold.add(f"{index:04X}h")
+            return value
 
     def _call(self, index: int, subindex: int, act: Any, *, value: int | None = None) -> Any:
         from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
@@ -121,7 +144,9 @@ class Objects:
             return act(entry if _plain(self._dictionary, index) else entry[subindex])  # pyright: ignore[reportIndexIssue]
         except SdoAbortedError as error:
             asked = "" if value is None else f" the value {value} for"
-            raise SdoError(f"node {self.node} refuses{asked} object {place} ({error}).", aborted=True) from error
+            raise SdoError(
+                f"node {self.node} refuses{asked} object {place} ({error}).", aborted=True, code=error.code
+            ) from error
         except SdoCommunicationError as error:
             raise SdoError(
                 f"node {self.node} does not answer (object {place}); is it on, is its number right?"

@@ -110,6 +110,12 @@ def identify(
     scales = _scales(seen, file, expected, types or {}, order, quiet=quiet)
     late = float(np.median(lags)) - expected.lag if lags and quiet and expected is not None else math.nan
     findings = [*_unmoved(moves, count), *_signs(seen, file), *_scale_findings(scales, file, seen), *turned]
+    if noises and not quiet:
+        findings.append(Finding(
+            "sensor noise", f"{math.degrees(noise):.2f} deg at rest, {math.degrees(_NOISY):.2f} at most: gears, "
+            "currents and lateness were not judged", "Commission with a quieter inclinometer, or let this one average "
+            "longer.",
+        ))  # fmt: skip
     if late > LATE:
         findings.append(Finding(
             "sensor late", f"{1e3 * late:.0f} ms later than expected", "Look at its filter, its rate and the line to "

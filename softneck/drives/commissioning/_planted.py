@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from softneck.core import SettingsError
 from softneck.plant import NeckParameters
 
@@ -14,11 +12,8 @@ from ..bus._axes import Axes, axes_of, inverse, said_of
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
 from ..running._virtual import simulated_plant
-from ..simulated import SimulatedDrive
-from ..simulated._axis import Axis
+from ..simulated._drives import twin
 from ..simulated._mounted import MountedOtherwise
-from ..simulated._profiles import PROFILES
-from ..simulated._servo_runtime import SERVO_SIZE
 
 # How a mistake is written, for people.
 KINDS = ("reversed:N", "exchanged:N:M", "gear:N:FACTOR", "lines:N:FACTOR", "current:N:FACTOR", "axes", "sign:OUTPUT",
@@ -113,14 +108,5 @@ def planted_link(
     mounted = MountedOtherwise(turns, inverse(axes_of(planted.file.sensor_axes, outputs)), late=planted.late)
     link = VirtualLink(mounted)  # pyright: ignore[reportArgumentType]  # it stands for what it is around
     link.axes = axes_of(believed.sensor_axes, outputs)
-    twins = [_twin(node, planted.file.profile) for node in planted.twins]
-    turns.drives = (*turns.drives, *twins)
+    turns.drives = (*turns.drives, *(twin(node, turns.settings) for node in planted.twins))
     return link
-
-
-def _twin(node: int, profile: str) -> SimulatedDrive:
-    drive = SimulatedDrive(Axis(node, PROFILES[profile](), np.zeros(SERVO_SIZE), peak_current=10.0, slow_loop=1e-3))
-    drive.axis.values[(0x1018, 4)] = 2000 + node
-    # Its boot-up message was long ago.
-    drive.tick(0.0)
-    return drive

@@ -20,7 +20,7 @@ from ..bus._objects import (
     speed_of_units,
     speed_units,
 )
-from ..bus._sdo import Objects, load_eds
+from ..bus._sdo import Objects, SdoError, load_eds
 from ..bus._units import counts_to_position
 from ..master import Frame, Tilt
 from ..master._cia402 import DriveState, state_of
@@ -32,7 +32,9 @@ if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
 
 
-_VELOCITY, _HOMING, _HERE = 3, 6, 35
+_MODE, _VELOCITY, _HOMING, _HERE = 0x6060, 3, 6, 35
+# A winch that holds is slower [rad/s], and moves less between two looks [rad].
+_UNMOVED = 0.01
 # Between two looks at a drive [s].
 _LOOK = 0.02
 # Speeds of 606Ch and of 6064h differ by less than this part, or the slow loop is not what the drives file says.
@@ -76,6 +78,7 @@ class _Motor:
         self.objects = Objects(link, entry.node, dictionary)
         self.link = link
         self.start = self.pulled = 0.0
+        self.held, self.late_mode = 0, False
 
     def position(self) -> float:
         return counts_to_position(self.objects.read(0x6064), self.entry.scale)
@@ -102,11 +105,19 @@ class _Motor:
             Write(0x6085, 0, max(1, abs(pull)), "zero"),
             current_write(zero.current, self.entry, self.file.profile, "zero"),
             Write(0x60FF, 0, 0, "zero"),
-            Write(0x6060, 0, _VELOCITY, "zero"),
         ]
         for write in writes:
-            if self.objects.written(write.index, write.subindex, write.value) != write.value:
-                raise CheckFailedError(f"node {self.entry.node}: {write.index:04X}h does not keep {write.value}.")
+            self._keep(write.index, write.subindex, write.value)
+        try:
+            self._keep(_MODE, 0, _VELOCITY)
+        except SdoError as error:
+            if not error.aborted:
+                raise
+            self.late_mode = True  # until then its speed, if that is what it has, is zero
+
+    def _keep(self, index: int, subindex: int, value: int) -> None:
+        if self.objects.written(index, subindex, value) != value:
+            raise CheckFailedError(f"node {self.entry.node}: {index:04X}h does not keep {value}.")
 
     def enable(self) -> None:
         until = self.link.now + _ENABLE_TIME
@@ -122,6 +133,28 @@ class _Motor:
                         f"node {self.entry.node}: does not get to {state.name}; it is in {found.name}.{advice}"
                     )
                 wait(self.link, _LOOK)
+        if self.late_mode:
+            self._keep(_MODE, 0, _VELOCITY)
+
+    def take_homing(self) -> int:
+        """Change to the homing mode; return by how many counts the winch went back meanwhile.
+
+        A drive that takes a mode only without power loses it for an instant, and the tendon turns the winch back.
+        """
+        try:
+            self.objects.write(_MODE, 0, _HOMING)
+        except SdoError as error:
+            if not error.aborted or self.late_mode:
+                raise
+            self.word(0x06)
+            wait(self.link, _LOOK)
+            self.objects.write(_MODE, 0, _HOMING)
+            self.enable()
+            until = self.link.now + _SETTLE  # it may still turn back when the drive begins to hold it
+            while abs(_creep(self.link, self)) > _UNMOVED and self.link.now < until:
+                pass
+            return self.objects.read(0x6064) - self.held
+        return 0
 
 
 def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: Operator | None = None) -> ZeroResult:
@@ -153,6 +186,8 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
         # What the later ones pulled may have loosened the first: all pull on with their small current.
         _rest(guarded, _SETTLE, operator)
         outputs = _upright(file, look)
+        for motor in motors:
+            motor.held = motor.objects.read(0x6064)
         for motor in motors:
             _set_zero(guarded, motor)
         zeroed = True
@@ -225,18 +260,18 @@ def _upright(file: DrivesFile, look: Look) -> dict[str, float]:
 def _set_zero(link: Link, motor: _Motor) -> None:
     objects, still = motor.objects, motor.file.zero.still
     before = _creep(link, motor)
-    objects.write(0x607C, 0, HOMED_MARK)
-    objects.write(0x6098, 0, _HERE)
     # The drive holds while its mode changes: its speed is zero and the tendon is tight.
     objects.write(0x60FF, 0, 0)
-    objects.write(0x6060, 0, _HOMING)
+    back = motor.take_homing()
+    objects.write(0x607C, 0, HOMED_MARK + back)
+    objects.write(0x6098, 0, _HERE)
     begin = link.now
     motor.word(0x1F)
     told = link.now
     wait(link, _LOOK)
     word = objects.read(0x6041)
     asked = link.now
-    counts = objects.read(0x6064)
+    counts = objects.read(0x6064) - back
     passed = link.now - begin
     speeds = (before, _creep(link, motor))
     # The zero was taken between `begin` and `told`, the position after `asked`: what a winch, pulled on by its small
@@ -249,6 +284,19 @@ def _set_zero(link: Link, motor: _Motor) -> None:
         raise CheckFailedError(
             f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}, "
             f"{speeds[1]:.3f} rad/s). Is its tendon tight still? Zero again."
+        )
+    if back:
+        _mark(motor, counts_to_position(back, motor.entry.scale))
+
+
+def _mark(motor: _Motor, back: float) -> None:
+    """Leave the mark of a zero whose home offset was another one; a drive that counts by it at once is refused."""
+    before = motor.position()
+    motor.objects.write(0x607C, 0, HOMED_MARK)
+    if abs(motor.position() - before) > max(0.5 * abs(back), _UNMOVED):
+        raise CheckFailedError(
+            f"node {motor.entry.node}: its position follows 607Ch at once, and it takes no mode with power; "
+            "it cannot be zeroed."
         )
 
 

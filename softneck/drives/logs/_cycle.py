@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 from ..master import Frame, Master, Tilt
 from ..master._gate import Reading, sample_of
-from ..master._measured import Measurement, Motors, Pilot
+from ..master._measured import Measurement, Motors, Pilot, reference_of
 
-# What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None), or
-# (what, "Error: text") where it raised.
+# What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None) and, of a
+# loop, ("reference", what it wanted its outputs to be), or (what, "Error: text") where it raised.
 Answer = tuple[str, Any]
 
 
@@ -67,6 +67,14 @@ class LoggedPilot:
             raise
         self._answers.append(("step", answer))
         return answer
+
+    @property
+    def reference(self) -> tuple[float, ...]:
+        """What the pilot's is; one that closes no loop has none, and none is kept."""
+        reference = reference_of(self._pilot)
+        if reference:
+            self._answers.append(("reference", reference))
+        return reference
 
     def finished(self, index: int) -> bool:
         """Return what the pilot returns."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import struct
 import zlib
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from softneck.core import FileFormatError
-from softneck.core._budget import require_size
+from softneck.core._budget import require_lines, require_size, require_unpacked
 
 from ..master import Frame
 
@@ -18,6 +19,10 @@ FRAME_LOGS = (".log", ".blf")
 # Bytes in one compressed piece of a BLF file: what a killed process may lose. 10 ms of a bus of three drives are some
 # 500 bytes, so that this is a tenth of a second, and less than one at 20 Hz.
 _BLF_PIECE = 4096
+# Of a BLF file: bytes of an object's head and of a container's, the kind of a container, and how it is packed (zlib).
+_OBJECT, _CONTAINER, _PACKED = 16, 10, b"\2\0"
+# Bytes that are unpacked at once to see how many there are.
+_WINDOW = 2**17
 
 
 class CandumpSink:
@@ -124,6 +129,7 @@ class FrameLog:
         count = 0
         if self.path.is_file():
             require_size(self.path)
+            (_require_containers if binary else require_lines)(self.path)
         try:
             # Opened here, for the readers leave the file open where it is damaged.
             with self.path.open("rb" if binary else "r", encoding=None if binary else "ascii") as stream:
@@ -138,6 +144,27 @@ class FrameLog:
                     f"{self.path}: holds no frames of `candump -L` or BLF ({' '.join(str(error).split())})."
                 ) from error
             self.cut = f"ends in the middle of frame {count + 1}"
+
+
+def _require_containers(path: Path) -> None:
+    """Raise FileFormatError where the packed containers of a BLF file hold more than a log of its size.
+
+    What is damaged otherwise the reader says.
+    """
+    size, total = path.stat().st_size, 0
+    with path.open("rb") as stream:
+        stream.seek(int.from_bytes(stream.read(8)[4:], "little"))
+        while len(head := stream.read(_OBJECT)) == _OBJECT and head.startswith(b"LOBJ"):
+            length, kind = struct.unpack_from("<II", head, 8)
+            body = stream.read(max(length - _OBJECT, 0))
+            stream.read(length % 4)  # objects begin at multiples of four
+            if kind != _CONTAINER or body[:2] != _PACKED:
+                continue
+            unpacker, left = zlib.decompressobj(), body[_OBJECT:]
+            with contextlib.suppress(zlib.error):
+                while part := unpacker.decompress(left, _WINDOW):
+                    total, left = total + len(part), unpacker.unconsumed_tail
+                    require_unpacked(path, total, size)
 
 
 def _frame(message: Any) -> Frame:

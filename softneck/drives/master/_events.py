@@ -69,6 +69,7 @@ RULES: dict[str, Rule] = {
     "current_scale": Rule(_R.STOP, 0, 0.5, "a motor's current does not fit its motion: is `peak_current_A` right?"),
     "gear_wrong": Rule(_R.STOP, 0, 0.5, "the tilt does not fit a winch's turns: is `gear` right?"),
     "tilt_unexplained": Rule(_R.STOP, 0, 4.0, "the neck is not where its motors put it: push, creep, tendon or sensor"),
+    "astray": Rule(_R.STOP, 0, 0.5, "the loop does not follow its reference as it did: controller or limits"),
     "sensor_reversed": Rule(_R.STOP, 0, 0.5, "an axis of the inclinometer is reversed"),
     "sensor_swapped": Rule(_R.STOP, 0, 0.5, "the inclinometer's axes are swapped"),
     "sensor_stuck": Rule(_R.RETREAT, 0, 0.5, "the inclinometer does not follow the motors"),

@@ -16,6 +16,8 @@ _TPDO = struct.Struct("<Hih")
 _RPDO = struct.Struct("<Hi")
 _EMERGENCY = struct.Struct("<HB")
 SYNC = Frame(0x080)
+# SDO request to write 8 to 6060h, and how a drive begins its answer that it did (CiA 301, 7.2.4.3.3).
+_LATE_MODE, _MODE_TAKEN = b"\x2f\x60\x60\0\x08\0\0\0", b"\x60\x60\x60\0"
 # Not faults: a drive at its own software limit decelerates and says so (FF06h, FF07h).
 _LIMIT_CODES = (0xFF06, 0xFF07)
 
@@ -34,6 +36,7 @@ class BusSettings:
         missing_cycles: without a drive's TPDO until it counts as lost.
         answer_time: without its guarding answer or heartbeat [s], the same.
         stalled_cycles: between two steps until the loop counts as stalled.
+        late_modes: nodes whose drive takes its mode in Operation Enabled alone: it is written there.
         off: names of guards that are switched off; for the tests that prove each one to be needed.
     """
 
@@ -46,6 +49,7 @@ class BusSettings:
     missing_cycles: int = 5
     answer_time: float = 0.25
     stalled_cycles: int = 5
+    late_modes: tuple[int, ...] = ()
     off: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
@@ -66,15 +70,17 @@ class DriveView:
         answered: when guarding or heartbeat last came [s]; None before the first.
         nmt: state that it said there.
         emergencies: (time, code, register) of all so far, the last 20.
+        mode: whether the drive has the cyclic mode; "asked" while it was told to and did not answer.
     """
 
     __slots__ = (
-        "answered", "counts", "current", "emergencies", "fresh", "heard", "nmt", "node", "silent", "state", "toggle",
-        "word",
+        "answered", "counts", "current", "emergencies", "fresh", "heard", "mode", "nmt", "node", "silent", "state",
+        "toggle", "word",
     )  # fmt: skip
 
-    def __init__(self, node: int) -> None:
+    def __init__(self, node: int, *, late_mode: bool = False) -> None:
         """Know nothing yet."""
+        self.mode = "missing" if late_mode else "taken"
         self.node = node
         self.word, self.state = 0, DriveState.UNKNOWN
         self.counts = self.current = 0
@@ -82,6 +88,11 @@ class DriveView:
         self.answered: float | None = None
         self.nmt, self.toggle = NodeState.UNKNOWN, -1
         self.emergencies: list[tuple[float, int, int]] = []
+
+    @property
+    def follows(self) -> bool:
+        """Whether the drive is in Operation Enabled, in the cyclic mode, and said so in this cycle."""
+        return self.state is DriveState.ENABLED and self.fresh and self.mode == "taken"
 
 
 class Fieldbus:
@@ -96,7 +107,7 @@ class Fieldbus:
     def __init__(self, settings: BusSettings) -> None:
         """Prepare the look-up of identifiers."""
         self.settings = settings
-        self.drives = tuple(DriveView(node) for node in settings.nodes)
+        self.drives = tuple(DriveView(node, late_mode=node in settings.late_modes) for node in settings.nodes)
         self.malformed = 0
         self._cycle = 0
         self._handlers = {}
@@ -105,6 +116,8 @@ class Fieldbus:
             self._handlers[0x180 + view.node] = (self._tpdo, view)
             self._handlers[0x080 + view.node] = (self._emergency, view)
             self._handlers[0x700 + view.node] = (self._error_control, view)
+            if view.mode != "taken":
+                self._handlers[0x580 + view.node] = (self._answer, view)
             foreign |= {base + view.node for base in (0x200, 0x300, 0x400, 0x500, 0x600)}
         self._foreign = frozenset(foreign)
         self._guards = tuple(Frame(0x700 + node, b"\0", remote=True) for node in settings.nodes)
@@ -170,6 +183,12 @@ class Fieldbus:
         if state is not NodeState.OPERATIONAL:
             events.append(Event(now, "node_left", view.node, f"it says {state.name}"))
 
+    def _answer(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
+        """Take the answer to `_LATE_MODE`; to one that refuses it the wait for Operation Enabled does not end."""
+        del now, events
+        if view.mode == "asked" and data[:4] == _MODE_TAKEN:
+            view.mode = "taken"
+
     def _watch(self, now: float, events: list[Event]) -> None:
         s = self.settings
         dead = True
@@ -194,6 +213,9 @@ class Fieldbus:
         for view, goal, target in zip(self.drives, goals, targets, strict=True):
             word = control_word(view.state, goal)
             frames.append(Frame(0x200 + view.node, _RPDO.pack(word, target)))
+            if view.mode == "missing" and goal is Goal.ENABLED and view.state is DriveState.ENABLED:
+                view.mode = "asked"
+                frames.append(Frame(0x600 + view.node, _LATE_MODE))
         frames.append(SYNC)
         if guard and self._cycle % self.settings.guard_cycles == 0:
             frames.extend(self.signs_of_life())

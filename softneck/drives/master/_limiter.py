@@ -21,7 +21,7 @@ class Limiter:
         clamped: whether the last step was limited, and by what ("" if not).
     """
 
-    __slots__ = ("_cycle", "_limits", "_range", "_slack_at", "clamped", "speed", "value")
+    __slots__ = ("_aim", "_cycle", "_limits", "_range", "_slack_at", "clamped", "speed", "value")
 
     def __init__(self, limits: LimitSettings, cycle: float, own: tuple[float, float, float] | None = None) -> None:
         """Begin at zero, at rest.
@@ -33,16 +33,20 @@ class Limiter:
         """
         self._limits, self._cycle = limits, cycle
         self._range = own or (-limits.position, limits.position, limits.speed)
-        self.value = self.speed = 0.0
+        self.value = self.speed = self._aim = 0.0
         self.clamped = ""
         self._slack_at: float | None = None
 
     def reset(self, value: float) -> None:
         """Stand still at `value` [rad]."""
-        self.value, self.speed, self.clamped, self._slack_at = value, 0.0, "", None
+        self.value, self.speed, self.clamped, self._slack_at, self._aim = value, 0.0, "", None, value
 
-    def step(self, wanted: float, tension: float) -> float:
-        """Return the set-point of this cycle [rad] on the way to `wanted`; `tension` [N] is estimated."""
+    def step(self, wanted: float, tension: float, led: float = 0.0) -> float:
+        """Return the set-point of this cycle [rad] on the way to `wanted`; `tension` [N] is estimated.
+
+        A tendon that hangs while the outputs lean away from it has to be let out as far as they went: `led` [rad] is
+        where they put its motor.
+        """
         limits, T = self._limits, self._cycle
         low, high, fastest = self._range
         # A winch that unwound beyond its range without power comes back as it is led: no jump to the edge.
@@ -60,10 +64,12 @@ class Limiter:
             self._slack_at = None
         else:
             if self._slack_at is None:
-                self._slack_at = self.value
-            floor = self._slack_at - limits.slack_unwind
+                self._slack_at = self.value - led
+            # Nothing is pulled that nobody asked for: outputs that lean back end the way out where it is.
+            floor = min(self._slack_at + led - limits.slack_unwind, self._aim)
             if goal < floor:
                 goal, why = floor, "slack"
+        self._aim = goal
         way = goal - self.value
         speed = way / T
         # Not faster than allowed, nor than what still stops at the goal: v^2 / (2 a) + v T / 2 = way, in steps of T.

@@ -12,7 +12,7 @@ from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
 from ._gate import Gate, Reading, Tilt
 from ._limiter import Limiter
-from ._measured import Measurement, Motors, Pilot
+from ._measured import Measurement, Motors, Pilot, reference_of
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
 from ._watches import Leaky, Watches, timing
@@ -36,7 +36,7 @@ class Master:
         supervisor: the phase, and what ended the run.
         positions, tensions: of the motors [rad] and tendons [N], as measured and estimated.
         setpoints: as sent [rad].
-        wanted: what the pilot asked for last [rad].
+        wanted: what the pilot asked for last [rad]; reference: what it wants the outputs to be [rad], () for nothing.
         counts: event name -> how often.
         events: the last 1000.
         cycle: number of steps so far.
@@ -62,6 +62,7 @@ class Master:
         self._clamped = Leaky(settings.limits.persistent, settings.bus.cycle)
         self.positions: Motors = (0.0,) * count
         self.tensions = self.setpoints = self.wanted = self._from = self.positions
+        self.reference: Motors = ()
         self.counts: Counter[str] = Counter()
         self.events: deque[Event] = deque(maxlen=1000)
         self.cycle = 0
@@ -199,12 +200,12 @@ class Master:
                 self._watches.signs(now, self.settings.bus.nodes, self.tensions, events)
             self._watches.motors(now, self.setpoints, self.positions, self.settings.bus.nodes, self.tensions, events)
             last = self._gate.last if fresh else None
+            asked = self.reference if phase is Phase.RUNNING else ()
             self._watches.plausible(now, self.settings.bus.nodes, self.setpoints, self.positions, self.tensions, events,
-                                    due=due, sample=last)  # fmt: skip
+                                    due=due, sample=last, reference=asked)  # fmt: skip
             if due:
-                measured = last.values if last else None
                 step = self.settings.sample_cycles * self.settings.bus.cycle
-                self._watches.tilt(now, step, self.positions, measured, events)
+                self._watches.tilt(now, step, self.positions, last and last.values, events)
         if events:
             self._judge(now, events)
             events.clear()
@@ -231,7 +232,7 @@ class Master:
         if self._enabling_since == _NEVER:
             self._enabling_since = now
         view = self.bus.drives[self._enabling]
-        if view.state is DriveState.ENABLED and view.fresh:
+        if view.follows:
             self._enabling += 1
             self._enabling_since = now
             if self._enabling == len(self.bus.drives):
@@ -239,7 +240,8 @@ class Master:
                 if self._gate.last is not None:
                     self._change(now, Signal.ENABLED)
         elif now - self._enabling_since > self.settings.ramps.enable_timeout:
-            events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}"))
+            why = " and does not take mode 8" if view.mode == "asked" else ""
+            events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}{why}"))
 
     def _ramp(self, now: float, events: list[Event]) -> None:
         """Straight to rest, where P is zero, and a while there."""
@@ -273,6 +275,7 @@ class Master:
         self._index = -1
         self._missing = 0
         self.wanted = self._from = self.setpoints
+        self.reference = ()
         if self._gate.last is not None:
             self._watches.align(self._gate.last.values, self.positions)
         try:
@@ -322,15 +325,15 @@ class Master:
             self._failed(now, error)
             return
         self._missing = 0
-        self._from, self.wanted = self.wanted, wanted
+        self._from, self.wanted, self.reference = self.wanted, wanted, reference_of(self.pilot)
 
     def _failed(self, now: float, error: Exception) -> None:
         self._judge(now, [Event(now, "controller_failed", 0, f"{type(error).__name__}: {error}")])
 
     def _limit(self, now: float, wanted: Sequence[float], events: list[Event], *, count: bool) -> None:
         values, why = [], ""
-        for limiter, value, tension in zip(self._limiters, wanted, self.tensions, strict=True):
-            values.append(limiter.step(value, tension))
+        for limiter, value, tension, led in zip(self._limiters, wanted, self.tensions, self._watches.led, strict=True):
+            values.append(limiter.step(value, tension, led))
             why = why or limiter.clamped
         self.setpoints = tuple(values)
         if not count:

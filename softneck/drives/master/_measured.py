@@ -42,3 +42,8 @@ class Pilot(Protocol):
     def finished(self, index: int) -> bool:
         """Return whether the run ends before sample `index`."""
         ...
+
+
+def reference_of(pilot: Pilot) -> tuple[float, ...]:
+    """Return what a pilot that closes a loop wanted its outputs to be at its last step [rad]; () of any other."""
+    return tuple(getattr(pilot, "reference", ()))

@@ -24,7 +24,7 @@ class LimitSettings:
         tension: of a tendon, as estimated from the motor's current [N]; nearer than a fifth it may not be pulled
             further, above it for 150 ms stops.
         slack: a tendon below this hangs [N].
-        slack_unwind: how far a hanging tendon may still be let out [rad].
+        slack_unwind: how far a hanging tendon may still be let out, beyond what the outputs lean away from it [rad].
     """
 
     position: float = 6.0

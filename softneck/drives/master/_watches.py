@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..supervision._baseline import Baseline
 from ..supervision._plausibility import Plausibility
 from ._events import Event
@@ -70,6 +72,7 @@ class Watches:
 
     Attributes:
         angles: that the model gives [rad].
+        led: motors that belong to the angles measured last, but for what all tendons do together [rad].
     """
 
     def __init__(
@@ -85,6 +88,9 @@ class Watches:
         self._settings, self._limits = settings, limits
         self._rows = settings.weights if weights is None else weights
         self.angles = [0.0] * len(self._rows)
+        self.led: tuple[float, ...] = (0.0,) * motors
+        # The smallest motion that gives the angles (Penrose): nothing of it where directions are to be identified.
+        self._back = np.linalg.pinv(settings.gain * np.array(self._rows)).tolist() if self._rows else None
         self._offset = self.angles
         self._started = False
         self._tilted = Patience()
@@ -122,6 +128,8 @@ class Watches:
     def tilt(self, now: float, step: float, positions: Sequence[float], measured: Sequence[float] | None,
              events: list[Event]) -> None:  # fmt: skip
         """Advance the model by `step` [s] and compare; each sample while enabled."""
+        if measured is not None and self._back is not None:
+            self.led = tuple([_product(row, measured) for row in self._back])
         if not self._started:
             return
         share = 1.0 - math.exp(-self._settings.pole * step)
@@ -138,24 +146,25 @@ class Watches:
 
     def plausible(self, now: float, nodes: Sequence[int], setpoints: Sequence[float], positions: Sequence[float],
                   tensions: Sequence[float], events: list[Event], *, due: bool,
-                  sample: Tilt | Reading | None) -> None:  # fmt: skip
+                  sample: Tilt | Reading | None, reference: Sequence[float]) -> None:  # fmt: skip
         """Ask the charts; each cycle while enabled, with the sample that came where one is due."""
         if self._plausible is None:
             return
         found = self._plausible.cycle(setpoints, positions, tensions)
         if due and found is None:
             values, rates = (None, ()) if sample is None else (sample.values, sample.rates)
-            found = self._plausible.sample(positions, values, rates)
+            found = self._plausible.sample(positions, values, rates, reference)
         if found is not None:
             events.append(Event(now, found.name, 0 if found.motor < 0 else nodes[found.motor], found.detail))
 
     def _static(self, P: Sequence[float]) -> list[float]:
         """Return the tilt that motors at `P` end at: Eq. 9, 10 for tendons in any direction, and the gain."""
-        ends = []
-        for row in self._rows:
-            # Not `sum`, which rounds in another way from Python 3.12 on.
-            total = 0.0
-            for weight, position in zip(row, P, strict=True):
-                total += weight * position
-            ends.append(self._settings.gain * total)
-        return ends
+        return [self._settings.gain * _product(row, P) for row in self._rows]
+
+
+def _product(row: Sequence[float], x: Sequence[float]) -> float:
+    # Not `sum`, which rounds in another way from Python 3.12 on.
+    total = 0.0
+    for weight, value in zip(row, x, strict=True):
+        total += weight * value
+    return total

@@ -78,6 +78,7 @@ class LoopPilot:
         self._validity = math.nan
         self._rows = round(loop.duration / self.sample_time)
         self._running = self._begun({})
+        self._asked = [self.slot("reference", f"{name}_reference") for name in robot.outputs.names]
         self.columns = tuple(dict.fromkeys(f"{item.part}.{item.port.name}" for item in wiring.named))
 
     def start(self) -> None:
@@ -141,6 +142,11 @@ class LoopPilot:
             if item.part == part and item.port.name == port:
                 return item.slot
         return None
+
+    @property
+    def reference(self) -> tuple[float, ...]:
+        """What the outputs were wanted to be at the last step [rad]."""
+        return tuple(math.nan if slot is None else float(self._running.bus[slot]) for slot in self._asked)
 
     @property
     def signals(self) -> Vector:

@@ -39,6 +39,13 @@ LISTEN = 1.0
 OVERRIDES = ("certificate", "identity", "firmware", "modes", "homed")
 # Default of 6502h in the manual: no bit for the cyclic mode though the drive has it.
 _NO_CSP_BIT = 0x001F0065
+_MODE = 0x6060
+# Why a drive that has a mode may refuse it (CiA 301, table 22): its state, its state of another kind, or no reason.
+_NOT_NOW = (0x08000022, 0x08000021, 0x08000020, 0x08000000)
+# What such a drive does when it gets power: nothing (0), what bit 4 of the control word asks for (1, 6), the speed that
+# we set to zero (3), what we want (8).
+_HOLDING = (0, 1, 3, 6, 8)
+_LATE = "to be taken in Operation Enabled"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,11 +75,13 @@ class Report:
         rows: all lines.
         guarding: "life" or "heartbeat", as it was set up.
         overridden: names that were let pass by the user.
+        late_modes: nodes of drives that take their mode in Operation Enabled alone.
     """
 
     rows: tuple[PreflightCheck, ...]
     guarding: str
     overridden: tuple[str, ...] = ()
+    late_modes: tuple[int, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -105,6 +114,7 @@ class Report:
 @dataclass(slots=True)
 class _Checks:
     rows: list[PreflightCheck] = field(default_factory=list)
+    late_modes: list[int] = field(default_factory=list)
 
     def add(self, node: int, name: str, found: str, holds: bool, advice: str = "") -> None:
         self.rows.append(PreflightCheck(node, name, found, holds, "" if holds else advice))
@@ -197,7 +207,7 @@ def preflight(
         guarding = guarding if guarding != "auto" else kind
     if sensor is not None:
         _check_sensor(link, file, sensor, rows)
-    return Report(tuple(rows.rows), guarding, tuple(override))
+    return Report(tuple(rows.rows), guarding, tuple(override), tuple(rows.late_modes))
 
 
 def _tell_robot(file: DrivesFile, rows: _Checks) -> None:
@@ -246,8 +256,9 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
     guarding, has = _guarding(objects, guarding, rows)
     if not guarding:
         return "auto"
+    late = node in rows.late_modes
     for topic, writes in (
-        ("modes", mode_writes(file)),
+        ("modes", [write for write in mode_writes(file) if not (late and write.index == _MODE)]),
         ("options", option_writes()),
         ("limits", limit_writes(file, entry)),
         ("guarding", guarding_writes(file, guarding, MASTER_NODE, has)),
@@ -286,13 +297,25 @@ def _check_modes(objects: Objects, node: int, rows: _Checks) -> None:
     modes = objects.read(0x6502) & 0xFFFFFFFF
     said = bool(modes & 0x80) or modes == _NO_CSP_BIT
     try:
-        taken = objects.written(0x6060, 0, CSP) == CSP
+        taken = "taken" if objects.written(_MODE, 0, CSP) == CSP else "not kept"
     except SdoError as error:
         if not error.aborted:
             raise
-        taken = False
-    found = f"6502h is {modes:08X}h, mode 8 is {'taken' if taken else 'refused'}"
-    rows.add(node, "modes", found, said and taken, "The cyclic synchronous position mode is needed.")
+        taken = _when_enabled(objects) if said and error.code in _NOT_NOW else "refused"
+    if taken.startswith(_LATE):
+        rows.late_modes.append(node)
+    found = f"6502h is {modes:08X}h, mode 8 is {taken}"
+    holds = said and taken in ("taken", _LATE)
+    rows.add(node, "modes", found, holds, "The cyclic synchronous position mode is needed.")
+
+
+def _when_enabled(objects: Objects) -> str:
+    """Return what to say of a drive that takes no mode while it is off: until it has it, it must hold its motor."""
+    now = objects.read(0x6061)
+    if now not in _HOLDING:
+        return f"{_LATE}, and until then it would be in mode {now}"
+    objects.write(0x60FF, 0, 0)
+    return _LATE
 
 
 def _guarding(objects: Objects, wanted: str, rows: _Checks) -> tuple[str, frozenset[int]]:
@@ -332,4 +355,6 @@ def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: _Checks)
             advice = "The drive did not keep what was written; change the drives file or its set-up."
             rows.add(objects.node, topic, f"{place} reads {found} after {write.value} was written", False, advice)
             return
-    rows.add(objects.node, topic, f"{len(writes)} values written and read back", True)
+    untold = sorted(objects.untold)
+    told = f" (not {', '.join(untold)}: write only)" if untold else ""
+    rows.add(objects.node, topic, f"{len(writes)} values written and read back{told}", True)

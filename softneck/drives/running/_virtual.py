@@ -16,6 +16,7 @@ from ..bus._link import VirtualLink
 from ..master import Frame, Master, Tilt
 from ..master._gate import Reading
 from ..simulated import SimulatedNeck, SimulatedSettings
+from ..simulated._habits import WireHabits
 from ..simulated._springs import SimulatedSprings, SpringSettings
 
 # A run is over at the latest this long after its loop, whatever happens [s].
@@ -28,8 +29,9 @@ _LITTLE = 1e-5
 
 
 def simulated_neck(
-    file: DrivesFile, parameters: NeckParameters, *, sample_time: float, homed: bool = True, seed: int = 0
-) -> SimulatedNeck:
+    file: DrivesFile, parameters: NeckParameters, *, sample_time: float, homed: bool = True, seed: int = 0,
+    habits: WireHabits | None = None,
+) -> SimulatedNeck:  # fmt: skip
     """Return the virtual neck, or a robot built like it, with drives that are set up as `file` says the real ones are.
 
     Raises:
@@ -37,11 +39,11 @@ def simulated_neck(
     """
     # The neck's tendons stand where its own file says.
     robot = None if file.moves.is_neck else file.moves
-    return SimulatedNeck(parameters, _settings(file, sample_time, homed, seed), robot)
+    return SimulatedNeck(parameters, _settings(file, sample_time, homed, seed, habits), robot)
 
 
 def simulated_springs(
-    file: DrivesFile, *, sample_time: float, homed: bool = True, seed: int = 0
+    file: DrivesFile, *, sample_time: float, homed: bool = True, seed: int = 0, habits: WireHabits | None = None
 ) -> SimulatedSprings:  # fmt: skip
     """Return drives on what stands for a robot without virtual plant: springs, and outputs by its directions.
 
@@ -69,23 +71,24 @@ def simulated_springs(
         pretension_current=file.zero.current,
         noise_std=(robot.noise_std or 0.0) * to_si(robot.outputs.unit)[0] or _LITTLE,
     )
-    return SimulatedSprings(springs, _settings(file, sample_time, homed, seed))
+    return SimulatedSprings(springs, _settings(file, sample_time, homed, seed, habits))
 
 
 def simulated_plant(
-    file: DrivesFile, neck: NeckParameters | None, *, sample_time: float, homed: bool = True, seed: int = 0
-) -> SimulatedNeck | SimulatedSprings:
+    file: DrivesFile, neck: NeckParameters | None, *, sample_time: float, homed: bool = True, seed: int = 0,
+    habits: WireHabits | None = None,
+) -> SimulatedNeck | SimulatedSprings:  # fmt: skip
     """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
 
     Args:
         file: of the drives, and what they move.
         neck: physics of the virtual plant; None: those that the robot names.
-        sample_time, homed, seed: see `SimulatedSettings`.
+        sample_time, homed, seed, habits: see `SimulatedSettings`.
     """
     physics = physics_of(file.moves, neck)
     if physics is None:
-        return simulated_springs(file, sample_time=sample_time, homed=homed, seed=seed)
-    return simulated_neck(file, physics, sample_time=sample_time, homed=homed, seed=seed)
+        return simulated_springs(file, sample_time=sample_time, homed=homed, seed=seed, habits=habits)
+    return simulated_neck(file, physics, sample_time=sample_time, homed=homed, seed=seed, habits=habits)
 
 
 def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParameters | None:
@@ -108,7 +111,9 @@ def stand_in(file: DrivesFile, neck: NeckParameters | None) -> str:
     )
 
 
-def _settings(file: DrivesFile, sample_time: float, homed: bool, seed: int) -> SimulatedSettings:
+def _settings(
+    file: DrivesFile, sample_time: float, homed: bool, seed: int, habits: WireHabits | None
+) -> SimulatedSettings:
     scales = [entry.scale for entry in file.drives]
     return SimulatedSettings(
         nodes=file.nodes,
@@ -123,6 +128,7 @@ def _settings(file: DrivesFile, sample_time: float, homed: bool, seed: int) -> S
         hold=sample_time,
         homed=homed,
         seed=seed,
+        habits=habits or WireHabits(),
     )
 
 

@@ -14,11 +14,13 @@ from typing import Any
 
 import click
 
+from softneck.core import SettingsError
 from softneck.plant import NeckParameters
 from softneck.robot import Robot, find_robot
 
 from ._drives import SimulatedSettings
 from ._frame import CanFrame
+from ._habits import habits_of
 from ._neck import SimulatedNeck
 from ._profiles import PROFILES
 from ._server import STATES, serve
@@ -37,11 +39,18 @@ _GAIN, _REACH, _CURRENT = 0.483 / 5.293, 6.0, 0.0299
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inclinometer's noise.")
 @click.option("--report", is_flag=True, help="Print one JSON line for each change of a drive's power state.")
 @click.option("--cycle", type=float, default=0.01, show_default=True, help="Bus period the drives expect [s].")
+@click.option(
+    "--habit",
+    "habits",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="How strict the drives are, such as sdo_latency=0.05; again for more (docs/reference/drives.md).",
+)
 @click.option("--sensor-socket", type=click.Path(path_type=Path),
               help="The inclinometer is softneck.drives.simulated.inclinometer and listens there.")  # fmt: skip
 def main(
     bus: str, neck: str, robot: str | None, profile: str, homed: bool, seed: int, report: bool, cycle: float,
-    sensor_socket: Path | None,
+    habits: tuple[str, ...], sensor_socket: Path | None,
 ) -> None:  # fmt: skip
     """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C.
 
@@ -53,6 +62,10 @@ def main(
 
     interface, _, channel = bus.partition(":")
     common: dict[str, Any] = {"profile": profile, "homed": homed, "seed": seed, "cycle": cycle}
+    try:
+        common["habits"] = habits_of(habits)
+    except SettingsError as error:
+        raise click.BadParameter(str(error), param_hint="--habit") from error
     virtual = (
         SimulatedNeck(NeckParameters.preset(neck), SimulatedSettings(**common))
         if robot is None

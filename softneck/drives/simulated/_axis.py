@@ -9,6 +9,7 @@ from collections import deque
 from softneck.core import Vector
 
 from . import _power as power
+from ._habits import WireHabits
 from ._profiles import Item, Profile
 from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
 from ._servo_runtime import (
@@ -36,7 +37,6 @@ from ._servo_runtime import (
     SERVO_ZERO,
 )
 
-MODES = (1, 3, 6, 8)
 # Current in internal units: A x 65520 / (2 I_peak).
 _CURRENT_RANGE = 65520.0
 # A stop ramp is over when the demand stands [counts/s].
@@ -58,15 +58,19 @@ class Axis:
         fault: code of the fault that holds, 0 if none.
         homed: whether the encoder's zero was set since the last reset.
         enable_input: the hardware input; without it the drive faults.
+        habits: what it refuses that others do not.
         device_name: which type it is (1008h), "" where it does not tell.
         counts_per_turn: of the motor, once in which its encoder's index comes.
     """
 
-    def __init__(self, node: int, profile: Profile, motion: Vector, *, peak_current: float, slow_loop: float) -> None:
+    def __init__(
+        self, node: int, profile: Profile, motion: Vector, *, peak_current: float, slow_loop: float,
+        habits: WireHabits | None = None,
+    ) -> None:  # fmt: skip
         """Make a drive with number `node` that acts on its row `motion` of the servo runtime."""
         self.node, self.profile, self.motion = node, profile, motion
         self.peak_current, self.slow_loop = peak_current, slow_loop
-        self.enable_input = True
+        self.enable_input, self.habits = True, habits or WireHabits()
         self.device_name = profile.name_of(peak_current)
         self.tick, self.counts_per_turn = 1e-3, 2048.0
         self.values: dict[tuple[int, int], int] = {}
@@ -125,24 +129,37 @@ class Axis:
     def read(self, index: int, subindex: int) -> bytes | int:
         """Return an object's bytes, or an SDO abort code."""
         item = self.profile.items.get((index, subindex))
-        if item is None:
-            return NO_SUBINDEX if any(key[0] == index for key in self.profile.items) else NO_OBJECT
+        if item is None or index in self.habits.lacks:
+            return self._not_there(index)
+        if code := self.habits.unreadable(index):
+            return code
         if not item.size:
             return (self.device_name if index == 0x1008 else item.text).encode("ascii")
         getter = self.getters.get((index, subindex))
         value = getter() if getter else self.values[(index, subindex)]
         return (int(value) & ((1 << 8 * item.size) - 1)).to_bytes(item.size, "little")
 
+    def _not_there(self, index: int) -> int:
+        known = index not in self.habits.lacks and any(key[0] == index for key in self.profile.items)
+        return NO_SUBINDEX if known else NO_OBJECT
+
+    def size(self, index: int, subindex: int) -> int:
+        """Return how many bytes an object takes; 4 of one that is not there."""
+        item = self.profile.items.get((index, subindex))
+        return item.size if item else 4
+
     def write(self, index: int, subindex: int, data: bytes) -> int:
         """Store an object's bytes; return 0 or an SDO abort code."""
         item = self.profile.items.get((index, subindex))
-        if item is None:
-            return NO_SUBINDEX if any(key[0] == index for key in self.profile.items) else NO_OBJECT
+        if item is None or index in self.habits.lacks:
+            return self._not_there(index)
         if not item.writable:
             return READ_ONLY
         if len(data) != item.size:
             return WRONG_LENGTH
-        return self.store((index, subindex), int.from_bytes(data, "little", signed=item.signed), item)
+        value = int.from_bytes(data, "little", signed=item.signed)
+        refused = self.habits.unwritable(index, subindex, value, enabled=self.state == power.ENABLED)
+        return refused or self.store((index, subindex), value, item)
 
     def store(self, key: tuple[int, int], value: int, item: Item) -> int:
         """Store a value that fits `item`; return 0 or an SDO abort code."""
@@ -159,7 +176,6 @@ class Axis:
 
     def _allowed(self, key: tuple[int, int], value: int) -> bool:
         allowed = {
-            (0x6060, 0): MODES,
             (0x605A, 0): (0, 1, 2, 5, 6),
             (0x605E, 0): (-1, 0, 2),
             (0x6007, 0): (0, 1, 2, 3),

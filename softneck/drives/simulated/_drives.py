@@ -14,6 +14,7 @@ from softneck.core._shown import Shown
 
 from ._axis import Axis
 from ._frame import CanFrame
+from ._habits import WireHabits
 from ._node import SimulatedDrive
 from ._profiles import PROFILES
 from ._servo_runtime import (
@@ -26,7 +27,7 @@ from ._servo_runtime import (
     SERVO_SIZE,
     SERVO_ZERO,
 )
-from ._wire import Wire, WireHabits
+from ._wire import Wire
 
 _TICK = 1e-3
 # What the ring must hold: the upper end of `drive_latency`, 0.1 s, in ticks.
@@ -79,7 +80,7 @@ class SimulatedDrives:
     """All drives of a robot, stepped by whoever owns the time and what they turn.
 
     Attributes:
-        nodes: on the bus; wire: between them and whoever speaks with them.
+        nodes: on the bus; twins: with the number of one of them; wire: between them and whoever speaks with them.
         motion: (motors, SERVO_SIZE), see the servo runtime; ring: (motors, n) past demands.
         ticks: of the servo loops in one bus cycle; h: time of one [s].
     """
@@ -104,13 +105,16 @@ class SimulatedDrives:
             self.motion[row, SERVO_LAG] = max(0, round(lag / self.h))
             self.motion[row, SERVO_PLACE], self.motion[row, SERVO_GEARING] = 0, 1.0
         self.nodes = tuple(self._drive(settings, row, current_limit) for row in range(count))
+        # A second device with somebody's number turns nothing; its boot-up message was long ago.
+        self.twins = tuple(twin(node, settings) for node in (settings.habits.twin,) if node)
         self.wire = Wire(settings.habits, settings.cycle)
 
     def _drive(self, s: SimulatedSettings, row: int, current_limit: float) -> SimulatedDrive:
         m = self.motion[row]
         axis = Axis(
-            s.nodes[row], PROFILES[s.profile](), m, peak_current=s.peak_current[row], slow_loop=s.slow_loop[row]
-        )
+            s.nodes[row], PROFILES[s.profile](), m, peak_current=s.peak_current[row], slow_loop=s.slow_loop[row],
+            habits=s.habits,
+        )  # fmt: skip
         axis.tick, axis.counts_per_turn = self.h, s.counts_per_turn[row]
         m[SERVO_CURRENT_LIMIT] = current_limit
         if s.homed:
@@ -118,7 +122,19 @@ class SimulatedDrives:
             axis.values[(0x607C, 0)] = 1
             m[SERVO_ZERO], m[SERVO_POSITION] = 1.0, 1.0
             axis.homed = True
-        return SimulatedDrive(axis, plain_sdo=s.habits.plain_sdo)
+        return SimulatedDrive(axis)
+
+
+def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
+    """Return a drive with number `node` that turns nothing, as one that was forgotten on the bus."""
+    axis = Axis(
+        node, PROFILES[settings.profile](), np.zeros(SERVO_SIZE), peak_current=10.0, slow_loop=1e-3,
+        habits=settings.habits,
+    )  # fmt: skip
+    axis.values[(0x1018, 4)] = 2000 + node
+    drive = SimulatedDrive(axis)
+    drive.tick(0.0)
+    return drive
 
 
 def exchange(drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float, wire: Wire) -> list[CanFrame]:
@@ -127,7 +143,7 @@ def exchange(drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: 
         for drive in drives:
             drive.receive(now, frame)
     said = [drive.tick(now) for drive in drives]
-    if wire.habits == WireHabits():
+    if not wire.habits.on_wire:
         return [frame for frames in said for frame in frames]
     out = wire.passed(now, frames, said)
     for row, drive in enumerate(drives):

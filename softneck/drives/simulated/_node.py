@@ -43,11 +43,12 @@ class SimulatedDrive:
         alive: False while it has no supply: then it neither hears nor speaks.
     """
 
-    def __init__(self, axis: Axis, *, plain_sdo: bool = False) -> None:
+    def __init__(self, axis: Axis) -> None:
         """Put `axis` on the bus; it speaks first when `tick` is called."""
         self.axis, self.alive = axis, True
         self._out: list[CanFrame] = []
-        self._sdo = SdoServer(axis.read, self._write, plain=plain_sdo)
+        plain, one = axis.habits.plain_sdo, axis.habits.one_abort
+        self._sdo = SdoServer(axis.read, self._write, plain=plain, one_abort=one, size=axis.size)
         self._boot(0.0)
 
     def _boot(self, now: float) -> None:
@@ -270,7 +271,7 @@ class SimulatedDrive:
                     actions = [self._getter(key) for key in keys]
                     pdo = _Pdo(packed, keys, v[(base + n, 2)], identifier & 0x7FF, actions)
                     pdo.inhibit, pdo.timer = v[(base + n, 3)] * 1e-4, v[(base + n, 5)] * 1e-3
-                    pdo.remote = not identifier & _NO_REMOTE
+                    pdo.remote = not (identifier & _NO_REMOTE or axis.habits.plain_pdo)
                     self._transmit_pdos.append(pdo)
                     self._asked[pdo.identifier] = pdo
 

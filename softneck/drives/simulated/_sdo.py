@@ -19,9 +19,11 @@ BAD_TOGGLE = 0x05030000
 BAD_BLOCK_SIZE = 0x05040002
 BAD_SUM = 0x05040004
 NO_MEMORY = 0x05040005
+GENERAL = 0x08000000
 
 Read = Callable[[int, int], "bytes | int"]
 Write = Callable[[int, int, bytes], int]
+Size = Callable[[int, int], int]
 # No object of a drive is larger; and of frames in a block, what a small controller can buffer.
 _MOST_BYTES, _BLOCK = 1024, 16
 
@@ -43,12 +45,16 @@ class _Transfer:
 class SdoServer:
     """Answers requests; `read` returns bytes or an abort code, `write` an abort code or 0.
 
-    With `plain` it knows expedited downloads and segmented uploads alone, as small drives do.
+    With `plain` it knows expedited downloads and segmented uploads alone, as small drives do; with `one_abort` it does
+    not say why it refuses something.
     """
 
-    def __init__(self, read: Read, write: Write, *, plain: bool = False) -> None:
-        """Serve the objects behind `read` and `write`."""
-        self._read, self._write, self._plain = read, write, plain
+    def __init__(
+        self, read: Read, write: Write, *, plain: bool = False, one_abort: bool = False, size: Size | None = None
+    ) -> None:
+        """Serve the objects behind `read` and `write`; `size` tells that of one [bytes], else what can be read does."""
+        self._read, self._write, self._plain, self._one_abort = read, write, plain, one_abort
+        self._size = size or (lambda *key: len(there) if isinstance(there := read(*key), bytes) else 4)
         self._running: _Transfer | None = None
 
     def answers(self, data: bytes) -> list[bytes]:
@@ -86,13 +92,9 @@ class SdoServer:
                 return self._abort(index, subindex, BAD_COMMAND)
             self._running = _Transfer("down", index, subindex)
             return struct.pack("<BHB4x", 0x60, index, subindex)
-        content = data[4:]
-        if data[0] & 0x01:
-            content = content[: 4 - ((data[0] >> 2) & 3)]
-        else:  # the size is not said: that of the object
-            there = self._read(index, subindex)
-            content = content[: len(there)] if isinstance(there, bytes) else content
-        return self._stored(index, subindex, content, 0x60)
+        # Where the size is not said it is that of the object.
+        size = 4 - ((data[0] >> 2) & 3) if data[0] & 0x01 else self._size(index, subindex)
+        return self._stored(index, subindex, data[4 : 4 + size], 0x60)
 
     def _down_segment(self, data: bytes) -> bytes:
         t = self._running
@@ -205,4 +207,4 @@ class SdoServer:
 
     def _abort(self, index: int, subindex: int, code: int) -> bytes:
         self._running = None
-        return struct.pack("<BHBI", 0x80, index, subindex, code)
+        return struct.pack("<BHBI", 0x80, index, subindex, GENERAL if self._one_abort else code)

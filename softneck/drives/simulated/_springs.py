@@ -123,7 +123,7 @@ class SimulatedSprings:
 
     def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
         """Deliver `frames` at `now`, and return what the drives send in answer."""
-        return exchange(self.drives, frames, now, self._on_bus.wire)
+        return exchange((*self.drives, *self._on_bus.twins), frames, now, self._on_bus.wire)
 
     def move(self) -> None:
         """Let one cycle of time pass."""

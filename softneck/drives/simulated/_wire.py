@@ -7,35 +7,11 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-
-from softneck.core import require_between, require_whole
 
 from ._frame import CanFrame
+from ._habits import WireHabits
 
 _OVERRUN = 0x8110
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WireHabits:
-    """How strict simulated drives and their wire are; 0 and False are off.
-
-    Attributes:
-        sdo_latency: from an SDO request to its answer [s]; drives that are at work take 1 to 50 ms.
-        queue: frames that a drive's controller holds; what comes when it is full is lost, and told by EMCY 8110h.
-        bitrate: of the wire [bit/s]; the lowest identifier goes first.
-        plain_sdo: no segmented download and no block transfer.
-    """
-
-    sdo_latency: float = 0.0
-    queue: int = 0
-    bitrate: float = 0.0
-    plain_sdo: bool = False
-
-    def __post_init__(self) -> None:
-        require_between("sdo_latency", self.sdo_latency, 0.0, 1.0, "s")
-        require_whole("queue", self.queue, 0, 1000)
-        require_between("bitrate", self.bitrate, 0.0, 1e6, "bit/s")
 
 
 def frame_bits(frame: CanFrame) -> int:

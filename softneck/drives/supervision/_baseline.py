@@ -5,16 +5,35 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from softneck.core import FileFormatError, SettingsError, atomic_write
 from softneck.core._budget import MOST_JSON, settings_text
 
 _KIND, _VERSION = "softneck supervision", 2
+_LATER = {"seconds", "tracking"}
 Row = tuple[float, ...]
 Rows = tuple[Row, ...]
+
+
+class Tracking(NamedTuple):
+    """What the tracking of a loop is compared with; all empty without one.
+
+    Attributes:
+        weights: c_i.
+        whitening: of each output's residual; spread: variance of its innovation [rad^2], and what is added for each
+            rad^2 between reference and model, and of change of the model over two samples.
+        bias: largest mean over a second of each residual on runs that it was not fitted on [rad].
+        thresholds: of the charts, an upper and a lower one for each output.
+    """
+
+    weights: Row = ()
+    whitening: Rows = ()
+    spread: Rows = ()
+    bias: Row = ()
+    thresholds: Row = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +65,7 @@ class Baseline:
         reach: of each motor, lowest and highest position seen [rad].
         slack: of each tendon: below this it may hang, and the tilt is not what the motors say [N].
         motor_thresholds, tilt_thresholds: of the charts, in the order of their names.
-        names: of both, to be sure of the order.
+        tracking: of a loop, where the experiments had one.
         seconds: of motion that it was calibrated from.
     """
 
@@ -78,6 +97,7 @@ class Baseline:
     slack: Row
     motor_thresholds: Row = ()
     tilt_thresholds: Row = ()
+    tracking: Tracking = field(default_factory=Tracking)
     seconds: float = 0.0
 
     @property
@@ -99,10 +119,12 @@ class Baseline:
             SettingsError: keys that are missing or unknown.
         """
         known = {item.name for item in fields(cls)}
-        wrong = sorted((known - {"seconds"}) ^ (set(table) - {"seconds"}))
+        # Files from before loops were compared with have no `tracking`.
+        wrong = sorted((known - _LATER) ^ (set(table) - _LATER))
         if wrong:
             raise SettingsError(f"`{wrong[0]}` is missing or unknown in what the supervisor compares with.")
-        return cls(**{name: _tuple(value) for name, value in table.items()})
+        rows = {name: _tuple(value) for name, value in table.items()}
+        return cls(**{**rows, "tracking": Tracking(*rows.get("tracking", ()))})
 
 
 def load_baseline(path: str | Path) -> Baseline:

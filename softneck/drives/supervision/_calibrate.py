@@ -11,10 +11,11 @@ from softneck.core import DataError, Matrix, Vector
 from softneck.signals.detection._threshold import Budget, thresholds
 from softneck.signals.detection._whitening import Whitening
 
-from ._baseline import Baseline, Row, Rows
-from ._motor_charts import EDGES, MotorCharts, motor_names
+from ._baseline import Baseline, Row, Rows, Tracking
+from ._motor_charts import EDGES, MotorCharts, MotorRules, motor_names
 from ._motor_models import Features, Flags, Motion, features_of, level_rows, motor_rows, row_of, variance_of
 from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
+from ._tracking import LoopRun, fit_tracking, tracking_scores
 
 # What the tilt may still answer to [s], in samples that lie closer together where it answers most.
 _REACH = 0.5
@@ -22,6 +23,8 @@ _LAGS = 8
 # Motors further out than this part of the seen range are not known ground, and none is so much faster.
 _MARGIN = 0.2
 _LEAST = 20.0
+# See `calibrate`; by `benchmarks/supervisor_choice.py`.
+_KNOWN_BIAS = 0.25
 # What is further out than this part of the cycles counts for seldom.
 _NEARLY = 0.95
 
@@ -34,24 +37,34 @@ def calibrate(
     slack: float,
     budget: Budget | None = None,
     seed: int = 0,
+    known_bias: float = _KNOWN_BIAS,
+    rules: MotorRules | None = None,
 ) -> Baseline:
     """Return what the supervisor compares with.
 
     Thresholds come from stretches that their models were not fitted on: each is left out once, a single one by halves.
+    Runs of a loop are for its tracking alone: motors and tilt are compared with experiments, which overload no motor.
 
     Args:
-        motions: undisturbed; together at least 40 s.
+        motions: undisturbed; those without a loop together at least 40 s.
         cycle: of the bus [s]; sample_cycles: of these for one sample of the tilt.
         slack: tension below which a tendon hangs [N].
         budget: of false alarms; `charts` and `step` are set here.
         seed: of the bootstrap.
+        known_bias: part of the largest slow error that the tilt's charts take for no fault; the bootstrap has the rest.
+        rules: of the motors' charts; None: as the charts have them.
 
     Raises:
         DataError: too little motion, or motors that did not move.
     """
+    loops = [motion for motion in motions if motion.references is not None]
+    motions = [motion for motion in motions if motion.references is None]
     seconds = sum(len(motion.due) for motion in motions) * cycle
     if seconds < 2.0 * _LEAST:
-        raise DataError(f"{seconds:.3g} s of motion are too few to compare with; record at least {2.0 * _LEAST:g} s.")
+        besides = ", beside those of a loop" if loops else ""
+        raise DataError(
+            f"{seconds:.3g} s of motion{besides} are too few to compare with; record at least {2.0 * _LEAST:g} s."
+        )
     parts = list(motions) if len(motions) > 1 else motions[0].halves()
     known = [(part, features_of(part, cycle)) for part in parts]
     motor, tilt, slow, fitted = [], [], [], []
@@ -59,26 +72,50 @@ def calibrate(
         others = [other for k, other in enumerate(known) if k != number]
         fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack))
         slow.append(_slow(fitted[-1], parts[number]))
-    bias = row_of(np.max(slow, axis=0))
+    bias = row_of(known_bias * np.max(slow, axis=0))
     for part, model in zip(parts, fitted, strict=True):
-        found = scores_of(replace(model, tilt_bias=bias), part)
+        found = scores_of(replace(model, tilt_bias=bias), part, rules)
         motor.append(found[0])
         tilt.append(found[1])
-    charts = motor[0].shape[1] + tilt[0].shape[1] + 1
+    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
+    runs = _loops(loops, replace(whole, tilt_bias=bias))
+    charts = motor[0].shape[1] + tilt[0].shape[1] + 1 + (2 * runs[0].values.shape[1] if runs else 0)
     shared = replace(budget or Budget(), charts=charts)
     rng = np.random.default_rng(seed)
-    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
     # Of samples that come or not by chance, e^-h bounds the rate of false alarms (Basseville and Nikiforov, 5.2.2).
     seldom = -np.log(shared.rate / shared.charts * cycle * sample_cycles)
     whole = replace(whole, tilt_bias=bias, missing_threshold=float(seldom))
     h = thresholds(motor, replace(shared, step=cycle), rng)
     g = thresholds(tilt, replace(shared, step=cycle * sample_cycles), rng)
-    return replace(whole, motor_thresholds=row_of(h), tilt_thresholds=row_of(g), seconds=seconds)
+    tracking = _tracking(runs, replace(shared, step=cycle * sample_cycles), rng) if runs else Tracking()
+    return replace(whole, motor_thresholds=row_of(h), tilt_thresholds=row_of(g), tracking=tracking, seconds=seconds)
 
 
-def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
+def _loops(loops: Sequence[Motion], model: Baseline) -> list[LoopRun]:
+    """Return the runs of a loop, two halves of a single one, that are long enough."""
+    runs = []
+    for part in loops[0].halves() if len(loops) == 1 else loops:
+        walk = _Walk(model)
+        valid = np.array([walk.tilt.valid for k in range(len(part.due)) if walk.step(part, k)])
+        run = LoopRun(part, valid, model.cycle * model.sample_cycles)
+        runs += [run] if run.long else []
+    if len(runs) == 1 or (loops and not runs):
+        raise DataError("too little of the loop's motion had taut tendons to compare with; run it for a minute.")
+    return runs
+
+
+def _tracking(runs: Sequence[LoopRun], budget: Budget, rng: np.random.Generator) -> Tracking:
+    """Return what a loop's tracking is compared with; thresholds from runs that it was not fitted on."""
+    fitted = [fit_tracking([other for other in runs if other is not run]) for run in runs]
+    slow = [_second(tracking_scores(model, run)[1], run.step) for model, run in zip(fitted, runs, strict=True)]
+    bias = row_of(np.max(slow, axis=0))
+    scores = [tracking_scores(model._replace(bias=bias), run)[0] for model, run in zip(fitted, runs, strict=True)]
+    return fit_tracking(runs)._replace(bias=bias, thresholds=row_of(thresholds(scores, budget, rng)))
+
+
+def scores_of(baseline: Baseline, motion: Motion, rules: MotorRules | None = None) -> tuple[Matrix, Matrix]:
     """Return the scores of all charts on one stretch: of motors (cycles, charts), of the tilt (samples, charts)."""
-    walk = _Walk(baseline)
+    walk = _Walk(baseline, rules)
     ours, theirs = [], []
     for k in range(len(motion.due)):
         if walk.step(motion, k):
@@ -90,9 +127,9 @@ def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
 class _Walk:
     """The charts over a stretch of motion, none of which ever says anything."""
 
-    def __init__(self, baseline: Baseline) -> None:
+    def __init__(self, baseline: Baseline, rules: MotorRules | None = None) -> None:
         self._gains = np.array(baseline.current)
-        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf))
+        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf), rules)
         names = tilt_names(baseline.motors, baseline.outputs, gyro=bool(baseline.gyro_spread))
         self.tilt = TiltCharts(baseline, np.full(len(names), np.inf))
         self.tilt.begin()
@@ -156,8 +193,13 @@ def _slow(baseline: Baseline, motion: Motion) -> Vector:
     for k in range(len(motion.due)):
         if walk.step(motion, k):
             rows.append(walk.tilt.residual if walk.tilt.valid else np.full(baseline.outputs, np.nan))
-    second = max(1, round(1.0 / (baseline.cycle * baseline.sample_cycles)))
-    means = [np.convolve(column, np.ones(second) / second, "valid") for column in np.array(rows).T]
+    return _second(np.array(rows), baseline.cycle * baseline.sample_cycles)
+
+
+def _second(rows: Matrix, step: float) -> Vector:
+    """Return the largest mean over a second of each column."""
+    second = max(1, round(1.0 / step))
+    means = [np.convolve(column, np.ones(second) / second, "valid") for column in rows.T]
     return np.nanmax(np.abs(means), axis=1, initial=0.0)
 
 

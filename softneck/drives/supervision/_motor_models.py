@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,8 @@ class Motion:
         values: of the tilt (time, outputs) [rad]; NaN in cycles without a sample.
         rates: of its gyro, the same [rad/s]; NaN without one.
         due: cycles in which a sample was due (time,).
+        references: of the loop that moved it, as known when the tilt was measured (time, outputs) [rad]; NaN in cycles
+            without one.
     """
 
     setpoints: Matrix
@@ -35,11 +37,12 @@ class Motion:
     values: Matrix
     rates: Matrix
     due: Flags
+    references: Matrix | None = None
 
     def halves(self) -> list[Motion]:
         """Return its first and its second half."""
         middle = len(self.due) // 2
-        names = ("setpoints", "positions", "tensions", "values", "rates", "due")
+        names = [item.name for item in fields(self) if getattr(self, item.name) is not None]
         parts = [
             {name: getattr(self, name)[cut] for name in names} for cut in (slice(None, middle), slice(middle, None))
         ]

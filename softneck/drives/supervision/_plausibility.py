@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ._baseline import Baseline
-from ._motor_charts import MotorCharts
+from ._motor_charts import MotorCharts, MotorRules
 from ._tilt_charts import TiltCharts
+from ._tracking import TrackingCharts
 
 # Samples that go missing: as many as this, or thrice as many as did.
 _RATE_LEAST = 0.2
@@ -40,15 +41,17 @@ class Plausibility:
     """All charts over one run.
 
     Attributes:
-        motors, tilt: the charts.
+        motors, tilt, tracking: the charts; the last where there is a loop to compare with.
     """
 
-    def __init__(self, baseline: Baseline) -> None:
-        """Know nothing yet."""
+    def __init__(self, baseline: Baseline, rules: MotorRules | None = None) -> None:
+        """Know nothing yet; `rules` other than those of the motors' charts are for choosing them."""
         self._b = baseline
         self._gains = np.array(baseline.current)
-        self.motors = MotorCharts(baseline)
+        self.motors = MotorCharts(baseline, rules=rules)
         self.tilt = TiltCharts(baseline)
+        step, known = baseline.cycle * baseline.sample_cycles, baseline.tracking
+        self.tracking = TrackingCharts(known, baseline.outputs, step) if known.weights else None
         self._missing = 0.0
         self._now = 0
         self._since: int | None = None
@@ -74,9 +77,19 @@ class Plausibility:
         return self._ripe()
 
     def sample(
-        self, positions: Sequence[float], values: Sequence[float] | None, rates: Sequence[float]
+        self,
+        positions: Sequence[float],
+        values: Sequence[float] | None,
+        rates: Sequence[float],
+        reference: Sequence[float] = (),
     ) -> Finding | None:
-        """Take what is due at a sample, after `cycle`: tilt [rad], None where none came, and rates [rad/s] or NaN."""
+        """Take what is due at a sample, after `cycle`.
+
+        Args:
+            positions: of the motors [rad].
+            values: of the tilt [rad], None where none came; rates: of its gyro [rad/s] or NaN.
+            reference: that the loop had when it was measured [rad], () without one.
+        """
         if self._rate(values is None):
             return Finding("sensor_rate", -1, "samples are missing more often than in the commissioning run")
         if self.motors.judging:
@@ -85,6 +98,11 @@ class Plausibility:
         tilt = None if values is None else np.array(values)
         if self.tilt.step(np.array(positions), taut, tilt, np.array(rates)) >= 0 and self._since is None:
             self._since = self._now
+        if self.tracking is not None and self.tracking.step(reference, values, valid=self.tilt.valid) >= 0:
+            off = ", ".join(f"{value:.1f}" for value in np.degrees(self.tracking.residual))
+            # Whatever goes wrong leads the loop astray: it is the loop if nothing else shows.
+            self._current = self._current or Finding("astray", -1, f"tilt less what the loop made of it {off} deg")
+            self._since = self._now if self._since is None else self._since
         return None
 
     def _ripe(self) -> Finding | None:

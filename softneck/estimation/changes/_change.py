@@ -17,6 +17,7 @@ from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._nested import nested, nested_model
+from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State, load_runtime
 from softneck.signals import Recording
@@ -25,12 +26,18 @@ from .._kalman import observer_ports
 from .._kalman_parts_runtime import KALMAN_LAG, KALMAN_MORE_LAGS
 from .._nonlinear import model_setup
 from .._offline import measured_angles
-from ._change_runtime import ChangeArrays, ChangeState
+from ._change_parts_runtime import ChangeArrays
+from ._change_runtime import ChangeState
+from ._payload_change_runtime import PayloadChangeArrays, PayloadChangeState
 
 _RUNTIME = "softneck.estimation.changes._change_runtime"
+# Over a model that takes the payload as a parameter.
+_PAYLOAD_RUNTIME = "softneck.estimation.changes._payload_change_runtime"
 KIND = "change"
 #: What undisturbed motion says of a model.
 NAMES = ("spread", "thresholds", "chart")
+#: How payloads are weighed, over a model of several.
+BANK = "bank"
 _OUTPUTS = (
     Port(name="changed", description="the neck is not the one that the model was identified from", boolean=True),
     Port(name="since_s", unit="s", description="time since that was found; 0 while it is not", minimum=0.0),
@@ -43,9 +50,12 @@ _OUTPUTS = (
 class ChangeDetector(Shown):
     """Says whether the neck is still the one that the model was identified from; `ChangeSettings.design` makes it.
 
+    Over a model of several payloads with a `bank`, it tells the payload as well, and `changed` says that none explains
+    the neck.
+
     Attributes:
         model: of any kind; nothing corrects its state.
-        arrays: see `ChangeArrays`, those of `NAMES`.
+        arrays: see `ChangeArrays`, those of `NAMES`; `BANK` as well where the payload is told.
         order: of the loop it is for.
         findings: what the undisturbed motion was.
     """
@@ -78,6 +88,7 @@ class ChangeDetector(Shown):
     def _block(self) -> Block:
         plant = replace(self.model, arrays=without_validity(self.model.arrays)).block()
         inputs, _ = observer_ports("nonlinear", self.robot)
+        ports = _payload_ports(self.payloads)
         constants = np.zeros(KALMAN_MORE_LAGS)
         constants[KALMAN_LAG] = 1.0 if self.order == "jacobi" else 0.0
         own = (model_setup(self.robot, plant, self.sample_time, self.stretch, 0.0), constants,
@@ -85,29 +96,41 @@ class ChangeDetector(Shown):
         return Block(
             kind=KIND,
             role="observer",
-            runtime=f"{_RUNTIME}({plant.runtime}:{len(plant.arrays)})",
+            runtime=f"{_PAYLOAD_RUNTIME if ports else _RUNTIME}({plant.runtime}:{len(plant.arrays)})",
             sample_time=self.sample_time,
-            arrays=(*own, *(self.arrays[name] for name in NAMES), *plant.arrays),
+            arrays=(*own, *(self.arrays[name] for name in self.names), *plant.arrays),
             inputs=inputs,
-            outputs=_OUTPUTS,
+            outputs=(*_OUTPUTS, *ports),
+            parameters=ports,
         )
 
-    def initial_state(self) -> State:
-        """Return the state at the start."""
-        return self.block().initial_state()
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its arrays."""
+        return (*NAMES, BANK) if BANK in self.arrays else NAMES
+
+    @property
+    def payloads(self) -> tuple[float, float] | None:
+        """Least and most payload [kg] that it tells; None where it tells none."""
+        return payloads(self.model.arrays) if BANK in self.arrays else None
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; the payload then is a parameter of a detector that tells it."""
+        return self.block().initial_state(**parameters)
 
     def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
         """Return the next state and the outputs valid now; inputs and outputs as in `block()`."""
         return self.block().step(state, inputs)
 
-    def watch(self, recording: Recording) -> Matrix:
-        """Return `changed`, `since_s` and `fit` at each row (time, 3); each run starts anew.
+    def watch(self, recording: Recording, **parameters: float) -> Matrix:
+        """Return `changed`, `since_s` and `fit`, and the payload if it is told, at each row; each run starts anew.
 
         Raises:
             DataError: another sample time or another robot.
         """
         self.model.check(recording)
-        return np.concatenate([self.block().run(self.initial_state(), self.rows(run))[1] for run in recording.runs()])
+        start = self.initial_state(**parameters)
+        return np.concatenate([self.block().run(start, self.rows(run))[1] for run in recording.runs()])
 
     def rows(self, run: Recording) -> Matrix:
         """Return the inputs (time, inputs) that a run gives."""
@@ -116,17 +139,21 @@ class ChangeDetector(Shown):
         asked = run.set_points[np.maximum(np.arange(len(run)) - late, 0)]
         return np.column_stack([asked, measured_angles(run), np.ones(len(run))])
 
-    def states(self, run: Recording) -> dict[str, Matrix]:
+    def states(self, run: Recording, **parameters: float) -> dict[str, Matrix]:
         """Return the parts of the state after each row of a run."""
-        block, state = self.block(), self.initial_state()
+        block, state = self.block(), self.initial_state(**parameters)
         step, x, outputs = load_runtime(block.runtime).step, state.values, state.outputs
-        parts = ChangeState.parts(ChangeArrays(block.arrays))
-        own = slice(0, parts["model"].start)
+        if self.payloads is None:
+            parts = ChangeState.parts(ChangeArrays(block.arrays))
+        else:
+            parts = PayloadChangeState.parts(PayloadChangeArrays(block.arrays))
+        *_, last = parts
+        own = slice(0, parts[last].start)
         kept = np.empty((len(run), own.stop))
         for row, inputs in zip(kept, block.checked_inputs(self.rows(run)), strict=True):
             step(block.arrays, state.parameters, x, inputs, outputs)
             row[:] = x[own]
-        return {name: kept[:, part] for name, part in parts.items() if name != "model"}
+        return {name: kept[:, part] for name, part in parts.items() if name != last}
 
     def summary(self) -> str:
         """Return some lines for people."""
@@ -138,6 +165,9 @@ class ChangeDetector(Shown):
             f"  at rest the model misses {', '.join(f'{value:.3g}' for value in rest)} {unit}; averaged over "
             f"{seconds:.3g} s, cumulative sums beyond {', '.join(f'{h:.3g}' for h in self.arrays['thresholds'])}",
         ]
+        if self.payloads is not None:
+            least, most = self.payloads
+            lines.append(f"  it tells the payload, from {least:g} to {most:g} kg, while the neck moves far enough")
         if "seconds" in self.findings:
             lines.append(
                 f"  from {self.findings['seconds']:.3g} s of undisturbed motion, a false alarm in "
@@ -166,10 +196,22 @@ class ChangeDetector(Shown):
         """Return the detector that `save` wrote; `softneck.core.load` calls this."""
         found = cls(
             model=nested_model(header["model"], arrays),
-            arrays={name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in NAMES},
+            arrays={
+                name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in (*NAMES, BANK) if name in arrays
+            },
             order=str(header["order"]),
             findings=header["findings"],
         )
-        names = ("setup", "constants", "free", *NAMES)
-        ChangeArrays.read(dict(zip(names, found.block().arrays, strict=False)))
+        names = ("setup", "constants", "free", *found.names)
+        declared = ChangeArrays if found.payloads is None else PayloadChangeArrays
+        declared.read(dict(zip(names, found.block().arrays, strict=False)))
         return found
+
+
+def _payload_ports(known: tuple[float, float] | None) -> tuple[Port, ...]:
+    """Return the port of the payload, an output and, at the start, a parameter; none where it is not told."""
+    if known is None:
+        return ()
+    least, most = known
+    return (Port(name="payload", unit="kg", start=least, minimum=least, maximum=most,
+                 description="that explains the neck best; at the start what is known of it"),)  # fmt: skip

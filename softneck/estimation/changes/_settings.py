@@ -6,20 +6,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, require_one_of, require_positive
+from softneck.core import DataError, Matrix, SettingsError, Vector, require_one_of, require_positive
 from softneck.identification import Model
 from softneck.identification.models._fitting import known_rows, one_recording
+from softneck.identification.models._ports import payloads
 from softneck.signals import Recording
 from softneck.signals.detection._threshold import Budget, thresholds
 
-from ._change import ChangeDetector
-from ._change_runtime import CHANGE_PERIOD, CHANGE_QUIET, CHANGE_STILL
+from ._change import BANK, ChangeDetector
+from ._change_parts_runtime import CHANGE_PERIOD, CHANGE_QUIET, CHANGE_STILL
 
 # [s] of a neck's time: what a block of the bootstrap lasts (about a motion, whose misses belong together), its windows,
 # the free run's start.
 _BLOCK, _WINDOW, _QUIET = 5.0, 20.0, 3.0
 # Motion below this part of the mean one is none.
 _STILL = 0.1
+# Copies of a model of several payloads; misses of this time [s of a neck] belong together.
+_COPIES, _TOGETHER = 5, 1.0
 # Above this part of rows that the model was trained on, it misses less than it will elsewhere.
 _MOST_KNOWN = 0.5
 
@@ -34,6 +37,8 @@ class ChangeSettings:
         clip: standard deviations for which such an average counts at most.
         hours: of motion in which all sums together raise one false alarm [h].
         memory: of the output `fit` [s].
+        payload_memory: over which a model of several payloads tells which one it is [s].
+        payload_doubt: as a part of their range, its standard deviation; in motion that leaves more nothing is told.
         order: of the loop it is for.
         seed: of the bootstrap.
     """
@@ -43,11 +48,13 @@ class ChangeSettings:
     clip: float = 1.5
     hours: float = 300.0
     memory: float = 10.0
+    payload_memory: float = 2.0
+    payload_doubt: float = 0.15
     order: str = "sequential"
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("ratio", "period", "clip", "hours", "memory"):
+        for name in ("ratio", "period", "clip", "hours", "memory", "payload_memory", "payload_doubt"):
             require_positive(name, getattr(self, name))
         if self.ratio <= 1.0:
             raise SettingsError(f"`ratio` must be above 1, for a change makes a model worse; got {self.ratio:g}.")
@@ -69,10 +76,17 @@ class ChangeSettings:
             raise DataError("the model was trained on this motion, so that it misses less than it will elsewhere; "
                             "take another recording.")  # fmt: skip
         draft = self._draft(model)
-        runs = [(run.outputs, draft.states(run)) for run in recording.runs()]
+        told = [_payload_of(draft, run) for run in recording.runs()]
+        # Each under the payload that it says: what a model misses is judged before what it tells.
+        runs = [(run.outputs, replace(draft, model=_under(model, payload)).states(run))
+                for run, payload in zip(recording.runs(), told, strict=True)]  # fmt: skip
         still = _STILL * float(np.mean(np.concatenate([states["fastest"] for _, states in runs])))
         draft.arrays["chart"][CHANGE_STILL] = still
         spread = _spread(runs, still)
+        if payloads(model.arrays) is not None:
+            draft = replace(draft, arrays={**draft.arrays, "spread": spread, BANK: self._bank(draft)})
+            runs = [(run.outputs, draft.states(run, payload=payload))
+                    for run, payload in zip(recording.runs(), told, strict=True)]  # fmt: skip
         scores = [self.scores(*_averages(draft, outputs, states, spread)) for outputs, states in runs]
         period = draft.arrays["chart"][0] * draft.sample_time
         budget = Budget(rate=1.0 / (3600.0 * self.hours), charts=len(spread) + 1, step=period,
@@ -84,6 +98,13 @@ class ChangeSettings:
             arrays={**draft.arrays, "spread": spread, "thresholds": limits},
             findings={"seconds": seconds, "hours": self.hours},
         )
+
+    def _bank(self, draft: ChangeDetector) -> Vector:
+        """Return how a model of several payloads is weighed, see BANK_*."""
+        least, most = payloads(draft.model.arrays) or (0.0, 0.0)
+        second = draft.sample_time / draft.stretch
+        return np.array([least, most, _COPIES, np.exp(-second / self.payload_memory),
+                         _TOGETHER / second / self.payload_doubt**2, 0.0])  # fmt: skip
 
     def scores(self, averages: Matrix, moved: np.ndarray) -> Matrix:
         """Return the scores (periods, charts) of averages (periods, outputs), in the order of the charts.
@@ -106,6 +127,24 @@ class ChangeSettings:
         keep = float(np.exp(-Ts / (self.memory * stretch)))
         chart = np.array([period, self.ratio, quiet, keep, Ts, self.clip, 0.0])
         return replace(draft, arrays={**none, "chart": chart})
+
+
+def _payload_of(draft: ChangeDetector, run: Recording) -> float:
+    """Return the payload [kg] that a run says, 0 where it says none; within those that the model knows."""
+    known = payloads(draft.model.arrays)
+    if known is None:
+        return 0.0
+    said = float(np.nanmean(run.channels["payload"])) if "payload" in run.channels else 0.0
+    return float(np.clip(said, *known))
+
+
+def _under(model: Model, payload: float) -> Model:
+    """Return a model of several payloads as if this were its least one, at which it starts; others as they are."""
+    if payloads(model.arrays) is None:
+        return model
+    found = model.arrays["payload"].copy()
+    found[0] = payload
+    return replace(model, arrays={**model.arrays, "payload": found})
 
 
 def _spread(runs: list[tuple[Matrix, dict[str, Matrix]]], still: float) -> Matrix:

@@ -6,6 +6,7 @@ import hashlib
 import uuid
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
@@ -87,23 +88,30 @@ def build_compiled_fmu(
 
 
 def next_outputs(block: Block) -> tuple[Port, ...]:
-    """Return the outputs that an FMU with sensitivities has beside its own: those of the robot at the next sample.
+    """Return the outputs that an FMU with sensitivities has beside its own: what a step makes of the inputs of now.
+
+    Of an identified plant those of the robot, of all others the first that are numbers.
 
     Raises:
-        SettingsError: no identified plant, or one of a kind that has no derivative.
+        SettingsError: a kind that has no derivative, or no such outputs.
     """
-    motors = [i for i, port in enumerate(block.outputs) if port.name.startswith("motor_position_")]
-    if block.role != "plant" or not motors:
-        raise SettingsError(f"{block.kind} ({block.role}) has no sensitivities; only plants have outputs to come.")
     try:
         with_tangent(bundle(block.runtime, loops=False))
     except TangentError as error:
         raise SettingsError(f"{block.kind} has no sensitivities: {error}") from None
+    own = takewhile(lambda port: not (port.boolean or port.integer or port.missing or _is_aside(port)), block.outputs)
     what = "at the next sample, if the inputs are held"
-    return tuple(
-        replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {what}")
-        for port in block.outputs[: motors[0]]
+    found = tuple(
+        replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {what}") for port in own
     )
+    if not found:
+        raise SettingsError(f"{block.kind} ({block.role}) has no sensitivities: none of its outputs is a number.")
+    return found
+
+
+def _is_aside(port: Port) -> bool:
+    """Return whether an output tells of the block itself, not of the robot or what it is asked to do."""
+    return port.name.startswith("motor_position_") or port.name == "innovation"
 
 
 def _check_kinds(modules: set[str], sources: Sources) -> None:
@@ -151,7 +159,7 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources,
     members = {
         "modelDescription.xml": describe(block, info, identity),
         "resources/model.bin": model_bytes(block, name, guid, ahead=ahead),
-        "documentation/index.html": documentation_page(name, block, info, _HOST).encode(),
+        "documentation/index.html": documentation_page(name, block, info, _HOST, ahead=ahead).encode(),
         "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
         ("model.png" if fmi == 2 else "terminalsAndIcons/icon.png"): icon_png(block.kind, block.role),
         "sources/README.txt": _REBUILD.format(

@@ -6,7 +6,7 @@ The page says what the model is, its variables, its timing, and what the host mu
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 
 from softneck.runtime import Block, Port
@@ -66,8 +66,17 @@ _STYLE = (
 )
 
 
-def documentation_page(name: str, block: Block, info: FmuInfo, host: str = "") -> str:
-    """Return the page as one HTML text without any outside resource; `host` says what the host needs, "" for Python."""
+def documentation_page(name: str, block: Block, info: FmuInfo, host: str = "", *, ahead: int = 0) -> str:
+    """Return the page as one HTML text without any outside resource.
+
+    Args:
+        name: of the model.
+        block: with its outputs of the next sample, `ahead` of them.
+        info: what the FMU says about itself.
+        host: what the host needs; "" for Python.
+        ahead: how many of the last outputs the block's own step does not fill.
+    """
+    own = replace(block, outputs=block.outputs[: len(block.outputs) - ahead])
     title = escape(info.description or f"{block.kind} ({block.role})")
     timing = _TIMING["plant" if block.role == "plant" else "other"]
     parts = [
@@ -75,7 +84,7 @@ def documentation_page(name: str, block: Block, info: FmuInfo, host: str = "") -
         f"<style>{_STYLE}</style></head><body>",
         f"<h1>{escape(name)}</h1><p>{title}</p>",
         info.documentation,
-        response_figure(block),
+        response_figure(own),
         "<h2>Variables</h2>",
         _table(block),
         f"<h2>Timing</h2><p>Internal sample time {block.sample_time:g} s; any communication step is legal.",

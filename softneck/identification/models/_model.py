@@ -150,7 +150,7 @@ class Model(Shown):
             inputs: (3,) motor set-points [rad].
 
         Raises:
-            SettingsError: a kind that searches its data (set membership), and so has no derivative.
+            SettingsError: a kind without derivative.
         """
         return _linearisation.jacobian(self, state, inputs)
 

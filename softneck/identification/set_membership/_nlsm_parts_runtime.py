@@ -3,9 +3,12 @@
 import numpy as np
 
 from softneck.identification.models._histories_runtime import NarxArrays, NarxState, narx_rest
-from softneck.identification.set_membership._principal_tree_runtime import slant_bounds
+from softneck.identification.set_membership._principal_tree_runtime import slant_bounds, slant_slopes
 from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import array
+
+# Thousands of times the rounding of angles and of sums as long as a regressor: numpy adds in another order.
+NLSM_ROUNDING = 1e-12
 
 
 class NlsmArrays(NarxArrays):
@@ -54,3 +57,18 @@ def nlsm_query(p: NlsmArrays, axis: int, epsilon: float, w: np.ndarray) -> tuple
         low, high = slant_bounds(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], gamma, w)
         return low - epsilon, high + epsilon  # epsilon moves all cones alike: the tree does without
     return nlsm_bounds(p.points[axis], p.values[axis], gamma, epsilon, w)
+
+
+def nlsm_query_slopes(
+    p: NlsmArrays, axis: int, epsilon: float, w: np.ndarray, low: float, high: float, slopes: np.ndarray
+) -> None:
+    """Fill `slopes` (2, n) with what w moves the bounds `low` and `high` of `nlsm_query` by."""
+    near = np.empty(2)
+    nlsm_near(low, high, epsilon, near)
+    slant_slopes(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], p.bounds[axis, 0], w, near, slopes)
+
+
+def nlsm_near(low: float, high: float, epsilon: float, near: np.ndarray) -> None:
+    """Fill `near` with bounds that lie beyond those of the cones alone: by more than what rounding does to angles."""
+    near[0] = low + epsilon - NLSM_ROUNDING * (1.0 + abs(low) + epsilon)
+    near[1] = high - epsilon + NLSM_ROUNDING * (1.0 + abs(high) + epsilon)

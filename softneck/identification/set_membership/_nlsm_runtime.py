@@ -9,7 +9,12 @@ import numpy as np
 from softneck.identification.linear._arx_runtime import arx_output
 from softneck.identification.models._feedforward_runtime import echo_rest
 from softneck.identification.models._histories_runtime import NarxState, narx_forward, narx_observe, narx_regressor
-from softneck.identification.set_membership._nlsm_parts_runtime import NlsmArrays, nlsm_query, nlsm_rest
+from softneck.identification.set_membership._nlsm_parts_runtime import (
+    NlsmArrays,
+    nlsm_query,
+    nlsm_rest,
+)
+from softneck.identification.set_membership._nlsm_parts_runtime import nlsm_query_slopes as nlsm_query_slopes
 
 
 def initialise(p: NlsmArrays, parameters: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
@@ -32,7 +37,8 @@ def step(p: NlsmArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray
     bounds = p.outputs + p.motors
     for axis in range(p.outputs):
         narx_regressor(p, p.table, x, axis, regressor)  # Eq. 21, or the lags asked for
-        low, high = nlsm_query(p, axis, p.bounds[axis, 1], regressor * p.scale)
+        w = regressor * p.scale
+        low, high = nlsm_query(p, axis, p.bounds[axis, 1], w)
         # Without a base a and b are empty and this is zero.
         base = arx_output(p, p.redefinition, p.a[axis], p.b[axis], int(p.delay[axis]), x, axis)
         # The central estimate (Eq. 18).

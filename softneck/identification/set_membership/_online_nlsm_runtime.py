@@ -9,7 +9,12 @@ import math
 import numpy as np
 
 from softneck.identification.models._histories_runtime import NarxState, narx_forward, narx_observe, narx_regressor
-from softneck.identification.set_membership._nlsm_parts_runtime import NlsmArrays, nlsm_query, nlsm_rest
+from softneck.identification.set_membership._nlsm_parts_runtime import (
+    NlsmArrays,
+    nlsm_query,
+    nlsm_rest,
+)
+from softneck.identification.set_membership._nlsm_parts_runtime import nlsm_query_slopes as nlsm_query_slopes
 from softneck.runtime._layout import array, cells, value
 
 
@@ -54,8 +59,8 @@ def online_learn(p: OnlineNlsmArrays, x: OnlineNlsmState, axis: int, y: float) -
     x.learnt[axis] += 1.0
 
 
-def online_query(p: OnlineNlsmArrays, x: OnlineNlsmState, axis: int, w: np.ndarray) -> tuple[float, float]:
-    """Return the least and largest output at `w` (n,), scaled, over all points (Eq. 19-20 without epsilon)."""
+def online_query(p: OnlineNlsmArrays, x: OnlineNlsmState, axis: int, w: np.ndarray) -> None:
+    """Expect the least and largest output at `w` (n,), scaled, over all points (Eq. 19-20 without epsilon)."""
     low, high = nlsm_query(p, axis, 0.0, w)
     count = min(int(x.learnt[axis]), p.capacity)
     for k in range(count):
@@ -66,7 +71,8 @@ def online_query(p: OnlineNlsmArrays, x: OnlineNlsmState, axis: int, w: np.ndarr
         cone = p.bounds[axis, 0] * math.sqrt(squared)
         low = max(low, x.values[axis, k] - cone)
         high = min(high, x.values[axis, k] + cone)
-    return low, high
+    x.expected[axis, 0] = low
+    x.expected[axis, 1] = high
 
 
 def step(
@@ -90,11 +96,11 @@ def step(
     for axis in range(p.outputs):
         narx_regressor(p, p.table, x, axis, regressor)
         w = regressor * p.scale
-        low, high = online_query(p, x, axis, w)
+        online_query(p, x, axis, w)
         for i in range(p.n):
             x.awaited[axis, i] = w[i]
-        x.expected[axis, 0] = low
-        x.expected[axis, 1] = high
+        low = float(x.expected[axis, 0])
+        high = float(x.expected[axis, 1])
         epsilon = p.bounds[axis, 1] + x.widened[axis]
         outputs[bounds + 2 * axis] = low - epsilon
         outputs[bounds + 2 * axis + 1] = high + epsilon

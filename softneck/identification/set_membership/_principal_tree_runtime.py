@@ -91,6 +91,54 @@ def slant_bounds(
     points: np.ndarray, values: np.ndarray, nodes: np.ndarray, frame: np.ndarray, gamma: float, x: np.ndarray
 ) -> tuple[float, float]:
     """Return max(y - gamma d) and min(y + gamma d) over `points` (n, N) in tree order and their `values` (N,)."""
+    best = np.empty(4)
+    best[0] = -np.inf
+    best[1] = np.inf
+    slant_search(points, values, nodes, frame, gamma, x, best)
+    return best[0], best[1]
+
+
+def slant_slopes(
+    points: np.ndarray, values: np.ndarray, nodes: np.ndarray, frame: np.ndarray, gamma: float, x: np.ndarray,
+    near: np.ndarray, slopes: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill `slopes` (2, n) with what x moves `slant_bounds` by: the slopes of the two cones that are the bounds at x.
+
+    The bounds are piecewise smooth: where two cones meet, the first in the tree's order counts, and a cone's tip is
+    moved by nothing.
+
+    Args:
+        points, values, nodes, frame, gamma, x: as of `slant_bounds`.
+        near: (2,) bounds a little looser than those at x, so that little is searched; changed.
+        slopes: (2, n).
+    """
+    best = np.empty(4)
+    best[0] = near[0]
+    best[1] = near[1]
+    slant_search(points, values, nodes, frame, gamma, x, best)
+    rows = values.shape[0]
+    leaves = nodes.shape[0] // 2
+    cones = np.empty(rows // leaves + 1)
+    for side in range(2):
+        sign = 2.0 * side - 1.0  # the lower bound is values less cones
+        node = int(best[2 + side])
+        first = (node - leaves) * rows // leaves
+        count = (node + 1 - leaves) * rows // leaves - first
+        tree_cones(points, first, count, gamma, x, cones)
+        at = 0
+        for k in range(count - 1, -1, -1):
+            if sign * values[first + k] + cones[k] <= sign * values[first + at] + cones[at]:
+                at = k
+        over = sign * gamma * gamma / cones[at] if cones[at] > 0.0 else 0.0  # the cone is gamma |x - w|
+        for i in range(x.shape[0]):
+            slopes[side, i] = over * (x[i] - points[i, first + at])
+
+
+def slant_search(
+    points: np.ndarray, values: np.ndarray, nodes: np.ndarray, frame: np.ndarray, gamma: float, x: np.ndarray,
+    best: np.ndarray,
+) -> None:  # fmt: skip
+    """Tighten `best` (low, high) by the cones of all points; behind them the leaf that each was found in."""
     rows = values.shape[0]
     leaves = nodes.shape[0] // 2
     at = np.dot(frame, x)
@@ -107,9 +155,8 @@ def slant_bounds(
     plane[2] = m / math.sqrt(gamma * gamma - m * m) if m > 0.0 else 0.0
     plane[3] = gamma
     plane[4] = (x.shape[0] + 8) * SLANT_ROUNDING * (gamma * size + nodes[0, 2])
-    best = np.empty(2)
-    best[0] = -np.inf
-    best[1] = np.inf
+    best[2] = leaves
+    best[3] = leaves
     # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.
     waiting = np.empty(64, dtype=np.int64)
     later = np.empty((64, 2))
@@ -128,7 +175,13 @@ def slant_bounds(
             if node >= leaves:
                 first = (node - leaves) * rows // leaves
                 count = (node + 1 - leaves) * rows // leaves - first
+                low = best[0]
+                high = best[1]
                 slant_leaf(points, values, first, count, gamma, x, cones, best)
+                if best[0] > low:
+                    best[2] = node
+                if best[1] < high:
+                    best[3] = node
                 break
             high, low, other_high, other_low = slant_children(nodes, node, at, plane)
             node = 2 * node
@@ -144,4 +197,3 @@ def slant_bounds(
                 later[top, 0] = other_high
                 later[top, 1] = other_low
                 top += 1
-    return best[0], best[1]

@@ -10,7 +10,8 @@ import numpy as np
 
 from softneck.identification.models._histories_runtime import narx_push
 from softneck.identification.models._validity_runtime import GroundArrays
-from softneck.identification.set_membership._principal_tree_runtime import slant_bounds
+from softneck.identification.set_membership._nlsm_parts_runtime import nlsm_near
+from softneck.identification.set_membership._principal_tree_runtime import slant_bounds, slant_slopes
 from softneck.identification.uncertainty._composed_runtime import composed_motors, composed_outputs, composed_validity
 from softneck.runtime._compiled_runtime import COMPILED
 from softneck.runtime._layout import StateVector, array, cells, rest, value
@@ -85,6 +86,16 @@ def residual_query(p: ResidualArrays, axis: int, regressor: np.ndarray) -> tuple
         squared += gap * gap
     cone = gamma * np.sqrt(squared)  # gamma |x - w(k)| of Eq. 19 and 20
     return np.max(p.values[axis] - cone) - epsilon, np.min(p.values[axis] + cone) + epsilon  # Eq. 20, Eq. 19
+
+
+def residual_query_slopes(
+    p: ResidualArrays, axis: int, regressor: np.ndarray, low: float, high: float, slopes: np.ndarray
+) -> None:
+    """Fill `slopes` (2, n) with what the regressor moves the bounds of `residual_query` by."""
+    near = np.empty(2)
+    nlsm_near(low, high, p.bounds[axis, 1], near)
+    gamma = p.bounds[axis, 0]
+    slant_slopes(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], gamma, regressor, near, slopes)
 
 
 def residual_observe(p: ResidualArrays, x: ResidualState, given: np.ndarray, measured: bool) -> None:

@@ -32,6 +32,8 @@ _MOTOR = {"motor", "mot", "m", "winch", "tendon", "drive", "axis", "joint", "ser
 _ANGLES = {"pitch": "pitch", "roll": "roll", "yaw": "yaw", "inclination": "inclination", "incl": "inclination",
            "tilt": "inclination", "orientation": "orientation", "orient": "orientation",
            "azimuth": "orientation"}  # fmt: skip
+#: Of a column whose title is empty, as pandas writes its index; its numbers say whether it does.
+COUNTS_ROWS = "it counts the rows"
 _EULER = {"pitch", "roll", "yaw"}
 _SENSED = {"sensor", "measured", "imu", "actual", "meas"}
 _NOT_SENSED = (
@@ -94,7 +96,7 @@ def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
         if known & said:
             return "ignored", f"'{' '.join(sorted(known & said))}' is {why}", 0
     if words[:1] == ["unnamed"]:
-        return "ignored", "it counts the rows", 0
+        return "ignored", COUNTS_ROWS, 0
     # `tilt.pitch` of a topic is pitch.
     angle = next((word for word in (*(known & _EULER), *words) if word in _ANGLES), None)
     target = next((word for word in _TARGET if word in known), None)
@@ -116,7 +118,7 @@ def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
     elif known & _TIME:
         return "time", f"'{next(word for word in words if word in _TIME)}' names time", len(words)
     elif known & _COUNTER:
-        return "ignored", "it counts the rows", 0
+        return "ignored", "it counts the rows by its name", 0
     return "unknown", "softneck does not recognise its name", 0
 
 

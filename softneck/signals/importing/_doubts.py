@@ -18,6 +18,7 @@ _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 _TILT = (*OUTPUTS, "inclination", "orientation", "pitch_reference", "roll_reference")
 _GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": _VELOCITIES}
 _AS_LOGGED = "as logged"
+ONE_AXIS = "outputs"
 # However surely the motors say so: a log that says otherwise by its titles is worth a question.
 _MOST_SURE = 0.89
 
@@ -111,6 +112,15 @@ def duplicates_doubt(rows: int, first: int) -> Doubt:
     """Return the doubt in rows of one time stamp."""
     why = f"time stands still at {rows} row(s), first at row {first}"
     return Doubt("rows of one time stamp", ("time",), "the first", 0.8, why, ("last",))
+
+
+def one_axis_doubt(axis: str) -> Doubt:
+    """Return the doubt in a log of one angle: a neck has two, and the other may have got lost on its way."""
+    other = "roll" if axis == "pitch" else "pitch"
+    why = (
+        f"no column is {other} or answers the motors like it, so the robot has one output; log {other} too if it tilts"
+    )
+    return Doubt(ONE_AXIS, (axis,), f"{axis} only", 0.8, why)
 
 
 def settled(layout: Layout, doubt: Doubt, choice: str) -> Layout:

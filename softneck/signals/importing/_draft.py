@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from softneck.core import Matrix, Vector
 
 from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_channels
 from ._column_shapes import shortened
-from ._column_titles import Title, read_title
+from ._column_titles import COUNTS_ROWS, Title, read_title
 from ._layout import Column, Quaternion, Term
 from ._table_format import SniffResult
 from ._tilt import pitch_roll
@@ -62,6 +62,9 @@ class Draft:
             for name in self.sniffed.columns
             if isinstance(name, str)
         }
+        for name, title in self.titles.items():
+            if title.why == COUNTS_ROWS and name in self.moving and not _counts(self.moving[name]):
+                self.titles[name] = replace(title, role="unknown", why="it has no name")
 
     def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, confidence: float = 0.97) -> None:
         """Take one column for a channel."""
@@ -122,6 +125,11 @@ class Draft:
         if "time" in self.picks and rows:
             run[1:] = np.cumsum(np.diff(self.values("time")) < 0)
         return run
+
+
+def _counts(values: Vector) -> bool:
+    """Return whether a column without a name is an index that a table was written with."""
+    return bool((np.diff(values) == 1.0).all())
 
 
 def say(column: Column) -> str:

@@ -15,7 +15,17 @@ from softneck.robot import Robot
 from ..recording._channels import MOTOR_POSITIONS, MOTORS, NECK, OUTPUTS, SET_POINTS
 from ..recording._redefinition import redefine
 from ._column_shapes import lagged
-from ._doubts import SURE, Doubt, doubts_of, duplicates_doubt, percent, settled, sign_doubt
+from ._doubts import (
+    ONE_AXIS,
+    SURE,
+    Doubt,
+    doubts_of,
+    duplicates_doubt,
+    one_axis_doubt,
+    percent,
+    settled,
+    sign_doubt,
+)
 from ._draft import Draft, say
 from ._guess_inputs import drop_or_turn_quaternion, one_axis, stand_ins
 from ._guess_names import by_names
@@ -77,7 +87,9 @@ class Guess(Shown):
 
 
 _NO_CLOCK = "the sample time"
-_NO_MOTORS = "without them nothing tells how the neck moves: record the drives' set-points, positions or velocities too"
+# Candidates that a line of what is missing names; the page and the notes have all.
+_SHOWN = 3
+_NO_MOTORS = "no column is of a motor; record the drives' set-points, positions or velocities too"
 
 
 def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
@@ -109,9 +121,10 @@ def _guess(path: Path, neck: Robot) -> Guess:
     check_lines, sign_doubts = _checks(draft)
     layout, clock_lines, clock_doubts = _clocked(draft, found, _layout(draft, found, robot))
     missing = _missing(draft, layout)
-    doubts = sorted([*doubts_of(draft, found), *clock_doubts, *sign_doubts], key=lambda doubt: doubt.confidence)
+    other_doubts = [*sign_doubts, *([one_axis_doubt(robot.outputs.names[0])] if robot is not neck else [])]
+    doubts = sorted([*doubts_of(draft, found), *clock_doubts, *other_doubts], key=lambda doubt: doubt.confidence)
     remarks = {name: _why(draft, found, name) for name in draft.picks}
-    remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in sign_doubts}
+    remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in other_doubts}
     remarks["file"] = "; ".join(line.removeprefix("file: ") for line in draft.sniffed.lines)
     remarks["sample_time"] = "; ".join([*clock_lines, *(f"NOT SURE: {doubt}" for doubt in clock_doubts)])
     remarks["quaternion"] = _marked(draft.quaternion_sure) + draft.quaternion_why
@@ -122,8 +135,7 @@ def _guess(path: Path, neck: Robot) -> Guess:
         )
     if layout.merge:
         lines.append("rows of several clocks, because set-points have empty cells: merged at the rows of the outputs")
-    if robot is not neck:
-        lines.append(f"one axis: nothing beside {robot.outputs.names[0]} answers the motors: a robot of one output")
+    lines += [f"not sure: {doubt}" for doubt in doubts if doubt.about == ONE_AXIS]
     lines += [f"not sure: {doubt.why} ({percent(doubt.confidence)} sure of {doubt.taken})" for doubt in clock_doubts]
     lines += [*check_lines, *_left_out(draft)]
     head = f"# Proposed by `softneck import --guess` for {path.name!r}; edit it.\n\n"
@@ -282,31 +294,28 @@ def _other_axis(draft: Draft) -> list[Column]:
 
 
 def _missing(draft: Draft, layout: Layout) -> tuple[str, ...]:
-    """Return what a recording needs and the layout does not give, with candidates and the line that would do it."""
+    """Return what a recording needs and the layout does not give, each with the line that would do it."""
     lines = []
     absent = [name for name in SET_POINTS if name not in draft.picks]
     if absent:
+        names = "motor_setpoint_1..3" if len(absent) == 3 else ", ".join(absent)
         free = draft.free()
-        names = ", ".join(absent)
-        lines.append(f"{names}: candidates are {_listed(free)}; {_line_for(absent[0], free, 'rad')}" if free
-                     else f"{names}: {_NO_MOTORS}")  # fmt: skip
+        lines.append(f"{names}: {_to_name(absent[0], free, 'rad') if free else _NO_MOTORS}")
     axes = [name for name in layout.robot.outputs.names if name not in draft.picks]
     if axes and layout.inclination is None and layout.quaternion is None:
-        candidates = _other_axis(draft)
-        lines.append(
-            f"{', '.join(axes)}: candidates are {_listed(candidates)}; {_line_for(axes[0], candidates, 'deg')}"
-        )
+        lines.append(f"{', '.join(axes)}: {_to_name(axes[0], _other_axis(draft), 'deg')}")
     if layout.time is None and layout.sample_time is None:
-        lines.append(
-            f"{_NO_CLOCK}: no column rises by equal steps; say it by `--sample-time S` or `sample_time_s = S` in [time]"
-        )
+        lines.append(f"{_NO_CLOCK}: no column rises by equal steps; say `--sample-time S`")
     return tuple(lines)
 
 
-def _line_for(channel: str, candidates: list[Column], unit: str) -> str:
-    column = f"'{candidates[0]}'" if candidates and isinstance(candidates[0], str) else (candidates or ["COLUMN"])[0]
-    return f"a line such as `{channel} = {{ column = {column}, unit = '{unit}' }}`"
+def _to_name(channel: str, candidates: list[Column], unit: str) -> str:
+    """Return the layout's line that names a channel, and the first columns that it may be."""
+    if not candidates:
+        return "no column is left that moves; record it too"
+    shown = ", ".join(repr(column) for column in candidates[:_SHOWN]) + (", ..." if candidates[_SHOWN:] else "")
+    return f"is it {shown}? Write `{channel} = {{ column = {_toml(candidates[0])}, unit = '{unit}' }}`"
 
 
-def _listed(columns: list[Column]) -> str:
-    return ", ".join(repr(column) for column in columns[:12]) or "none of the columns"
+def _toml(column: Column) -> str:
+    return f"'{column}'" if isinstance(column, str) else str(column)

@@ -14,6 +14,7 @@ from ._column_shapes import (
     leads,
     motors_and_answers,
     rates,
+    still,
     sums,
     triples,
 )
@@ -25,6 +26,8 @@ _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 _MOST = 40
 # A term that adds less than this part of the motion is noise of the fit.
 _COUNTS = 0.05
+# R2 of a sum with fitted factors that is what the drives were asked for: they leave less of it than a hundredth.
+_SUM = 0.99
 _AXIS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
@@ -52,7 +55,7 @@ def by_shapes(draft: Draft) -> None:
 
 
 def _answer(draft: Draft, axis: str, column: str | int, r: float) -> None:
-    why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; no other column does so more"
+    why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; none that moves as far does so more"
     sign = -1.0 if r < 0 else 1.0
     draft.pick(
         axis,
@@ -109,15 +112,20 @@ def _set_points(draft: Draft) -> None:
                 confidence=_sure(found[1]),
             )
         return
-    pair, factors, R2 = sums(draft.moving, positions, free[:12])
-    if R2 < FOLLOWS:
-        return
+    stands = still(draft.moving, positions)
+    moved = [j for j in range(3) if j not in stands]
+    pair, factors, R2 = sums(draft.moving, [positions[j] for j in moved], free[:12])
+    if R2 < _SUM:
+        return  # the positions become the inputs
     parts = np.abs(factors) * np.array([[draft.moving[name].std()] for name in pair])
-    for j, channel in enumerate(SET_POINTS):
-        counts = parts[:, j] > _COUNTS * parts[:, j].sum()
-        terms = tuple(Term(name, float(f"{factors[i, j]:.4g}")) for i, name in enumerate(pair) if counts[i])
+    for k, j in enumerate(moved):
+        counts = parts[:, k] > _COUNTS * parts[:, k].sum()
+        terms = tuple(Term(name, float(f"{factors[i, k]:.4g}")) for i, name in enumerate(pair) if counts[i])
         why = f"the position follows this sum (R2 {R2:.3f} or more); its factors were fitted to the data"
-        draft.picks[channel] = Pick(terms, why, draft.picks[MOTOR_POSITIONS[j]].unit, confidence=_sure(R2))
+        draft.picks[SET_POINTS[j]] = Pick(terms, why, draft.picks[MOTOR_POSITIONS[j]].unit, confidence=_sure(R2))
+    for j in stands:
+        why = "its position stands still beside the others', so nothing tells what was asked of it: taken as asked for"
+        draft.pick(SET_POINTS[j], positions[j], why, confidence=0.7)
 
 
 def _motors_without_rates(draft: Draft) -> None:

@@ -20,6 +20,9 @@ _BLOCKS = 10
 # Motions of lagged set-points below this part of the largest are left out of a fit: what hardly moves in the blocks
 # fitted, and moves in those judged, is extrapolated by thousands of times. Which part is small is tried.
 _SINGULAR = (1e-6, 1e-4, 1e-2)
+# By outputs that move by less of what they do in all rows [standard deviations] nothing can be judged: a good model's
+# error, a twentieth of the motion that it was trained on, would read as a fit of 0 %.
+_STANDS = 0.05
 # Lags [samples] over which an output may follow: an octave apart, to 5 s at 20 ms.
 _LAGS = (0, *(2**k for k in range(9)))
 
@@ -52,6 +55,16 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
         if share < _UNRELATED
     ]
     return tuple(said)
+
+
+def stands_still(held_out: Recording, whole: Recording) -> str | None:
+    """Return why no model can be judged by `held_out`, a part of `whole`; None if one can."""
+    for name, judged, seen in zip(whole.robot.outputs.names, held_out.outputs.T, whole.outputs.T, strict=True):
+        there = np.isfinite(judged)
+        if there.any() and np.nanstd(judged) < _STANDS * np.nanstd(seen):
+            part = 100.0 * float(np.nanstd(judged) / np.nanstd(seen))
+            return f"the rows held out stand still: {name} moves by {part:.1f} % of what it does in all rows"
+    return None
 
 
 def independent_motions(recording: Recording) -> int:

@@ -7,15 +7,19 @@ import json
 import os
 import shlex
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from softneck.cli.start import _sitting
 from softneck.core import CheckFailedError
 
+from ...data import neck_recording
 from ..conftest import Call
 
 STEPS = ["robot: robot.toml", "quality: copy.toml", "loop: project/loop.toml"]
@@ -227,7 +231,7 @@ def test_a_full_disk_or_a_read_only_one_ends_in_one_line_wherever_it_comes(
         patch.setattr(Path, "replace", replace)
         said = call("start", "log.csv", "-o", "p", "--yes")
     assert said.code == 2
-    assert f"cannot be written: {os.strerror(reason)}" in said.error
+    assert f"cannot be written: {os.strerror(reason)}" in said.err.splitlines()[-1]
     left = {path for path in (tmp_path / "p").rglob("*") if path.is_file()}
     assert left <= {path.absolute() for path in written} | {(tmp_path / "p" / path) for path in written}, "no half file"
     assert all(states(call)) is False
@@ -286,7 +290,7 @@ def test_a_recording_that_lacks_something_is_asked_about_before_it_is_identified
     said = call("start", "log.csv", "-o", "p")
     assert said.code == 1
     assert "log: a motor never moves." in said.err
-    assert "stopped, as was answered. Record next" in said.err.splitlines()[-1]
+    assert "stopped, as was answered. Record 60 s" in said.err.splitlines()[-1]
     assert not Path("p").exists()
 
 
@@ -307,7 +311,7 @@ def test_what_a_later_step_would_refuse_is_refused_at_once(
     assert not Path("p").exists()
 
 
-@pytest.mark.parametrize(("stage", "advice"), [("tune", "give it by --requirements. Paths"), ("verify", "it. Paths")])
+@pytest.mark.parametrize(("stage", "advice"), [("tune", "give them by --requirements"), ("verify", "paths are")])
 def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, stage: str, advice: str
 ) -> None:
@@ -322,6 +326,25 @@ def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     monkeypatch.setattr(_sitting, "_softneck", refuses)
     said = call("start", "log.csv", "-o", "p", "--yes")
     assert said.code == 2
-    assert said.error.startswith(f"softneck: {stage}: `new` cannot be")
-    assert advice in said.error
-    assert said.error.endswith("Mended, the same command goes on here.")
+    assert said.err.splitlines()[-1].startswith(f"softneck: {stage}: `new` cannot be")
+    assert advice in said.err
+    assert "once that is mended the same command goes on" in said.err
+
+
+def test_a_disk_that_is_really_full_ends_in_one_line(tmp_path: Path) -> None:
+    """Files may grow to 8 KiB only, as on a small disk: the first that does not fit ends the sitting; none is half."""
+    neck = neck_recording(700)
+    angles = dict(zip(("pitch", "roll"), neck.outputs.T, strict=True))
+    motors = {f"target_motor{j}": neck.set_points[:, j - 1] for j in (1, 2, 3)}
+    pd.DataFrame({"time": neck.time, **motors, **angles}).to_csv(tmp_path / "log.csv", index=False)
+    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192)); "
+    words = ["start", "log.csv", "-o", "p", "--yes"]
+    done = subprocess.run(
+        [sys.executable, "-c", f"{limited}from softneck.cli._main import run; sys.exit(run({words}))"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("softneck: import: ")
+    assert f"cannot be written: {os.strerror(errno.EFBIG)}" in last
+    assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]

@@ -29,7 +29,7 @@ class Truth:
 
     def __call__(self, *_: Any) -> None:
         told = self._link.neck.truth()
-        now = np.degrees([told["pitch"], told["roll"]])
+        now = np.degrees([told[name] for name in ("pitch", "roll") if name in told])
         self._first = now if self._first is None else self._first
         self.largest = max(self.largest, float(np.linalg.norm(now)))
         self.moved = max(self.moved, float(np.linalg.norm(now - self._first)))

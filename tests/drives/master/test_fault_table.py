@@ -8,8 +8,8 @@ from softneck.drives.master import Phase
 from softneck.drives.master._events import RULES, Reaction
 
 from ..bench import Bench
+from ..broken import ROWS
 from ..fault_table import Scenario, short_dropout
-from ..plausible import ROWS
 from ..scenarios import SCENARIOS
 
 

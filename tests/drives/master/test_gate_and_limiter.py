@@ -160,6 +160,35 @@ def test_a_hanging_tendon_is_let_out_by_so_much_from_where_it_hung() -> None:
     assert limiter.value == pytest.approx(-4.5, abs=1e-6)
 
 
+def test_a_hanging_tendon_goes_with_the_neck_and_is_never_pulled_for_it() -> None:
+    """What the neck leant away is no slack: 0.5 rad beyond it, and none where it leans back."""
+    limits = LimitSettings(slack=0.2, slack_unwind=0.5, speed=100.0, acceleration=1e5)
+    limiter = Limiter(limits, T)
+    # It began to hang with the neck leaning towards it by 0.3 rad of its motor; now it leans the other way.
+    limiter.step(0.0, 0.1, 0.3)
+    for _ in range(50):
+        limiter.step(-4.0, 0.1, -0.7)
+    assert limiter.value == pytest.approx(-1.0 - 0.5, abs=1e-6)
+    for _ in range(50):
+        limiter.step(-4.0, 0.1, 0.3)
+    assert limiter.value == pytest.approx(-1.5, abs=1e-6)
+    assert limiter.clamped == "slack"
+
+
+def test_what_the_angles_lead_the_motors_to_gives_these_angles() -> None:
+    """The inverse of the static model: two angles from three motors, of which the sum is nobody's."""
+    watches = Watches(WatchSettings(), LimitSettings())
+    watches.tilt(0.0, 0.02, (0.0, 0.0, 0.0), (0.1, -0.05), [])
+    assert sum(watches.led) == pytest.approx(0.0, abs=1e-12)
+    assert watches._static(watches.led) == pytest.approx([0.1, -0.05], abs=1e-12)
+    # A sample that did not come leaves the last; unknown directions lead nobody.
+    watches.tilt(0.02, 0.02, (0.0, 0.0, 0.0), None, [])
+    assert watches._static(watches.led) == pytest.approx([0.1, -0.05], abs=1e-12)
+    unknown = Watches(WatchSettings(), LimitSettings(), weights=())
+    unknown.tilt(0.0, 0.02, (0.0, 0.0, 0.0), (0.1, -0.05), [])
+    assert unknown.led == (0.0, 0.0, 0.0)
+
+
 def test_a_reset_stands_still_at_its_value_and_forgets() -> None:
     limiter = Limiter(LimitSettings(), T)
     for _ in range(5):

@@ -99,6 +99,7 @@ def test_the_rules_are_those_of_the_fault_table() -> None:
         "diverged": (stop, 0, 0.2), "tension": (stop, 0, 0.2), "pushed": (stop, 0, 0.2), "stalled": (stop, 1, 0.0),
         "motor_jammed": (stop, 0, 0.5), "encoder_slip": (stop, 0, 0.5), "position_bad": (stop, 0, 0.5),
         "current_scale": (stop, 0, 0.5), "gear_wrong": (stop, 0, 0.5), "tilt_unexplained": (stop, 0, 4.0),
+        "astray": (stop, 0, 0.5),
         "sensor_reversed": (stop, 0, 0.5), "sensor_swapped": (stop, 0, 0.5), "sensor_stuck": (retreat, 0, 0.5),
         "sensor_late": (retreat, 0, 0.5), "sensor_noise": (retreat, 0, 0.5), "sensor_rate": (retreat, 0, 0.5),
         "sensor_drift": (retreat, 0, 4.0),

@@ -82,6 +82,16 @@ def test_the_tree_gives_the_bounds_of_algorithm_1(
         best = np.array([-np.inf, np.inf])
         SLANT.slant_leaf(points, values, 0, len(y), gamma, x, np.empty(len(y)), best)
         assert tuple(best) == (low, high)
+        # What moves the bounds: the cones that they are, gamma times the unit vector from the point.
+        moves = np.zeros((2, x.size))
+        looser = np.array([low - 1e-9 * (1.0 + abs(low)), high + 1e-9 * (1.0 + abs(high))])
+        SLANT.slant_slopes(points, values, nodes, frames[0], gamma, x, looser, moves)
+        distance = np.linalg.norm(points.T - x, axis=1)
+        for sign, bound, moved in zip((-1.0, 1.0), (low, high), moves, strict=True):
+            # Any cone that is the bound but for rounding may be the one.
+            near = np.abs(values + sign * gamma * distance - bound) <= 1e-12 * (1.0 + abs(bound) + gamma * distance)
+            unit = (x - points.T[near]) / np.maximum(distance[near], 1e-300)[:, None]
+            assert np.abs(sign * gamma * unit - moved).max(axis=1).min() <= 1e-9 * gamma
 
 
 def test_a_plane_among_the_values_is_followed_as_far_as_cones_allow() -> None:

@@ -264,7 +264,7 @@ static int sn_parse_model(sn_model *model, unsigned char *bytes, size_t size, co
     for (uint64_t i = 0; i < count; i++)
         if (!sn_take_port(&r, &model->ports[i]))
             return 0;
-    if (model->ahead > model->n_out / 2 || (model->ahead > 0 && !model->plant))
+    if (model->ahead > model->n_out / 2)
         return sn_refuse(&r, "%u of its %u outputs cannot be those of the next sample.", model->ahead, model->n_out);
     if (!sn_take_node(&r, &model->root, 0))
         return 0;

@@ -1,0 +1,179 @@
+"""One controller of all axes at once: verified on every sample, its reference filter chosen, assembled."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError
+
+from ..plants._coupled_axis import AnyAxes, closed, radius, sensitivity
+from ._assembly import ReferenceFilter, assemble_whole
+from ._axis_settings import AxisSettings, _slowest_filter, slowest_time
+from ._controller import LinearController
+from ._margins import LOWEST, frequencies
+from ._rise import rise_time
+
+# Steps are looked at for so many times the slowest time constant, dead time and filter.
+_LONG = 8.0
+_HALVINGS = 20
+# Samples are judged on frequencies 4 % apart, as those of one axis are.
+_COARSE = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class WholeDesign:
+    """A controller of all axes and what it is for.
+
+    Attributes:
+        law: A, Br, By, C, Dr, Dy and the conditioning L, see `LinearArrays`.
+        samples: all axes of every plant that it must hold on; the first is nominal.
+        redefinition: T and its inverse.
+        gains: numbers for people.
+        notes: more findings, of each axis.
+    """
+
+    law: tuple[Matrix, ...]
+    samples: Sequence[AnyAxes]
+    redefinition: tuple[Matrix, Matrix]
+    gains: dict[str, float]
+    notes: dict[str, Any]
+
+    @property
+    def parts(self) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+        """A, B, C, D from references and outputs to redefined inputs."""
+        A, Br, By, C, Dr, Dy, _ = self.law
+        return A, np.hstack([Br, By]), C, np.hstack([Dr, Dy])
+
+    def worst(self, extra_delay: int) -> float:
+        """Return the largest Ms of all samples; inf where one is not stable."""
+        nominal = self.samples[0][0]
+        w = frequencies(nominal.sample_time, lowest=LOWEST / nominal.stretch)[::-_COARSE][::-1]
+        if any(radius(self.parts, plants, extra_delay) >= 1.0 for plants in self.samples):
+            return math.inf
+        return max(sensitivity(self.parts, plants, extra_delay, w) for plants in self.samples)
+
+
+def whole_controller(settings: AxisSettings, made: WholeDesign, robot: Any, *, filtered: bool) -> LinearController:
+    """Return the controller.
+
+    Args:
+        settings: order of the loop, limits, and what its references are filtered by.
+        made: the controller's law and its plants.
+        robot: whose plant it is.
+        filtered: whether a reference filter is chosen where none is given.
+
+    Raises:
+        SettingsError: a loop that is not stable around one of the samples, or a filter that does not help.
+    """
+    extra, plants = settings.extra_delay, made.samples[0]
+    for k, sample in enumerate(made.samples):
+        if (found := radius(made.parts, sample, extra)) >= 1.0:
+            raise SettingsError(
+                f"the loop is not stable around sample {k} of {len(made.samples)} (spectral radius {found:.4f}); "
+                "design the controller for less."
+            )
+    time = settings.reference_time or 0.0
+    if settings.rise_s is not None:
+        time = _filter_for(settings.rise_s, made, extra)
+    elif settings.reference_time is None and filtered:
+        time = _least_filter(settings, made)
+    sample_time, limits = plants[0].sample_time, settings.limits(robot)
+    found = {
+        name: {
+            "gains": {**made.gains, "reference_time_s": time},
+            "dead_time_s": (plant.delay + extra) * sample_time,
+            "states": len(made.law[0]),
+            "samples": len(made.samples),
+            **made.notes,
+        }
+        for name, plant in zip(robot.outputs.names, plants, strict=True)
+    }
+    return LinearController(
+        kind=settings.KIND,
+        sample_time=sample_time,
+        arrays=assemble_whole(
+            made.law,
+            filters=[ReferenceFilter(time)] * (len(plants) + 1),
+            redefinition=made.redefinition,
+            constants=limits.constants(sample_time),
+        ),
+        limits=limits,
+        order=settings.order,
+        design={"settings": settings._stored(), "extra_delay": extra, **found},
+    )
+
+
+def fastest(keeps: Callable[[float], bool], low: float, high: float) -> float | None:
+    """Return the largest speed from `low` to `high` that keeps what it must, to 3 %; None where not even `low` does."""
+    if not keeps(low):
+        return None
+    for _ in range(math.ceil(math.log2(math.log(high / low) / 0.03))):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if keeps(middle) else (low, middle)
+    return low
+
+
+def _steps(made: WholeDesign, plants: AnyAxes, extra_delay: int, time: float) -> Matrix:
+    """Return each output (rows, outputs) after a unit step of its own reference alone, no limit acting."""
+    A, B, C = closed(made.parts, plants, extra_delay)
+    Ts, m = plants[0].sample_time, len(plants)
+    slowest = max(slowest_time(plant) for plant in plants)
+    late = max(plant.delay for plant in plants) + extra_delay
+    rows = math.ceil(_LONG * ((slowest + time) / Ts + late))
+    keep, at = ReferenceFilter(time).pole(Ts), 0.0
+    x, y = np.zeros((len(A), m)), np.zeros((rows, m))
+    for k in range(rows):
+        at = keep * at + 1.0 - keep
+        x = A @ x + at * B
+        y[k] = np.diag(C @ x)
+    return y
+
+
+def _least_filter(settings: AxisSettings, made: WholeDesign) -> float:
+    """Return the least time [s], from half the plant's lag on, with which no sample overshoots by more."""
+    plants, Ts = made.samples[0], made.samples[0][0].sample_time
+    slowest: Any = max(plants, key=slowest_time)
+    high = _slowest_filter(slowest)
+    low = min(round(0.5 * slowest_time(slowest) / Ts), high // 2)
+
+    def keeps(samples: int) -> bool:
+        peaks = [_steps(made, each, settings.extra_delay, samples * Ts).max() for each in made.samples]
+        return max(peaks) <= 1.0 + settings.overshoot_pct / 100.0
+
+    if keeps(low):
+        return low * Ts
+    if not keeps(high):
+        raise SettingsError(
+            f"no reference filter up to {high * Ts:g} s keeps the overshoot below {settings.overshoot_pct:g} % on "
+            "every sample; lower `max_sensitivity`, or give `reference_time`."
+        )
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if keeps(middle) else (middle, high)
+    return high * Ts
+
+
+def _filter_for(asked: float, made: WholeDesign, extra_delay: int) -> float:
+    """Return the time [s] of the filter with which the slowest output rises in `asked` [s] on the nominal plant."""
+    plants = made.samples[0]
+    Ts = plants[0].sample_time
+
+    def rise(time: float) -> float:
+        return max(rise_time(y, Ts) for y in _steps(made, plants, extra_delay, time).T)
+
+    own = rise(0.0)
+    if own > asked:
+        raise SettingsError(
+            f"`rise_s` = {asked:g}: the loop rises in {own:.2g} s by itself; ask for more, or let the feedback be "
+            "faster (`max_sensitivity`)."
+        )
+    low, high = 0.0, asked
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rise(middle) < asked else (low, middle)
+    return low

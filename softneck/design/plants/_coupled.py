@@ -1,0 +1,210 @@
+"""A coupled plant of any size, out of a state space: outputs that answer to the redefined inputs of all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector
+from softneck.estimation._axis import AXES, robot_of
+from softneck.identification.models._directions import NECK_SECONDS
+from softneck.robot import Robot
+from softneck.robot._channels import Motors, Outputs
+from softneck.robot._directions import Directions
+from softneck.robot._redefined import redefinition_of
+from softneck.signals import redefinition_matrix
+
+from ._coupled_axis import CoupledAxis
+from ._uncertain import UncertainAxis
+
+# Of the largest number of its kind: what rounding leaves of a dead time, of a state that no output shows, of a gain.
+_ROUNDING = 1e-10
+_NECK_INPUTS = ("theta_i", "phi_i")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoupledPlant:
+    """A plant of n motors and m outputs; its redefined inputs are those that move one output each at rest.
+
+    Attributes:
+        rows: one for each output.
+        robot: whose plant it is.
+        redefinition: T (outputs + 1, motors) and its inverse.
+    """
+
+    rows: tuple[CoupledAxis, ...]
+    robot: Robot
+    redefinition: tuple[Matrix, Matrix]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The outputs."""
+        return self.robot.outputs.names
+
+    @property
+    def sample_time(self) -> float:
+        """[s]."""
+        return self.rows[0].sample_time
+
+    @property
+    def axes(self) -> Mapping[str, UncertainAxis]:
+        """The rows by output."""
+        rows: Any = self.rows
+        return {name: UncertainAxis(row, (row,)) for name, row in zip(self.names, rows, strict=True)}
+
+
+def coupled_plant(source: Any, *, asked: bool = False) -> CoupledPlant | None:
+    """Return the coupled plant of a `control` system of any size; None for what is a plant for each axis.
+
+    Args:
+        source: a discrete system from motors, or a neck's redefined inputs, to outputs; else whatever a design takes.
+        asked: whether an identified model is to be taken with all that it says between its axes.
+
+    Raises:
+        SettingsError: a model that says nothing between its axes, or a system that no controller of this package can be
+            for, in a line.
+    """
+    import control
+
+    if isinstance(source, control.StateSpace | control.TransferFunction):
+        system: Any = control.ss(source)
+        neck = _is_necks(system)
+        if neck and (system.ninputs == 1 or not (asked or _crosses(system))):
+            return None
+        return _coupled(system, Robot.preset() if neck else _robot(system))
+    if not asked:
+        return None
+    if not hasattr(source, "ss"):
+        raise SettingsError(
+            f"`coupled` needs one model with a state space, or a control.StateSpace; got {type(source).__name__}. "
+            "Identify `subspace`, or leave `coupled` out."
+        )
+    return _coupled(source.ss(), robot_of(source))
+
+
+def _is_necks(system: Any) -> bool:
+    """Return whether a system is of a neck: without names scalar or of two inputs and outputs, else by its names."""
+    size, inputs, outputs = (system.ninputs, system.noutputs), set(system.input_labels), set(system.output_labels)
+    if size == (1, 1):
+        return True
+    if size == (2, 2) and all(name.startswith(("u[", "y[")) for name in inputs | outputs):
+        return True
+    known = [set(_NECK_INPUTS), set(Robot.preset().set_points)]
+    # Half a neck's names is a mistake, which `uncertain_plant` says.
+    return outputs == set(AXES) and (inputs in known or size == (2, 2))
+
+
+def _crosses(system: Any) -> bool:
+    """Return whether a neck's system has more than a plant for each axis."""
+    labels = list(system.input_labels)
+    if not set(labels) <= {*_NECK_INPUTS, *(label for label in labels if label.startswith("u["))}:
+        return system.ninputs > len(AXES)
+    A, B, C = _sorted(system, Robot.preset())
+    across = [np.array([C[i] @ np.linalg.matrix_power(A, k) @ B for k in range(len(A))]) for i in range(len(AXES))]
+    largest = max(float(np.abs(part).max(initial=0.0)) for part in across)
+    return any(float(np.abs(part[:, 1 - i]).max(initial=0.0)) > _ROUNDING * largest for i, part in enumerate(across))
+
+
+def _sorted(system: Any, robot: Robot) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A, B, C of a system, inputs and outputs found by name where it has the robot's names."""
+    A, B, C = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C))
+    inputs, outputs = list(system.input_labels), list(system.output_labels)
+    for wanted in (_NECK_INPUTS, robot.set_points):
+        if set(inputs) == set(wanted):
+            B = B[:, [inputs.index(name) for name in wanted]]
+    if set(outputs) == set(robot.outputs.names):
+        C = C[[outputs.index(name) for name in robot.outputs.names]]
+    return A, B, C
+
+
+def _robot(system: Any) -> Robot:
+    """Return a robot of so many motors and outputs, named as the system's signals are."""
+
+    def named(labels: list[str], what: str) -> tuple[str, ...]:
+        plain = all(label.isidentifier() for label in labels)
+        return tuple(labels) if plain else tuple(f"{what}_{i + 1}" for i in range(len(labels)))
+
+    return Robot(
+        name="plant",
+        motors=Motors(names=named(list(system.input_labels), "motor"), unit="1"),
+        outputs=Outputs(names=named(list(system.output_labels), "output"), unit="1"),
+        directions=Directions(kind="identified"),
+    )
+
+
+def _coupled(system: Any, robot: Robot) -> CoupledPlant:
+    dt = system.dt
+    if dt is None or isinstance(dt, bool) or not dt > 0.0:
+        raise SettingsError(
+            f"the plant must be discrete, for a controller runs at its sample time; its dt is {dt}. Use "
+            "control.sample_system(plant, 0.02), or take it as it is with `lqgsyn`, `mixsyn`, `ncfsyn` or `loopsyn`."
+        )
+    A, B, C = _sorted(system, robot)
+    _check(A, B, C, np.asarray(system.D, dtype=np.float64))
+    if B.shape[1] == len(_NECK_INPUTS) < len(robot.motors.names) and robot.is_neck:
+        B = B @ redefinition_matrix()[: len(_NECK_INPUTS)]
+    at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
+    _require_apart(at_rest, robot)
+    directions = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True)
+    if robot.is_neck:
+        # As large as theta_i and phi_i (Eq. 9 and 10).
+        directions *= math.sqrt(1.5)
+    elif robot.directions.kind == "identified":
+        robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, directions.tolist()))))
+    T, inverse = redefinition_of(directions, robot.outputs.names)
+    rows = tuple(_row(A, B @ inverse[:, : len(C)], c, axis, float(dt)) for axis, c in enumerate(C))
+    if not robot.is_neck:
+        radius = max(float(np.abs(np.linalg.eigvals(row.A)).max()) for row in rows)
+        slowest = -dt / math.log(radius) if radius > 0.0 else 0.0
+        rows = tuple(replace(row, stretch=max(slowest, float(dt)) / NECK_SECONDS) for row in rows)
+    return CoupledPlant(rows, robot, (T, inverse))
+
+
+def _check(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:
+    """Raise SettingsError for what no such controller is for."""
+    if not all(np.isfinite(part).all() for part in (A, B, C, D)):
+        raise SettingsError("the plant has entries that are not finite.")
+    if D.any():
+        raise SettingsError("the plant must be strictly proper (D = 0): an input acts one sample later.")
+    radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
+    if radius >= 1.0:
+        raise SettingsError(
+            f"the plant is not stable (spectral radius {radius:.4f}), which limits of the motors ask for; `lqgsyn`, "
+            "`mixsyn` and `ncfsyn` take it."
+        )
+
+
+def _require_apart(at_rest: Matrix, robot: Robot) -> None:
+    outputs, motors = at_rest.shape
+    sizes = np.linalg.norm(at_rest, axis=1)
+    dead = np.flatnonzero(sizes <= _ROUNDING * sizes.max(initial=0.0))
+    if motors < outputs or dead.size or sizes.max(initial=0.0) == 0.0:
+        what = f"`{robot.outputs.names[dead[0]]}` answers to none of them at rest" if dead.size else "they are too few"
+        raise SettingsError(
+            f"{motors} input(s) cannot bring {outputs} output(s) to references of their own: {what}. Leave outputs "
+            "out, or take `lqgsyn`, which brings the rest as near as it can."
+        )
+
+
+def _row(A: Matrix, B: Matrix, c: Vector, axis: int, dt: float) -> CoupledAxis:
+    """Return one output with its dead time split off, in states of which it shows each, itself the first."""
+    delay, size, row = 0, float(np.abs(c).max()) * float(np.abs(B).max()), c
+    while delay < len(A) and float(np.abs(row @ B).max()) <= _ROUNDING * size:
+        row, delay = row @ A, delay + 1
+    Q = [row / np.linalg.norm(row)]
+    scale = max(1.0, float(np.linalg.norm(A, 2)))
+    while len(Q) < len(A):
+        # Arnoldi of A': what it does not reach never shows in this output.
+        basis = np.array(Q)
+        further = A.T @ Q[-1]
+        for _ in range(2):
+            further = further - basis.T @ (basis @ further)
+        if np.linalg.norm(further) <= _ROUNDING * scale:
+            break
+        Q.append(further / np.linalg.norm(further))
+    basis = np.array(Q)
+    return CoupledAxis(basis @ A @ basis.T, float(np.linalg.norm(row)) * basis @ B, axis, delay, dt)

@@ -1,0 +1,193 @@
+"""`lqg`, `mpc` and `custom` on plants of any number of inputs and outputs, each of which may move each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+from softneck.core import SettingsError, load
+from softneck.design import CustomSettings, LqgSettings, MpcSettings, PidSettings, lqgsyn
+from softneck.design.linear._linear_parts_runtime import LinearArrays
+from softneck.design.plants._coupled import CoupledPlant, coupled_plant
+from softneck.design.plants._coupled_axis import closed, responses
+from softneck.identification import Subspace
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import redefinition_matrix, signal
+
+from ..oracles.bake_off import bake_off_plant
+
+TS = 0.02
+LIMITS: dict[str, Any] = {"position_limit": 6.0, "slew_limit": 12.0}
+SIZES = [(2, 2), (3, 2), (4, 3), (3, 1)]
+
+
+def plant(inputs: int, outputs: int, *, late: int = 2, seed: int = 0) -> control.StateSpace:
+    """Return lags of 0.1 to 0.5 s, mixed at random, behind so many samples."""
+    rng = np.random.default_rng(seed)
+    poles = np.exp(-TS * rng.uniform(2.0, 9.0, outputs + 2))
+    B, C = rng.standard_normal((outputs + 2, inputs)), rng.standard_normal((outputs, outputs + 2))
+    lags = control.StateSpace(np.diag(poles), (1.0 - poles)[:, None] * B, C, np.zeros((outputs, inputs)), TS)
+    line: Any = control.ss(control.TransferFunction([1.0], [1.0, *[0.0] * late], TS))
+    return lags * control.append(*[line] * inputs)
+
+
+def taken(G: Any, **more: Any) -> CoupledPlant:
+    found = coupled_plant(G, **more)
+    assert found is not None
+    return found
+
+
+def neck(gains: tuple[float, float] = (1.0, 0.8), across: float = 0.0) -> Any:
+    """Return a neck's plant from theta_i, phi_i whose axes answer to each other by this part."""
+    each: Any = control.append(*(control.ss(bake_off_plant(gain, 1.0).tf()) for gain in gains))
+    return each * control.StateSpace([], [], [], [[1.0, across], [-across, 1.0]], TS)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [size for size in SIZES if size != (2, 2)])
+def test_a_plants_rows_answer_as_it_does(inputs: int, outputs: int) -> None:
+    G = plant(inputs, outputs)
+    found = taken(G)
+    w = np.array([0.1, 1.0, 10.0, 100.0])
+    each = np.array([G(np.exp(1j * x * TS), squeeze=False) for x in w]) @ found.redefinition[1][:, :outputs]
+    # An orthogonal change of at most 17 states.
+    np.testing.assert_allclose(responses(found.rows, w, 0), each, rtol=1e-9, atol=1e-12)
+    # The dead time is split off, and what is left shows in the output at once.
+    assert [row.delay for row in found.rows] == [2] * outputs
+    # At rest each redefined input moves its own output alone.
+    at_rest = responses(found.rows, np.array([0.0]), 0)[0].real
+    np.testing.assert_allclose(at_rest, np.diag(np.diag(at_rest)), atol=1e-10)
+
+
+def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
+    """One filter and one regulator for two axes that do not touch are those of each axis."""
+    settings = LqgSettings(load_rate=3.0, reference_time=0.2)
+    each, whole = settings.design(neck()), settings._whole(taken(neck(), asked=True))
+    z = np.exp(1j * np.array([0.3, 3.0, 30.0]) * TS)
+    # Riccati equations of twice the order.
+    np.testing.assert_allclose(whole.ss()(z), each.ss()(z), rtol=1e-7, atol=1e-9)
+    plans = [MpcSettings(bandwidth=5.0).design(G) for G in (neck(), neck(across=1e-9))]
+    # What couples them is a billionth.
+    np.testing.assert_allclose(plans[1].ss()(z), plans[0].ss()(z), rtol=1e-5, atol=1e-6)
+    assert plans[1].arrays[2].shape[1] == 2 * plans[0].arrays[2].shape[1]
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), SIZES)
+@pytest.mark.parametrize(
+    "settings",
+    [LqgSettings(**LIMITS), pytest.param(MpcSettings(**LIMITS), marks=pytest.mark.slow)],
+    ids=["lqg", "mpc"],
+)
+def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, outputs: int, tmp_path: Path) -> None:
+    G: Any = plant(inputs, outputs, seed=1)
+    G = control.StateSpace(G.A, G.B, G.C, G.D, TS, inputs=[f"p{j}" for j in range(inputs)],
+                           outputs=[f"y{i}" for i in range(outputs)])  # fmt: skip
+    controller = settings.design(G)
+    controller.save(tmp_path / "k.npz")
+    block = load(tmp_path / "k.npz").block()
+    assert [port.name for port in block.outputs] == [f"motor_setpoint_{j + 1}" for j in range(inputs)]
+    asked = 0.05 * np.arange(1, outputs + 1)
+    state, x, u, most = block.initial_state(), np.zeros(len(G.A)), np.zeros(inputs), np.zeros(outputs)
+    load_at = 0.1 * np.ones(inputs)
+    for k in range(1500):
+        y = G.C @ x
+        most = np.maximum(most, y) if k < 750 else most
+        state, u = block.step(state, np.concatenate([asked, [0.0], y, u, [1.0, 1.0]]))
+        # A load on the inputs half way.
+        x = G.A @ x + G.B @ (u + (load_at if k >= 750 else 0.0))
+    # Integral action: what is left of modes of half a second after 15 s.
+    np.testing.assert_allclose(G.C @ x, asked, atol=1e-4)
+    # 4 % asked of `lqg`, 2 % of `mpc`, of each step alone; here all step at once.
+    assert (most <= 1.15 * asked.max()).all()
+
+
+def test_a_coupled_design_holds_where_one_for_each_axis_does_not() -> None:
+    """Axes that turn into each other by as much as they move themselves."""
+    G, settings = neck((1.0, 1.0), across=1.0), LqgSettings()
+    whole, apart = settings.design(G), settings.design({"pitch": G[0, 0], "roll": G[1, 1]})
+    # What `lqg` asks of a step of each reference, some of it for the gains within `gain_spread`; the other swings.
+    assert largest(whole, G) < 1.06
+    assert largest(apart, G) > 1.3
+
+
+def largest(controller: Any, G: Any) -> float:
+    """Return the largest angle after a unit step of pitch's reference, on the plant from theta_i, phi_i."""
+    K, T = controller.ss(), controller.arrays[LinearArrays.names().index("T")]
+    turn = redefinition_matrix()[:2] @ np.linalg.inv(T)[:, :2]
+    A = np.block([[G.A + G.B @ turn @ K.D[:, 2:] @ G.C, G.B @ turn @ K.C], [K.B[:, 2:] @ G.C, K.A]])
+    B = np.concatenate([G.B @ turn @ K.D[:, 0], K.B[:, 0]])
+    x, most = np.zeros(len(A)), 0.0
+    for _ in range(500):
+        x = A @ x + B
+        most = max(most, float((G.C @ x[: len(G.A)])[0]))
+    return most
+
+
+def test_a_controller_of_ones_own_is_taken_with_its_plant() -> None:
+    G = plant(3, 2, seed=1)
+    found = taken(G)
+    # K of u = K e in the plant's inputs is T K in its redefined ones.
+    K: Any = lqgsyn(G, load_rate=0.5)
+    K = control.StateSpace(K.A, K.B, found.redefinition[0][:2] @ K.C, found.redefinition[0][:2] @ K.D, TS)
+    controller = CustomSettings(controller=K, **LIMITS).design(G)
+    z = np.exp(1j * np.array([0.3, 3.0]) * TS)
+    np.testing.assert_allclose(controller.ss()(z)[:, :2], K(z), rtol=1e-9)
+    with pytest.raises(SettingsError, match="the loop is not stable around sample 0 of 1"):
+        CustomSettings(controller=K * 100.0, **LIMITS).design(G)
+    with pytest.raises(SettingsError, match="need one `controller` of output_1 and output_2"):
+        CustomSettings(controller={"pitch": K[0, 0], "roll": K[1, 1]}, **LIMITS).design(G)
+
+
+@pytest.fixture(scope="module")
+def subspace() -> Any:
+    excitation = signal("eq22", duration=40.0)
+    return Subspace(order=4).fit(record(excitation, VirtualNeck(NeckParameters.preset("paper")), seed=1))
+
+
+@pytest.mark.parametrize(
+    "settings", [LqgSettings(coupled=True), MpcSettings(coupled=True, bandwidth=5.0)], ids=["lqg", "mpc"]
+)
+def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, subspace: Any) -> None:
+    controller = settings.design(subspace)
+    plants = taken(subspace, asked=True).rows
+    late = tuple(row.delayed(settings.least_delay) for row in plants)
+    made = controller.ss()
+    A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)
+    assert np.abs(np.linalg.eigvals(A)).max() < 1.0
+    at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
+    # Integral action; the slowest modes that nothing shows are within 1e-3 of the border.
+    np.testing.assert_allclose(at_rest, np.eye(2), atol=1e-6)
+
+
+UNSTABLE = control.StateSpace(np.diag([1.1, 0.5, 0.5]), np.ones((3, 3)), np.ones((2, 3)), np.zeros((2, 3)), TS)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            control.StateSpace(-np.eye(3), np.eye(3), np.eye(3)[:2], np.zeros((2, 3))),
+            "must be discrete, for a",
+        ),
+        (UNSTABLE, r"not stable \(spectral radius 1.1000\).*`lqgsyn`"),
+        (plant(1, 2), "1 input.s. cannot bring 2 output.s. to references of their own: they are too few"),
+        (plant(3, 2) * 0.0, "`output_1` answers to none of them at rest"),
+        (plant(9, 2), "`motors.names` must hold 1 to 8 names; got 9"),
+        (plant(3, 2), "gives no `motors.setpoint_min` and `setpoint_max`.*or give `position_limit` in 1"),
+        (control.StateSpace(0.5 * np.eye(2), np.ones((2, 3)), np.eye(2), np.ones((2, 3)), TS), "strictly proper"),
+    ],
+)
+@pytest.mark.parametrize("settings", [LqgSettings(), MpcSettings()], ids=["lqg", "mpc"])
+def test_what_cannot_be_is_one_line(settings: Any, source: Any, message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        settings.design(source)
+
+
+def test_other_kinds_say_who_takes_it() -> None:
+    with pytest.raises(SettingsError, match="`lqg`, `mpc` and `custom` take systems of any size"):
+        PidSettings().design(plant(3, 2))
+    with pytest.raises(SettingsError, match="`coupled` needs one model with a state space"):
+        LqgSettings(coupled=True).design([neck()])
