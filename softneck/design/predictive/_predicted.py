@@ -104,6 +104,19 @@ def predicted_plants(settings: _Settings, model: HasTransferFunctions) -> Pair:
     return plants
 
 
+def with_taken(made: S, settings: Any, model: HasTransferFunctions) -> S:
+    """Return a controller that says what of the paper's neck, and not of this plant, it takes for nobody said other."""
+    plants = [axis_plant(model, axis) for axis in robot_of(model).outputs.names]
+    late = [plant.delayed(settings.least_delay) for plant in plants]
+    changed = {"least_delay": any(item.delay > plant.delay for item, plant in zip(late, plants, strict=True))}
+    for name in ("small_move_pole", "taut_pole"):
+        pole = float(getattr(settings, name))
+        changed[name] = pole > 0.0 and any(plant.faster(pole) is not plant for plant in plants)
+    taken = {name: float(getattr(settings, name)) for name, changes in changed.items()
+             if changes and isinstance(getattr(settings, name), NeckDefault)}  # fmt: skip
+    return replace(made, design={**made.design, "assumed": taken})
+
+
 def plant_of(model: Any, *, coupled: bool) -> Any:
     """Return what is to be predicted of a model or a `control` system: one plant for each axis, or a coupled one."""
     whole = coupled_plant(model, asked=coupled)
@@ -126,21 +139,6 @@ def families(nominal: Pair, small_move_pole: float) -> list[Pair]:
         return [nominal]
     fast = tuple(plant.faster(small_move_pole) for plant in nominal)
     return [nominal] if fast == nominal else [nominal, fast]
-
-
-def taken_of_neck(settings: Any, model: HasTransferFunctions) -> dict[str, float]:
-    """Return what of the paper's neck, and not of this plant, a design takes where nobody says otherwise."""
-    plants = [axis_plant(model, axis) for axis in robot_of(model).outputs.names]
-    late = [plant.delayed(settings.least_delay) for plant in plants]
-    changed = {"least_delay": any(item.delay > plant.delay for item, plant in zip(late, plants, strict=True))}
-    for name in ("small_move_pole", "taut_pole"):
-        pole = float(getattr(settings, name))
-        changed[name] = pole > 0.0 and any(plant.faster(pole) is not plant for plant in plants)
-    return {
-        name: float(getattr(settings, name))
-        for name, changes in changed.items()
-        if changes and isinstance(getattr(settings, name), NeckDefault)
-    }
 
 
 def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> AnyAxis:

@@ -35,7 +35,7 @@ from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance, effects
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
-from ._predicted import families, plant_of, predicted_plants, settings_for, settings_of_robot, taken_of_neck, weighed
+from ._predicted import families, plant_of, predicted_plants, settings_for, settings_of_robot, weighed, with_taken
 from ._prediction import Problem, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
 from ._scenarios import chosen_scenarios, sample_pairs
@@ -228,8 +228,7 @@ class MpcSettings(Shown):
         robot, settings = robot_of(plant), settings_for(self, plant)
         limits = limits_of(settings, robot)
         if robot.is_neck and not isinstance(plant, CoupledPlant):
-            made, assumed = settings._designed(plant, limits), taken_of_neck(settings, plant)
-            return replace(made, design={**made.design, "assumed": assumed})
+            return with_taken(settings._designed(plant, limits), settings, plant)
         whole = plant if isinstance(plant, CoupledPlant) else uncertain_plant(plant)
         settings = settings if robot.is_neck else settings_of_robot(settings, whole)
         return settings._designed(sized_plant(whole, limits, weighed(whole)), limits)
