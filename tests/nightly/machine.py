@@ -26,7 +26,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "nightly"
-MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can", "can_raw", "can_dev", "vcan", "sja1000", "kvaser_pci")
+MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can", "can_raw", "can_bcm", "can_dev", "vcan", "sja1000",
+           "kvaser_pci")  # fmt: skip
 TOOLS = ("qemu-system-x86_64", "busybox", "modprobe", "cpio", "ip", "apt-get", "dpkg-deb")
 SHARE = "trans=virtio,version=9p2000.L,msize=512000,cache=loose,ro"
 COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
