@@ -22,8 +22,10 @@ from softneck.signals import (
     parse_layout,
     read_layout,
 )
+from softneck.signals.importing._column_shapes import answers, lagged, rates
 from softneck.signals.importing._layout import Source, Term
 from softneck.signals.recording._channels import MOTOR_POSITIONS, known_channels, si_unit
+from softneck.signals.recording._redefinition import redefine
 
 from ..data import LAYOUTS, TS, neck_recording
 
@@ -349,3 +351,29 @@ def test_the_arm_comes_out_as_far_as_its_data_tell(shared_data: Path) -> None:
         for term, other in zip(found.terms, source.terms, strict=True):
             # Set-points are sums fitted to positions that trail them: 0.6 % off at most on this record.
             assert term.factor == pytest.approx(other.factor, rel=0.01)
+
+
+def test_what_leads_the_motors_is_no_angle_however_alike() -> None:
+    x = neck_recording(1500).motor_positions
+    assert x is not None
+    theta, phi = redefine(x)[:, 0], redefine(x)[:, 1]
+    rng = np.random.default_rng(0)
+    # The angle is noisy, so that the command, 3 samples ahead, is more alike.
+    noisy = np.roll(theta, 5) + theta.std() * rng.standard_normal(theta.size)
+    columns: dict[str | int, np.ndarray] = {0: np.roll(theta, -3), 1: noisy, 2: np.roll(phi, 5)}
+    assert lagged(theta, columns[0], 25)[0] > lagged(theta, columns[1], 25)[0] + 0.1
+    found = answers(columns, x, list(columns))
+    assert {axis: column for axis, (column, _) in found.items()} == {"pitch": 1, "roll": 2}
+
+
+def test_a_motor_that_stands_still_hides_no_rates() -> None:
+    x = neck_recording(1500).motor_positions
+    assert x is not None
+    x = x.copy()
+    x[:, 2] = 1e-4 * np.random.default_rng(0).standard_normal(len(x))
+    v = np.gradient(x, TS, axis=0)
+    v[:, 2] = 1e-3 * np.random.default_rng(1).standard_normal(len(x))
+    columns: dict[str | int, np.ndarray] = dict(zip(range(6), np.column_stack([x, v]).T, strict=True))
+    found = rates(columns, np.zeros(len(x), dtype=np.int64))
+    assert found is not None
+    assert found[:2] == ((0, 1, 2), (3, 4, 5))
