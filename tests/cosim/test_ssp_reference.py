@@ -25,7 +25,8 @@ STRUCTURE = f"""<ssd:SystemStructureDescription {SPACES} version="1.0" name="Dec
 </ssv:ParameterSet></ssd:ParameterValues></ssd:ParameterBinding></ssd:ParameterBindings>
 <ssd:Elements><ssd:Component name="decay" source="resources/Dahlquist.fmu"/>
 <ssd:Component name="pass" source="resources/Feedthrough.fmu"/></ssd:Elements>
-<ssd:Connections><ssd:Connection startElement="decay" startConnector="x" endElement="pass" endConnector="Float64_continuous_input">
+<ssd:Connections>
+ <ssd:Connection startElement="decay" startConnector="x" endElement="pass" endConnector="Float64_continuous_input">
   <ssc:LinearTransformation factor="2" offset="-0.25"/></ssd:Connection></ssd:Connections>
 <ssd:Annotations><ssc:Annotation type="softneck"><Master order="jacobi" stepSize="{STEP}"/></ssc:Annotation>
 </ssd:Annotations></ssd:System><ssd:DefaultExperiment startTime="0" stopTime="{END}"/>

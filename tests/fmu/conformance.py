@@ -240,7 +240,8 @@ def command_version(command: str, *arguments: str) -> Callable[[], str]:
             return ""
         done = ran([command, *arguments])
         lines = (done.stdout or done.stderr).strip().splitlines()
-        return lines[0].split(" build date")[0][:60] if lines and not lines[0].startswith("Usage") else "version not said"
+        told = lines and not lines[0].startswith("Usage")
+        return lines[0].split(" build date")[0][:60] if told else "version not said"
 
     return found
 
