@@ -87,6 +87,13 @@ def test_everything_is_on_the_screen() -> None:
     assert any("tension: from the drives' current" in line for line in lines)
 
 
+def test_what_a_change_detector_says_is_on_the_screen_where_there_is_one() -> None:
+    assert "neck of its model" not in _text(_snapshot())
+    assert "fit 91 %   the neck is that of its model" in _text(replace(_snapshot(), change=(0.0, 0.0, 91.2)))
+    text = _text(replace(_snapshot(), change=(1.0, 12.34, 42.0)))
+    assert "fit 42 %   changed since 12.3 s: not the neck of its model; at rest, `softneck adapt`" in text
+
+
 def test_a_fault_is_named_and_what_is_not_known_is_a_dash() -> None:
     fault = Event(103.4, "emergency", 2, "code 2310h")
     one, two, three = _snapshot().drives

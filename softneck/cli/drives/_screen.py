@@ -60,6 +60,15 @@ def _head(picture: dict[str, Any]) -> Text:
     text.append(f"   bus cycle {picture['cycle']}")
     text.append("   validity ")
     text.append(_number(picture["validity"], ".2f"), style="bold red" if picture["validity"] < 0.5 else "none")
+    changed, since, fit = picture["change"]
+    if math.isfinite(changed):
+        text.append(f"\nfit {_number(fit, '.0f')} %   ")
+        if changed > 0.5:
+            asked = "at rest, `softneck adapt` and `softneck tune`"
+            said = f"changed since {_number(since, '.1f')} s: not the neck of its model; {asked}"
+            text.append(said, style="bold yellow")
+        else:
+            text.append("the neck is that of its model")
     if picture["fault"] is not None:
         text.append(f"\n{picture['fault']}", style="bold red")
     return text

@@ -143,6 +143,14 @@ class LoopPilot:
                 return item.slot
         return None
 
+    def slots_of(self, ports: tuple[str, ...]) -> tuple[int | None, ...]:
+        """Return where all `ports` of the first part that has them lie in `signals`; None each where none has."""
+        for part in self._parts:
+            found = tuple(self.slot(part, port) for port in ports)
+            if None not in found:
+                return found
+        return (None,) * len(ports)
+
     @property
     def reference(self) -> tuple[float, ...]:
         """What the outputs were wanted to be at the last step [rad]."""

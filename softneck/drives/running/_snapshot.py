@@ -41,6 +41,10 @@ class DriveSnapshot:
     emergency: int
 
 
+# Outputs of a change detector.
+_CHANGE = ("changed", "since_s", "fit")
+
+
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """One bus cycle of a run.
@@ -65,6 +69,7 @@ class Snapshot:
         tension_limit: beyond which a run stops [N].
         validity: of the model that stands for the plant in the loop file, told what is measured; NaN without one, for
             an FMU, which nothing runs beside the hardware, and for a model that does not know.
+        change: `changed`, `since_s` [s] and `fit` [%] of a change detector in the loop; NaN without one.
     """
 
     time: float
@@ -86,6 +91,7 @@ class Snapshot:
     tension_limit: float
     outputs: tuple[str, ...] = ("pitch", "roll")
     validity: float = math.nan
+    change: Motors = (math.nan,) * 3
 
     @property
     def run_time(self) -> float:
@@ -115,7 +121,8 @@ class Snapshots:
             index=master.index,
             references=signals[: len(outputs) + 1],
             angles=(math.nan,) * len(outputs) if tilt is None else tilt.values,
-            estimates=signals[len(outputs) + 1 : -1],
+            estimates=signals[len(outputs) + 1 : 2 * len(outputs) + 1],
+            change=signals[2 * len(outputs) + 1 : -1],
             validity=signals[-1],
             setpoints=master.setpoints,
             positions=master.positions,
@@ -139,16 +146,17 @@ class Snapshots:
         )  # fmt: skip
 
     def _signals(self, master: Master, outputs: tuple[str, ...]) -> Motors:
-        """Return the references of the outputs and of co-contraction, the estimates of the outputs, and validity."""
+        """Return references of outputs and co-contraction, estimates of the outputs, what changed, and validity."""
         pilot = master.pilot
         # Beyond the run they would be the last ones, and say something that nobody asks for any more.
         if not isinstance(pilot, LoopPilot) or master.index < 0 or master.supervisor.phase is not Phase.RUNNING:
-            return (math.nan,) * (2 * len(outputs) + 2)
+            return (math.nan,) * (2 * len(outputs) + 2 + len(_CHANGE))
         if pilot is not self._pilot:
             self._pilot = pilot
             wanted = [("reference", f"{name}_reference") for name in (*outputs, "cocontraction")]
             wanted += [("observer", name) for name in outputs]
-            self._slots = tuple(pilot.slot(part, port) for part, port in wanted)
+            found = tuple(pilot.slot(part, port) for part, port in wanted)
+            self._slots = (*found, *pilot.slots_of(_CHANGE))
         signals = pilot.signals
         seen = [math.nan if slot is None else float(signals[slot]) for slot in self._slots]
         return (*seen, pilot.validity)
