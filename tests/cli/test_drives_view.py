@@ -107,7 +107,7 @@ def test_a_change_detector_is_told_by_a_line_and_none_by_no_line() -> None:
         drawn = _text(replace(_snapshot(), change=change))
         return [" ".join(line.strip("│ ").split()) for line in drawn.splitlines() if "neck " in line]
 
-    assert lines((1.0, 12.5, 43.2)) == ["neck changed since 12.5 s fit 43 %"]
+    assert lines((1.0, 12.5, 43.2)) == ["neck changed since 12.5 s: at rest, adapt and tune fit 43 %"]
     assert lines((0.0, 0.0, 93.0)) == ["neck as the model knows it fit 93 %"]
     assert lines((0.0, 0.0, math.nan)) == ["neck as the model knows it fit - %"]
     assert lines((math.nan,) * 3) == []

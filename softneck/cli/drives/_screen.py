@@ -63,7 +63,7 @@ def _head(picture: dict[str, Any]) -> Text:
     text.append(_number(picture["validity"], ".2f"), style="bold red" if picture["validity"] < 0.5 else "none")
     changed, since, fit = picture["change"]
     if math.isfinite(changed):
-        told = f"changed since {since:.1f} s" if changed > 0.5 else "as the model knows it"
+        told = f"changed since {since:.1f} s: at rest, adapt and tune" if changed > 0.5 else "as the model knows it"
         text.append("\nneck ").append(told, style="bold yellow" if changed > 0.5 else "none")
         text.append(f"   fit {_number(fit, '.0f')} %")
     if picture["fault"] is not None:

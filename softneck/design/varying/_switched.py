@@ -27,7 +27,7 @@ from ._operating_points import OperatingPoint
 from ._scheduled import ScheduledSettings
 from ._varying import RUNTIMES, VaryingController
 
-# A dwell time longer than this [s of a neck] is none: payloads come and go sooner.
+# A dwell time longer than this [s of a neck] is not looked for: payloads come and go sooner.
 _LONGEST_DWELL = 30.0
 #: What the estimator says, behind the inputs of every controller.
 INPUTS = (
@@ -80,8 +80,8 @@ class SwitchedSettings(LoopSettings):
         """Return the controller for linear models or families of `payloads`.
 
         Raises:
-            SettingsError: fewer than two payloads, no gains that keep the robustness, gains that do not stand another
-                payload until the estimate has followed, or no dwell time that keeps the switches harmless.
+            SettingsError: fewer than two payloads, no gains that keep the robustness, or gains that do not stand
+                another payload until the estimate has followed.
         """
         plants = [uncertain_plant(item) for item in (plant if isinstance(plant, Sequence) else [plant])]
         if len(plants) != len(self.payloads) or len(plants) < 2 or len(set(self.payloads)) < len(plants):
@@ -114,12 +114,13 @@ class SwitchedSettings(LoopSettings):
         found = self._elsewhere(points, gains, names)
         longest = _LONGEST_DWELL * max(axis.nominal.stretch for axis in plants[0].axes.values())
         needed = max(
-            _least_dwell([pair[axis] for pair in gains], item, self.extra_delay, name, round(longest / Ts))
-            for axis, name in enumerate(names)
+            _least_dwell([pair[axis] for pair in gains], item, self.extra_delay, round(longest / Ts))
+            for axis in range(len(names))
             for point in points
             for item in point.plants[axis]
         )
-        dwell = max(round(self.dwell_time / Ts), needed)
+        shown = needed * Ts <= longest
+        dwell = max(round(self.dwell_time / Ts), needed if shown else 0)
         limits = self.limits(robot)
         arrays = self._inner()._arrays(points, gains, redefinition, limits.constants(Ts)) | {
             "payloads": np.array([point.inclination for point in points]),
@@ -133,7 +134,7 @@ class SwitchedSettings(LoopSettings):
             limits=limits,
             order=self.order,
             inputs=INPUTS,
-            lines=tuple(_lines(points, gains, found, names, (dwell * Ts, needed * Ts))),
+            lines=tuple(_lines(points, gains, found, names, (dwell * Ts, needed * Ts if shown else None))),
             design={
                 "settings": asdict(self),
                 "extra_delay": self.extra_delay,
@@ -141,7 +142,7 @@ class SwitchedSettings(LoopSettings):
                 "gains": [[asdict(axis) for axis in pair] for pair in gains],
                 "largest_ms": found,
                 "dwell_s": dwell * Ts,
-                "dwell_needed_s": needed * Ts,
+                "dwell_needed_s": needed * Ts if shown else None,
             },
         )
 
@@ -212,15 +213,14 @@ def _closed(gains: Gains, plant: AxisPlant, extra_delay: int) -> Matrix:
     return loop
 
 
-def _least_dwell(gains: Sequence[Gains], plant: AxisPlant, extra_delay: int, name: str, most: int) -> int:
+def _least_dwell(gains: Sequence[Gains], plant: AxisPlant, extra_delay: int, most: int) -> int:
     """Return the samples between switches for which none of their sequences drives the loop on one plant off.
+
+    `most + 1` where none up to `most` is found: a slow pole that no controller moves takes that long to die out.
 
     Each controller's loop has V = x' P x that falls on its own. If after so many samples under one controller, and the
     reset of the integral at the switch, the other's V is below what the first one's was, V falls from switch to switch
     (Geromel and Colaneri 2006, SIAM J. Control Optim. 45:1915, theorem 1).
-
-    Raises:
-        SettingsError: none up to `most`.
     """
     from scipy.linalg import solve_discrete_lyapunov
 
@@ -236,23 +236,25 @@ def _least_dwell(gains: Sequence[Gains], plant: AxisPlant, extra_delay: int, nam
         while float(np.linalg.eigvalsh(root.T @ moved.T @ P[there] @ moved @ root).max()) >= 1.0:
             moved, samples = moved @ loops[here], samples + 1
             if samples > most:
-                raise SettingsError(f"{name}: no dwell time up to {most * plant.sample_time:g} s keeps switches "
-                                    "harmless; give payloads nearer to each other.")  # fmt: skip
+                return samples
         longest = max(longest, samples)
     return longest
 
 
 def _lines(
     points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], worst: float, names: tuple[str, ...],
-    dwell: tuple[float, float],
+    dwell: tuple[float, float | None],
 ) -> list[str]:  # fmt: skip
     lines = [
         f"  at {point.inclination:5.3g} kg: "
         + "; ".join(f"{name} K {g.gain:.4g}, Ti {g.integral_time:.3g} s" for name, g in zip(names, pair, strict=True))
         for point, pair in zip(points, gains, strict=True)
     ]
+    shown = "that this is enough for any sequence of them is not shown"
+    if dwell[1] is not None:
+        shown = f"{dwell[1]:.3g} s are shown to be enough for any sequence"
     return [
         *lines,
         f"  largest Ms of the gains of each payload at every other: {worst:.3g}",
-        f"  {dwell[0]:.3g} s between switches at the least; {dwell[1]:.3g} s are shown to be enough for any sequence",
+        f"  {dwell[0]:.3g} s between switches at the least; {shown}",
     ]

@@ -100,8 +100,8 @@ class ChangeDetector(Shown):
             sample_time=self.sample_time,
             arrays=(*own, *(self.arrays[name] for name in self.names), *plant.arrays),
             inputs=inputs,
-            outputs=(*_OUTPUTS, *ports),
-            parameters=ports,
+            outputs=(*_OUTPUTS, *ports[:1]),
+            parameters=ports[1:],
         )
 
     @property
@@ -209,9 +209,9 @@ class ChangeDetector(Shown):
 
 
 def _payload_ports(known: tuple[float, float] | None) -> tuple[Port, ...]:
-    """Return the port of the payload, an output and, at the start, a parameter; none where it is not told."""
+    """Return the output and, for the start, the parameter of a detector that tells the payload; none of others."""
     if known is None:
         return ()
-    least, most = known
-    return (Port(name="payload", unit="kg", start=least, minimum=least, maximum=most,
-                 description="that explains the neck best; at the start what is known of it"),)  # fmt: skip
+    told = Port(name="payload", unit="kg", start=known[0], minimum=known[0], maximum=known[1],
+                description="that explains the neck best")  # fmt: skip
+    return told, replace(told, name="payload_start", description="known at the start")
