@@ -88,7 +88,7 @@ class ChangeDetector(Shown):
     def _block(self) -> Block:
         plant = replace(self.model, arrays=without_validity(self.model.arrays)).block()
         inputs, _ = observer_ports("nonlinear", self.robot)
-        ports = _payload_ports(self.payloads)
+        ports = _payload_port(self.payloads, "payload", "that explains the neck best")
         constants = np.zeros(KALMAN_MORE_LAGS)
         constants[KALMAN_LAG] = 1.0 if self.order == "jacobi" else 0.0
         own = (model_setup(self.robot, plant, self.sample_time, self.stretch, 0.0), constants,
@@ -101,7 +101,8 @@ class ChangeDetector(Shown):
             arrays=(*own, *(self.arrays[name] for name in self.names), *plant.arrays),
             inputs=inputs,
             outputs=(*_OUTPUTS, *ports),
-            parameters=ports,
+            # Variables of an FMU need names of their own.
+            parameters=_payload_port(self.payloads, "payload_start", "known of the payload at the start"),
         )
 
     @property
@@ -208,10 +209,9 @@ class ChangeDetector(Shown):
         return found
 
 
-def _payload_ports(known: tuple[float, float] | None) -> tuple[Port, ...]:
-    """Return the port of the payload, an output and, at the start, a parameter; none where it is not told."""
+def _payload_port(known: tuple[float, float] | None, name: str, description: str) -> tuple[Port, ...]:
+    """Return a port of the payload; none where it is not told."""
     if known is None:
         return ()
     least, most = known
-    return (Port(name="payload", unit="kg", start=least, minimum=least, maximum=most,
-                 description="that explains the neck best; at the start what is known of it"),)  # fmt: skip
+    return (Port(name=name, unit="kg", start=least, minimum=least, maximum=most, description=description),)

@@ -85,7 +85,7 @@ class ChangeSettings:
         spread = _spread(runs, still)
         if payloads(model.arrays) is not None:
             draft = replace(draft, arrays={**draft.arrays, "spread": spread, BANK: self._bank(draft)})
-            runs = [(run.outputs, draft.states(run, payload=payload))
+            runs = [(run.outputs, draft.states(run, payload_start=payload))
                     for run, payload in zip(recording.runs(), told, strict=True)]  # fmt: skip
         scores = [self.scores(*_averages(draft, outputs, states, spread)) for outputs, states in runs]
         period = draft.arrays["chart"][0] * draft.sample_time

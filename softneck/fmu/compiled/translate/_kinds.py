@@ -33,6 +33,7 @@ _NECKS = (
     "softneck.estimation._nonlinear_runtime",
     "softneck.estimation._payload_runtime",
     "softneck.estimation.changes._change_runtime",
+    "softneck.estimation.changes._payload_change_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.design.varying._scheduled_runtime",
     "softneck.design.varying._switched_runtime",
