@@ -1,12 +1,13 @@
 """How soon a change detector over a `greybox` finds a payload, how often it cries wolf, and how it was chosen.
 
-`python benchmarks/changes.py choose|found|alarms [--necks NECK...] [--hours H]`
+`python benchmarks/changes.py choose|found|alarms [--several] [--necks NECK...] [--hours H]`
 
 Models are of 140 s of Eq. 22; thresholds of some 200 s of other motion of the same neck. `choose` leaves each neck out
 in turn: seconds until a payload put on at 60 s is found during the paper's rotation (60 where it is not), and as many
 again for each false alarm over other motion. `found` prints these seconds, and those of the next motion after a hold
 at 14 deg. `alarms` counts false alarms over independent minutes of motion; it goes on where it was stopped
-(`build/changes`).
+(`build/changes`). With `--several` the model is one of 0, 0.5 and 1 kg, so that the detector tells the payload: found
+is then `changed`, or a payload of more than 0.16 kg (half of the least that is put on) where there was less before.
 """
 
 from __future__ import annotations
@@ -18,10 +19,12 @@ from pathlib import Path
 
 import numpy as np
 from adaptation import trained
+from payload import log as logged
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, load
 from softneck.estimation.changes._change import ChangeDetector
 from softneck.estimation.changes._settings import ChangeSettings
+from softneck.identification import GreyBox
 from softneck.signals import Recording, concatenate, signal
 from tests.foreign_necks.choosing import leave_one_out
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record_under
@@ -35,6 +38,8 @@ CANDIDATES = [
     for ratio in (2.0, 4.0)
 ]
 PUT_ON, NEXT = 60.0, 70.0
+# [kg] A payload told beyond it is one that was found.
+TOLD = 0.5 * LOADS[0]
 
 
 def moved(neck: str, P: Matrix, payload: float | Vector, seed: int) -> Recording:
@@ -71,8 +76,24 @@ def baseline(neck: str) -> Recording:
 
 def first(detector: ChangeDetector, run: Recording, since: float) -> float:
     """Return the seconds from `since` to the first alarm; infinite where there is none, below 0 where it is false."""
-    alarms = np.flatnonzero(detector.watch(run)[:, 0] > 0.5)
+    told = detector.watch(run)
+    there = told[:, 0] > 0.5
+    if detector.payloads is not None:
+        there |= told[:, 3] > TOLD
+    alarms = np.flatnonzero(there)
     return float(alarms[0]) * TS - since if alarms.size else np.inf
+
+
+def detector_of(neck: str, *, several: bool) -> ChangeDetector:
+    """Return a detector over a model without payload, or over one of several."""
+    if not several:
+        return ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
+    path = OUT / f"{neck}.several.npz"
+    if not path.exists():
+        OUT.mkdir(parents=True, exist_ok=True)
+        GreyBox().fit([logged(neck, kg).rows(0, 5000) for kg in (0.0, 0.5, 1.0)]).save(path)
+    runs = [moved(neck, P, kg, 5) for kg in (0.0, 0.5, 1.0) for P in motions(3)]
+    return ChangeSettings().design(load(path, role="model"), runs)
 
 
 def loaded(neck: str, P: Matrix, payload: float, seed: int = 9) -> Recording:
@@ -100,23 +121,23 @@ def choose(necks: list[str]) -> None:
               f"{fold.ratios[fold.chosen]:.2f} of the code's; its own best {fold.ratios[fold.best]:.2f}")  # fmt: skip
 
 
-def found(necks: list[str]) -> None:
+def found(necks: list[str], *, several: bool) -> None:
     """Print how soon a payload is found."""
     print(f"{'':22}" + "".join(f"{payload:>9g} kg" for payload in (0.0, *LOADS)))
     for neck in necks:
-        detector = ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
+        detector = detector_of(neck, several=several)
         for name, P, since in (("rotation", rotation(80.0), PUT_ON), ("hold", hold(80.0), NEXT)):
             delays = [first(detector, loaded(neck, P, payload), since) for payload in (0.0, *LOADS)]
             print(f"{neck:14}{name:8}" + "".join(f"{'none' if d == np.inf else f'{d:.2f} s':>12}" for d in delays),
                   flush=True)  # fmt: skip
 
 
-def alarms(necks: list[str], hours: float) -> None:
+def alarms(necks: list[str], hours: float, *, several: bool) -> None:
     """Count false alarms, minute by minute of motion that each seed makes anew; kept where it stopped."""
     OUT.mkdir(parents=True, exist_ok=True)
     for neck in necks:
-        detector = ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
-        path = OUT / f"{neck}.alarms.json"
+        detector = detector_of(neck, several=several)
+        path = OUT / f"{neck}{'.several' if several else ''}.alarms.json"
         done: list[bool] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
         while len(done) < 60.0 * hours:
             seed = 1000 + len(done)
@@ -136,13 +157,14 @@ def main() -> None:
     parser.add_argument("what", choices=["choose", "found", "alarms"])
     parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=list(CHOOSING))
     parser.add_argument("--hours", type=float, default=30.0, help="of motion of each neck")
+    parser.add_argument("--several", action="store_true", help="a model of several payloads, which is told as well")
     asked = parser.parse_args()
     if asked.what == "choose":
         choose(asked.necks)
     elif asked.what == "found":
-        found(asked.necks)
+        found(asked.necks, several=asked.several)
     else:
-        alarms(asked.necks, asked.hours)
+        alarms(asked.necks, asked.hours, several=asked.several)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from ._own_plants import OwnPlant
 from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
 from ._search import SearchResult, search
-from ._steps import Steps, StepTest, run_steps
+from ._steps import UNTOLD, Steps, StepTest, run_steps
 from ._structured import StructuredResult, structured
 from ._tested import TestedAxis, tested_axes
 
@@ -261,6 +261,8 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         absent["observer in the linear checks"] = (
             "margins are of controller and plant alone; the observer is in the loops over the virtual neck"
         )
+    if any(port.name == "payload" for port in controller.block.inputs):
+        absent["steps of other payloads"] = UNTOLD
     if not asked.sampling["search_generations"]:
         absent["stability.searched_radius"] = "the search is switched off (search_generations = 0)"
     if evidence.linear and not evidence.linear[0].intervals:

@@ -13,6 +13,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.design.linear._ports import motor_ranges
+from softneck.loop import BlockPart, Part
 from softneck.loop._result import SETTLING_BAND, shown_unit
 from softneck.robot import Robot
 from softneck.robot._redefined import redefinition_of
@@ -22,6 +23,11 @@ from softneck.signals import TENDON_ANGLES, redefinition_matrix
 from ._plants import Plants, mixing
 
 _RUNTIME = "softneck.verification._sweep_runtime"
+# Of a controller that is told the payload.
+UNTOLD = (
+    "linear plants are stepped with the payload at its start value (0 kg); the estimate is in the loops over plants "
+    "that step"
+)
 METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "load_rms_deg", "coupling_deg")
 # As the lab and `softneck.loop` measure a rise, and the part of the time in which all is settled.
 _RISE, _STEADY_PART = (0.1, 0.9), 0.25
@@ -64,6 +70,14 @@ class Steps:
     motors: np.ndarray
     metrics: dict[str, Vector]
     worse: dict[str, np.ndarray]
+
+
+def eyes_of(observer: Block | None) -> tuple[BlockPart | None, dict[str, Part]]:
+    """Return the observer of a `Loop` and its further parts: a change detector tells no angles and stands beside it."""
+    if observer is None:
+        return None, {}
+    beside = any(port.name == "changed" for port in observer.outputs)
+    return (None, {"detector": BlockPart(observer)}) if beside else (BlockPart(observer), {})
 
 
 def check_ports(block: Block, robot: Robot) -> None:

@@ -22,6 +22,7 @@ from softneck.design import (
     PiSettings,
     ScheduledSettings,
 )
+from softneck.design.varying._switched import SwitchedSettings
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.estimation.changes._settings import ChangeSettings
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
@@ -66,9 +67,9 @@ def recording() -> Recording:
     return Recording(np.arange(2 * ROWS) * TS, TS, channels)
 
 
-def _linear() -> LinearNeck:
+def _linear(stronger: float = 1.0) -> LinearNeck:
     pole = math.exp(-5.293 * TS)  # Eq. 31
-    tf = control.TransferFunction([0.09 * (1.0 - pole)], [1.0, -pole, 0.0, 0.0], TS)
+    tf = control.TransferFunction([0.09 * stronger * (1.0 - pole)], [1.0, -pole, 0.0, 0.0], TS)
     return LinearNeck(pitch=tf, roll=tf)
 
 
@@ -175,12 +176,24 @@ def _change() -> Block:
     return ChangeSettings().design(Rls().fit(recording()), neck_recording(4000, seed=9)).block()
 
 
+def _payload_change() -> Block:
+    run = neck_recording(4000, seed=9)
+    half = run.with_channels(payload=np.full(len(run), 0.5))
+    return ChangeSettings().design(_loaded_greybox_model(), [run, half]).block()
+
+
 def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
 
 def _scheduled() -> Block:
     return ScheduledSettings(inclinations=(0.05, 0.3)).design([_linear(), _linear()]).block()
+
+
+def _switched() -> Block:
+    # Random payloads pass the middle now and then.
+    settings = SwitchedSettings(payloads=(0.0, 0.2), dwell_time=0.1)
+    return settings.design([_linear(), _linear(1.3)]).block()
 
 
 def _adaptive() -> Block:
@@ -308,6 +321,12 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         ["changed", "since_s", "fit"],
         (),
     ),
+    "change_payload": (
+        _payload_change,
+        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
+        ["changed", "since_s", "fit", "payload"],
+        ("payload_start",),
+    ),
     "mpc": (
         _mpc,
         ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"],
@@ -322,6 +341,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         (),
     ),
     "scheduled": (_scheduled, _REFERENCES, MOTORS, ("lead_limit", "least_position", "least_cocontraction")),
+    "switched": (_switched, [*_REFERENCES, "payload", "changed"], MOTORS, ("lead_limit", "least_cocontraction")),
     "adaptive": (_adaptive, _REFERENCES, MOTORS, ("lead_limit", "least_cocontraction", "adapt")),
     "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
     "ncf": (_ncf, _REFERENCES, MOTORS, ("slew_limit",)),

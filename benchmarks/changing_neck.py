@@ -1,0 +1,188 @@
+"""A closed loop on a neck that changes, with the controller that switches by the estimated payload.
+
+`python benchmarks/changing_neck.py [--necks NECK...]`
+
+Of each foreign neck: logs of 100 s of Eq. 22 around a co-contraction of 1.5 rad with 0, 0.5 and 1 kg; a line of each,
+a `greybox` of all three, a detector over it from 200 s of other motion with each, and `switched` at the three. Beside
+it stands `first`: its own gains of 0 kg, never switched. Both follow the same random steps of 6 to 20 deg every 4 s
+(12 deg from upright at the most) on a noisy sensor, without observer. Printed are the largest overshoot of any step in
+% of it, the largest mean error of a step's last second (not while `changed` slows the reference), the time with a
+set-point beyond its limit, the payload that is told at the end, and seconds of `changed`. The angle is the measured
+one: nobody sees a sensor's bias. Creep: tendon 1 grows by 5 % of 0.11 m in 10 minutes, the others by half of that.
+Nothing is chosen here.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from softneck.core import Matrix, Vector, load
+from softneck.design.varying._switched import SwitchedSettings
+from softneck.design.varying._varying import VaryingController
+from softneck.estimation.changes._change import ChangeDetector
+from softneck.estimation.changes._settings import ChangeSettings
+from softneck.identification import GreyBox, Model, Rls
+from softneck.loop import BlockPart, Loop, LoopResult, NeckFault, Part, RecordingReference, SensorFault, run_loop
+from softneck.signals import Recording, signal
+from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record_under
+
+OUT, TS, LOADS, TAUT = Path("build/changing_neck"), 0.02, (0.0, 0.5, 1.0), 1.5
+EVERY, AT = 4.0, 20.0
+# 5 % of 0.11 m on a winch of 7.5 mm.
+CREEP, CREPT = 0.05 * 0.11 / 0.0075, 600.0
+MOTIONS = ("steps", "sine", "rotation", "aprbs", "multisine", "mixed")
+
+
+def moved(neck: str, P: Matrix, payload: float, seed: int) -> Recording:
+    """Return what a specimen does, with the payload that it bears."""
+    run = record_under(np.clip(P + TAUT, -6.0, 6.0), specimen(neck), np.full(len(P), payload), seed=seed)
+    return run.with_channels(payload=np.full(len(P), payload))
+
+
+def specimen(neck: str) -> ForeignNeck:
+    """Return the neck that is looked at."""
+    return ForeignNeck(name=neck, seed=1)
+
+
+@cache
+def logs(neck: str) -> list[Recording]:
+    """Return what models are made from."""
+    return [moved(neck, signal("eq22").set_points[:5000], kg, 1) for kg in LOADS]
+
+
+def several(neck: str) -> Model:
+    """Return the model of all payloads, kept for the next time."""
+    path = OUT / f"{neck}.npz"
+    if not path.exists():
+        OUT.mkdir(parents=True, exist_ok=True)
+        GreyBox().fit(logs(neck)).save(path)
+    return load(path, role="model")
+
+
+def detector(neck: str) -> ChangeDetector:
+    """Return what tells the payload, from other motion than the model's."""
+    motions = [signal(name).set_points if name in MOTIONS[:3] else signal(name, duration=40.0, seed=3).set_points
+               for name in MOTIONS]  # fmt: skip
+    runs = [moved(neck, P, kg, 5) for kg in LOADS for P in motions]
+    return ChangeSettings().design(several(neck), runs)
+
+
+def controller(neck: str) -> VaryingController:
+    """Return the controller of lines at each payload."""
+    lines = [Rls().fit(log) for log in logs(neck)]
+    return SwitchedSettings(payloads=LOADS, least_cocontraction=TAUT, observer=False).design(lines)
+
+
+@dataclass(frozen=True, slots=True)
+class Creeping:
+    """A plant whose tendons grow: what a winch winds up beyond that arrives."""
+
+    part: BlockPart
+
+    @property
+    def inputs(self):
+        """Of the plant."""
+        return self.part.inputs
+
+    @property
+    def outputs(self):
+        """Of the plant."""
+        return self.part.outputs
+
+    @property
+    def sample_time(self) -> float:
+        """Of the plant [s]."""
+        return self.part.sample_time
+
+    @property
+    def role(self) -> str:
+        """Of the plant."""
+        return self.part.role
+
+    def start(self, time: float, parameters: dict[str, float]) -> Vector:
+        """Begin with tendons as they were."""
+        return self.part.start(time, parameters)
+
+    def advance(self, time: float, inputs: Vector) -> Vector:
+        """Step the plant with motors that are behind by what their tendons have grown."""
+        grown = CREEP * min(1.0, time / CREPT) * np.array([1.0, 0.5, 0.5])
+        less = inputs.copy()
+        less[:3] -= grown
+        found = self.part.advance(time, less)
+        at = [port.name for port in self.outputs].index("motor_position_1")
+        # The encoder sits on the motor.
+        found[at : at + 3] += grown
+        return found
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def targets(seconds: float) -> Matrix:
+    """Return a tilt (steps, 2) [rad] for every `EVERY`, each a step of at least 6 deg from the one before."""
+    rng, found = np.random.default_rng(7), [np.zeros(2)]
+    while len(found) < round(seconds / EVERY):
+        angle, size = rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(0.0, 12.0))
+        there = size * np.array([np.cos(angle), np.sin(angle)])
+        if np.radians(6.0) <= np.linalg.norm(there - found[-1]) <= np.radians(20.0):
+            found.append(there)
+    return np.array(found)
+
+
+def run(neck: str, case: str, judged: VaryingController, watch: ChangeDetector, *, told: bool) -> LoopResult:
+    """Return a closed loop."""
+    seconds = CREPT if case == "creep" else 60.0
+    wanted = targets(seconds)
+    block = specimen(neck).block(noise_seed=11)
+    plant: Part = Creeping(BlockPart(block)) if case == "creep" else BlockPart(block)  # pyright: ignore[reportAssignmentType]
+    faults = {
+        "put on": (NeckFault(start=AT, values={"payload": 1.0}),),
+        "taken off": (NeckFault(start=0.0, duration=AT, values={"payload": 1.0}),),
+        "bias 2 deg": (SensorFault(kind="bias", start=AT, axis="pitch", size=np.radians(2.0)),),
+    }
+    unsaid = {} if told else {"controller": {"payload": 0.0}}
+    return run_loop(Loop(
+        plant=plant, controller=BlockPart(judged.block()), duration=seconds, faults=faults.get(case, ()),
+        reference=RecordingReference(time=np.arange(len(wanted)) * EVERY, pitch=wanted[:, 0], roll=wanted[:, 1],
+                                     cocontraction=np.full(len(wanted), TAUT)),
+        others={"watch": BlockPart(watch.block())}, other_inputs=unsaid,
+    ))  # fmt: skip
+
+
+def judge(found: LoopResult, seconds: float) -> str:
+    """Return what a loop is worth."""
+    y = np.column_stack([found["pitch_measured"], found["roll_measured"]])
+    wanted, rows = targets(seconds), round(EVERY / TS)
+    over, off = 0.0, 0.0
+    for k in range(2, len(wanted)):
+        way, part = wanted[k] - wanted[k - 1], y[k * rows : (k + 1) * rows]
+        over = max(over, 100.0 * (float(((part - wanted[k - 1]) @ way).max()) / float(way @ way) - 1.0))
+        if not found["changed"][(k - 1) * rows : (k + 1) * rows].any():
+            off = max(off, float(np.degrees(np.linalg.norm(part[-50:].mean(axis=0) - wanted[k]))))
+    P = np.column_stack([found[f"motor_setpoint_{j}"] for j in (1, 2, 3)])
+    beyond = float((np.abs(P) > 6.0 + 1e-9).any(axis=1).sum()) * TS
+    return (f"{over:10.1f} %{off:8.2f} deg{beyond:8.1f} s{found['payload'][-1]:9.2f} kg"
+            f"{float((found['changed'] > 0.5).sum()) * TS:9.1f} s")  # fmt: skip
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=["column", "spring", "foam"])
+    for neck in parser.parse_args().necks:
+        judged, watch = controller(neck), detector(neck)
+        print(f"{neck:22}{'overshoot':>12}{'error':>12}{'beyond':>10}{'payload':>12}{'changed':>11}", flush=True)
+        for case in ("nothing", "put on", "taken off", "creep", "bias 2 deg"):
+            for told in (True, False) if case in ("put on", "taken off") else (True,):
+                found = run(neck, case, judged, watch, told=told)
+                name = f"{case}, {'switched' if told else 'first'}"
+                print(f"{name:22}{judge(found, CREPT if case == 'creep' else 60.0)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
