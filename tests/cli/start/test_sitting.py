@@ -9,7 +9,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,15 @@ def test_other_settings_do_a_step_again_and_are_kept_for_the_next_time(call: Cal
     assert states(call, "--robot", "finger") == [False, False, False]
 
 
+@pytest.fixture
+def heard() -> Iterator[None]:
+    """Ctrl-C arrives, whatever runs the tests: what a shell puts into the background ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize("number", range(3))
 @pytest.mark.parametrize("how", ["before", "after", "swallowed"])
 def test_ctrl_c_at_any_step_ends_in_one_line_and_the_same_command_goes_on(
@@ -338,6 +347,7 @@ def neck_log(folder: Path) -> None:
     pd.DataFrame({"time": neck.time, **motors, **angles}).to_csv(folder / "log.csv", index=False)
 
 
+@pytest.mark.usefixtures("heard")
 @pytest.mark.slow
 def test_ctrl_c_of_a_user_in_steps_at_work(tmp_path: Path) -> None:
     """Once in the import, in the look at the quality and in the identification: each time the same command goes on."""
