@@ -4,7 +4,8 @@
 `mpc_following.py`, and a step of 18 deg of pitch over 8 s, rms of the worse axis [deg], under 0 and 1 kg. `mpc` is over
 the family, `nmpc` over models of 80 s of Eq. 22, around zero or pulled taut by 2 rad of co-contraction. `--told`: over
 a `greybox` of 0, 0.5 and 1 kg, pulled taut, that is told its payload, against linear ones as taut
-(`rise_s=0.2`; with preview the default), and the circle with preview.
+(`rise_s=0.2`; with preview the default), and the circle with preview. `--ahead`: the same over one observer for all,
+over the `greybox`, that looks 50 ms ahead, which all designs know.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from payload import told
 
 from softneck.core import KINDS, load, resolve
 from softneck.design import MpcSettings, NmpcSettings
+from softneck.estimation import KalmanSettings
 from softneck.identification import GreyBox
 from softneck.loop import BlockPart, Loop, run_loop
 from softneck.plant import NeckParameters, VirtualNeck
@@ -44,6 +46,8 @@ from softneck.signals import Recording, signal
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 
 TAUT = 2.0
+# Of an observer over a nonlinear model [s].
+LOOK = 0.05
 # As quick as the linear one's defaults.
 QUICK = NmpcSettings(bandwidth=12.0, reference_time=0.05)
 LARGE = math.radians(18.0)
@@ -112,21 +116,26 @@ def rows(name: str, kind: str) -> Iterator[tuple[str, list[float]]]:
         yield what, errors(on, [settings.design(model) for model in models], common)
 
 
-def rows_told(name: str) -> Iterator[tuple[str, list[float]]]:
-    """Yield the errors of controllers that know the payload, by how taut tendons are."""
+def rows_told(name: str, look: float = 0.0) -> Iterator[tuple[str, list[float]]]:
+    """Yield the errors of controllers that know the payload, by how taut tendons are; `look` is their look-ahead."""
     on, file = neck(name), OUT / f"{name}-taut-greybox.npz"
     if not file.exists():
         GreyBox().fit([recorded(name, kg, TAUT) for kg in PAYLOADS]).save(file, force=True)
     several: Any = load(file)
     models = [told(several, kg) for kg in JUDGED]
+    if look > 0.0:
+        on = replace(on, observer=KalmanSettings().design(several).block())
     for taut in (TAUT, 3.5):
-        pulled = replace(QUICK, minimum_tautness=taut)
-        wish = MpcSettings(minimum_tautness=NeckDefault(taut))
+        wish = MpcSettings(minimum_tautness=NeckDefault(taut), look_ahead=look)
         quick, ahead = (replace(wish, **more).design(on.family) for more in ({"rise_s": 0.2}, {"preview": PREVIEW}))
-        yield f"`nmpc`, payload told, {taut:g} rad", [
-            *errors(on, [pulled.design(model) for model in models], 0.0),
-            *previewed(on, [replace(pulled, preview=PREVIEW).design(model) for model in models]),
-        ]  # fmt: skip
+        # With less dead time as quick as it was is not as quick as it could be.
+        for bandwidth in (QUICK.bandwidth, *((20.0,) if look > 0.0 else ())):
+            pulled = replace(QUICK, minimum_tautness=taut, look_ahead=look, bandwidth=bandwidth)
+            which = f", {bandwidth:g} rad/s" if look > 0.0 else ""
+            yield f"`nmpc`, payload told, {taut:g} rad{which}", [
+                *errors(on, [pulled.design(model) for model in models], 0.0),
+                *previewed(on, [replace(pulled, preview=PREVIEW).design(model) for model in models]),
+            ]  # fmt: skip
         yield f"`mpc`, {taut:g} rad", [*errors(on, [quick] * 2, 0.0), *previewed(on, [ahead] * 2)]
 
 
@@ -144,12 +153,14 @@ def main() -> None:
     parser.add_argument("--necks", nargs="+", choices=(*CHOOSING, *OURS), default=["chain", "column", "spring"])
     parser.add_argument("--kind", default="play", help="of model (play)")
     parser.add_argument("--told", action="store_true", help="controllers that know the payload")
+    parser.add_argument("--ahead", action="store_true", help="the same, over an observer that looks ahead")
     options = parser.parse_args()
+    knows = options.told or options.ahead
     for name in options.necks:
-        columns = ("circle", "step", *(("ahead",) if options.told else ()))
+        columns = ("circle", "step", *(("ahead",) if knows else ()))
         heads = [f"{what}, {kg:g} kg" for what in columns for kg in JUDGED]
         print(f"\n| `{name}` | {' | '.join(heads)} |\n|{'---|' * (1 + len(heads))}")
-        for what, found in rows_told(name) if options.told else rows(name, options.kind):
+        for what, found in rows_told(name, LOOK if options.ahead else 0.0) if knows else rows(name, options.kind):
             print(f"| {what} | " + " | ".join(f"{value:.2f}" for value in found) + " |", flush=True)
 
 

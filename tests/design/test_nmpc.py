@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import State, load_functions, load_runtime
 from softneck.signals import Recording, signal
 
-from ..data import slow_but
+from ..data import ROOT, slow_but
 
 
 @pytest.fixture(scope="module")
@@ -398,3 +398,29 @@ def test_a_rise_sets_filter_or_bandwidth(network: Model, tmp_path: Path) -> None
     lag = 1.0 / slow.bandwidth
     assert np.log(9.0) * np.hypot(lag, slow.reference_time) == pytest.approx(0.5)
     assert (fast.reference_time, fast.bandwidth) == (0.0, pytest.approx(np.log(9.0) / 0.1))
+
+
+def test_what_the_observer_is_ahead_is_dead_time_that_nobody_sees(tmp_path: Path) -> None:
+    """What a perfect predictor tells is a model whose sensor is two samples quicker."""
+    late, less = load(ROOT / "tests" / "golden" / "greybox.npz"), NmpcSettings(horizon=8, moves=2, lead_limit=12.0)
+    delay, period = late.arrays["sensor"]
+    sooner = replace(late, arrays={**late.arrays, "sensor": np.array([delay - 2.0, period])})
+    # 50 ms are two whole samples.
+    replace(less, look_ahead=0.05).design(late).save(tmp_path / "nmpc.npz")
+    known, blind, found = load(tmp_path / "nmpc.npz"), less.design(late), {}
+    for axis, values in blind.found.items():
+        found[axis] = {**values, "delay": values["delay"] - 2}
+    said = []
+    for controller in (known, replace(less.design(sooner), found=found), blind):
+        block, motors = controller.block(), np.zeros(3)
+        f, state = load_functions(block.runtime, compiled=False), block.initial_state()
+        x, rows = state.values.copy(), []
+        for k in range(5):
+            f.step(
+                block.arrays, state.parameters, x, np.array([0.1, -0.05, 0.2, 0.01 * k, 0.0, *motors, 1.0, 1.0]), motors
+            )
+            rows.append(motors.copy())
+        said.append(np.array(rows))
+    # What is left of the model's way to rest, which it is two samples further on; moves are 0.25 rad.
+    np.testing.assert_allclose(said[0], said[1], atol=1e-6)
+    assert np.abs(said[2] - said[1]).max() > 1e-3

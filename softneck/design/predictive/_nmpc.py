@@ -43,7 +43,7 @@ from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem, controller_arrays
 from ._nmpc_probe import plant_of, probed, require_horizon, risen
 from ._scale import SizedPlant, limits_of, sized_plant
-from ._tuning import move_weight, require_rise, require_solvable, spaced_starts
+from ._tuning import move_weight, require_rise, require_solvable, samples_ahead, spaced_starts
 
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
@@ -84,6 +84,7 @@ class NmpcSettings(Shown):
         cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
         slack_weight: on violations of soft limits, against errors of the angles, squared.
         budget: iterations of the QP solver.
+        look_ahead: by how much the observer of the loop runs ahead of its sensor [s]; whole samples of it count.
         order: of the loop; "jacobi" needs a model that was identified with its delays.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
@@ -107,6 +108,7 @@ class NmpcSettings(Shown):
     cocontraction_weight: float = 1.0
     slack_weight: float = 1e3
     budget: int = 200
+    look_ahead: float = 0.0
     order: str = "sequential"
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
@@ -129,6 +131,7 @@ class NmpcSettings(Shown):
             require_between("minimum_tautness", self.minimum_tautness, -MAX_MOTOR, MAX_MOTOR, "rad")
         require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
         require_whole("budget", self.budget, 1, 10_000)
+        require_between("look_ahead", self.look_ahead, 0.0, 1.0, "s")
         require_one_of("order", self.order, ORDERS)
         if self.order != "sequential":
             raise SettingsError("nonlinear predictive control is for `order=sequential`, as on the hardware.")
@@ -292,6 +295,7 @@ class NmpcController(Shown):
             move_weight=1.5 * max(move_weight(plant, s.bandwidth) for plant in plants),
             cocontraction_weight=s.cocontraction_weight,
             scale=scale,
+            look=samples_ahead(s.look_ahead, self.sample_time),
         )
 
     def initial_state(self, **parameters: float) -> State:
@@ -371,10 +375,8 @@ class NmpcController(Shown):
         model, arrays = nested(self.model)
         settings = asdict(self.settings)
         # Files say what they said before where nobody asks for what came later.
-        for name in (
-            "rise_s",
-            *(("minimum_tautness", "tautness_lever") if settings["minimum_tautness"] is None else ()),
-        ):
+        taut = ("minimum_tautness", "tautness_lever") if settings["minimum_tautness"] is None else ()
+        for name in ("rise_s", *taut, *(() if settings["look_ahead"] else ("look_ahead",))):
             del settings[name]
         header = {
             "kind": "nmpc",

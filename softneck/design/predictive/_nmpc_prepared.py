@@ -43,6 +43,7 @@ class NonlinearProblem:
         move_weight: lambda.
         cocontraction_weight: rho.
         scale: units of another robot than the neck, in which all these numbers are.
+        look: samples by which the observer is ahead of its sensor.
     """
 
     model: Model
@@ -54,6 +55,7 @@ class NonlinearProblem:
     move_weight: float
     cocontraction_weight: float
     scale: Scale | None = None
+    look: int = 0
 
     @property
     def motors(self) -> int:
@@ -111,7 +113,7 @@ class Preparation:
         self.ahead = round(s.preview / Ts)
         self.keep = math.exp(-Ts / s.reference_time) if s.reference_time > 0.0 else 0.0
         self.lead = min(round(s.reference_time / Ts), self.ahead)
-        delay = max(plant.delay for plant in plants)
+        delay = max(0, max(plant.delay for plant in plants) - p.look)
         L = p.horizon + delay + 1
         i = np.arange(1, L + 1)
         self.asked_at = np.minimum(i + self.lead, max(self.ahead, 1)) - 1
@@ -163,6 +165,7 @@ def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
         p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), coast, settle,
         len(block.outputs), -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness, s.tautness_lever,
+        p.look,
         *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),
     ])  # fmt: skip
     return (

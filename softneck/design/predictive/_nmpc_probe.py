@@ -15,6 +15,7 @@ from softneck.identification import Model
 from softneck.identification.models._directions import NECK_SECONDS
 
 from ..linear._ports import ControllerLimits
+from ._tuning import samples_ahead
 
 # A neck's model is moved by this much of a redefined input to learn its gain and its time constant [rad]; another
 # robot's by as much of its motors' range: 2/3 rad of 6 rad to either side.
@@ -111,7 +112,8 @@ def risen(settings: S) -> S:
 
 def require_horizon(settings: Any, plants: Sequence[AxisPlant]) -> None:
     """Raise SettingsError for a horizon that sees no move's effect, or a preview that is more than is remembered."""
-    late, Ts = max(plant.delay for plant in plants), plants[0].sample_time
+    Ts = plants[0].sample_time
+    late = max(0, max(plant.delay for plant in plants) - samples_ahead(settings.look_ahead, Ts))
     if settings.horizon <= late:
         raise SettingsError(
             f"`horizon` {settings.horizon} samples end within the model's dead time of {late}: no move would be seen "

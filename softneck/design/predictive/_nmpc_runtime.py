@@ -19,12 +19,9 @@ from softneck.design.predictive._nmpc_state_runtime import (
     NMPC_MOVE,
     NMPC_NO_BOUND,
     NMPC_NUMBERS,
-    NMPC_OPTIMAL,
     NMPC_OUTPUTS,
-    NMPC_PLAN,
     NMPC_SETTLE,
     NMPC_SLACK,
-    NMPC_SOFT,
     NMPC_TS,
     NmpcArrays,
     NmpcState,
@@ -38,6 +35,7 @@ from softneck.design.predictive._nmpc_state_runtime import (
     nmpc_measured,
     nmpc_range,
     nmpc_shift,
+    nmpc_take,
 )
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
 
@@ -88,6 +86,7 @@ def step(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray
         nmpc_decide(p, nmpc_limits(p, parameters), x, u)
     # In free run, measured or not: what it misses is in `missed`, not in its state.
     nmpc_model(p, x.model, x.held, x.angles)
+    nmpc_look(p, x)
     outputs[:] = x.held
     if p.numbers > NMPC_NUMBERS:
         outputs *= p.setup[p.numbers - p.outputs - 1]
@@ -120,12 +119,21 @@ def nmpc_model(p: NmpcArrays, model: np.ndarray, motors: np.ndarray, angles: np.
         angles /= p.setup[p.numbers - p.outputs :]
 
 
+def nmpc_look(p: NmpcArrays, x: NmpcState) -> None:
+    """Fill the model's `angles` of where the observer will be: its dead time is known, what is held does the rest."""
+    if p.look > 0:
+        later = x.model.copy()
+        for _ in range(p.look):
+            nmpc_model(p, later, x.held, x.angles)
+
+
 def nmpc_settle(p: NmpcArrays, x: NmpcState) -> None:
     """Bring the model to where it had been, had it stood under the held set-points for ever."""
     out = np.zeros(int(p.setup[NMPC_OUTPUTS]))
     member_initialise(p, 0, p.free, x.model, out)
     for _ in range(int(p.setup[NMPC_SETTLE])):
         nmpc_model(p, x.model, x.held, x.angles)
+    nmpc_look(p, x)
 
 
 def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np.ndarray) -> None:
@@ -140,7 +148,7 @@ def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np
     # dx/dz, du/dz, dy/dz: the state of now answers to no move.
     X, U, D = np.zeros((now.shape[0], nz)), np.zeros((2 * n + m, nz)), np.zeros((out.shape[0], nz))
     block = 0
-    for k in range(p.N):
+    for k in range(p.N + p.look):
         if block < p.moves and p.starts[block] == k:
             for j in range(n):
                 held[j] += z[n * block + j]
@@ -150,10 +158,12 @@ def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np
         # Moves that are still to come have moved nothing.
         moved = n * block
         member_tangent(p, 0, p.free, now, u, out, X, U, D, moved)
-        for axis in range(m):
-            size = p.setup[p.numbers - m + axis] if p.numbers > NMPC_NUMBERS else 1.0
-            Y[m * k + axis] = out[axis] / size
-            S[m * k + axis, :moved] = D[axis, :moved] / size
+        row = m * (k - p.look)  # what comes before the first has happened: the observer told it
+        if row >= 0:
+            for axis in range(m):
+                size = p.setup[p.numbers - m + axis] if p.numbers > NMPC_NUMBERS else 1.0
+                Y[row + axis] = out[axis] / size
+                S[row + axis, :moved] = D[axis, :moved] / size
 
 
 def nmpc_quadratic(
@@ -380,18 +390,3 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
         low, high = min(low, held[j]), max(high, held[j])
         held[j] = min(max(held[j] + move, low), high)
     nmpc_shift(p.starts, plan)
-
-
-def nmpc_take(p: NmpcArrays, x: NmpcState, z: np.ndarray, sign: np.ndarray, answered: bool, slack: float) -> None:
-    """Make an answer the plan; without one the previous plan goes on."""
-    if answered:
-        x.plan[:] = z
-        x.active[:] = sign
-        # 1e-6 rad is no violation that anybody could measure.
-        x.status = NMPC_SOFT if slack > 1e-6 else NMPC_OPTIMAL
-        if slack > 1e-6:
-            x.softened += 1.0
-    else:
-        x.active[:] = 0.0
-        x.status = NMPC_PLAN
-        x.shifted += 1.0

@@ -39,9 +39,10 @@ NMPC_SETTLE = 13
 NMPC_OUTPUTS = 14  # of the model
 NMPC_TAUT = 15  # least tautness wished for; -NMPC_NO_BOUND for none
 NMPC_LEVER = 16  # motor that one radian of neck takes up [rad/rad]
+NMPC_LOOK = 17  # samples by which what is measured is ahead of the sensor
 # Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
 # units in SI, that of the motors and one for each output.
-NMPC_NUMBERS = 17
+NMPC_NUMBERS = 18
 
 
 def nmpc_slacks(setup: np.ndarray) -> int:
@@ -76,6 +77,7 @@ class NmpcArrays(Arrays):
     N = value("setup", NMPC_N)
     H = value("setup", NMPC_AHEAD)
     lead = value("setup", NMPC_LEAD)
+    look = value("setup", NMPC_LOOK)
     slacks = value("setup", function=nmpc_slacks)
     outputs = value("T", function=nmpc_outputs, written=True)
     motors = value("T", function=nmpc_motors, written=True)
@@ -95,7 +97,7 @@ class NmpcState(StateVector):
     filtered = cells("outputs + 1", "references behind their filter [rad]")
     seen = cells("outputs + 1", "references last seen [rad]")
     ahead = cells("outputs, H", "references to come [rad]")
-    angles = cells("outputs", "of the model now [rad]")
+    angles = cells("outputs", "of the model now, or as far ahead as the observer looks [rad]")
     missed = cells("window, outputs", "what measurements were above the model, newest first [rad]")
     plan = cells("motors * moves", "moves of the motors [rad]")
     active = cells(
@@ -232,6 +234,21 @@ def nmpc_ahead(p: NmpcArrays, x: NmpcState, ahead: np.ndarray) -> None:
         for i in range(p.future.shape[0]):
             # o_i = o + r (1 + a + ...): the same disturbance as the linear controller's.
             ahead[p.outputs * i + axis] = p.future[i, 0] * level + p.future[i, 1] * rate
+
+
+def nmpc_take(p: NmpcArrays, x: NmpcState, z: np.ndarray, sign: np.ndarray, answered: bool, slack: float) -> None:
+    """Make an answer the plan; without one the previous plan goes on."""
+    if answered:
+        x.plan[:] = z
+        x.active[:] = sign
+        # 1e-6 rad is no violation that anybody could measure.
+        x.status = NMPC_SOFT if slack > 1e-6 else NMPC_OPTIMAL
+        if slack > 1e-6:
+            x.softened += 1.0
+    else:
+        x.active[:] = 0.0
+        x.status = NMPC_PLAN
+        x.shifted += 1.0
 
 
 def nmpc_shift(starts: np.ndarray, plan: np.ndarray) -> None:

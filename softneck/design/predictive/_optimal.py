@@ -54,9 +54,9 @@ class OptimalControl:
 
     def __init__(
         self, model: Model, *, spread: Matrix, weights: Vector, R: Matrix, Q: Matrix, G: Matrix,
-        options: dict[str, Any], scale: Scale | None = None,
+        options: dict[str, Any], scale: Scale | None = None, look: int = 0,
     ) -> None:  # fmt: skip
-        """Make the expression; `options` are ipopt's, `scale` the units of another robot."""
+        """Make the expression; `options` are ipopt's, `scale` the units of another robot; Y from `look` samples on."""
         import casadi as ca
 
         n, m = len(model.robot.motors.names), len(model.robot.outputs.names)
@@ -67,13 +67,13 @@ class OptimalControl:
         x, offset, target, asked = ca.vertsplit(p, [0, *np.cumsum(sizes).tolist()])
         U = ca.reshape(ca.mtimes(_sparse(spread), z) + offset, n, N)
         S, angles, slopes = ca.MX(len(self._keep), nz), [], []
-        for i in range(N):
+        for i in [*range(N), *[N - 1] * look]:
             move = _sparse(spread[n * i : n * i + n])
             x, y, A, B, C, D = linear(x, U[:, i])
             slopes.append(ca.mtimes(C, S) + ca.mtimes(D, move))
             S = ca.mtimes(A, S) + ca.mtimes(B, move)
             angles.append(y)
-        Y, S, w = ca.vertcat(*angles), ca.densify(ca.vertcat(*slopes)), 2.0 * ca.DM(weights)
+        Y, S, w = ca.vertcat(*angles[look:]), ca.densify(ca.vertcat(*slopes[look:])), 2.0 * ca.DM(weights)
         own = ca.mtimes(_sparse(R), z) - asked
         cost = 0.5 * ca.dot(w, (Y - target) ** 2) + ca.sumsqr(own)
         gradient = ca.mtimes(S.T, w * (Y - target)) + 2.0 * ca.mtimes(_sparse(R.T), own)
@@ -169,7 +169,7 @@ class OptimalPart(BlockPart):
             ]),
             Q=np.vstack([np.zeros((nz, m * p.horizon)), self._seen, self._seen]),
             G=np.vstack([np.hstack([sums, np.zeros((nz, slacks))]), -give, give]),
-            options={"tol": 1e-10}, scale=p.scale,
+            options={"tol": 1e-10}, scale=p.scale, look=p.look,
         )  # fmt: skip
 
     def advance(self, time: float, inputs: Vector) -> Vector:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -15,7 +14,7 @@ from softneck.estimation._axis import robot_of
 from ..plants._coupled_axis import AnyAxis
 from ._prediction import Scenario
 from ._scale import SizedPlant
-from ._tuning import Pair
+from ._tuning import Pair, samples_ahead
 
 # The nominal plant counts as much as all other scenarios together.
 _NOMINAL_WEIGHT = 0.5
@@ -37,8 +36,7 @@ class Timing(Protocol):
 def timed(plant: AnyAxis, timing: Timing) -> Any:
     """Return a plant with the dead time that the controller sees: at least so much, less what the observer is ahead."""
     late = plant.delayed(timing.least_delay)
-    # Whole samples: a dead time that is counted too long costs speed, one too short stability. 1e-9: of rounding.
-    return replace(late, delay=max(0, late.delay - math.floor(timing.look_ahead / plant.sample_time + 1e-9)))
+    return replace(late, delay=max(0, late.delay - samples_ahead(timing.look_ahead, plant.sample_time)))
 
 
 def sample_pairs(model: Any, timing: Timing) -> list[Pair]:

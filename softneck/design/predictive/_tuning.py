@@ -31,6 +31,11 @@ _MOST_UNKNOWNS = 120
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 
 
+def samples_ahead(look_ahead: float, sample_time: float) -> int:
+    """Return the whole samples of a look-ahead [s]: dead time counted too long costs speed, too short stability."""
+    return math.floor(look_ahead / sample_time + 1e-9)  # of rounding
+
+
 def move_weight(plant: AnyAxis, bandwidth: float) -> float:
     """Return the weight on moves of an axis' input with which the slowest pole of its LQR is as fast as `bandwidth`.
 
