@@ -83,13 +83,16 @@ def test_the_whole_state_replays_to_the_bit(kind: str, path: Path, running: Any)
 
 
 def test_building_takes_less_than_two_seconds(kind: str, path: Path, tmp_path: Path) -> None:
+    import gc
     import time
 
     block = block_of(kind)
-    begin = time.process_time()
+    # What other tests left to collect, and other threads, are not of building.
+    gc.collect()
+    begin = time.thread_time()
     again = build_fmu(block, tmp_path / path.name)
     # Measured 0.05 to 0.16 s; the bound is the public one. Of the processor: a busy machine makes the wall's longer.
-    assert time.process_time() - begin < 2.0
+    assert time.thread_time() - begin < 2.0
     assert again.read_bytes() == path.read_bytes()
 
 
