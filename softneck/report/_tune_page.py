@@ -80,8 +80,8 @@ def stands_in_the_way(found: Tuned) -> str:
     text = f"What stands in the way is {found.binding}"
     if found.nearest is not None:
         text += f": at {found.nearest:.3g} all the rest would hold"
-    told = [in_words(price) for price in found.prices if price.least is not None]
-    return text + (f" ({'; '.join(told)})." if told else ".")
+    told = in_words(found.prices)
+    return text + (f" ({told})." if told else ".")
 
 
 def _result(found: Tuned, steps: Chart) -> Section:

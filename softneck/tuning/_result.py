@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 
@@ -165,12 +166,18 @@ def _paid_with(
     return None if best is None else best[2]
 
 
-def in_words(price: Price) -> str:
-    """Return a price as a sentence."""
-    what = f"{price.metric} {price.limit:.3g}"
-    if price.least is None:
-        return f"{what}: no candidate keeps the rest"
-    return f"{what} costs {price.other} {price.least:.3g}" + ("" if price.held else " and all else as it is")
+def in_words(prices: Sequence[Price]) -> str:
+    """Return prices as a sentence, one clause for all that are paid with the same; "" where none is known."""
+    told = []
+    for (metric, other, held), alike in groupby(
+        (price for price in prices if price.least is not None),
+        key=lambda price: (price.metric, price.other, price.held),
+    ):
+        items = list(alike)
+        limits, least = (", ".join(f"{value:.3g}" for value in part if value is not None)
+                         for part in ([p.limit for p in items], [p.least for p in items]))  # fmt: skip
+        told.append(f"{metric} {limits} costs {other} {least}" + ("" if held else ", all else as it is"))
+    return "; ".join(told)
 
 
 def _small(name: str, value: float) -> float:

@@ -18,7 +18,7 @@ from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, 
 from softneck.core._kinds import make_settings
 from softneck.tuning import tune
 from softneck.tuning._log import FILE, Job, Log
-from softneck.tuning._result import binding, front, prices
+from softneck.tuning._result import Price, binding, front, in_words, prices
 from softneck.tuning._search import Candidate, given_out, ratio
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._tune import Tuned
@@ -227,6 +227,20 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
     assert binding([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
     good = candidate(neck__rise_s=0.3, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
     assert binding([good, slow], BOUNDS, tested=False) == (None, None)
+
+
+def test_prices_paid_with_the_same_are_one_clause() -> None:
+    def price(limit: float, other: str, least: float | None, held: bool = False) -> Price:
+        return Price(metric="rise", limit=limit, other=other, least=least, held=held)
+
+    paid = [
+        price(0.4, "circle", None),
+        price(0.5, "circle", 3.28),
+        price(0.6, "circle", 3.1),
+        price(2.0, "load", 1.0, True),
+    ]
+    assert in_words(paid) == "rise 0.5, 0.6 costs circle 3.28, 3.1, all else as it is; rise 2 costs load 1"
+    assert in_words(paid[:1]) == ""
 
 
 def test_what_a_requirement_costs() -> None:
