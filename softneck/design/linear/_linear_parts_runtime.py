@@ -60,6 +60,24 @@ class LinearArrays(FilterArrays):
     motors = value("T_inverse", function=linear_motors, written=True)
 
 
+class SeveralArrays(FilterArrays):
+    """The arrays of several linear controllers; those that differ between them stand one below the other."""
+
+    A = array("k * n, n", "as of the linear controller, of every one")
+    Br = array("k * n, outputs", "")
+    By = array("k * n, outputs", "")
+    C = array("k * outputs, n", "")
+    Dr = array("k * outputs, outputs", "")
+    Dy = array("k * outputs, outputs", "")
+    L = array("k * n, outputs", "")
+    align = array("k * n, 2 * outputs", "from angles and theta, phi to the state at rest")
+    rest = array("m, references", "from r to the filter's state at rest")
+    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
+    T_inverse = array("motors, references", "redefined inputs to motors")
+    constants = array("numbers", "as of the linear controller: the sample time [s], of other robots also their ranges")
+    motors = value("T_inverse", function=linear_motors, written=True)
+
+
 class LinearState(StateVector):
     """What every linear controller remembers; kinds add what else they do."""
 

@@ -13,37 +13,23 @@ import math
 import numpy as np
 
 from softneck.design.linear._linear_parts_runtime import (
-    FilterArrays,
     LinearArrays,
     LinearState,
+    SeveralArrays,
     linear_align,
     linear_control,
     linear_exactly,
     linear_finite,
-    linear_motors,
 )
 from softneck.design.linear._rest_runtime import initialise as initialise
-from softneck.runtime._layout import array, cells, value
+from softneck.runtime._layout import array, cells
 
 
-class ScheduledArrays(FilterArrays):
-    """The linear controller's arrays; those that follow the inclination hold one below the other."""
+class ScheduledArrays(SeveralArrays):
+    """Those of every inclination."""
 
-    A = array("k * n, n", "as of the linear controller, of every inclination")
-    Br = array("k * n, outputs", "")
-    By = array("k * n, outputs", "")
-    C = array("k * outputs, n", "")
-    Dr = array("k * outputs, outputs", "")
-    Dy = array("k * outputs, outputs", "")
-    L = array("k * n, outputs", "")
-    align = array("k * n, 2 * outputs", "from angles and theta, phi to the state at rest")
-    rest = array("m, references", "from r to the filter's state at rest")
-    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("motors, references", "redefined inputs to motors")
-    constants = array("numbers", "as of the linear controller: the sample time [s], of other robots also their ranges")
     knots = array("k", "inclinations, rising [rad]")
     memory = array("1", "pole of the inclination's lag")
-    motors = value("T_inverse", function=linear_motors, written=True)
 
 
 class ScheduledState(LinearState):

@@ -12,18 +12,17 @@ import math
 import numpy as np
 
 from softneck.design.linear._linear_parts_runtime import (
-    FilterArrays,
     LinearArrays,
     LinearState,
+    SeveralArrays,
     linear_align,
     linear_control,
     linear_exactly,
     linear_finite,
-    linear_motors,
     linear_reference,
 )
 from softneck.design.linear._rest_runtime import initialise as initialise
-from softneck.runtime._layout import array, cells, value
+from softneck.runtime._layout import array, cells
 
 # Places in `switching`.
 SWITCHED_DWELL = 0  # samples between two switches, at the least
@@ -31,24 +30,11 @@ SWITCHED_MARGIN = 1  # past the middle between two payloads, as a part of their 
 SWITCHED_SLOW = 2  # the most that a reference moves in a sample while the neck is unknown
 
 
-class SwitchedArrays(FilterArrays):
-    """The linear controller's arrays; those that differ between payloads hold one below the other."""
+class SwitchedArrays(SeveralArrays):
+    """Those of every payload."""
 
-    A = array("k * n, n", "as of the linear controller, of every payload")
-    Br = array("k * n, outputs", "")
-    By = array("k * n, outputs", "")
-    C = array("k * outputs, n", "")
-    Dr = array("k * outputs, outputs", "")
-    Dy = array("k * outputs, outputs", "")
-    L = array("k * n, outputs", "")
-    align = array("k * n, 2 * outputs", "from angles and theta, phi to the state at rest")
-    rest = array("m, references", "from r to the filter's state at rest")
-    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("motors, references", "redefined inputs to motors")
-    constants = array("numbers", "as of the linear controller: the sample time [s], of other robots also their ranges")
     payloads = array("k", "rising [kg]")
     switching = array("3", "see SWITCHED_*")
-    motors = value("T_inverse", function=linear_motors, written=True)
 
 
 class SwitchedState(LinearState):
