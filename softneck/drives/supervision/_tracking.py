@@ -4,8 +4,8 @@ The reference model of a loop is a sum of first-order lags of its reference, the
 
     y_m = sum c_i x_i,     tau_i x_i' = r - x_i,
 
-whose weights are least squares over undisturbed runs of the loop. It needs no model of neck or tendons, and holds
-where those do not: near the payload at which tendons hang.
+whose weights are least squares over undisturbed runs of the loop. It needs no model of neck or tendons. Where tendons
+hang a loop goes otherwise: there nothing is compared.
 """
 
 from __future__ import annotations
