@@ -30,7 +30,7 @@ _NOTE = (
     epilog="Example: softneck validate rls.npz nn.npz --data neck.csv --horizon 1,25,inf --html fit.html",
 )
 @click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--data", "data", multiple=True, required=True, type=click.Path(path_type=Path), help="A recording.")
+@click.option("--data", "data", multiple=True, required=True, type=click.Path(path_type=Path), help="Recordings.")
 @click.option("--horizon", default="1,5,25,inf", show_default=True, help="Samples ahead; inf is the free run.")
 @click.option(
     "--motors",
@@ -83,6 +83,11 @@ def command(
     horizons = _horizons(horizon)
     if html is not None:
         refuse_existing(html, force=force)
+    # `--data a.csv b.csv`: click gives what follows the first to MODELs.
+    data += tuple(path for path in models if path.suffix in (".csv", ".parquet"))
+    models = tuple(path for path in models if path not in data)
+    if not models:
+        raise SettingsError("recordings only; expected a model before them: softneck validate MODEL --data REC...")
     loaded = {str(path): load_of(path, robot, role="model") for path in models}
     recordings = {str(path): read_recording(path, robot=robot) for path in data}
     rules = Rules(horizons, motors, include_training, initial, tolerance)

@@ -90,7 +90,7 @@ def test_a_model_that_is_none(call: Call, tmp_path: Path, recording: Path) -> No
     (tmp_path / "m.npz").write_text(recording.read_text())
     refused(call("info", "m.npz"), "m.npz: is not a softneck file", tmp_path, {"m.npz"})
     said = call("validate", recording, "--data", recording, "--json")
-    refused(said, "expected a model, family, controller or observer", tmp_path, {"m.npz"})
+    refused(said, "recordings only; expected a model before them", tmp_path, {"m.npz"})
 
 
 def test_a_model_of_another_version(call: Call, tmp_path: Path, recording: Path, rls_file: Path) -> None:

@@ -1,7 +1,8 @@
-"""What `softneck validate` refuses: one clear line each, exit code 2, nothing on stdout."""
+"""What `softneck validate` takes and refuses: one clear line each, exit code 2, nothing on stdout."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -64,6 +65,16 @@ def test_data_that_cannot_be_judged(call: Call, rls_file: Path, case: str, how: 
     recording, options, message = CASES[case]
     write_recording("bad.csv", recording)
     refused(call("validate", rls_file, "--data", "bad.csv", *options, *how), message)
+
+
+def test_one_data_takes_several_recordings(call: Call, rls_file: Path) -> None:
+    write_recording("a.csv", WHOLE.rows(0, 200))
+    write_recording("b.csv", WHOLE.rows(200, 300))
+    together = call("validate", rls_file, "--data", "a.csv", "b.csv", "--json")
+    apart = call("validate", rls_file, "--data", "a.csv", "--data", "b.csv", "--json")
+    assert together.code == 0
+    assert together.out == apart.out
+    assert len(json.loads(together.out)["models"]) == 2
 
 
 def test_training_data_of_another_kind_is_refused(call: Call, rls_file: Path) -> None:
