@@ -93,19 +93,25 @@ class AxisPlant(Shown):
         ratio = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
         return ratio * z ** (-(self.delay + extra_delay))
 
-    def faster(self, pole: float) -> AxisPlant:
-        """Return the same plant with its slowest pole moved to `pole` [1/s], gain and delay kept; itself if faster.
+    @property
+    def time_constant(self) -> float:
+        """Of the main pole [s]."""
+        poles, main = main_pole(self.numerator, self.denominator)
+        return -self.sample_time / math.log(max(float(np.abs(poles[main])), 1e-9))
 
-        A complex pair is left as it is.
+    def faster(self, pole: float) -> AxisPlant:
+        """Return the same plant with its main pole moved to `pole` [1/s], gain and delay kept; itself if faster.
+
+        A complex pair is left as it is, and so is a slower pole that the output hardly shows: moved away from the zero
+        that hides it, it would multiply the gain of quick motions.
         """
-        poles = np.roots(self.denominator)
-        slowest = complex(poles[int(np.argmax(np.abs(poles)))])
-        moved = float(np.exp(-pole * self.sample_time))
+        poles, main = main_pole(self.numerator, self.denominator)
+        slow, moved = complex(poles[main]), float(np.exp(-pole * self.sample_time))
         # 1e-9: the same pole, but for the rounding of its root.
-        if abs(slowest.imag) > 0.0 or slowest.real <= moved + 1e-9:
+        if abs(slow.imag) > 0.0 or slow.real <= moved + 1e-9:
             return self
-        a = float(slowest.real)
-        rest = np.real(np.poly(np.delete(poles, int(np.argmax(np.abs(poles))))))
+        a = float(slow.real)
+        rest = np.real(np.poly(np.delete(poles, main)))
         numerator = self.numerator * (1.0 - moved) / (1.0 - a)
         return replace(self, numerator=numerator, denominator=np.convolve(rest, [1.0, -moved]))
 
@@ -157,6 +163,20 @@ class AxisPlant(Shown):
         return control.TransferFunction(self.numerator, denominator, self.sample_time)
 
 
+def main_pole(numerator: Vector, denominator: Vector) -> tuple[Vector, int]:
+    """Return the poles of B/A, the slowest first, and which of them makes most of where a step ends.
+
+    B(p)/(A'(p) (1 - p)) is the part of the pole p in the sum that is the static gain (Kailath 1980, sec. 2.2); of two
+    that are nearly alike it is larger for the slower one.
+    """
+    poles = np.roots(denominator)
+    poles = poles[np.argsort(-np.abs(poles), kind="stable")]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        part = np.polyval(numerator, poles) / (np.polyval(np.polyder(denominator), poles) * (1.0 - poles))
+    # A pole that is double to the last bit has no part of its own.
+    return poles, int(np.argmax(np.nan_to_num(np.abs(part), nan=np.inf)))
+
+
 def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
     """Return `axis` ("pitch", "roll" or another robot's output) of a linear model, its dead time split off.
 
@@ -182,7 +202,7 @@ def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
     delay = min(poles_at_zero, denominator.size - numerator.size - 1)
     A = denominator[: denominator.size - delay]
     B = np.concatenate([np.zeros(A.size - 1 - numerator.size), numerator])
-    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _stretch(model, A, float(dt)))
+    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _stretch(model, B, A, float(dt)))
 
 
 def robot_of(source: Any) -> Robot:
@@ -196,13 +216,12 @@ def directions_of(source: Any) -> Matrix:
     return weights_of(source) if own is None else np.asarray(own)
 
 
-def _stretch(model: HasTransferFunctions, denominator: Vector, sample_time: float) -> float:
-    """Return by how much a robot is slower than a neck, by its slowest pole."""
+def _stretch(model: HasTransferFunctions, numerator: Vector, denominator: Vector, sample_time: float) -> float:
+    """Return by how much a robot is slower than a neck, by its main pole."""
     if robot_of(model).is_neck:
         return 1.0
-    radius = float(np.abs(np.roots(denominator)).max(initial=0.0))
-    slowest = -sample_time / math.log(radius) if radius > 0.0 else 0.0
-    return max(slowest, sample_time) / NECK_SECONDS
+    slow = AxisPlant(numerator, denominator, 0, sample_time).time_constant
+    return max(slow, sample_time) / NECK_SECONDS
 
 
 def _check(axis: str, numerator: Vector, denominator: Vector) -> None:

@@ -13,7 +13,6 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_whole
 from softneck.estimation import AxisPlant
 
-from ..plants._coupled_axis import AnyAxis
 from ..plants._step_and_load import StepAndLoad
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import AxisController, ReferenceFilter, assemble
@@ -301,7 +300,7 @@ def filter_numbers(led: ReferenceFilter) -> dict[str, float]:
 
 def _first_filter(plant: AxisPlant) -> int:
     """Return half the plant's lag [samples]: a reference that is faster only runs into the motors' limits."""
-    return min(round(0.5 * slowest_time(plant) / plant.sample_time), _slowest_filter(plant) // 2)
+    return min(round(0.5 * plant.time_constant / plant.sample_time), _slowest_filter(plant) // 2)
 
 
 def _slowest_filter(plant: AxisPlant) -> int:
@@ -320,12 +319,6 @@ def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign |
 def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
     """Return the plant with its gain times `factor`."""
     return replace(plant, numerator=factor * plant.numerator)
-
-
-def slowest_time(plant: AnyAxis) -> float:
-    """Return the time constant [s] of the slowest pole."""
-    radius = float(np.abs(np.roots(plant.denominator)).max(initial=1e-9))
-    return -plant.sample_time / math.log(max(radius, 1e-9))
 
 
 def margins_json(margins: Margins) -> dict[str, float | None]:

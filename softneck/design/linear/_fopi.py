@@ -14,7 +14,7 @@ from softneck.estimation import AxisPlant
 
 from ..plants._uncertain import UncertainAxis
 from ._axis_loop import error_feedback
-from ._axis_settings import AxisDesign, AxisSettings, slowest_time
+from ._axis_settings import AxisDesign, AxisSettings
 from ._fractional import fopi
 
 
@@ -52,7 +52,7 @@ class FopiSettings(AxisSettings):
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.crossover is not None:
             return self._built(axis, self.crossover)
-        lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
+        lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
             lambda speed: self._built(axis, speed), axis, low=0.2 / lag, high=5.0 / lag, what="crossover"
         )

@@ -31,7 +31,7 @@ class LoopSettings:
 
     Attributes:
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
-        small_move_pole: the plant is taken as well with its slowest pole as fast as this [1/s], at the same static
+        small_move_pole: the plant is taken as well with its main pole as fast as this [1/s], at the same static
             gain; 0 for the identified plant alone. Fits to large moves come out slower than small moves are, for
             there the drives run at their current limit.
         position_limit: of each motor [rad].

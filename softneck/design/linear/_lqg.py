@@ -14,7 +14,7 @@ from ..plants._coupled_axis import AnyAxes, realised, times
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
 from ._axis_loop import delayed_form
-from ._axis_settings import AxisDesign, AxisSettings, scaled, slowest_time
+from ._axis_settings import AxisDesign, AxisSettings, scaled
 from ._controller import LinearController
 from ._whole import WholeDesign, fastest, whole_controller
 
@@ -65,7 +65,7 @@ class LqgSettings(AxisSettings):
         spread = {1.0, 1.0 - self.gain_spread, 1.0 + self.gain_spread}
         own = tuple(row.delayed(self.least_delay) for row in plant.own_rows)
         samples = [times(own, gain) for gain in sorted(spread, key=lambda gain: (gain != 1.0, gain))]
-        lag = max(slowest_time(row) + row.delay * row.sample_time for row in nominal)
+        lag = max(row.time_constant + row.delay * row.sample_time for row in nominal)
 
         def built(rate: float) -> WholeDesign:
             return WholeDesign(
@@ -116,7 +116,7 @@ class LqgSettings(AxisSettings):
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.load_rate is not None:
             return self._built(axis, self.load_rate)
-        lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
+        lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
             lambda speed: self._built(axis, speed), axis, low=0.02 / lag, high=100.0 / lag, what="load_rate"
         )

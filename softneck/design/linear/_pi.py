@@ -13,7 +13,7 @@ from softneck.robot._neck_default import NeckDefault
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import ReferenceFilter, assemble, pi_axis
 from ._axis_loop import sensitivities, unstable_samples
-from ._axis_settings import axis_test, filter_numbers, margins_json, slowest, slowest_time
+from ._axis_settings import axis_test, filter_numbers, margins_json, slowest
 from ._controller import LinearController
 from ._loop_settings import LoopSettings
 from ._margins import LOWEST, loop_margins
@@ -81,7 +81,7 @@ class PiSettings(LoopSettings):
         return self.of_robot(uncertain)._designed(uncertain)
 
     def _others(self, plant: UncertainPlant) -> dict[str, Any]:
-        slowest = max(slowest_time(axis.nominal) for axis in plant.axes.values())
+        slowest = max(axis.nominal.time_constant for axis in plant.axes.values())
         return {**LoopSettings._others(self, plant), "reference_time": slowest}
 
     def _designed(self, uncertain: UncertainPlant) -> LinearController:

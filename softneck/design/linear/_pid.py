@@ -15,7 +15,7 @@ from softneck.estimation import AxisPlant
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
 from ._axis_loop import closed_radius, coarse, conditioning_gain
-from ._axis_settings import AxisDesign, AxisSettings, slowest_time
+from ._axis_settings import AxisDesign, AxisSettings
 from ._sweep import Sweep
 
 TUNINGS = ("samples", "placement")
@@ -143,7 +143,7 @@ class PidSettings(AxisSettings):
         from scipy.optimize import minimize
 
         gain = axis.nominal.static_gain
-        lag = slowest_time(axis.nominal)
+        lag = axis.nominal.time_constant
         dead = (axis.nominal.delay + 1 + self.extra_delay) * dt
         judge = _Judge.of(self, axis)
         best: PidGains | None = None

@@ -60,7 +60,7 @@ def least_rise(plant: AxisPlant, test: StepAndLoad, size: float | None = None) -
     from scipy.signal import lfilter
 
     dt = plant.sample_time
-    rows = math.ceil(_LONG * max(lag_of(plant), test.position_limit / test.slew_limit * dt) / dt)
+    rows = math.ceil(_LONG * max(plant.time_constant, test.position_limit / test.slew_limit * dt) / dt)
     u = np.minimum(test.slew_limit * np.arange(1, rows + 1), test.position_limit)
     y = np.asarray(lfilter(np.append(0.0, plant.numerator), plant.denominator, u)) * math.copysign(
         1.0, plant.static_gain
@@ -133,7 +133,7 @@ def _rise_with(
     reference: ReferenceFilter, asked: float, axis: AxisController, plant: AxisPlant, extra_delay: int
 ) -> float:
     dt = plant.sample_time
-    long = _LONG * max(asked, lag_of(plant), (plant.delay + extra_delay) * dt)
+    long = _LONG * max(asked, plant.time_constant, (plant.delay + extra_delay) * dt)
     test = StepAndLoad(
         reference=1.0, position_limit=_FAR, slew_limit=_FAR, load=0.0, load_at=long, duration=long + dt, sample_time=dt
     )
@@ -141,9 +141,3 @@ def _rise_with(
     with np.errstate(over="ignore", invalid="ignore"):
         y = sweep.run(replace(axis, L=np.zeros_like(axis.Br)), reference, np.zeros_like(axis.Br)).angles[0]
     return rise_time(y, dt) if np.isfinite(y).all() else math.inf
-
-
-def lag_of(plant: AxisPlant) -> float:
-    """Return the time constant [s] of the slowest pole."""
-    radius = float(np.abs(np.roots(plant.denominator)).max(initial=1e-9))
-    return -plant.sample_time / math.log(max(radius, 1e-9))

@@ -82,7 +82,7 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
 def _tuned(G: np.ndarray, z: np.ndarray, plant: AxisPlant, extra_delay: int, bounds: tuple[float, float]) -> Gains:
     """Return the best gains for the responses G (plants, frequencies) at z, in units of the plant's static gain."""
     max_sensitivity, phase_margin = bounds
-    lag = _slowest_time(plant) + (plant.delay + 1 + extra_delay) * plant.sample_time
+    lag = plant.time_constant + (plant.delay + 1 + extra_delay) * plant.sample_time
     best, best_rate = Gains(0.0, lag), 0.0
     for integral_time in lag * _TIMES:
         shape = G * (1.0 + plant.sample_time / integral_time / (z - 1.0))
@@ -160,12 +160,6 @@ def _keeps(loops: Matrix, max_sensitivity: float, phase_margin: float) -> bool:
     below = np.abs(loops) < 1.0
     crossing = loops[:, 1:][~below[:, :-1] & below[:, 1:]]
     return bool(np.all(np.abs(np.angle(-crossing)) >= phase_margin))
-
-
-def _slowest_time(plant: AxisPlant) -> float:
-    """Return the time constant [s] of the slowest pole."""
-    radius = float(np.abs(np.roots(plant.denominator)).max(initial=1e-9))
-    return -plant.sample_time / math.log(max(radius, 1e-9))
 
 
 def _step_response(plant: AxisPlant, extra_delay: int, gains: Gains, rows: int, scale: float) -> Vector:

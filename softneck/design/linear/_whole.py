@@ -13,7 +13,7 @@ from softneck.core import Matrix, SettingsError
 
 from ..plants._coupled_axis import AnyAxes, closed, radius, sensitivity
 from ._assembly import ReferenceFilter, assemble_whole
-from ._axis_settings import AxisSettings, _slowest_filter, slowest_time
+from ._axis_settings import AxisSettings, _slowest_filter
 from ._controller import LinearController
 from ._margins import LOWEST, frequencies
 from ._rise import rise_time
@@ -122,7 +122,7 @@ def _steps(made: WholeDesign, plants: AnyAxes, extra_delay: int, time: float) ->
     """Return each output (rows, outputs) after a unit step of its own reference alone, no limit acting."""
     A, B, C = closed(made.parts, plants, extra_delay)
     Ts, m = plants[0].sample_time, len(plants)
-    slowest = max(slowest_time(plant) for plant in plants)
+    slowest = max(plant.time_constant for plant in plants)
     late = max(plant.delay for plant in plants) + extra_delay
     rows = math.ceil(_LONG * ((slowest + time) / Ts + late))
     keep, at = ReferenceFilter(time).pole(Ts), 0.0
@@ -137,9 +137,9 @@ def _steps(made: WholeDesign, plants: AnyAxes, extra_delay: int, time: float) ->
 def _least_filter(settings: AxisSettings, made: WholeDesign) -> float:
     """Return the least time [s], from half the plant's lag on, with which no sample overshoots by more."""
     plants, Ts = made.samples[0], made.samples[0][0].sample_time
-    slowest: Any = max(plants, key=slowest_time)
+    slowest: Any = max(plants, key=lambda plant: plant.time_constant)
     high = _slowest_filter(slowest)
-    low = min(round(0.5 * slowest_time(slowest) / Ts), high // 2)
+    low = min(round(0.5 * slowest.time_constant / Ts), high // 2)
 
     def keeps(samples: int) -> bool:
         peaks = [_steps(made, each, settings.extra_delay, samples * Ts).max() for each in made.samples]

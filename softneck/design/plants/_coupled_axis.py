@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,6 +45,12 @@ class CoupledAxis:
     def static_gain(self) -> float:
         """Output over its own input in steady state."""
         return float(np.linalg.solve(np.eye(self.order) - self.A, self.B[:, self.axis])[0])
+
+    @property
+    def time_constant(self) -> float:
+        """Of the slowest pole [s]."""
+        radius = float(np.abs(np.linalg.eigvals(self.A)).max(initial=0.0))
+        return -self.sample_time / math.log(max(radius, 1e-9))
 
     def observable_form(self) -> tuple[Matrix, Vector, Vector]:
         """Return A (n, n), B (n,) of its own input, C (n,), as of a plant that is not coupled."""

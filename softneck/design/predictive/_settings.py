@@ -119,7 +119,7 @@ class MpcSettings(Shown):
             input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
-        small_move_pole: the design must hold as well where the slowest pole is as fast as this [1/s]; 0 for the
+        small_move_pole: the design must hold as well where the main pole is as fast as this [1/s]; 0 for the
             identified plant alone.
         taut_pole: an identified neck is predicted as it moves while its tendons are taut: its slowest pole at least as
             fast as this [1/s], its static gain the largest of its family. 0 for as identified. Slack tendons make fits

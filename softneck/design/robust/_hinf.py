@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core import SettingsError, require_between, require_one_of, require_positive
 
 from ..linear._axis_loop import error_feedback
-from ..linear._axis_settings import AxisDesign, AxisSettings, slowest_time
+from ..linear._axis_settings import AxisDesign, AxisSettings
 from ..plants._uncertain import UncertainAxis
 from ._synthesis import METHODS, Synthesis, mixsyn
 from ._weights import makeweight, ucover
@@ -61,7 +61,7 @@ class HinfSettings(AxisSettings):
         W3 = self._uncertainty(axis)
         if self.bandwidth is not None:
             return self._built(axis, self.bandwidth, W3)
-        lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
+        lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
             lambda speed: self._built(axis, speed, W3), axis, low=0.05 / lag, high=5.0 / lag, what="bandwidth"
         )

@@ -12,7 +12,7 @@ from softneck.core import SettingsError, require_positive
 
 from ..linear._assembly import AxisController
 from ..linear._axis_loop import conditioning_gain
-from ..linear._axis_settings import AxisDesign, AxisSettings, slowest_time
+from ..linear._axis_settings import AxisDesign, AxisSettings
 from ..plants._uncertain import UncertainAxis
 from ._bilinear import drawn_out, to_discrete
 from ._synthesis import ncf_parts
@@ -50,7 +50,7 @@ class NcfSettings(AxisSettings):
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.crossover is not None:
             return self._built(axis, self.crossover)
-        lag = slowest_time(axis.nominal) + axis.nominal.delay * axis.sample_time
+        lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
             lambda speed: self._built(axis, speed), axis, low=0.05 / lag, high=5.0 / lag, what="crossover"
         )
@@ -62,7 +62,7 @@ class NcfSettings(AxisSettings):
         gain = plant.static_gain
         if crossover >= math.pi / dt:
             raise SettingsError(f"`crossover` must be below the Nyquist frequency {math.pi / dt:.4g} rad/s.")
-        time = self.integral_time or slowest_time(plant)
+        time = self.integral_time or plant.time_constant
         shape = control.TransferFunction([1.0, 1.0 / time], [1.0, 0.0])
         w = np.array([crossover])
         size = float(np.abs(plant.response(w) / gain * np.asarray(shape(1j * drawn_out(w, dt))))[0])

@@ -22,7 +22,7 @@ from ..linear._axis_settings import slowest
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import LOWEST, frequencies
-from ..linear._rise import filter_for_lag, lag_of
+from ..linear._rise import filter_for_lag
 from ..linear._tuning import Gains, tune_pi
 from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._operating_points import OperatingPoint, family_points, model_points
@@ -219,7 +219,7 @@ class ScheduledSettings(LoopSettings):
         """Return the reference filters, the last of co-contraction: for `rise_s` at the middle operating point."""
         if self.rise_s is None:
             return (ReferenceFilter(self.reference_time),) * (len(plants) + 1)
-        each = [filter_for_lag(self.rise_s, lag_of(self._followed(plant))) for plant in plants]
+        each = [filter_for_lag(self.rise_s, self._followed(plant).time_constant) for plant in plants]
         return (*each, slowest(each))
 
     def _between(
