@@ -1,12 +1,13 @@
 """Print how fast and how closely `mpc` with its defaults follows on necks that nobody tuned to.
 
-`python benchmarks/mpc_following.py [--necks NECK...] [--set KEY=VALUE...] [--told|--inclined] [--seed N]`: on a family
-of 80 s of Eq. 22 at 0, 0.5 and 1 kg, with the observer's defaults, sequential order, judged on the true angle. Steps of
-10 deg of pitch and of roll; a circle of 12 deg at 1.2 rad/s, rms of the worse axis after the first turn, without and
-with preview. `python benchmarks/leave_one_neck_out.py mpc.taut_pole` (and the other `mpc.` settings) chooses by the
-same runs. With `payload_tautness` the observer is over a `greybox` of the same recordings and estimates the payload,
-which `--told` tells instead. `--inclined` prints what is left to schedule over the inclination: steps of 5 deg of pitch
-from 0, 5, 10 and 15 deg. Families and models are kept in `build/mpc_following`.
+`python benchmarks/mpc_following.py [--necks NECK...] [--set KEY=VALUE...] [--observer|--told|--inclined] [--seed N]`:
+on a family of 80 s of Eq. 22 at 0, 0.5 and 1 kg, with the observer's defaults, sequential order, judged on the true
+angle. Steps of 10 deg of pitch and of roll; a circle of 12 deg at 1.2 rad/s, rms of the worse axis after the first
+turn, without and with preview. `python benchmarks/leave_one_neck_out.py mpc.taut_pole` (and the other `mpc.` settings)
+chooses by the same runs. With `payload_tautness` the observer is over a `greybox` of the same recordings and estimates
+the payload, which `--told` tells instead. With `--observer` it is so in any case, and the design knows it
+(`softneck design mpc FAMILY --observer OBSERVER`). `--inclined` prints what is left to schedule over the inclination:
+steps of 5 deg of pitch from 0, 5, 10 and 15 deg. Families and models are kept in `build/mpc_following`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 from softneck.core import Vector, load
 from softneck.design import MpcController, MpcSettings
 from softneck.design.linear._rise import rise_time
-from softneck.estimation import KalmanSettings
+from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference, metrics, run_loop
 from softneck.loop._reference_parts import AheadReference
@@ -69,12 +70,15 @@ class Specimen:
 
     def watched(self, controller: MpcController) -> Block:
         """Return the observer of a loop: one that tells the payload to a controller that asks for it."""
-        if all(port.name != "payload" for port in controller.block().inputs):
-            return self.observer
+        asks = any(port.name == "payload" for port in controller.block().inputs)
+        return self.estimates_payload().block() if asks else self.observer
+
+    def estimates_payload(self) -> NonlinearObserver:
+        """Return the default observer over a `greybox` of all payloads."""
         file = OUT / f"{self.name}-greybox.npz"
         if not file.exists():
             GreyBox().fit(self.recorded()).save(file, force=True)
-        return KalmanSettings().design(load(file)).block()
+        return KalmanSettings().design(load(file))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,6 +242,7 @@ def main() -> None:
     everywhere = (*CHOOSING, *OURS)
     parser.add_argument("--necks", nargs="+", choices=everywhere, default=everywhere, help=", ".join(everywhere))
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings other than the defaults")
+    parser.add_argument("--observer", action="store_true", help="a design that knows its observer, over a `greybox`")
     parser.add_argument("--told", action="store_true", help="tell the payload, in the place of an estimate")
     parser.add_argument("--inclined", action="store_true", help="steps of 5 deg from several inclinations instead")
     parser.add_argument("--seed", type=int, default=0, help="of the sensor's noise (0)")
@@ -258,9 +263,12 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|")
     for name in options.necks:
         on = neck(name)
+        asked = settings
+        if options.observer:
+            eyes = on.estimates_payload()
+            on, asked = replace(on, observer=eyes.block()), settings.over(eyes)
         for payload in JUDGED:
-            asked = told(settings, payload) if options.told else settings
-            f = followed(on, asked, payload, options.seed)
+            f = followed(on, told(asked, payload) if options.told else asked, payload, options.seed)
             print(f"| `{name}` | {payload:g} | {f.overshoot:.0f} | {f.rise:.2f} | {f.steady:.2f} | {f.circle:.1f} | "
                   f"{f.ahead:.1f} |", flush=True)  # fmt: skip
 

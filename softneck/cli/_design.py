@@ -35,6 +35,11 @@ _LEAST_FIT = 30.0
 @output_option("controller", "CONTROLLER")
 @click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")
 @click.option("--mat", type=click.Path(path_type=Path), metavar="FILE.mat", help="Write it for MATLAB as well.")
+@click.option(
+    "--observer", type=click.Path(path_type=Path), metavar="OBSERVER",
+    help="Of the loop: `mpc` and `nmpc` plan without the delay that it makes up for, and `mpc` with tendons as taut as "
+    "the payload that it tells wants them.",
+)  # fmt: skip
 @robot_option
 @set_option
 @force_option
@@ -45,6 +50,7 @@ def command(
     output: Path | None,
     any_fit: bool,
     mat: Path | None,
+    observer: Path | None,
     robot: str | None,
     settings: tuple[str, ...],
     force: bool,
@@ -58,8 +64,13 @@ def command(
         target(mat, "", force=force, ending=".mat")
         refuse_existing(mat, force=force)
     plants = [_linear(model, robot, any_fit=any_fit) for model in models]
+    asked = apply_settings(resolve(entry.settings), settings)
+    if observer is not None:
+        if not hasattr(asked, "over"):
+            raise SettingsError(f"`--observer` is for mpc and nmpc, and {kind} does not ask for it; leave it out.")
+        asked = asked.over(load_of(observer, robot, role="observer"))
     with progress(f"design {kind}", quiet=as_json):
-        controller = apply_settings(resolve(entry.settings), settings).design(plants[0] if len(plants) == 1 else plants)
+        controller = asked.design(plants[0] if len(plants) == 1 else plants)
     controller.save(path, force=replace)
     if mat is not None:
         if not hasattr(controller, "to_mat"):

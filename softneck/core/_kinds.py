@@ -212,7 +212,8 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
             f"{path}: holds the unknown kind `{header.get('kind')}`; was it written by a newer softneck?"
         )
     if role is not None and kind.role != role:
-        raise FileFormatError(f"{path}: is a {kind.role} ({kind.name}), not a {role}.")
+        is_a, wanted = (f"{'an' if word[0] in 'aeiou' else 'a'} {word}" for word in (kind.role, role))
+        raise FileFormatError(f"{path}: is {is_a} ({kind.name}), not {wanted}.")
     with fitting(path):
         return resolve(kind.result).from_archive(header, arrays)
 

@@ -57,6 +57,9 @@ def test_it_designs_a_switched_one_from_a_list_of_payloads(models: list[str], ca
     ("words", "message"),
     [
         (("ncf", "m0.npz", "--set", "crossover=200.0"), "below the Nyquist frequency"),
+        (("pi", "m0.npz", "--observer", "m0.npz"), "`--observer` is for mpc and nmpc, and pi does not ask for it"),
+        (("mpc", "m0.npz", "--observer", "m0.npz"), "m0.npz: is a model (rls), not an observer"),
+        (("lqg", "m0.npz", "--set", "sample_time=0.01"), "`sample_time` is for continuous plants"),
         (("ncf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),
         (("custom", "m0.npz"), "`controller` must be a control.StateSpace"),
         (("switched", "m0.npz", "m1.npz", "--set", "payloads=[0,0.5,1]"), "got 2 and 3 payload(s)"),

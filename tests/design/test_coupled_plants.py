@@ -224,10 +224,6 @@ UNSTABLE = control.StateSpace(np.diag([1.1, 0.5, 0.5]), np.ones((3, 3)), np.ones
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (
-            control.StateSpace(-np.eye(3), np.eye(3), np.eye(3)[:2], np.zeros((2, 3))),
-            "must be discrete, for a",
-        ),
         (UNSTABLE, r"not stable \(spectral radius 1.1000\).*`lqgsyn`"),
         (plant(1, 2), "1 input.s. cannot bring 2 output.s. to references of their own: they are too few"),
         (plant(3, 2) * 0.0, "`output_1` answers to none of them at rest"),

@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_whole
+from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive, require_whole
 from softneck.estimation import AxisPlant
 
+from ..plants._held import USUAL_PERIOD, held
 from ..plants._step_and_load import StepAndLoad
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import AxisController, ReferenceFilter, assemble
@@ -63,6 +64,8 @@ class AxisSettings(LoopSettings, ABC):
         conditioning: "hanus" (what a limit took away is taken from the reference), or "tuned": of that and of
             predictors that follow the limited output faster, the one that overshoots least on the worst sample in a
             step of 20 deg and in one with half the slew.
+        sample_time: [s] at which a continuous `control` system is held (exact); None for 20 ms. Other plants have their
+            own.
     """
 
     KIND: ClassVar[str]
@@ -73,6 +76,7 @@ class AxisSettings(LoopSettings, ABC):
     gain_spread: float = 0.2
     controller_order: int = 0
     conditioning: str = "tuned"
+    sample_time: float | None = None
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
@@ -83,13 +87,25 @@ class AxisSettings(LoopSettings, ABC):
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         require_whole("controller_order", self.controller_order, 0, 100)
         require_one_of("conditioning", self.conditioning, CONDITIONINGS)
+        if self.sample_time is not None:
+            require_positive("sample_time", self.sample_time, "s")
 
     def design(self, plant: Any) -> LinearController:
-        """Return the controller for `plant`, whatever `uncertain_plant` takes; verified on every sample.
+        """Return the controller for `plant`, whatever `uncertain_plant` takes, continuous `control` systems as well;
+        verified on every sample. `lqg` and `custom` take systems of any size.
 
         Raises:
             SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
         """
+        settings, discrete = held(self, plant, self._period())
+        return settings._around(discrete)
+
+    def _period(self) -> float:
+        """Sample time [s] at which a continuous plant is held where nobody says."""
+        return USUAL_PERIOD
+
+    def _around(self, plant: Any) -> LinearController:
+        """Return the controller for what `uncertain_plant` takes; `lqg` and `custom` take coupled plants as well."""
         uncertain = uncertain_plant(plant)
         return self.of_robot(uncertain)._designed(uncertain)
 

@@ -18,6 +18,7 @@ from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.runtime._bundle import sized
 
+from ..plants._held import held_line
 from ._linear_parts_runtime import LinearArrays
 from ._ports import ControllerLimits, controller_inputs, controller_outputs
 
@@ -117,6 +118,7 @@ class LinearController(Shown):
             f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
             *self.limits.lines(self.sample_time),
+            *held_line(self.design),
             *assumed_lines(self.design.get("assumed", {})),
         ]
         for axis in self.robot.outputs.names:

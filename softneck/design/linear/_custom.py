@@ -62,17 +62,21 @@ class CustomSettings(AxisSettings):
             return self._whole(uncertain.robot, plants, self.redefinition(uncertain))
         return AxisSettings._designed(self, uncertain)
 
-    def design(self, plant: Any) -> LinearController:
-        """Return the controller for `plant`, whatever `uncertain_plant` takes, or a `control` system of any size."""
+    def _around(self, plant: Any) -> LinearController:
         whole: Any = coupled_plant(plant)
         if whole is None or (whole.robot.is_neck and not self._is_whole()):
-            return AxisSettings.design(self, plant)
+            return AxisSettings._around(self, plant)
         if isinstance(self.controller, Mapping):
             raise SettingsError(
                 f"outputs that answer to each other need one `controller` of {' and '.join(whole.names)}."
             )
         samples = [tuple(row.delayed(self.least_delay) for row in whole.own_rows)]
         return self.of_robot(whole)._whole(whole.robot, samples, whole.own_redefinition)
+
+    def _period(self) -> float:
+        # It says itself how often it runs.
+        one = next(iter(self.controller.values())) if isinstance(self.controller, Mapping) else self.controller
+        return float(one.dt)
 
     def _is_whole(self) -> bool:
         return not isinstance(self.controller, Mapping) and self.controller.noutputs > 1

@@ -52,10 +52,9 @@ class LqgSettings(AxisSettings):
         require_between("control_weight", self.control_weight, 1e-4, 1e4)
         require_between("input_noise", self.input_noise, 0.0, 1e4)
 
-    def design(self, plant: Any) -> LinearController:
-        """Return the controller for `plant`, whatever `uncertain_plant` takes, or a `control` system of any size."""
+    def _around(self, plant: Any) -> LinearController:
         whole: Any = coupled_plant(plant, asked=self.coupled)
-        return AxisSettings.design(self, plant) if whole is None else self.of_robot(whole)._whole(whole)
+        return AxisSettings._around(self, plant) if whole is None else self.of_robot(whole)._whole(whole)
 
     def _whole(self, plant: CoupledPlant) -> LinearController:
         """Return the controller of a coupled plant."""

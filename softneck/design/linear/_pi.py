@@ -10,6 +10,7 @@ from softneck.core import Matrix, SettingsError, require_between, require_one_of
 from softneck.estimation._axis import HasTransferFunctions
 from softneck.robot._neck_default import NeckDefault
 
+from ..plants._held import held
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import ReferenceFilter, assemble, pi_axis
 from ._axis_loop import sensitivities, unstable_samples
@@ -47,6 +48,8 @@ class PiSettings(LoopSettings):
             `gain_spread` overshoots by more than `overshoot_pct`. Of another robot the slowest pole's, if not given.
         overshoot_pct: of a step, without limits.
         gain_spread: relative spread of the plant's gain that the filter allows for.
+        sample_time: [s] at which a continuous `control` system is held (exact); None for 20 ms. Other plants have their
+            own.
     """
 
     tuning: str = "nominal"
@@ -58,6 +61,7 @@ class PiSettings(LoopSettings):
     reference_time: float | None = NeckDefault(0.2)
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
+    sample_time: float | None = None
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
@@ -70,6 +74,8 @@ class PiSettings(LoopSettings):
             require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
+        if self.sample_time is not None:
+            require_positive("sample_time", self.sample_time, "s")
 
     def design(self, model: HasTransferFunctions) -> LinearController:
         """Return the controller for `model`, anything with `tf("pitch")` and `tf("roll")`, or of another robot.
@@ -77,8 +83,9 @@ class PiSettings(LoopSettings):
         Raises:
             SettingsError: a model that is not linear, discrete and stable, or no gains that keep the robustness.
         """
-        uncertain = uncertain_plant(model)
-        return self.of_robot(uncertain)._designed(uncertain)
+        settings, plant = held(self, model)
+        uncertain = uncertain_plant(plant)
+        return settings.of_robot(uncertain)._designed(uncertain)
 
     def _others(self, plant: UncertainPlant) -> dict[str, Any]:
         slowest = max(axis.nominal.time_constant for axis in plant.axes.values())

@@ -159,8 +159,8 @@ def _coupled(system: Any, robot: Robot, weights: Matrix | None = None) -> Couple
     dt = system.dt
     if dt is None or isinstance(dt, bool) or not dt > 0.0:
         raise SettingsError(
-            f"the plant must be discrete, for a controller runs at its sample time; its dt is {dt}. Use "
-            "control.sample_system(plant, 0.02), or take it as it is with `lqgsyn`, `mixsyn`, `ncfsyn` or `loopsyn`."
+            f"the plant must say its sample time; its dt is {dt}. Give dt in seconds, or 0: a continuous plant is held "
+            "for the `sample_time` of the settings."
         )
     A, B, C = _sorted(system, robot)
     _check(A, B, C, np.asarray(system.D, dtype=np.float64))

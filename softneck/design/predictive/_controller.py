@@ -18,6 +18,7 @@ from softneck.runtime import Block, Port, State
 
 from ..linear._controller import assumed_lines, robot_in
 from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
+from ..plants._held import held_line
 from . import _mpc_state_runtime as rt
 from ._disturbance import MeasuredDisturbance
 from ._lti import lti
@@ -156,9 +157,10 @@ class MpcController(Shown):
             + " and ".join(f"{value:.3g}" for value in d.get("sensitivity", []))
             + (" (as identified, small moves)" if self.robot.is_neck else " (as identified)"),
         ]
+        lines += _observer_line(settings)
         if d.get("worst_sensitivity") is not None:
             lines.append(f"  Ms at most {d['worst_sensitivity']:.3g} over samples of the family")
-        lines += assumed_lines(d.get("assumed", {}))
+        lines += [*held_line(d), *assumed_lines(d.get("assumed", {}))]
         return "\n".join(lines + [f"  review: {line}" for line in self.review()])
 
     def _limits_line(self) -> str:
@@ -213,6 +215,14 @@ class MpcController(Shown):
             design=dict(header["design"]),
             robot=robot_in(header),
         )
+
+
+def _observer_line(settings: Mapping[str, Any]) -> list[str]:
+    """Return a line on the observer that it is made for, none where it is one that does not look ahead."""
+    ahead, taut = (float(settings.get(name, 0.0)) for name in ("look_ahead", "payload_tautness"))
+    told = [f"looks {1e3 * ahead:g} ms ahead"] * (ahead > 0.0)
+    told += [f"tells the payload, for which tendons are tauter by {taut:g} rad/kg"] * (taut > 0.0)
+    return [f"  for an observer that {' and '.join(told)}"] if told else []
 
 
 _LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "angle_limit", "minimum_tautness")

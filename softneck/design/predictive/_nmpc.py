@@ -18,7 +18,6 @@ from softneck.core import (
     Vector,
     require_between,
     require_one_of,
-    require_positive,
     require_whole,
     to_si,
     write_archive,
@@ -42,8 +41,9 @@ from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_part import NmpcPart, SampleSolution, explain
 from ._nmpc_prepared import NonlinearProblem, controller_arrays
 from ._nmpc_probe import plant_of, probed, require_horizon, risen
+from ._observed import over
 from ._scale import SizedPlant, limits_of, sized_plant
-from ._tuning import move_weight, require_rise, require_solvable, samples_ahead, spaced_starts
+from ._tuning import move_weight, require_given, require_rise, require_solvable, samples_ahead, spaced_starts
 
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
@@ -108,25 +108,20 @@ class NmpcSettings(Shown):
     cocontraction_weight: float = 1.0
     slack_weight: float = 1e3
     budget: int = 200
-    look_ahead: float = 0.0
+    look_ahead: float = NeckDefault(0.0)
     order: str = "sequential"
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
-        require_positive("bandwidth", self.bandwidth, "rad/s")
+        require_given(self, {"bandwidth": "rad/s", "angle_limit": "rad", "disturbance_time": "s",
+                             "cocontraction_weight": "", "slack_weight": ""})  # fmt: skip
         require_whole("window", self.window, 2, 100)
-        if self.disturbance_time is not None:
-            require_positive("disturbance_time", self.disturbance_time, "s")
         require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
         require_rise(self.rise_s, self.reference_time)
         require_between("preview", self.preview, 0.0, 1e6, "s")
         require_whole("horizon", self.horizon, 2, 100)
         require_whole("moves", self.moves, 1, self.horizon)
         require_limits({name: getattr(self, name) for name in LIMITS[:4]})
-        if self.angle_limit is not None:
-            require_positive("angle_limit", self.angle_limit, "rad")
-        for name in ("cocontraction_weight", "slack_weight"):
-            require_positive(name, getattr(self, name))
         if self.minimum_tautness is not None:
             require_between("minimum_tautness", self.minimum_tautness, -MAX_MOTOR, MAX_MOTOR, "rad")
         require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
@@ -135,6 +130,10 @@ class NmpcSettings(Shown):
         require_one_of("order", self.order, ORDERS)
         if self.order != "sequential":
             raise SettingsError("nonlinear predictive control is for `order=sequential`, as on the hardware.")
+
+    def over(self, observer: Any) -> NmpcSettings:
+        """Return the settings for a loop with this observer, which says `look_ahead`."""
+        return over(self, observer)
 
     def design(self, model: Model) -> NmpcController:
         """Return the controller for an identified nonlinear `model`.

@@ -15,7 +15,6 @@ from softneck.core import (
     require_between,
     require_finite,
     require_one_of,
-    require_positive,
     require_whole,
     to_si,
 )
@@ -29,12 +28,14 @@ from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import LIMITS, ControllerLimits, require_limits
 from ..plants._coupled import CoupledPlant
 from ..plants._coupled_axis import radius, sensitivity, times
+from ..plants._held import held
 from ..plants._uncertain import uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._disturbance import MeasuredDisturbance, effects
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
+from ._observed import over
 from ._predicted import families, plant_of, predicted_plants, settings_for, settings_of_robot, weighed, with_taken
 from ._prediction import Problem, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
@@ -45,10 +46,12 @@ from ._tuning import (
     Pair,
     filter_for_rise,
     guard_samples,
+    halved,
     keeps_bounds,
     move_weight,
     observer_trust,
     reference_time,
+    require_given,
     require_rise,
     require_solvable,
     rise,
@@ -58,14 +61,16 @@ from ._tuning import (
 
 # Of Ms at 5 % between frequencies; a peak is missed by less than 1 %.
 _THINNING = 5
-# Bandwidths that are tried [rad/s], and how often the range is halved: to 2 %.
+# Bandwidths that are tried [rad/s].
 _BANDWIDTHS = (1.0, 40.0)
-_HALVINGS = 7
 # Of another robot than the neck, stretched by its slowest pole: the neck's 25 samples without a measurement until the
 # motors hold [s].
 _COAST = 0.5
 # Weight of the default tautness (`benchmarks/leave_one_neck_out.py mpc.tautness_weight`).
 _WISH = 0.3
+# Settings that are positive where they are given, and their units.
+_POSITIVE = {"bandwidth": "rad/s", "angle_limit": "rad", "disturbance_time": "s", "sample_time": "s",
+             "cocontraction_weight": "", "slack_weight": "", "tautness_weight": ""}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -129,6 +134,7 @@ class MpcSettings(Shown):
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
+        sample_time: [s] at which a continuous `control` system is held (exact); None for 20 ms.
     """
 
     bandwidth: float | None = None
@@ -150,7 +156,7 @@ class MpcSettings(Shown):
     least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
     minimum_tautness: float | None = NeckDefault(0.5)
-    payload_tautness: float = 0.0
+    payload_tautness: float = NeckDefault(0.0)
     # Radius of the tendons' attachment over that of the winch: 52 mm / 7.5 mm (lab code; paper, section 3.1).
     tautness_lever: float = NeckDefault(6.93)
     # Light: where tendons must be taut, co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
@@ -166,15 +172,15 @@ class MpcSettings(Shown):
     least_delay: float = NeckDefault(0.1)
     small_move_pole: float = NeckDefault(5.293)
     taut_pole: float = NeckDefault(9.0)
-    look_ahead: float = 0.0
+    look_ahead: float = NeckDefault(0.0)
     coupled: bool = False
     order: str = "sequential"
     observer: bool = True
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
+    sample_time: float | None = None
 
     def __post_init__(self) -> None:
-        if self.bandwidth is not None:
-            require_positive("bandwidth", self.bandwidth, "rad/s")
+        require_given(self, _POSITIVE)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("worst_sensitivity", self.worst_sensitivity, self.max_sensitivity, 10.0)
         if self.reference_time is not None:
@@ -189,15 +195,8 @@ class MpcSettings(Shown):
         require_limits({name: getattr(self, name) for name in LIMITS[:4]})
         require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
         require_between("payload_tautness", self.payload_tautness, 0.0, 12.0, "rad/kg")
-        if self.angle_limit is not None:
-            require_positive("angle_limit", self.angle_limit, "rad")
         if self.minimum_tautness is not None:
             require_finite("minimum_tautness", self.minimum_tautness)
-        if self.disturbance_time is not None:
-            require_positive("disturbance_time", self.disturbance_time, "s")
-        for name in ("cocontraction_weight", "slack_weight", "tautness_weight"):
-            if getattr(self, name) is not None:
-                require_positive(name, getattr(self, name))
         require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
@@ -216,16 +215,21 @@ class MpcSettings(Shown):
         """Samples of the horizon at which the motors move."""
         return spaced_starts(self.horizon, self.moves)
 
+    def over(self, observer: Any) -> MpcSettings:
+        """Return the settings for a loop with this observer, which says `look_ahead` and `payload_tautness`."""
+        return over(self, observer)
+
     def design(self, model: Any) -> MpcController:
         """Return the controller for `model`, a linear model of any robot with its `tf`, or for a `Family`.
-        A discrete `control` system is taken as well, with all that each of its inputs does to each of its outputs.
+        A `control` system is taken as well, with all that each of its inputs does to each of its outputs.
 
         Raises:
-            SettingsError: a model that is not linear, discrete and stable, limits that contradict each other, or a
+            SettingsError: a model that is not linear and stable, limits that contradict each other, or a
                 robustness that nothing keeps.
         """
+        settings, model = held(self, model)
         plant = plant_of(model, coupled=self.coupled)
-        robot, settings = robot_of(plant), settings_for(self, plant)
+        robot, settings = robot_of(plant), settings_for(settings, plant)
         limits = limits_of(settings, robot)
         if robot.is_neck and not isinstance(plant, CoupledPlant):
             return with_taken(settings._designed(plant, limits), settings, plant)
@@ -275,10 +279,7 @@ class MpcSettings(Shown):
                 f"({self.worst_sensitivity:g} on the samples of a family); raise them, or give "
                 "`bandwidth`, with which less of what is measured is believed."
             )
-        for _ in range(_HALVINGS):
-            middle = math.sqrt(low * high)
-            low, high = (middle, high) if keeps(middle) else (low, middle)
-        return low
+        return halved(keeps, low, high)[0]
 
     def _risen(self, model: HasTransferFunctions, nominal: Pair, least: float) -> float:
         """Return the least bandwidth from `least` on with which a step rises as fast as asked without a filter.
@@ -295,10 +296,7 @@ class MpcSettings(Shown):
             return low
         if not rises(high):
             raise SettingsError(f"`rise_s` {self.rise_s:g} is faster than any plan of this plant rises; ask for more.")
-        for _ in range(_HALVINGS):
-            middle = math.sqrt(low * high)
-            low, high = (low, middle) if rises(middle) else (middle, high)
-        return high
+        return halved(lambda bandwidth: not rises(bandwidth), low, high)[1]
 
     def _arrays(self, model: HasTransferFunctions, bandwidth: float) -> tuple[Any, ...]:
         problem = self._problem(model, bandwidth)

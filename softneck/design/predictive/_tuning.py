@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_between
+from softneck.core import Matrix, SettingsError, Vector, require_between, require_positive
 from softneck.estimation import AxisPlant
 from softneck.robot._neck_default import NeckDefault
 
@@ -22,6 +24,8 @@ _WEIGHTS = (-6.0, 6.0)
 # Trust of the observers that are tried.
 _LEAST, FULL_TRUST = 1e-4, 1e3
 _HALVINGS = 18
+# Of a range of 40: to 2 %.
+_NARROWED = 7
 # A step response is judged over this long [s].
 _HORIZON = 4.0
 _SLOWEST_FILTER = 2.0
@@ -29,6 +33,21 @@ _SLOWEST_FILTER = 2.0
 _MOST_UNKNOWNS = 120
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
+
+
+def halved(keeps: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """Return the range from `low`, which keeps something, to `high`, which does not, halved until it is 2 % wide."""
+    for _ in range(_NARROWED):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if keeps(middle) else (low, middle)
+    return low, high
+
+
+def require_given(settings: Any, units: Mapping[str, str]) -> None:
+    """Raise SettingsError for what is given and not positive, of these settings with their units."""
+    for name, unit in units.items():
+        if getattr(settings, name) is not None:
+            require_positive(name, getattr(settings, name), unit)
 
 
 def samples_ahead(look_ahead: float, sample_time: float) -> int:

@@ -1,0 +1,77 @@
+"""Continuous plants as a controller sees them: its set-points held from one sample to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from softneck.core import SettingsError
+
+# Of the paper's loop [s].
+USUAL_PERIOD = 0.02
+
+S = TypeVar("S", bound=Any)
+
+
+def held(settings: S, plant: Any, usual: float = USUAL_PERIOD) -> tuple[S, Any]:
+    """Return the settings and the plant with each continuous `control` system of it made discrete by a zero-order hold.
+
+    At the samples both agree, as set-points are held in between. What is not continuous stays as it is, and so do then
+    the settings; else they, and with them the controller's file, hold the `sample_time` that was taken.
+
+    Args:
+        settings: of a controller.
+        plant: whatever a design takes.
+        usual: what stands where `sample_time` is None [s].
+
+    Raises:
+        SettingsError: a `sample_time` for what has one, or a system that has no state space.
+    """
+    if not _any_continuous(plant):
+        if settings.sample_time is not None:
+            raise SettingsError("`sample_time` is for continuous plants, and this one has its own; leave it out.")
+        return settings, plant
+    period = usual if settings.sample_time is None else settings.sample_time
+    return replace(settings, sample_time=period), _sampled(plant, period)
+
+
+def held_line(design: Mapping[str, Any]) -> list[str]:
+    """Return a line on a continuous plant, none for another."""
+    period = design.get("settings", {}).get("sample_time")
+    return [] if period is None else [f"  the plant is continuous, its inputs held for {1e3 * period:g} ms (exact)"]
+
+
+def _any_continuous(plant: Any) -> bool:
+    if isinstance(plant, Mapping | list | tuple):
+        return any(_any_continuous(item) for item in (plant.values() if isinstance(plant, Mapping) else plant))
+    return _is_continuous(plant)
+
+
+def _is_continuous(plant: Any) -> bool:
+    import control
+
+    return isinstance(plant, control.StateSpace | control.TransferFunction) and control.isctime(plant, strict=True)
+
+
+def _sampled(plant: Any, period: float) -> Any:
+    import control
+
+    if isinstance(plant, Mapping):
+        return {name: _sampled(item, period) for name, item in plant.items()}
+    if isinstance(plant, Sequence):
+        return [_sampled(item, period) for item in plant]
+    if not _is_continuous(plant):
+        return plant
+    try:
+        system: Any = control.ss(plant)
+    except (ValueError, control.ControlMIMONotImplemented) as error:
+        raise SettingsError(
+            "the continuous plant has no state space: each of its transfer functions must be proper, and several "
+            "outputs need slycot, or a control.StateSpace."
+        ) from error
+    if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C, system.D)):
+        raise SettingsError("the plant has entries that are not finite.")
+    return system.sample(period, method="zoh")
