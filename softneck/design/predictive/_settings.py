@@ -24,7 +24,6 @@ from softneck.estimation._settings import ORDERS
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import LIMITS, ControllerLimits, require_limits
 from ..plants._coupled import CoupledPlant
 from ..plants._coupled_axis import radius, sensitivity, times
@@ -36,10 +35,19 @@ from ._disturbance import MeasuredDisturbance, effects
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
 from ._observed import over
-from ._predicted import families, plant_of, predicted_plants, settings_for, settings_of_robot, weighed, with_taken
+from ._predicted import (
+    chosen_scenarios,
+    families,
+    plant_of,
+    predicted_plants,
+    sample_pairs,
+    settings_for,
+    settings_of_robot,
+    weighed,
+    with_taken,
+)  # fmt: skip
 from ._prediction import Problem, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
-from ._scenarios import chosen_scenarios, sample_pairs
 from ._tightening import tightened, trial_of
 from ._tuning import (
     FULL_TRUST,
@@ -47,6 +55,7 @@ from ._tuning import (
     filter_for_rise,
     guard_samples,
     halved,
+    judged_frequencies,
     keeps_bounds,
     move_weight,
     observer_trust,
@@ -59,8 +68,6 @@ from ._tuning import (
     spaced_starts,
 )  # fmt: skip
 
-# Of Ms at 5 % between frequencies; a peak is missed by less than 1 %.
-_THINNING = 5
 # Bandwidths that are tried [rad/s].
 _BANDWIDTHS = (1.0, 40.0)
 # Of another robot than the neck, stretched by its slowest pole: the neck's 25 samples without a measurement until the
@@ -267,7 +274,7 @@ class MpcSettings(Shown):
         )
 
     def _fastest(self, model: HasTransferFunctions, nominal: Pair, samples: list[Pair]) -> float:
-        bounds, w = self._bounds(nominal, samples), self._frequencies(nominal)
+        bounds, w = self._bounds(nominal, samples), judged_frequencies(nominal)
 
         def keeps(bandwidth: float) -> bool:
             return keeps_bounds(self._arrays(model, bandwidth), bounds, self.extra_delay, w)
@@ -360,9 +367,6 @@ class MpcSettings(Shown):
         bounds = [(pair, self.max_sensitivity) for pair in families(nominal, self.small_move_pole)]
         return bounds + [(pair, self.worst_sensitivity) for pair in samples]
 
-    def _frequencies(self, nominal: Pair) -> Vector:
-        return frequencies(nominal[0].sample_time, lowest=LOWEST / slowness(nominal))[::_THINNING]
-
     def _delayed(self, pair: Pair, late: int = 0) -> Pair:
         return tuple(replace(plant, delay=plant.delay + self.extra_delay + late) for plant in pair)
 
@@ -370,7 +374,7 @@ class MpcSettings(Shown):
         self, arrays: tuple[Any, ...], nominal: Pair, samples: list[Pair]
     ) -> tuple[tuple[Any, ...], dict[str, Any]]:
         """Return the arrays with observer and filter, and what was found."""
-        moved, w = families(nominal, self.small_move_pole), self._frequencies(nominal)
+        moved, w = families(nominal, self.small_move_pole), judged_frequencies(nominal)
         bounds = self._bounds(nominal, samples)
         arrays = with_gains(arrays, observer_trust(arrays, bounds, self.extra_delay, w))
         time = self.reference_time

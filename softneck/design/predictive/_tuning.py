@@ -12,6 +12,7 @@ from softneck.core import Matrix, SettingsError, Vector, require_between, requir
 from softneck.estimation import AxisPlant
 from softneck.robot._neck_default import NeckDefault
 
+from ..linear._margins import LOWEST, frequencies
 from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
 from ._arrays import with_filter, with_gains
 from ._lti import system
@@ -24,6 +25,7 @@ _WEIGHTS = (-6.0, 6.0)
 # Trust of the observers that are tried.
 _LEAST, FULL_TRUST = 1e-4, 1e3
 _HALVINGS = 18
+_THINNING = 5
 # Of a range of 40: to 2 %.
 _NARROWED = 7
 # A step response is judged over this long [s].
@@ -33,6 +35,11 @@ _SLOWEST_FILTER = 2.0
 _MOST_UNKNOWNS = 120
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
 _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
+
+
+def judged_frequencies(nominal: Pair) -> Vector:
+    """Return the frequencies [rad/s] of Ms: 5 % apart, so that a peak is missed by less than 1 %."""
+    return frequencies(nominal[0].sample_time, lowest=LOWEST / slowness(nominal))[::_THINNING]
 
 
 def halved(keeps: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
