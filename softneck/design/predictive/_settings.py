@@ -70,8 +70,7 @@ from ._tuning import (
 
 # Bandwidths that are tried [rad/s].
 _BANDWIDTHS = (1.0, 40.0)
-# Of another robot than the neck, stretched by its slowest pole: the neck's 25 samples without a measurement until the
-# motors hold [s].
+# Of another robot, stretched by its slowest pole: without a measurement the motors hold then [s].
 _COAST = 0.5
 # Weight of the default tautness (`benchmarks/leave_one_neck_out.py mpc.tautness_weight`).
 _WISH = 0.3
