@@ -327,5 +327,13 @@ def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: boo
         note(f"the proposed layout is in {more['layout_file']}; edit it and use --layout{robot} if anything is wrong")
     click.echo(
         f"{path}: {len(recording)} rows in {facts['runs']} run(s) at {1e3 * recording.sample_time:g} ms, "
-        f"{missed} with a missed sample"
+        f"{missed} with a missed sample{_one_output(more)}"
     )
+
+
+def _one_output(more: dict[str, Any]) -> str:
+    """Return what the last line says of a log that was taken for that of a robot with one output."""
+    from softneck.signals.importing._doubts import ONE_AXIS
+
+    taken = [doubt["taken"] for doubt in more.get("doubts", ()) if doubt["about"] == ONE_AXIS]
+    return f"; NOT SURE: {taken[0]}, as no column is the other angle" if taken else ""

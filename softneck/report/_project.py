@@ -17,9 +17,12 @@ from softneck.cosim.loops._trust import python_of
 from softneck.cosim.studies._store import read_description
 from softneck.identification.models._directions import bandwidth_of
 from softneck.signals import assess_quality, read_recording
+from softneck.signals.importing._layout_text import doubts_in
 
 # Folders that are no part of a project, beside those whose name begins with a dot.
 _SKIPPED = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")
+# As an import names the layouts that it proposes.
+_LAYOUT = ".layout.toml"
 # Larger logs are no recordings to draw in a page that goes by mail.
 _LARGEST = 200_000_000
 
@@ -36,6 +39,7 @@ class Project:
         certificates: path -> content.
         loops: path -> result of its run.
         studies: path of the folder -> (description, runs).
+        doubts: path of a layout -> what its import was not sure of.
         problems: path -> why it could not be read or run.
     """
 
@@ -49,6 +53,7 @@ class Project:
     certificates: dict[str, Any] = field(default_factory=dict)
     loops: dict[str, Any] = field(default_factory=dict)
     studies: dict[str, Any] = field(default_factory=dict)
+    doubts: dict[str, tuple[str, ...]] = field(default_factory=dict)
     problems: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -78,7 +83,9 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
         name = path.relative_to(root).as_posix()
         progress(number / len(files), name)
         try:
-            if run_loops or path.suffix.lower() != ".toml":
+            if path.name.endswith(_LAYOUT):
+                _layout(project, path, name)
+            elif run_loops or path.suffix.lower() != ".toml":
                 _READERS[path.suffix.lower()](project, path, name)
         except SoftneckError as error:
             project.problems[name] = str(error).removeprefix(f"{path}: ")
@@ -106,6 +113,11 @@ def _files(root: Path) -> Iterator[Path]:
             yield from _files(entry)
         elif entry.suffix.lower() in _READERS:
             yield entry
+
+
+def _layout(project: Project, path: Path, name: str) -> None:
+    if found := doubts_in(path):
+        project.doubts[name] = found
 
 
 def _loop(project: Project, path: Path, name: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -55,10 +55,18 @@ def _sentence(project: Project) -> tuple[str, bool | None]:
         parts.append(f"{certified} of {len(project.certificates)} certificates hold")
     if project.problems:
         parts.append(f"{len(project.problems)} file(s) could not be read or run")
+    doubts = [one for found in project.doubts.values() for one in found]
+    unsure = f" Not sure of the log{'s' if len(project.doubts) > 1 else ''}: {_shortly(doubts)}." if doubts else ""
     if not parts:
-        return "Nothing in this project states a limit, so nothing was judged.", None
+        return f"Nothing in this project states a limit, so nothing was judged.{unsure}", None
     good = held == len(loops) and certified == len(project.certificates) and not project.problems
-    return f"{'; '.join(parts)}.".capitalize(), good
+    return f"{'; '.join(parts)}.".capitalize() + unsure, good
+
+
+def _shortly(doubts: Sequence[str]) -> str:
+    """Return the first doubt without its reason, and how many more there are."""
+    more = f" and {len(doubts) - 1} more" if doubts[1:] else ""
+    return f"{doubts[0].partition(' sure): ')[0]} sure){more}"
 
 
 def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, str, str]]:
@@ -118,6 +126,9 @@ def _data(project: Project) -> Section | None:
     tables = [Table("Recordings", head, rows)]
     if findings:
         tables.append(Table("What was found in them", ["recording", "finding"], findings, text=2))
+    unsure = [[name, doubt] for name, found in project.doubts.items() for doubt in found]
+    if unsure:
+        tables.insert(0, Table("What the import was not sure of", ["layout", "taken"], unsure, text=2))
     return Section("Data", tables=tables, charts=charts)
 
 

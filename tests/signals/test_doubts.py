@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import DataError, SettingsError
+from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.signals import Guess, guess_layout, import_log, parse_layout
+from softneck.signals.importing._doubts import percent
+from softneck.signals.importing._layout_text import doubts_in
 from softneck.signals.importing._unit_odds import UNITS, judge
 
 from ..data import neck_recording
@@ -140,3 +142,75 @@ def test_a_log_without_a_clock_takes_the_sample_time_that_is_answered(tmp_path: 
     assert told.missing == ()
     assert parse_layout(told.text) == told.layout
     assert import_log(path, told.layout).recording.sample_time == 0.02
+
+
+def test_references_in_another_unit_than_the_angles_do_not_change_theirs_and_are_doubted(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=2.01, platform=0.44)
+    frame = pd.read_csv(path)
+    frame.assign(pitch_target=np.degrees(1.1 * frame["pitch"])).to_csv(path, index=False)
+    guess = guess_layout(path)
+    units = {name: guess.layout.channels[name].unit for name in ("pitch", "roll", "pitch_reference")}
+    assert units == {"pitch": "rad", "roll": "rad", "pitch_reference": "deg"}
+    assert [doubt.about for doubt in guess.doubts] == ["unit of angles of the platform"]
+    # In one unit nothing is to be doubted.
+    frame.assign(pitch_target=1.1 * frame["pitch"]).to_csv(path, index=False)
+    assert guess_layout(path).doubts == ()
+
+
+@pytest.mark.parametrize("size", [4096 / (2.0 * np.pi), 53.0 * 4096 / (2.0 * np.pi), 300.0, 1.0 / (2.0 * np.pi)],
+                         ids=["counts", "geared counts", "before the gear", "turns"])  # fmt: skip
+@pytest.mark.parametrize("motors", [2.01, 115.189], ids=["rad", "deg"])
+def test_positions_in_counts_come_back_as_what_was_asked_and_are_doubted(
+    tmp_path: Path, size: float, motors: float
+) -> None:
+    path = log(tmp_path, motors=motors, platform=25.0)
+    frame, told = pd.read_csv(path), {}
+    for k in (1, 2, 3):
+        x = frame[f"encoder{k}"]
+        told[f"encoder{k}"] = size * (np.radians(x) if motors > 100.0 else x)
+    frame.assign(**told).to_csv(path, index=False)
+    guess = guess_layout(path)
+    assert [doubt.about for doubt in guess.doubts] == ["unit of motor set-points and positions"]
+    truth = import_log(path, guess.layout).recording
+    # The factor is fitted by one linear pole; the synthetic drives have a slew limit beside it: 1 %.
+    scale = 2.01 / np.abs(NECK.set_points).max()
+    np.testing.assert_allclose(truth.motor_positions, scale * NECK.motor_positions, rtol=1e-2, atol=1e-6)
+
+
+def test_counts_of_set_points_and_positions_are_refused_with_the_fix(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=69_000.0, platform=25.0)
+    with pytest.raises(DataError, match=r"\d+ turns; .* are they an encoder's counts \(`unit = \"rad\", factor"):
+        import_log(path, guess_layout(path).layout)
+
+
+def test_a_number_that_stands_for_what_was_missed_is_refused_by_its_name(tmp_path: Path) -> None:
+    path = log(tmp_path, motors=2.01, platform=25.0)
+    frame = pd.read_csv(path)
+    frame.loc[frame.index[50::60], "pitch"] = -999.0
+    frame.to_csv(path, index=False)
+    with pytest.raises(DataError, match=r"column `pitch` holds -999 in 6 rows, \d+ times as far as all others"):
+        import_log(path, guess_layout(path).layout)
+    frame["pitch"] = frame["pitch"].where(frame["pitch"] > -900.0)
+    frame.to_csv(path, index=False)
+    recording = import_log(path, guess_layout(path).layout).recording
+    assert np.isnan(recording.channels["pitch"]).sum() == 6
+
+
+def test_a_layout_file_tells_its_doubts_until_they_are_settled(tmp_path: Path) -> None:
+    path, layout = log(tmp_path, motors=12.0, platform=25.0), tmp_path / "log.layout.toml"
+    pd.read_csv(path).drop(columns="roll").to_csv(path, index=False)
+    guess = guess_layout(path)
+    layout.write_text(guess.text)
+    # Which outputs there are comes first: all else follows from it.
+    assert [line.partition(" sure): ")[0] for line in doubts_in(layout)] == [
+        "outputs: pitch only (80 %",
+        *(f"motor_{what}_1, motor_{what}_2, motor_{what}_3 ({percent(guess.doubts[0].confidence)}" for what in
+          ("setpoint", "position")),
+    ]  # fmt: skip
+    for doubt in guess.doubts:
+        guess = guess.settled(doubt)
+    layout.write_text(guess.text)
+    assert doubts_in(layout) == ()
+    layout.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FileFormatError, match="is not a layout"):
+        doubts_in(layout)

@@ -94,6 +94,19 @@ def test_a_log_of_any_tool_comes_back_by_a_guess(tmp_path: Path, name: str) -> N
     same(import_log(path, guess.layout).recording)
 
 
+@pytest.mark.parametrize("mark", ["# operator paused here", "  % mark, 2"])
+def test_remarks_between_the_rows_are_left_out_and_it_is_said(tmp_path: Path, mark: str) -> None:
+    path = tmp_path / "log.csv"
+    write.write_text(path, named(columns()), sep=",", decimal=".")
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for row in (40, 90):
+        lines.insert(row, mark)
+    path.write_text("\n".join(lines), encoding="utf-8")
+    guess = guess_layout(path)
+    assert "file: 2 line(s) of remarks between the rows are left out" in guess.lines
+    same(import_log(path, guess.layout).recording)
+
+
 def test_a_quaternion_is_pitch_and_roll_of_the_axes_that_answer(tmp_path: Path) -> None:
     write.write_mcap(tmp_path / "bag.mcap", columns(), quaternion=True)
     guess = guess_layout(tmp_path / "bag.mcap")

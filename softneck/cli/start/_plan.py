@@ -145,8 +145,9 @@ def _controller(asked: Asked) -> Iterator[Step]:
     words = [word for name, value in (("--requirements", asked.requirements), ("--kinds", asked.kinds),
                                       ("--budget", asked.budget), ("--seed", asked.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
-    # --force goes on with the judgements of the same search, and replaces another one.
-    command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "-o", "tune", "--force")
+    # --force goes on with the judgements of the same search, and replaces another one. In this process: with empty
+    # caches each further one compiles the same again, which is most of what a search of 80 judgements takes.
+    command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"),
                reads=(*plants, OBSERVER, *wanted))  # fmt: skip
     eyes = (OBSERVER,) if observed() else ()

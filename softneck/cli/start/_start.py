@@ -222,12 +222,31 @@ def _facts(sitting: Sitting, folder: Path) -> dict[str, Any]:
     return {
         "folder": str(folder),
         "holds": all(row["holds"] for row in rows),
+        "doubts": _doubts(),
         "failed": [row["stage"] for row in rows if not row["holds"]],
         "models": {sort: _model(file) for sort, file in models.items() if file is not None},
         "controller": BEST,
         "report": "build/report.html",
         "steps": rows,
     }
+
+
+def _doubts() -> dict[str, list[str]]:
+    """Return layout -> what the import was not sure of, and nobody settled since."""
+    from softneck.signals.importing._layout_text import doubts_in
+
+    found = {path.as_posix(): doubts_in(path) for path in sorted(Path("recordings").glob("*.layout.toml"))}
+    return {name: list(doubts) for name, doubts in found.items() if doubts}
+
+
+def _unsure(facts: dict[str, Any]) -> str:
+    """Return in a clause what the verdict rests on and is not sure; empty where nothing is."""
+    doubts = [(one, name) for name, found in facts["doubts"].items() for one in found]
+    if not doubts:
+        return ""
+    said, file = min(doubts, key=lambda pair: not pair[0].startswith("outputs: "))
+    more = f", {len(doubts) - 1} more" if doubts[1:] else ""
+    return f"not sure of the log: {said.partition(' sure): ')[0]} sure){more}; see NOT SURE in {file}"
 
 
 def _model(file: str) -> dict[str, Any]:
@@ -248,10 +267,16 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
                 f"\nbest {sort} model: {model['kind']}, free run {fits} % over the rows held out, {model['file']}"
             )
         print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts["steps"]))
+        for doubt in (one for found in facts["doubts"].values() for one in found):
+            click.echo(f"not sure: {doubt}")
         click.echo(f"report: {folder}/{facts['report']}")
+    unsure = _unsure(facts)
+    if unsure and not failed:
+        note(unsure)
     if failed:
         more = f" ({len(failed)} of {len(STAGES)} steps say so: {', '.join(facts['failed'])})" if failed[1:] else ""
-        raise CheckFailedError(f"{failed[0]['stage']} does not hold{more}: {failed[0]['said']}")
+        also = f" ({unsure}.)" if unsure else ""
+        raise CheckFailedError(f"{failed[0]['stage']} does not hold{more}: {failed[0]['said']}{also}")
 
 
 def _rows(steps_done: list[dict[str, Any]]) -> list[list[str]]:

@@ -11,6 +11,7 @@ from ..recording._channels import MOTOR_POSITIONS, MOTORS, OUTPUTS, SET_POINTS
 from ._draft import Draft, say
 from ._guess_units import Unit
 from ._layout import Layout
+from ._layout_text import ONE_AXIS
 
 #: Below it a guess is asked about, or marked.
 SURE = 0.9
@@ -18,7 +19,6 @@ _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 _TILT = (*OUTPUTS, "inclination", "orientation", "pitch_reference", "roll_reference")
 _GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": _VELOCITIES}
 _AS_LOGGED = "as logged"
-ONE_AXIS = "outputs"
 # However surely the motors say so: a log that says otherwise by its titles is worth a question.
 _MOST_SURE = 0.89
 
@@ -104,7 +104,8 @@ def _units(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
 
 def sign_doubt(axis: str, name: str, r: float) -> Doubt:
     """Return the doubt in the sign of an angle that was turned round as it falls where the motors' `name` rises."""
-    why = f"as logged {axis} falls as {name} rises (correlation {r:.2f}), and recordings have both rise"
+    order = "; or motors 2 and 3 are swapped" if axis == "roll" else ""
+    why = f"as logged {axis} falls as {name} rises (correlation {r:.2f}), and recordings have both rise{order}"
     return Doubt(f"sign of {axis}", (axis,), "turned round", min(_MOST_SURE, 0.5 - 0.5 * r), why, (_AS_LOGGED,))
 
 

@@ -14,7 +14,8 @@ from ._unit_odds import MOTOR_RANGE, Verdict, judge
 from .formats._dates import DATE
 
 _VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
-_TILTED = ("pitch", "roll", "inclination", "pitch_reference", "roll_reference")
+_REFERENCES = ("pitch_reference", "roll_reference")
+_TILTED = ("pitch", "roll", "inclination", *_REFERENCES)
 # The paper's sample time [s], which decides where the data leave it open; sample times of loggers lie around it by a
 # factor of exp(1.2), two thirds of them.
 _USUAL, _STEP_SPREAD = 0.02, 1.2
@@ -24,6 +25,10 @@ _CLOCKS = {"s": ("s", 1.0), "ms": ("ms", 1.0), "us": ("ms", 1e-3), "ns": ("ms", 
 _SUREST, _ALONE = 0.99, 0.85
 # Pitch and roll further apart than this are doubted.
 _FAR_APART, _ALIKE = 20.0, 0.6
+# What is asked of an angle and what it does are in two units where they are further apart than half way (in logarithms)
+# from 1 to 57. Positions that follow set-points this well and are so many times as large, or as small, are counts,
+# turns or those before a gear, unless the number is nearly the 57 of degrees.
+_TWO_UNITS, _FOLLOW, _COUNTS, _DEGREES = 7.6, 0.9, 3.0, (45.0, 72.0)
 
 
 class Unit(NamedTuple):
@@ -43,7 +48,11 @@ def units(draft: Draft) -> dict[str, Unit]:
             sure = 1.0 if pick.unit_sure else 0.8
             found[channel] = Unit(pick.unit, 1.0, "its title says so", sure)
     _time(draft, found)
-    _angles(draft, found)
+    counts = _counts(draft, found)
+    _angles(draft, found, counted=counts is not None)
+    if counts is not None:
+        found.update(dict.fromkeys(MOTOR_POSITIONS, _of_counts(counts, found[SET_POINTS[0]].name)))
+    _references(draft, found)
     _velocities(draft, found)
     for channel in draft.picks:
         if channel not in found and channel != "run":
@@ -86,12 +95,13 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
     found["time"] = Unit(*_CLOCKS[name], why, sure)
 
 
-def _angles(draft: Draft, found: dict[str, Unit]) -> None:
+def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
     """Judge the units of set-points, positions and platform together; a title tells the unit of its whole group."""
+    apart = _asked_in_another_unit(draft, found)
     groups = {
         "set-points": [name for name in SET_POINTS if name in draft.picks],
-        "positions": [name for name in MOTOR_POSITIONS if name in draft.picks],
-        "tilt": [name for name in _TILTED if name in draft.picks],
+        "positions": [name for name in MOTOR_POSITIONS if name in draft.picks and not counted],
+        "tilt": [name for name in _TILTED if name in draft.picks and name not in apart],
     }
     groups = {group: names for group, names in groups.items() if names}
     step = nominal_step(draft, found)
@@ -118,6 +128,58 @@ def _angles(draft: Draft, found: dict[str, Unit]) -> None:
         for name in ("pitch_rate", "roll_rate"):
             if name in draft.picks:
                 found.setdefault(name, Unit(f"{verdicts['tilt'].unit}/s", 1.0, "as the angles", 0.9))
+
+
+def _asked_in_another_unit(draft: Draft, found: dict[str, Unit]) -> tuple[str, ...]:
+    """Return the references where no title names a unit and they reach so far beside the angles that theirs differs."""
+    asked = [name for name in _REFERENCES if name in draft.picks]
+    angles = [name for name in (*OUTPUTS, "inclination") if name in draft.picks]
+    if any(name in found for name in (*asked, *angles)):
+        return ()
+    reaches = [max((largest(draft, name) for name in names), default=0.0) for names in (asked, angles)]
+    return tuple(asked) if max(reaches) > _TWO_UNITS * min(reaches) > 0.0 else ()
+
+
+def _references(draft: Draft, found: dict[str, Unit]) -> None:
+    """Take references that are not in the unit of the angles in the other one, which is doubted, and so is theirs."""
+    for name in (one for one in _REFERENCES if one in draft.picks and one not in found):
+        beside = next((one for one in (*OUTPUTS, "inclination") if one in found), None)
+        if beside is None:
+            continue
+        other = "deg" if found[beside].name == "rad" else "rad"
+        why = f"reach {largest(draft, name):.4g}, the angles {largest(draft, beside):.4g}: they are in two units"
+        found[name] = Unit(other, 1.0, f"what is asked of the angles {why}", _ALONE)
+        for angle in (*OUTPUTS, "inclination", "orientation"):
+            if angle in found and found[angle].confidence > _ALONE:
+                found[angle] = found[angle]._replace(confidence=_ALONE, why=f"{found[angle].why}; references {why}")
+
+
+def _counts(draft: Draft, found: dict[str, Unit]) -> float | None:
+    """Return how many times as large as the set-points positions of no named unit are that follow them, where that is
+    no question of rad and deg."""
+    if not draft.has(MOTOR_POSITIONS) or not draft.has(SET_POINTS) or MOTOR_POSITIONS[0] in found:
+        return None
+    x, u = (np.column_stack([draft.values(name) for name in names]) for names in (MOTOR_POSITIONS, SET_POINTS))
+    seen = np.isfinite(x).all(axis=1) & np.isfinite(u).all(axis=1)
+    if not seen.any():
+        return None
+    x, u = x[seen] - x[seen].mean(axis=0), u[seen] - u[seen].mean(axis=0)
+    size = np.sqrt((x**2).sum() * (u**2).sum())
+    if size <= 0.0 or (x * u).sum() < _FOLLOW * size:
+        return None
+    # Drives lag behind what is asked: the static gain of one pole, and not the ratio of sizes, is a count's.
+    before_and_now = np.column_stack([x[:-1].ravel(), u[:-1].ravel(), u[1:].ravel()])
+    a, *b = np.linalg.lstsq(before_and_now, x[1:].ravel(), rcond=None)[0]
+    counts = float(sum(b) / (1.0 - a)) if abs(a) < 1.0 else 0.0
+    apart = max(counts, 1.0 / counts) if counts > 0.0 else 0.0
+    return counts if apart > _COUNTS and not _DEGREES[0] < apart < _DEGREES[1] else None
+
+
+def _of_counts(counts: float, unit: str) -> Unit:
+    """Return the unit of positions by that of their set-points, to be multiplied by a factor that was fitted."""
+    factor = float(f"{1.0 / counts:.4g}")
+    why = f"they follow the set-points {counts:.4g} times as large (counts, turns, a gear?); the factor was fitted"
+    return Unit(unit, factor, why, _ALIKE)
 
 
 def _apart(draft: Draft) -> bool:

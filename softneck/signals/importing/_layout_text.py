@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
-from softneck.core import SettingsError
+from softneck.core import FileFormatError, SettingsError
+from softneck.core._budget import settings_text
 
 from ._layout import Layout, Source
 
@@ -123,3 +126,34 @@ def _comment(text: str | None) -> list[str]:
     if not text:
         return []
     return ["# " + "".join(c if c.isprintable() else " " for c in line) for line in text.splitlines()]
+
+
+#: What a doubt in which outputs a robot has is about.
+ONE_AXIS = "outputs"
+# As a guess writes them: `NOT SURE (70 %): why` of a channel's column and unit, `NOT SURE: what (80 % sure): why` else.
+_NOT_SURE = re.compile(r"NOT SURE(?: \((\d+ %)\))?: (.*?)(?=; NOT SURE|$)")
+_KEY = re.compile(r"\[?(?:channels\.)?(\w+)")
+
+
+def doubts_in(path: str | Path) -> tuple[str, ...]:
+    """Return what a layout file marks as not sure, as `what (80 % sure): why`, which outputs there are first.
+
+    Who looked and found a guess right removes its remark.
+
+    Raises:
+        FileFormatError: no text, or too long for a layout.
+    """
+    try:
+        text = settings_text(path)
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{path}: is not a layout ({error}).") from error
+    found: dict[str, list[str]] = {}
+    marked: list[str] = []
+    for line in text.splitlines():
+        key = None if line.startswith("#") else _KEY.match(line)
+        marked += [line] * line.startswith("#")
+        for sure, why in _NOT_SURE.findall(" ".join(marked)) if key else ():
+            found.setdefault(f"({sure} sure): {why}" if sure else why, []).extend([key[1]] if sure and key else [])
+        marked = [] if key else marked
+    said = [" ".join([", ".join(keys), why]).strip() for why, keys in found.items()]
+    return tuple(sorted(said, key=lambda one: not one.startswith(f"{ONE_AXIS}: ")))

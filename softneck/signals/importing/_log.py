@@ -29,6 +29,11 @@ if TYPE_CHECKING:
 _GLITCHES = 0.01
 # A wrong unit is off by 57. Less than half as far again as the range may be another winch, and is told only.
 _ANOTHER_UNIT = 1.5
+# What stands for a missed sample is a whole number that stands there often, this much further than all others, of which
+# there are many.
+_STAND_IN, _FURTHER, _VARIED = 90.0, 10.0, 20
+# [turns] So far no unit of angles goes.
+_COUNTS_FROM = 60.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +130,9 @@ def _beyond(layout: Layout, name: str, reach: float, limit: float) -> str:
     turned = reach / (2.0 * np.pi) if unit == "rad" else 0.0
     turns_said = f", which is {turned:.0f} turns" if turned > 1.5 else ", more than a turn" if turned > 1.0 else ""
     hint = "is `factor` right?"
-    if source.unit in ("rad", "rad/s"):
+    if unit == "rad" and turned > _COUNTS_FROM:
+        hint = 'are they an encoder\'s counts (`unit = "rad", factor = 6.2832 / counts of a turn`)?'
+    elif source.unit in ("rad", "rad/s"):
         meant = "deg" if source.unit == "rad" else "deg/s"
         hint = f'is it in degrees (`unit = "{meant}"`)?'
     return (
@@ -224,7 +231,10 @@ def _values(frame: pd.DataFrame, source: Source, channel: str, layout: Layout) -
     for term in source.terms:
         column = _column(frame, term.column, channel)
         missing = may_miss(channel, layout.robot) or clocked(layout, channel)
-        total = total + term.factor * numbers(column, str(term.column), missing=missing, nan_words=True)
+        cells = numbers(column, str(term.column), missing=missing, nan_words=True)
+        if missing:
+            _refuse_stand_in(cells, term.column)
+        total = total + term.factor * cells
     if total.size and np.isnan(total).all():
         named = ", ".join(f"`{term.column}`" for term in source.terms)
         raise DataError(
@@ -232,6 +242,20 @@ def _values(frame: pd.DataFrame, source: Source, channel: str, layout: Layout) -
             "Name another column, or leave the channel out of the layout where a recording does not need it."
         )
     return (source.sign * to_si(source.unit)[0]) * total
+
+
+def _refuse_stand_in(cells: Vector, name: Column) -> None:
+    """Raise DataError where a logger wrote a number such as -999 for what was missed."""
+    seen = np.unique(cells[np.isfinite(cells)])
+    far = seen[int(np.argmax(np.abs(seen)))] if seen.size > _VARIED else 0.0
+    if abs(far) < _STAND_IN or far != round(far):
+        return
+    rows, rest = int((cells == far).sum()), float(np.abs(seen[seen != far]).max())
+    if rows > 1 and abs(far) > _FURTHER * rest:
+        raise DataError(
+            f"column `{name}` holds {far:g} in {rows} rows, {abs(far) / rest:.0f} times as far as all others: is that "
+            "a missed sample? Leave these cells empty."
+        )
 
 
 def _column(frame: pd.DataFrame, name: Column, channel: str) -> pd.Series:

@@ -19,7 +19,7 @@ from .formats._arrays import table_of
 from .formats._dates import is_date, seconds
 from .formats._encodings import encoding_of, format_of
 from .formats._mcap import mcap_table
-from .formats._read import arrays_of
+from .formats._read import arrays_of, without_remarks
 from .formats._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
@@ -118,7 +118,10 @@ def _form(source: Path, fewest: int) -> Form:
     if kind == "sheet":
         return _sheet(source)
     form, lines, units = _text_form(source, fewest)
-    frame = read_table(source, ".csv", form.form)
+    whole = read_table(source, ".csv", form.form)
+    frame = without_remarks(whole)
+    if len(frame) < len(whole):
+        lines = (*lines, f"file: {len(whole) - len(frame)} line(s) of remarks between the rows are left out")
     if form.header:
         frame.columns = [str(name).strip() for name in frame.columns]
     return frame, form, lines, units

@@ -11,6 +11,7 @@ import pytest
 from softneck.cli.start import _start
 from softneck.cli.start._plan import Asked
 from softneck.cli.start._sitting import Sitting
+from softneck.cli.start._start import _doubts
 from softneck.cli.start._step import Step, Unmet
 
 
@@ -28,7 +29,8 @@ def facts_of(sitting: Sitting, folder: Path) -> dict[str, Any]:
     """What a sitting that ends before its models says of itself."""
     rows = [{"stage": key.partition(":")[0], "done_before": kept, **sitting.done[key]}
             for key, kept in sitting.ran.items()]  # fmt: skip
-    return {"folder": str(folder), "models": {}, "report": "none", "failed": [], "steps": rows}
+    more = {"models": {}, "report": "none", "doubts": _doubts(), "failed": [], "steps": rows}
+    return {"folder": str(folder), **more}
 
 
 @pytest.fixture

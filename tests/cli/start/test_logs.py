@@ -196,3 +196,29 @@ def test_logs_of_labs_that_teach_nothing_end_in_one_short_line(
     last = said.err.splitlines()[-1]
     assert says in last
     assert len(last) <= 160
+
+
+def test_one_angle_of_two_is_doubted_in_the_verdict_of_terminal_json_and_page(
+    call: Call, tmp_path: Path, until: Callable[[str], None]
+) -> None:
+    until("identification")
+    table = {"time": NECK.time, **{f"target_motor{j}": NECK.set_points[:, j - 1] for j in (1, 2, 3)}}
+    pd.DataFrame({**table, "roll": NECK.outputs[:, 1]}).to_csv("log.csv", index=False)
+    said = call("start", "log.csv", "-o", "p", "--yes")
+    assert said.code == 0, said.err
+    doubt, file = "outputs: roll only (80 % sure)", "recordings/log.layout.toml"
+    assert said.err.splitlines()[-1] == f"not sure of the log: {doubt}; see NOT SURE in {file}"
+    assert f"not sure: {doubt}: " in said.out
+    facts = json.loads(call("start", "log.csv", "-o", "p", "--yes", "--json").out)
+    assert [line.startswith(doubt) for line in facts["doubts"][file]] == [True]
+    assert call("report", "p", "-o", "page.html").code == 0
+    page = Path("page.html").read_text(encoding="utf-8")
+    assert f"Not sure of the log: {doubt}." in page
+    # The import alone says so in its last line too.
+    said = call("import", "log.csv", "--guess", "--yes", "-o", "r.csv")
+    assert said.out.splitlines()[-1].endswith("; NOT SURE: roll only, as no column is the other angle")
+    # Who looked, and found it right, removes the remark.
+    layout = tmp_path / "p" / file
+    kept = [line for line in layout.read_text().splitlines() if "NOT SURE" not in line]
+    layout.write_text("\n".join(kept) + "\n")
+    assert json.loads(call("start", "log.csv", "-o", "p", "--yes", "--json").out)["doubts"] == {}

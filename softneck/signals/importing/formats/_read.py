@@ -47,9 +47,17 @@ def read_foreign(
     if kind == "sheet":
         _, cells = sheet_cells(source, sheet)
         return sheet_table(cells, header=form.header, skip=form.skip, unit_row=form.unit_row)
-    frame = read_table(source, ".parquet" if kind == "parquet" else ".csv", form)
+    frame = without_remarks(read_table(source, ".parquet" if kind == "parquet" else ".csv", form))
     frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
     return frame
+
+
+def without_remarks(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table without the lines that a logger or its operator put between its rows: `# paused`, `% mark 2`."""
+    if not frame.shape[1] or frame.iloc[:, 0].dtype.kind != "O":
+        return frame
+    remark = frame.iloc[:, 0].astype(str).str.lstrip().str.startswith(("#", "%"))
+    return frame.loc[~remark].reset_index(drop=True) if remark.any() else frame
 
 
 def arrays_of(source: Path, kind: str) -> Arrays:
