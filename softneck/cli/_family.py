@@ -133,7 +133,8 @@ def _page(family: Family, names: list[str]) -> str:
     unit, gain, _ = shown_gain(family.robot)
     sections = []
     for name, axis in family.axes.items():
-        figures = []
+        title = f"{name}: the weight over its samples"
+        figures = [(title, cover_figure(family.frequency, *_cover(family, name), title))]
         for number, what in enumerate(_SCOPES):
             groups = {}
             for index, recording in enumerate([*names, "several"]):
@@ -143,21 +144,26 @@ def _page(family: Family, names: list[str]) -> str:
             if groups:
                 title = f"{name}: {what}"
                 figures.append((title, local_map_figure(groups, title, family.robot)))
-        title = f"{name}: the weight over its samples"
-        figures.append((title, cover_figure(family.frequency, *_cover(family, name), title)))
         head = ["", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
         rows = [[label, *_numbers(row, gain)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
         rows.append(["nominal", *_numbers(axis.nominal, gain)])
         sections.append(Section(name, tables=[Table("Box", head, rows)], figures=figures))
     sections.append(Section("In numbers", text=family.summary().splitlines()))
-    spans = []
-    for name, axis in family.axes.items():
-        low, high = (_numbers(row, gain) for row in axis.box)
-        spans.append(f"{name}'s static gain is {low[0]} to {high[0]} {unit} and its dead time {low[2]} to {high[2]} ms")
-    return page(
-        "Family of linear models", sections, verdict=f"Over {len(names)} recording(s) {'; '.join(spans)}.",
-        footer="Written by softneck family.",
-    )  # fmt: skip
+    verdict = " ".join(_verdict(family, name, gain, unit) for name in family.axes)
+    return page("Family of linear models", sections, verdict=verdict, footer="Written by softneck family.")
+
+
+def _verdict(family: Family, name: str, gain: float, unit: str) -> str:
+    """Return where the weight covers what an axis was measured to do, and how wide its plant is."""
+    low, high = (_numbers(row, gain) for row in family.axes[name].box)
+    span = f"its static gain is {low[0]} to {high[0]} {unit} and its dead time {low[2]} to {high[2]} ms"
+    band = family.band(name)
+    if band is None:
+        return f"{name.capitalize()} was not tested against the data; {span}."
+    return (
+        f"{name.capitalize()}: the weight covers every response measured from {band[0]:.2g} to {band[1]:.2g} rad/s; "
+        f"nothing is known above. In them {span}."
+    )
 
 
 def _cover(family: Family, name: str) -> tuple[np.ndarray, np.ndarray]:
