@@ -1,12 +1,12 @@
 """Successive halving over kinds and settings: generations of candidates, judged further the better they are.
 
 Each kind begins as fast as its margins allow: its bound on Ms is led there by halves. All kinds are judged by loops
-there; after that and after each round half of them are left (successive halving: Jamieson and Talwalkar 2016, AISTATS).
-Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary Computation 9:159),
-which knows ranks alone, so that candidates of different levels are told to it as they are. What holds so far goes on
-to the next level, and of a round's candidates at least half. At the end the best is refined: by neighbours to all
-sides, nearer where none of these is better. All is asked for in rounds and told in order: the number of workers changes
-nothing.
+there; after that and after each round a third of them is left (successive halving: Jamieson and Talwalkar 2016,
+AISTATS). Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary
+Computation 9:159), which knows ranks alone, so that candidates of different levels are told to it as they are. What
+holds so far goes on to the next level, and of a round's candidates at least half. At the end the best is refined: by
+neighbours to all sides, nearer where none of these is better. All is asked for in rounds and told in order: the number
+of workers changes nothing.
 """
 
 from __future__ import annotations
@@ -38,6 +38,8 @@ _LED_BY, _LED = 0.24, 3
 _REFINED, _AWAY, _NEAREST = 0.3, 0.08, 0.005
 # Kinds that are never left out, and candidates whose margins are found by experiment at the end.
 _LEAST_KINDS, _FINALS = 2, 3
+# One kind of so many goes on to the next round.
+_OF = 3
 # What breaks ties: all ratios together weigh this part of the largest one.
 _REST = 0.02
 # No requirement adds more, however far it is beyond its limit: what is not certified, not known or never reached is as
@@ -168,7 +170,7 @@ class Search:
             self._through([item for each in generation.values() for item in each], levels, finals)
             for space in alive:
                 _tell(optimisers[space.kind], generation[space.kind], self._key)
-            alive = self._halved(alive)
+            alive = self._fewer(alive)
         self._refined(levels, finals)
         if finals:
             # Of those that loops have judged: what was judged further comes first.
@@ -180,12 +182,7 @@ class Search:
 
     def cost(self, item: Candidate) -> float:
         """Return what the search minimises."""
-        return item.cost(self.task.asked.bounds, tested=self.tested)
-
-    @property
-    def tested(self) -> bool:
-        """Whether a family was tested against its recordings."""
-        return any(getattr(thing, "measured", {}) for thing in self.task.linear.values())
+        return item.cost(self.task.asked.bounds, tested=self.task.tested)
 
     def _of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]
@@ -208,7 +205,7 @@ class Search:
         for number, space in enumerate(self.spaces):
             if not np.array_equal(starts[space.kind].x, space.start):
                 optimisers[space.kind] = _optimiser(space, self.task.seed, number, starts[space.kind].x)
-        return self._halved([space for space in self.spaces if space.kind not in self.dropped])
+        return self._fewer([space for space in self.spaces if space.kind not in self.dropped])
 
     def _led(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
         """Return the starts with their bound on Ms as large as the margins allow, by halves."""
@@ -222,11 +219,8 @@ class Search:
         for _ in range(_LED):
             for kind, k in led.items():
                 x = at[kind].x.copy()
-                if at[kind].error:
-                    # What could not be designed is given more room: bolder, and slower.
-                    x[[0, k]] += step
-                else:
-                    x[k] += step if self._robust(at[kind]) else -step
+                # What could not be designed is given more room.
+                x[k] += step if at[kind].error or self._robust(at[kind]) else -step
                 at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
             self._judge([at[kind] for kind in led], LEVELS[0], reserved)
             for kind, k in led.items():
@@ -237,7 +231,7 @@ class Search:
 
     def _robust(self, item: Candidate) -> bool:
         """Return whether the margins that are known hold."""
-        found = item.ratios(self.task.asked.bounds, tested=self.tested)
+        found = item.ratios(self.task.asked.bounds, tested=self.task.tested)
         return all(value <= 1.0 for name, value in found.items() if name.startswith(_LINEAR))
 
     def _led_key(self, item: Candidate, k: int) -> tuple[bool, bool, float]:
@@ -270,9 +264,9 @@ class Search:
             if self.ranked()[0] is best:
                 away /= 2.0
 
-    def _halved(self, alive: list[Space]) -> list[Space]:
-        """Return the better half of the kinds, in their order."""
-        keep = max(_LEAST_KINDS, math.ceil(len(alive) / 2))
+    def _fewer(self, alive: list[Space]) -> list[Space]:
+        """Return the better third of the kinds, in their order."""
+        keep = max(_LEAST_KINDS, math.ceil(len(alive) / _OF))
         best = sorted(alive, key=lambda space: min(self._key(item) for item in self._of(space.kind)))[:keep]
         return [space for space in alive if space in best]
 

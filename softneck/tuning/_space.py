@@ -15,6 +15,8 @@ from softneck.core._kinds import kinds_of
 
 #: Kinds that are searched where nobody names any; `nmpc` needs a nonlinear model of its own and minutes.
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptive", "mpc")
+#: Of these nothing is certified beside recordings, since they have no linear form: named, they are searched there too.
+UNCERTIFIED = ("scheduled", "adaptive")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ _ROOM = 1.03
 # same from 0.4 to 1.5, and the neck itself overshoots by 2 % at 0.4 and 0.6, by 7 % at 0.8, by 20 % at 1.5; at 0.4 it
 # is slow (0.42 to 0.48 s).
 _LEAD = 0.6
+_LEADING = Dimension("reference_lead", 0.2, 2.5, 1.0)
 # These plan with it.
 _PLANNED = {kind: Dimension("lead_limit", 0.4, 2.0, 0.8) for kind in ("mpc", "nmpc")}
 
@@ -125,13 +128,13 @@ def spaces(
                 else f"unknown kind of controller `{kind}`; use some of {', '.join(_OWN)}."
             )
         names = {item.name for item in dataclasses.fields(resolve(KINDS[kind].settings))}
-        # Until a kind has the one meaning of speed, its filter stands for it: of a lag that is a part of its rise.
-        speed = (
-            Dimension("rise_s", max(0.3 * rise, _ROOM * least), 1.2 * rise, max(_AIM * rise, _ROOM**2 * least))
-            if "rise_s" in names
-            else Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise)
+        speed: tuple[Dimension, ...] = (
+            Dimension("rise_s", max(0.3 * rise, _ROOM * least), 1.2 * rise, max(_AIM * rise, _ROOM**2 * least)),
         )
-        wanted = (speed, *_OWN[kind], *((_PLANNED[kind],) if neck and kind in _PLANNED else ()))
+        if "reference_lead" in names:
+            # A step is led into the motors' limits at once, and a circle is followed the closer.
+            speed = (Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), _LEADING)
+        wanted = (*speed, *_OWN[kind], *((_PLANNED[kind],) if neck and kind in _PLANNED else ()))
         fixed: dict[str, Any] = {"lead_limit": _LEAD} if neck and kind not in _PLANNED else {}
         if cocontraction is not None and "least_cocontraction" in names:
             fixed["least_cocontraction"] = cocontraction

@@ -34,6 +34,11 @@ class Task:
     seed: int = 0
 
     @property
+    def tested(self) -> bool:
+        """Whether a family was tested against its recordings."""
+        return any(getattr(thing, "measured", {}) for thing in self.linear.values())
+
+    @property
     def plant(self) -> Any:
         """What controllers are designed on: the first of several linear sources is the nominal plant."""
         sources = list(self.linear.values())

@@ -25,7 +25,7 @@ from ._requirements import TuneRequirements, make_tune_requirements, read_tune_r
 from ._responses import kept_with
 from ._result import Price, binding, front, objectives, prices
 from ._search import Candidate, Search
-from ._space import KINDS_SEARCHED, spaces
+from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
 from ._task import Task
 
 #: Judgements of candidates that a search makes where nobody says otherwise.
@@ -34,6 +34,8 @@ BUDGET = 160
 _LEAST_BUDGET = 1
 # So many of the best are held against `verify`, until one holds.
 _VERIFIED = 2
+# Why a kind is left out where nobody names it.
+_UNCERTIFIED = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
 # The rise that is aimed at where nothing limits it, in time constants of the nominal plant.
 _USUAL_RISE = 2.0
 # Motors that are held closer to zero than this [rad] have no rule for their co-contraction.
@@ -59,7 +61,7 @@ class Tuned:
         nearest: the value to which that alone would have to be loosened; None where that would not do.
         prices: what it costs.
         evaluations: judgements that were asked for.
-        dropped: kind -> why it could not be designed.
+        dropped: kind -> why it was not searched.
         task: what was tuned.
         own: plants that step.
     """
@@ -106,7 +108,7 @@ def tune(
         plants: by name: families and linear models, of which at least one, the first the nominal plant; and plants
             that step (nonlinear models, neck parameters, functions that return a part), which loops are closed over.
         requirements: what is asked, also as a file or a table like one; the defaults if not given.
-        kinds: of controllers; `KINDS_SEARCHED` if none is named.
+        kinds: of controllers; `KINDS_SEARCHED` if none is named, beside recordings without `UNCERTIFIED`.
         budget: judgements of candidates.
         observer: that the loop shall have, if the requirements are kept with it; else a Kalman filter over the nominal
             plant.
@@ -125,8 +127,9 @@ def tune(
     """
     require_whole("budget", budget, _LEAST_BUDGET, 1_000_000)
     require_whole("seed", seed, 0, 2**31 - 2)
-    chosen = tuple(dict.fromkeys(kinds or KINDS_SEARCHED))
     task = task_of(plants, requirements, seed)
+    dropped = {} if kinds or not task.tested else dict.fromkeys(UNCERTIFIED, _UNCERTIFIED)
+    chosen = tuple(kind for kind in dict.fromkeys(kinds or KINDS_SEARCHED) if kind not in dropped)
     if observer is not None:
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
@@ -138,6 +141,7 @@ def tune(
     log = Log(folder, task.digest, resume=resume, force=force)
     with crew(workers, None) as members:
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
+        search.dropped |= dropped
         search.run()
     eyes = _observer(task) if observer is None else observer
     return _finished(search, eyes, files, lambda done, text: progress(0.9 + 0.1 * done, text))
@@ -205,7 +209,7 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
     task, ranked = search.task, search.ranked()
     if not ranked:
         why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
-        if len(search.dropped) < len(search.spaces):
+        if any(space.kind not in search.dropped for space in search.spaces):
             raise CheckFailedError(f"the budget ended before any candidate could be judged ({why}); give a larger one.")
         raise SettingsError(f"no candidate could be judged ({why}).")
     looped_ones = [item for item in ranked if _level(item) >= 1]
@@ -218,7 +222,7 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
     holds = verification.holds
     if looped and task.own:
         holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
-    stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=search.tested)
+    stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=task.tested)
     if not holds and stuck is None:
         # The search saw nothing broken, the certificate of the whole box does.
         stuck = next((v.requirement.metric for v in verification.failed), None)
@@ -229,7 +233,7 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
         observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
         verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
-        prices=[] if stuck is None else prices(compared, bounds, stuck, tested=search.tested),
+        prices=[] if stuck is None else prices(compared, bounds, stuck, tested=task.tested),
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
 

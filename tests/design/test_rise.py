@@ -150,3 +150,22 @@ def test_what_somebody_says_is_not_assumed(kind: str) -> None:
     assert "a dead time of at least 0.08 s and small moves" in both
     said = settings(least_delay=0.08, small_move_pole=5.293).design(neck(4.0, 3.3, 2)).summary()
     assert "of the paper's neck" not in said
+
+
+@pytest.mark.parametrize("kind", ["pi", "lqg"])
+def test_what_leads_the_reference_is_taken_off_the_lag_at_which_it_is_followed(kind: str) -> None:
+    """The area between a step and its response is the lag of what moves slowly (Franklin et al. 2015, sec. 4.2)."""
+    plant, made, T2 = neck(*PLANTS["paper"]), resolve(KINDS[kind].settings), 0.2
+    plain, led = (made(reference_time=T2, reference_lead=part).design(plant) for part in (0.0, 0.8))
+    gains = led.design["pitch"]["gains"]
+    lags = [TS * float(np.sum(1.0 - simulated(plant, item))) for item in (plain, led)]
+    # The sampled lag of T2 is late by Ts a/(1 - a), of which T1/T2 passes at once; after 6 s nothing is left of a step.
+    a = math.exp(-TS / T2)
+    assert lags[0] - lags[1] == pytest.approx(gains["reference_lead_s"] / T2 * TS * a / (1.0 - a), rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", LINEAR)
+def test_a_lead_is_of_a_filter_that_is_given(kind: str) -> None:
+    for given in ({}, {"reference_time": 0.0}, {"rise_s": 0.4}):
+        with pytest.raises(SettingsError, match="give that as well, above 0"):
+            resolve(KINDS[kind].settings)(reference_lead=1.0, **given)

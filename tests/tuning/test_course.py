@@ -27,7 +27,7 @@ CERTIFIED = {"pi": 1.6, "ncf": 1.2}
 
 def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgement:
     """A loop that is quicker and overshoots more the more is asked, as far as Ms goes that it is designed for."""
-    Ms, rise = settings["max_sensitivity"], settings["rise_s"]
+    Ms, rise = settings["max_sensitivity"], 2.0 * settings["reference_time"]
     certified = CERTIFIED[kind] * Ms
     if level == "linear":
         return Judgement({"axes.sensitivity": certified, "axes.gain_margin": certified / (certified - 1.0)})
@@ -39,8 +39,7 @@ def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgem
 def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) -> Search:
     monkeypatch.setattr(_search, "judge_candidate", judged)
     task: Any = SimpleNamespace(
-        asked=SimpleNamespace(bounds=BOUNDS), own={"neck": 0}, seed=0,
-        linear={"family": SimpleNamespace(measured={"pitch": 1} if tested else {})},
+        asked=SimpleNamespace(bounds=BOUNDS), own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
     each = spaces(("pi", "ncf"), rise=0.4, cocontraction=None, neck=True)
     found = Search(task, each, Here(), Log(None, ""), budget, lambda *_: None)
@@ -55,12 +54,12 @@ def test_kinds_begin_at_the_largest_bound_on_Ms_that_their_margins_allow(monkeyp
         (led,) = [
             item for item in found.candidates.values() if item.kind == space.kind and item.level not in ("", "linear")
         ]
-        dimension = space.dimensions[1]
+        dimension = space.dimensions[space.led or 0]
         # A gain margin of 2 is a certified Ms of 2.
         most = math.log(2.0 / CERTIFIED[space.kind] / dimension.low) / math.log(dimension.high / dimension.low)
         # 0.24 of the range, 0.12 and 0.06: within the last of them, if it is within all of them of the start.
-        if abs(most - space.start[1]) < 0.42:
-            assert most - 0.12 <= led.x[1] <= most
+        if abs(most - space.start[space.led or 0]) < 0.42:
+            assert most - 0.12 <= led.x[space.led or 0] <= most
         assert found._robust(led)
 
 

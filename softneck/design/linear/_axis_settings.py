@@ -19,11 +19,11 @@ from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import AxisController, ReferenceFilter, assemble
 from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
 from ._controller import LinearController
-from ._loop_settings import LoopSettings
+from ._loop_settings import LoopSettings, check_reference
 from ._margins import Margins
 from ._ports import ControllerLimits
 from ._reduction import reduce_axis
-from ._rise import check_rise, filter_for
+from ._rise import check_rise, filter_for, leading_filter
 from ._sweep import Sweep, make_sweep
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
@@ -58,6 +58,8 @@ class AxisSettings(LoopSettings, ABC):
         max_sensitivity: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
         reference_time: time constant of the reference filter [s]; None for the least with which no sample overshoots
             by more than `overshoot_pct`, from half the plant's lag on.
+        reference_lead: T1 of that filter, (1 + T1 s)/(1 + T2 s), where `reference_time` is given, as a part of the
+            loop's own lag (its rise over ln 9): what moves is followed the closer, and a step overshoots rather.
         overshoot_pct: of a step of 10 deg, within the limits.
         gain_spread: relative; a plant without samples of its own is taken at both ends of it as well.
         controller_order: states that balanced reduction leaves to the axis' controller; 0 for all.
@@ -72,6 +74,7 @@ class AxisSettings(LoopSettings, ABC):
 
     max_sensitivity: float = 2.0
     reference_time: float | None = None
+    reference_lead: float = 0.0
     overshoot_pct: float = 4.0
     gain_spread: float = 0.2
     controller_order: int = 0
@@ -81,8 +84,7 @@ class AxisSettings(LoopSettings, ABC):
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 10.0)
-        if self.reference_time is not None:
-            require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        check_reference(self.reference_time, self.reference_lead)
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         require_whole("controller_order", self.controller_order, 0, 100)
@@ -204,9 +206,9 @@ class AxisSettings(LoopSettings, ABC):
             if axis.test is not None:
                 check_rise(self.rise_s, axis.nominal, axis.test)
             return filter_for(self.rise_s, controller, axis.nominal, self.extra_delay)
-        return ReferenceFilter(
-            self._reference_time(controller, axis) if self.reference_time is None else self.reference_time
-        )
+        if self.reference_time is not None:
+            return leading_filter(self.reference_time, self.reference_lead, controller, axis.nominal, self.extra_delay)
+        return ReferenceFilter(self._reference_time(controller, axis))
 
     def _reference_time(self, controller: AxisController, axis: UncertainAxis) -> float:
         """Return the least time [s] with which no sample overshoots by more, by halving in whole samples."""

@@ -16,11 +16,11 @@ from ._assembly import ReferenceFilter, assemble, pi_axis
 from ._axis_loop import sensitivities, unstable_samples
 from ._axis_settings import axis_test, filter_numbers, margins_json, slowest
 from ._controller import LinearController
-from ._loop_settings import LoopSettings
+from ._loop_settings import LoopSettings, check_reference
 from ._margins import LOWEST, loop_margins
 from ._pid import place_pid
 from ._ports import ControllerLimits
-from ._rise import check_rise, filter_for
+from ._rise import check_rise, filter_for, leading_filter
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 
 TUNINGS = ("nominal", "samples", "placement")
@@ -45,7 +45,9 @@ class PiSettings(LoopSettings):
         max_sensitivity: bound on Ms, on the identified plant and on its faster form.
         phase_margin: least phase margin [rad], on both.
         reference_time: time constant of the reference filter [s]; None for the least with which no plant within
-            `gain_spread` overshoots by more than `overshoot_pct`. Of another robot the slowest pole's, if not given.
+            `gain_spread` overshoots by more than `overshoot_pct`. Of another robot the main pole's, if not given.
+        reference_lead: T1 of that filter, (1 + T1 s)/(1 + T2 s), where `reference_time` is given, as a part of the
+            loop's own lag (its rise over ln 9): what moves is followed the closer, and a step overshoots rather.
         overshoot_pct: of a step, without limits.
         gain_spread: relative spread of the plant's gain that the filter allows for.
         sample_time: [s] at which a continuous `control` system is held (exact); None for 20 ms. Other plants have their
@@ -59,6 +61,7 @@ class PiSettings(LoopSettings):
     phase_margin: float = math.radians(60.0)
     # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
     reference_time: float | None = NeckDefault(0.2)
+    reference_lead: float = 0.0
     overshoot_pct: float = 2.0
     gain_spread: float = 0.2
     sample_time: float | None = None
@@ -70,8 +73,7 @@ class PiSettings(LoopSettings):
         require_between("damping", self.damping, 0.1, 1.0)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
-        if self.reference_time is not None:
-            require_between("reference_time", self.reference_time, 0.0, 60.0, "s")
+        check_reference(self.reference_time, self.reference_lead)
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         if self.sample_time is not None:
@@ -153,13 +155,13 @@ class PiSettings(LoopSettings):
         return Gains(K, K / Ki)
 
     def _filter(self, family: Plants, gains: Gains, limits: ControllerLimits, inverse: Matrix) -> ReferenceFilter:
+        plant = family[0]
+        axis = pi_axis(gains.gain, gains.integral_time, plant.sample_time)
         if self.rise_s is not None:
-            plant = family[0]
             check_rise(self.rise_s, plant, axis_test(plant, limits, inverse))
-            axis = pi_axis(gains.gain, gains.integral_time, plant.sample_time)
             return filter_for(self.rise_s, axis, plant, self.extra_delay)
         if self.reference_time is not None:
-            return ReferenceFilter(self.reference_time)
+            return leading_filter(self.reference_time, self.reference_lead, axis, plant, self.extra_delay)
         # Samples say themselves how the gain spreads.
         spread = 0.0 if self.tuning == "samples" and len(family) > 2 else self.gain_spread
         return ReferenceFilter(

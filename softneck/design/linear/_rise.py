@@ -105,6 +105,24 @@ def filter_for(rise: float, axis: AxisController, plant: AxisPlant, extra_delay:
     return _solved(lambda T: ReferenceFilter(T2, most.lead - T), most.lead, rise, axis, plant, extra_delay)
 
 
+def leading_filter(
+    time: float, lead: float, axis: AxisController, plant: AxisPlant, extra_delay: int
+) -> ReferenceFilter:
+    """Return the reference filter with T2 = `time` [s] whose zero cancels the part `lead` of the nominal loop's lag.
+
+    Raises:
+        SettingsError: a loop that does not rise by itself has none.
+    """
+    if lead == 0.0:
+        return ReferenceFilter(time)
+    alone = _rise_with(ReferenceFilter(0.0), time, axis, plant, extra_delay)
+    if not math.isfinite(alone):
+        raise SettingsError(
+            "`reference_lead`: the loop does not rise by itself; raise `max_sensitivity`, or leave it out."
+        )
+    return ReferenceFilter(time, lead * alone / LAG)
+
+
 def filter_for_lag(rise: float, lag: float) -> ReferenceFilter:
     """Return the filter with which a lag of time constant `lag` [s] rises in `rise` [s]: a lead cancels its pole."""
     own = LAG * lag

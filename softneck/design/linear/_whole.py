@@ -77,6 +77,8 @@ def whole_controller(settings: AxisSettings, made: WholeDesign, robot: Any, *, f
                 f"the loop is not stable around sample {k} of {len(made.samples)} (spectral radius {found:.4f}); "
                 "design the controller for less."
             )
+    if settings.reference_lead > 0.0:
+        raise SettingsError("`reference_lead` is of plants whose axes do not answer to each other; leave it out.")
     time = settings.reference_time or 0.0
     if settings.rise_s is not None:
         time = _filter_for(settings.rise_s, made, extra)
