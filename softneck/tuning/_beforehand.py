@@ -16,7 +16,8 @@ from softneck.estimation import AxisPlant
 
 from ._requirements import TuneRequirements
 
-_RISES = ("neck.rise_s", "step.rise_s")
+# What has settled has risen before.
+_RISES = ("neck.rise_s", "step.rise_s", "neck.settling_s", "step.settling_s")
 
 
 def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
@@ -32,6 +33,7 @@ def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
         nominal = uncertain.axis(name).nominal
         _refuse_rise(asked, uncertain, limits, name, nominal)
         _refuse_circle(asked, name, nominal)
+        _refuse_sensitivity(asked, name)
         _refuse_load(asked, name, nominal)
 
 
@@ -70,19 +72,27 @@ def _refuse_rise(
 
 
 def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
-    """Refuse a circle closer than the dead time alone leaves it behind: a bandwidth beyond 1/delay."""
+    """Refuse a circle beyond a bandwidth of 1/delay: slower ones a filter leads, but for overshoot."""
     limit = asked.wanted("track.circle_rms_deg")
-    if limit is None or not asked.certificate.robot.is_neck:
+    dead, turn = (plant.delay + 1) * plant.sample_time, asked.track["circle_rad_s"]
+    # Who stands still in the middle is as far behind as the circle is large.
+    if limit is None or not asked.certificate.robot.is_neck or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
         return
-    dead = (plant.delay + 1) * plant.sample_time
-    track = asked.track
-    behind = 2.0 * track["circle_deg"] * math.sin(min(0.5 * track["circle_rad_s"] * dead, 0.5 * math.pi))
-    if limit < behind:
-        raise SettingsError(
-            f"`track.circle_rms_deg` <= {limit:g} cannot be: the dead time of {name}, {1e3 * dead:.0f} ms, alone "
-            f"leaves a circle of {track['circle_deg']:g} deg at {track['circle_rad_s']:g} rad/s {behind:.2g} deg "
-            "behind; allow more, or ask for `track.ahead_rms_deg`, of a reference that is known ahead."
-        )
+    raise SettingsError(
+        f"`track.circle_rms_deg` <= {limit:g} cannot be: a circle at {turn:g} rad/s is beyond the bandwidth that the "
+        f"dead time of {name}, {1e3 * dead:.0f} ms, allows, {1.0 / dead:.3g} rad/s; ask for a slower one, or for "
+        "`track.ahead_rms_deg`, of a reference that is known ahead."
+    )
+
+
+def _refuse_sensitivity(asked: TuneRequirements, name: str) -> None:
+    """Refuse an Ms of 1: Bode's integral leaves |S| above 1 somewhere (Astrom and Murray 2021, ch. 14)."""
+    for group in ("axes", name):
+        limit = asked.wanted(f"{group}.sensitivity")
+        if limit is not None and limit <= 1.0:
+            raise SettingsError(
+                f"`{group}.sensitivity` <= {limit:g} cannot be: no feedback through a dead time has it."
+            )
 
 
 def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:

@@ -151,17 +151,22 @@ def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
         )
 
 
-def test_a_circle_closer_than_the_dead_time_is_refused() -> None:
-    dead = (DELAY + 1) * TS
-    # The chord between two points of the circle that are the dead time apart.
-    z = np.exp(1j * 1.2 * np.array([0.0, dead]))
-    least = 12.0 * abs(z[0] - z[1])
-    for limit, refused in ((0.99 * least, True), (1.01 * least, False)):
-        asked = make_tune_requirements({"require": {"track.circle_rms_deg": {"max": float(limit)}}})
+def test_a_circle_beyond_a_bandwidth_of_one_over_the_dead_time_is_refused() -> None:
+    fastest = 1.0 / ((DELAY + 1) * TS)
+    for part, limit, refused in ((1.01, 11.9, True), (1.01, 12.0, False), (0.99, 0.1, False)):
+        table = {"require": {"track.circle_rms_deg": {"max": limit}}, "track": {"circle_rad_s": part * fastest}}
+        asked = make_tune_requirements(table)
         if refused:
-            with pytest.raises(SettingsError, match="dead time of pitch, 100 ms, alone"):
+            with pytest.raises(SettingsError, match="dead time of pitch, 100 ms, allows, 10 rad/s"):
                 refuse_impossible(asked, neck())
         else:
+            refuse_impossible(asked, neck())
+
+
+def test_what_settles_before_it_can_rise_and_an_Ms_of_one_are_refused() -> None:
+    for metric, limit, match in (("neck.settling_s", 0.05, "slew and range"), ("axes.sensitivity", 1.0, "no feedback")):
+        asked = make_tune_requirements({"require": {metric: {"max": limit}}})
+        with pytest.raises(SettingsError, match=match):
             refuse_impossible(asked, neck())
 
 
