@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from softneck.cli.drives._target import require_armed, sensor_of, words
 from softneck.core import SettingsError
 from softneck.drives import load_drives
 from softneck.drives.supervision._baseline import load_baseline
+from softneck.drives.supervision._motor_models import Motion
 from softneck.signals import read_recording
 
 from ..data import ROOT
@@ -107,3 +110,14 @@ def test_beside_is_refused_before_anything_moves(call: Call) -> None:
     assert (said.code, "needs --supervision" in said.error) == (2, True)
     said = call(*record, "--supervision", "b.json")
     assert (said.code, "a.mcap" in said.error) == (2, True)
+
+
+def test_a_minute_of_a_loop_is_refused_before_anything_moves(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = np.zeros((6000, 3))
+    loop = Motion(setpoints=rows, positions=rows, tensions=rows, values=rows[:, :2], rates=rows[:, :2],
+                  due=np.ones(6000, dtype=bool), references=rows[:, :2])  # fmt: skip
+    monkeypatch.setattr("softneck.drives.read_run_log", lambda path: path)
+    monkeypatch.setattr("softneck.drives.logs._replay.logged_motion", lambda *_: loop)
+    record = ("drives", "record", "aprbs", "--simulated", "-o", "a.csv", "--no-log", "--supervision", "b.json")
+    said = call(*record, "--beside", "run.mcap")
+    assert (said.code, "60 s of a loop's motion" in said.error, Path("a.csv").exists()) == (2, True, False)

@@ -36,8 +36,9 @@ COMMISSIONING = (
 )
 # What the neck carries in it [kg].
 PAYLOADS = (0.0, 0.5)
-# And of its loop, each with each payload: kind, seed.
+# And of its loop, each with each payload: kind, seed; and how long [s].
 LOOPS = (("step", 15), ("ramp", 16))
+LOOP_TIME = 240.0
 
 # At rest before a loop moves, as after the ramp in of a real run [samples].
 _CALM = 75
@@ -95,7 +96,7 @@ def commissioned(neck: NeckParameters | None = None, payloads: tuple[float, ...]
     return calibrate(motions, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
 
 
-def looped(seed: int, kind: str, payload: float, seconds: float = 60.0) -> Motion:
+def looped(seed: int, kind: str, payload: float, seconds: float = LOOP_TIME) -> Motion:
     """Let the loop run undisturbed in virtual time."""
     bench, log = watched(seed, kind, payload), MotionLog()
     bench.run.watches = (log,)

@@ -192,7 +192,7 @@ def record_command(
     from softneck.drives.commissioning._record import drive_limits
     from softneck.drives.logs._replay import logged_motion
     from softneck.drives.running._keyboard import Keyboard
-    from softneck.drives.supervision._calibrate import calibrate
+    from softneck.drives.supervision._calibrate import calibrate, require_loops
     from softneck.drives.supervision._log import MotionLog
     from softneck.signals.recording._files import recording_suffix
 
@@ -220,6 +220,8 @@ def record_command(
     # Before anything moves: what is read back may be damaged.
     like = chosen.file.master_settings(prepared[0][0].sample_time)
     motions = [logged_motion(read_run_log(path), like) for path in beside]
+    if loops := [len(motion.due) * like.bus.cycle for motion in motions if motion.references is not None]:
+        require_loops(sum(loops))
     with (
         open_link(chosen, moves=True, homed=True, seed=seed) as link,
         opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,

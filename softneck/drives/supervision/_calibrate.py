@@ -23,6 +23,9 @@ _LAGS = 8
 # Motors further out than this part of the seen range are not known ground, and none is so much faster.
 _MARGIN = 0.2
 _LEAST = 20.0
+# Runs of a loop, of all together [s]: four minutes show half of the slow error that a quarter of an hour does, and the
+# tracking cried wolf once in eight hours.
+_LEAST_LOOPS = 600.0
 # See `calibrate`; by `benchmarks/supervisor_choice.py`.
 _KNOWN_BIAS = 0.25
 # What is further out than this part of the cycles counts for seldom.
@@ -99,9 +102,18 @@ def _loops(loops: Sequence[Motion], model: Baseline) -> list[LoopRun]:
         valid = np.array([walk.tilt.valid for k in range(len(part.due)) if walk.step(part, k)])
         run = LoopRun(part, valid, model.cycle * model.sample_cycles)
         runs += [run] if run.long else []
-    if len(runs) == 1 or (loops and not runs):
-        raise DataError("too little of the loop's motion had taut tendons to compare with; run it for a minute.")
+    if loops:
+        require_loops(sum(run.seconds for run in runs) if len(runs) > 1 else 0.0)
     return runs
+
+
+def require_loops(seconds: float) -> None:
+    """Raise DataError unless so many seconds of loops, those with taut tendons, are enough to compare with."""
+    if seconds < _LEAST_LOOPS:
+        raise DataError(
+            f"{seconds:.0f} s of a loop's motion with taut tendons are too few to compare its tracking with. Run it "
+            f"for at least {_LEAST_LOOPS:.0f} s, or leave its runs out: then tracking is not compared."
+        )
 
 
 def _tracking(runs: Sequence[LoopRun], budget: Budget, rng: np.random.Generator) -> Tracking:

@@ -162,6 +162,11 @@ class LoopRun:
         self.x, self.good = np.array(x), np.array(good)
 
     @property
+    def seconds(self) -> float:
+        """How long it may be compared with [s]."""
+        return float(self.good.sum()) * self.step
+
+    @property
     def long(self) -> bool:
-        """Whether there is enough to compare with."""
-        return float(self.good.sum()) * self.step >= _LEAST
+        """Whether it says enough by itself, for those that its model is fitted without it."""
+        return self.seconds >= _LEAST
