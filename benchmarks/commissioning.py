@@ -1,13 +1,14 @@
 """All pairs of planted mistakes through `softneck drives commission`'s moves: named, put right, and the true tilt.
 
 `python benchmarks/commissioning.py [--most N]` goes on where it was stopped (build/commissioning.jsonl; as many
-pairs as N in this call) and prints the table.
+pairs as N in this call, drawn at random, always in the same order) and prints the table.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import random
 import sys
 from pathlib import Path
 
@@ -27,7 +28,8 @@ def main() -> None:
     KEPT.parent.mkdir(parents=True, exist_ok=True)
     lines = KEPT.read_text(encoding="utf-8").splitlines() if KEPT.exists() else []
     done = {tuple(item["pair"]): item for item in map(json.loads, lines)}
-    for pair in [*all_pairs(), tuple(sorted(MIRROR))]:
+    pairs = [*all_pairs(), tuple(sorted(MIRROR))]
+    for pair in random.Random(0).sample(pairs, len(pairs)):
         if pair in done or left <= 0:
             continue
         left -= 1

@@ -24,6 +24,8 @@ FINDINGS: Mapping[str, str] = {
     "directions": "the tendons stand elsewhere",
     "hangs": "no tendon gets taut within the travel",
     "no tilt": "a tendon gets taut, and the sensor sees no tilt",
+    "unclear": "the wiggle tells too little of its tilt",
+    "sensor noise": "the sensor is too noisy for gears, currents and lateness",
     "not moved": "the moves ended before this motor",
 }
 

@@ -259,13 +259,18 @@ class Mover:
     def _measure(self, way: int) -> _Steps:
         """Slowly back into the slack, up and down under tension, and wiggle at the top."""
         self._phase, slow, far = SWEEP, self.guards.slow * self._scale, way * _BEYOND * self._scale
-        top, begin = self._at, 0
+        top, begin, pulled = self._at, 0, self._tilt() / self._size()
+
+        def away() -> bool:
+            """Whether it tilts to the side that it was pulled to: a tendon that was taut before lets it go beyond."""
+            return float(self._tilt() @ pulled) > 0.0
+
         for _ in range(_SWEEPS):
-            yield from self._go(self._at - far, slow, lambda: self._size() < _LOOSE * self.guards.target)
+            yield from self._go(self._at - far, slow, lambda: not away() or self._size() < _LOOSE * self.guards.target)
             yield from self._go(self._at - way * _SLACK * self._scale, slow)
             yield from self._stand(_STAND)
             begin = len(self._rows)
-            yield from self._go(top + far, slow, lambda: self._size() > self.guards.target)
+            yield from self._go(top + far, slow, lambda: away() and self._size() > self.guards.target)
             top = self._at
             yield from self._stand(_STAND)
         slope = self._slope(begin)
@@ -313,8 +318,11 @@ class Mover:
         """The tilt that is one: from `contact` on, or from what stands out of the noise [rad]."""
         return max(self.guards.contact, _OUT_OF_NOISE * self._noise / math.sqrt(_MEAN))
 
+    def _tilt(self) -> Vector:
+        return np.mean(self._tilts, axis=0) - self._level
+
     def _size(self) -> float:
-        return float(np.linalg.norm(np.mean(self._tilts, axis=0) - self._level))
+        return float(np.linalg.norm(self._tilt()))
 
     def _put(self, position: float) -> None:
         self._wanted[self.motor - 1] = position

@@ -11,7 +11,7 @@ from softneck.plant import NeckParameters
 from ..bus._axes import Axes, axes_of, inverse, said_of
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
-from ..running._virtual import simulated_plant
+from ..running._virtual import physics_of, simulated_plant
 from ..simulated._drives import twin
 from ..simulated._mounted import MountedOtherwise
 
@@ -102,7 +102,16 @@ def _motor(text: str, count: int) -> int:
 def planted_link(
     believed: DrivesFile, planted: Planted, neck: NeckParameters | None, *, sample_time: float, seed: int = 0
 ) -> VirtualLink:
-    """Return simulated drives that are set up as `planted` says, on a bus that is read as `believed` says."""
+    """Return simulated drives that are set up as `planted` says, on a bus that is read as `believed` says.
+
+    Raises:
+        SettingsError: nothing that has tendons stands for the robot.
+    """
+    if physics_of(believed.moves, neck) is None:
+        raise SettingsError(
+            f"robot {believed.moves.label()} has no virtual plant, and the springs that stand in for it pull both "
+            "ways: moves say nothing of them. Give it one: --neck, or [plant] neck in the robot file."
+        )
     turns = simulated_plant(planted.file, neck, sample_time=sample_time, homed=False, seed=seed)
     outputs = believed.moves.outputs.names
     mounted = MountedOtherwise(turns, inverse(axes_of(planted.file.sensor_axes, outputs)), late=planted.late)

@@ -20,14 +20,16 @@ from softneck.drives.bus._read import make_drives
 from softneck.drives.bus._write import drives_table
 from softneck.drives.commissioning._features import Features
 from softneck.drives.commissioning._findings import FINDINGS, Finding
-from softneck.drives.commissioning._identify import Identified, factors, proposed
+from softneck.drives.commissioning._identify import Identified, Scale, factors, identify, proposed
 from softneck.drives.commissioning._known import fatal, known_before, peak_of, require_answers, typed
 from softneck.drives.commissioning._mounting import Mounting, exchanges, explain, seen
+from softneck.drives.commissioning._moves import WIGGLE
 from softneck.drives.commissioning._planted import plant
 from softneck.drives.master import Tilt
 from softneck.robot import Robot
 
 from ...data import ROOT
+from .toy import Toy, mover_of
 
 TENDONS = np.array([[1.0, -0.5, -0.5], [0.0, math.sqrt(0.75), -math.sqrt(0.75)]])
 STRAIGHT: Axes = ((0, 1.0), (1, 1.0))
@@ -105,6 +107,18 @@ def test_what_is_no_power_of_two_is_what_was_measured() -> None:
     found = factors(np.array([0.0, 0.0, 0.5]))
     assert found[:2].tolist() == [1.0, 1.0]
     assert found[2] == pytest.approx(2.0**0.5, rel=0.1)
+
+
+def test_a_wiggle_that_drowns_is_named_and_not_guessed_from() -> None:
+    """Its gear was nan times the file's."""
+    moves = Toy().run(mover_of())
+    one, rng = moves.motors[0], np.random.default_rng(0)
+    outputs = one.outputs.copy()
+    # Ten times the wiggle's own 0.25 deg.
+    outputs[one.rows(WIGGLE)] = math.radians(2.5) * rng.standard_normal((int(one.rows(WIGGLE).sum()), 2))
+    found = identify(replace(moves, motors=(replace(one, outputs=outputs), *moves.motors[1:])), default_drives(), None)
+    assert [told.motors for told in found.findings if told.name == "unclear"] == [(1,)]
+    assert found.scales[0] == Scale()
 
 
 def test_a_poor_measurement_says_less() -> None:
