@@ -13,7 +13,10 @@ from softneck.cli._main import run
 from softneck.core import FileFormatError, SettingsError, SoftneckError
 from softneck.cosim import FmuPart, load_loop, load_ssp, simulate, study, write_ssp
 from softneck.cosim.loops._loop_file import LoopSetup
+from softneck.cosim.structure._flat import Flat, Line, Ports, flatten
+from softneck.cosim.structure._parse import Affine, Binding, Component, Connection, Structure, SystemNode, Value
 from softneck.loop._system import System
+from softneck.runtime import Port
 
 from ._foreign import build_foreign
 
@@ -231,6 +234,7 @@ BASE = '<ssd:Units><ssc:Unit name="q"><ssc:BaseUnit m="{}" factor="{}"/></ssc:Un
 PASSES = """<ssd:System name="x"><ssd:Connectors><ssd:Connector name="a" kind="input"><ssc:Real/></ssd:Connector>
 <ssd:Connector name="b" kind="output"><ssc:Real/></ssd:Connector></ssd:Connectors>
 <ssd:Connections><ssd:Connection startConnector="a" endConnector="b"/></ssd:Connections></ssd:System>"""
+TURNED = PASSES.replace('startConnector="a" endConnector="b"', 'startConnector="b" endConnector="a"')
 CIRCLE = """<ssd:Connection startElement="x" startConnector="b" endElement="x" endConnector="a"/>
 <ssd:Connection startElement="x" startConnector="b" endElement="a" endConnector="u1"/>"""
 BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
@@ -249,6 +253,11 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
         (ssd(COMPONENT.format(""), LINK.format("alpha", "u9")), "`a.u9`, which is not there"),
         (ssd(COMPONENT.format(""), LINK.format("alpha", "u1") * 2), "`a.u1` has two writers"),
         (ssd(COMPONENT.format(""), LINK.format("u2", "u1")), "`a.u2` to `a.u1`"),
+        (ssd(COMPONENT.format(""), LINK.format("u1", "alpha")), "`a.u1` to `a.alpha` against direction"),
+        (
+            ssd(COMPONENT.format("") + PASSES.replace('"a" end', '"b" end').replace('r="b"/', 'r="a"/'), ""),
+            "against dir",
+        ),
         (ssd(COMPONENT.format("") + PASSES, CIRCLE), "connects `x.b` to itself"),
         (ssd(COMPONENT.format(UNIT.format("parsec")), LINK.format("alpha", "u1")), "unknown unit `parsec`"),
         (ssd(COMPONENT.format(UNIT.format("kg")), LINK.format("alpha", "u1")), "these units do not fit"),
@@ -259,6 +268,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
         (ssd(COMPONENT.format(""), "").replace('stepSize="0.1"', 'stepSize="0"'), "must be positive"),
         (ssd(COMPONENT.format(""), "").replace('stopTime="1.0"', 'stopTime="inf"'), "stopTime = `inf`"),
         (ssd(COMPONENT.format(""), "").replace('stopTime="1.0"', 'stopTime="0"'), "begins at 0 s"),
+        (ssd(COMPONENT.format(""), "").replace('startTime="0"', 'startTime="0.5"'), "softneck's runs begin at 0 s"),
         (ssd().replace('factor="3"', 'factor="nan"'), "factor = `nan`"),
         (ssd().replace('value="4"', 'value="inf"'), "k = `inf`"),
         (ssd(COMPONENT.format("") * 2, ""), "two elements `a`"),
@@ -276,6 +286,60 @@ def test_what_cannot_be_run_is_named(text: str, words: str, foreign: Path, tmp_p
     assert words in str(error.value)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+TYPES = {
+    "real": Port(name="real"),
+    "whole": Port(name="whole", integer=True),
+    "yes": Port(name="yes", boolean=True),
+}
+PLAIN = Affine()
+
+
+def _flat(start: str, end: str, line: Affine = PLAIN, given: float | None = None) -> Flat:
+    """Return a's output `start` at b's input `end`, and a value of that input instead."""
+    value = {} if given is None else {f"b.{end}": Value(given, "", "Real")}
+    root = SystemNode(
+        bindings=(Binding(value, None, {}),),
+        elements={"a": Component("a.fmu", {}, ()), "b": Component("b.fmu", {}, ())},
+        connections=() if value else (Connection(("a", start), ("b", end), line),),
+    )
+    ports = {"a.fmu": Ports({}, TYPES, {}, frozenset()), "b.fmu": Ports(TYPES, {}, {}, frozenset())}
+    return flatten(Structure("s", root, {}, None, None, None), ports, Path("X.ssp"))
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "line"),
+    [
+        ("whole", "real", Affine(0.5)), ("yes", "real", Affine()), ("yes", "whole", Affine(2.0, 1.0)),
+        ("whole", "whole", Affine(-1.0)), ("yes", "yes", Affine()),
+    ],
+)  # fmt: skip
+def test_whole_numbers_and_booleans_count_as_numbers(start: str, end: str, line: Affine) -> None:
+    links = _flat(start, end, line).links
+    assert links[("b",), end] == ((("a",), start), Line(line.factor, line.offset))
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "line", "words"),
+    [
+        ("real", "whole", Affine(), "which is a whole number; softneck does not round"),
+        ("whole", "whole", Affine(0.5), "which is a whole number"),
+        ("real", "yes", Affine(), "which is a Boolean"),
+        ("whole", "yes", Affine(), "which is a Boolean"),
+        ("yes", "yes", Affine(-1.0, 1.0), "which is a Boolean"),
+    ],
+)
+def test_nothing_is_rounded_on_the_way(start: str, end: str, line: Affine, words: str) -> None:
+    with pytest.raises(SettingsError, match=f"connects `a.{start}` to `b.{end}`, {words}"):
+        _flat(start, end, line)
+
+
+def test_values_of_whole_numbers_and_booleans_are_such() -> None:
+    assert _flat("real", "whole", given=3.0).values[("b",)] == {"whole": 3.0}
+    for end, given in (("whole", 2.5), ("yes", 2.0)):
+        with pytest.raises(SettingsError, match=rf"sets `b.{end}`, which is a .*, to {given:g}"):
+            _flat("real", end, given=given)
 
 
 def test_an_archive_that_reaches_out_of_itself(foreign: Path, tmp_path: Path) -> None:

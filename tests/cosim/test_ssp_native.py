@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib.util
 import json
 import os
@@ -64,6 +65,39 @@ def test_other_masters_compute_our_jacobi_loop_without_python(master: str, tmp_p
     for how, theirs in compared.items():
         _assert_equal(how, signals, theirs, ours)
     assert np.abs(ours["pitch"]).max() > 0.02  # the loop does move
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("OMSimulator") is None, reason="OMSimulator is not on PATH; no registry has it")
+def test_omsimulator_computes_our_jacobi_loop(tmp_path: Path) -> None:
+    linear = _linear()
+    build_compiled_fmu(VirtualNeck(NeckParameters.paper()).block(), tmp_path / "VirtualNeck.fmu")
+    build_compiled_fmu(KalmanSettings().design(linear).block(), tmp_path / "kalman.fmu")
+    PiSettings().design(linear).save(tmp_path / "pi.npz")
+    (tmp_path / "loop.toml").write_text(LOOP)
+    setup = load_loop(tmp_path / "loop.toml")
+    archive = write_ssp(setup, tmp_path / "Loop.ssp")
+    ours, out = simulate(setup), tmp_path / "loop.csv"
+    folders = [f"--workingDir={tmp_path}", f"--tempDir={tmp_path}", f"--resultFile={out}"]
+    command = ["OMSimulator", *folders, "--stopTime=2", str(archive)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    log = done.stdout + done.stderr
+    assert "error:" not in log, log[-2000:]
+    with out.open(newline="") as file:
+        head, *lines = csv.reader(file)
+    rows = np.array([[float(cell) for cell in line if cell] for line in lines])
+    # Its table has each moment before and after the step to it.
+    after = rows[np.searchsorted(rows[:, 0], np.arange(100) * 0.02 + 1e-9) - 1]
+    signals = {
+        "plant.pitch": "pitch",
+        "observer.roll": "roll_estimate",
+        "controller.motor_setpoint_1": "motor_setpoint_1",
+    }
+    for theirs, name in signals.items():
+        (place,) = (i for i, text in enumerate(head) if text.endswith(theirs))
+        # It writes 12 digits.
+        np.testing.assert_allclose(after[1:, place], ours[name][1:], rtol=1e-11, atol=1e-12, err_msg=name)
+    assert np.abs(ours["pitch"]).max() > 0.02
 
 
 @pytest.mark.parametrize("kind", ["kalman", "pi", pytest.param("ensemble", marks=pytest.mark.slow)])

@@ -28,6 +28,10 @@ _BASES = {
     "1": (),
 }
 
+# Kinds of connectors at which a connection can begin only, and end only, seen from outside of their element.
+_GIVES = ("output", "calculatedParameter")
+_TAKES = ("input", "parameter", "structuralParameter")
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -114,8 +118,14 @@ class _Flattening:
                 ((*path, element) if element else path, connector)
                 for element, connector in (connection.start, connection.end)
             )
-            for place in (start, end):
-                self._connector(place)
+            for place, ends in ((start, False), (end, True)):
+                kind = self._connector(place).kind
+                # Seen from within a system, what comes into it leaves its own connector.
+                if kind in (_GIVES if ends != (place[0] == path) else _TAKES):
+                    raise self._wrong(
+                        f"connects `{_named(start)}` to `{_named(end)}` against direction: `{_named(place)}` is of "
+                        f"kind {kind}"
+                    )
             if end in self.ending:
                 raise self._wrong(f"`{_named(end)}` has two writers")
             self.ending[end] = (start, connection.affine)
@@ -144,10 +154,23 @@ class _Flattening:
                     ):
                         ends = f"`{_named(origin)}` to `{_named(place)}`"
                         raise self._wrong(f"connects {ends}; softneck connects outputs to inputs")
+                    self._check_types(origin, place, line)
                     links[place] = (origin, line)
                 elif origin in self.values:
-                    values[path][name] = self._number(origin, self.values[origin], line)
+                    values[path][name] = self._number(origin, self.values[origin], line, place)
         return Flat(self.components, links, values)
+
+    def _check_types(self, origin: Place, place: Place, line: Line) -> None:
+        """Refuse to round: whole numbers and Booleans count as numbers, numbers do not count as them."""
+        start = self.ports[self.components[origin[0]].source].outputs[origin[1]]
+        end = self.ports[self.components[place[0]].source].inputs[place[1]]
+        whole = (start.integer or start.boolean) and line.factor.is_integer() and line.offset.is_integer()
+        if (end.integer and not whole) or (end.boolean and not (start.boolean and line == Line())):
+            kind = "Boolean" if end.boolean else "whole number"
+            raise self._wrong(
+                f"connects `{_named(origin)}` to `{_named(place)}`, which is a {kind}; softneck does not round what it "
+                "is given"
+            )
 
     def _given(self, path: tuple[str, ...]) -> Iterator[tuple[Place, tuple[Value, Affine, Mapping[str, Unit]]]]:
         for place, found in self.values.items():
@@ -235,7 +258,10 @@ class _Flattening:
                 return self._place((*path, element), name[len(element) + 1 :])
         return None
 
-    def _number(self, place: Place, found: tuple[Value, Affine, Mapping[str, Unit]], line: Line) -> float:
+    def _number(
+        self, place: Place, found: tuple[Value, Affine, Mapping[str, Unit]], line: Line, target: Place | None = None
+    ) -> float:
+        """Return the value given at a place, behind the line from there to `target`, the place itself by default."""
         value, affine, own = found
         if isinstance(value.value, str):
             raise self._wrong(f"sets `{_named(place)}` to the {value.type} `{value.value}`; softneck sets numbers")
@@ -246,7 +272,13 @@ class _Flattening:
             after = self._converted(value.unit, self._known(value.unit, own), unit, self._known(unit, {}), what).then(
                 after
             )
-        return after.then(line).of(value.value)
+        number, (path, name) = after.then(line).of(value.value), target or place
+        ports = self.ports[self.components[path].source]
+        port = ports.inputs.get(name) or ports.parameters[name]
+        if (port.integer and not number.is_integer()) or (port.boolean and number not in (0.0, 1.0)):
+            kind = "Boolean" if port.boolean else "whole number"
+            raise self._wrong(f"sets `{_named((path, name))}`, which is a {kind}, to {number:g}")
+        return number
 
     def _wrong(self, what: str) -> SettingsError:
         return SettingsError(f"{self.where}: its structure {what}.")

@@ -140,9 +140,11 @@ class Reader:
         experiment = root.find(f"{SSD}DefaultExperiment")
         start, stop = (None if experiment is None else experiment.get(key) for key in ("startTime", "stopTime"))
         begin = 0.0 if start is None else self._number("startTime", start)
-        span = None if stop is None else self._number("stopTime", stop) - begin
+        if begin != 0.0:  # FMUs may know the time of day: a run shifted to 0 would be another one
+            raise self._wrong("SystemStructure.ssd", f"begins at {begin:g} s; softneck's runs begin at 0 s")
+        span = None if stop is None else self._number("stopTime", stop)
         if span is not None and span <= 0.0:
-            raise self._wrong("SystemStructure.ssd", f"ends at {stop} s and begins at {begin:g} s")
+            raise self._wrong("SystemStructure.ssd", f"ends at {stop} s and begins at 0 s")
         step, order = self._master(root)
         return Structure(
             name=root.get("name", ""),
