@@ -114,6 +114,11 @@ def _nss() -> Block:
     return NeuralStateSpace(neurons=3, starts=1, iterations=3).fit(recording()).block()
 
 
+def _loaded_nss() -> Block:
+    heavy = recording().with_channels(payload=np.full(len(recording()), 0.5))
+    return NeuralStateSpace(neurons=3, starts=1, iterations=3).fit([recording(), heavy]).block()
+
+
 def _greybox() -> Block:
     return GreyBox(evaluations=3, sensor_delay=2).fit(recording()).block()
 
@@ -278,6 +283,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     ),
     "guarded": (_guarded, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
     "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
+    "nss_loaded": (_loaded_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], (*_MODEL, "payload")),
     "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
     "neck": (
         _neck,

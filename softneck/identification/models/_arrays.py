@@ -17,14 +17,18 @@ from softneck.runtime._bundle import declared, sized
 from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import AFFINE, STATE_SPACE
+from ._ports import MOST_PAYLOAD
 
 COMPOSED = ("residual", "ensemble", "guarded")
 # A base and one other at least.
 _LEAST_MEMBERS = {"guarded": 2}
 # Of `nss` where the state is corrected by what is measured.
 OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
-# Of `greybox` where the recordings had several payloads.
-LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
+# Where the recordings had several payloads.
+LOADED = {
+    "greybox": "softneck.identification.structured._loaded_greybox_runtime",
+    "nss": "softneck.identification.networks._loaded_nss_runtime",
+}
 
 
 # What says where a model knows the robot: older files, models made by hand and members of others have none.
@@ -117,8 +121,8 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
 def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the module of the runtime: some kinds have several forms, which their arrays tell apart."""
     runtime = KINDS[kind].runtime
-    if kind == "greybox" and "payload" in arrays:
-        return LOADED_GREYBOX
+    if kind in LOADED and "payload" in arrays:
+        return LOADED[kind]
     if "A" not in arrays:
         return runtime
     if kind == "nss":
@@ -160,6 +164,12 @@ _LONGEST_HISTORY = 60_000
 def memory_array(seconds: float, sample_time: float) -> Vector:
     """Return the array `memory` of a model's file: samples in so many seconds, as far as a file goes."""
     return np.array([float(min(np.ceil(seconds / sample_time), _LONGEST_HISTORY))])
+
+
+def check_payloads(least: float, most: float) -> None:
+    """Raise FileFormatError unless a neck bears the payloads [kg] of a model's recordings."""
+    if not 0.0 <= least <= most <= MOST_PAYLOAD:
+        raise FileFormatError(f"its payloads from {least:g} to {most:g} kg are not between 0 and {MOST_PAYLOAD:g}.")
 
 
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:

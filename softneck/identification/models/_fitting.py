@@ -17,7 +17,7 @@ from softneck.signals import Recording, concatenate
 from softneck.signals.quality._poor_excitation import independent_motions
 
 from ._model import WARM_UP, Model
-from ._ports import trained_set_points
+from ._ports import MOST_PAYLOAD, trained_set_points
 from ._scores import nrmse_fit
 from ._validity import grounded
 
@@ -202,3 +202,14 @@ def fitted_model(
         robot=recording.robot,
     )
     return grounded(model, recording)
+
+
+def payload_of(run: Recording) -> float:
+    """Return the payload of a run [kg]; none logged is none."""
+    payload = run.channels.get("payload", np.zeros(1))
+    low, high = float(np.nanmin(payload)), float(np.nanmax(payload))
+    if low != high:
+        raise DataError(f"the payload changes within a run, from {low:g} to {high:g} kg; cut the recording there.")
+    if not 0.0 <= low <= MOST_PAYLOAD:
+        raise DataError(f"a run's payload is {low:g} kg and must be 0 to {MOST_PAYLOAD:g}; is its column in grams?")
+    return low

@@ -8,7 +8,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix
 
-from ..models._arrays import check_table, within
+from ..models._arrays import check_payloads, check_table, within
 
 
 def check_nn(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
@@ -22,3 +22,5 @@ def check_nss(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     within(np.array([sizes["p"]]), 1, sizes["H"], "the length of the echo")
     if np.abs(np.linalg.eigvals(arrays["A"])).max(initial=0.0) >= 1.0:
         raise FileFormatError("its linear part is not stable, so that a free run could diverge.")
+    if "payload" in arrays:
+        check_payloads(*arrays["payload"])

@@ -26,6 +26,14 @@ def nss_inputs(redefinition: np.ndarray, widths: np.ndarray, m: np.ndarray, play
             v[at + 1 + i] = plays[c * count + i]
 
 
+def nss_loaded(payload: float, v: np.ndarray) -> None:
+    """Fill what comes behind the inputs in `v`: each of them times the payload [kg], and the payload."""
+    count = (v.shape[0] - 1) // 2
+    for j in range(count):
+        v[count + j] = payload * v[j]
+    v[2 * count] = payload
+
+
 def nss_next(
     A: np.ndarray,
     B: np.ndarray,

@@ -13,6 +13,7 @@ from softneck.signals import Recording
 
 from ..models._directions import Directions
 from ..models._drive import LoadedDrive, drive_start
+from ..models._fitting import payload_of
 from ..models._model import WARM_UP
 from ..models._scores import nrmse_fit
 
@@ -61,6 +62,7 @@ class Inputs:
         redefinition: (channels, motors) T of Eq. 9-11.
         widths: half-widths of the play operators [rad].
         delay: of the inputs [samples].
+        loaded: the payload is an input as well, alone and times each other (see `_loaded_nss_runtime`).
     """
 
     drive: LoadedDrive
@@ -68,6 +70,7 @@ class Inputs:
     redefinition: Matrix
     widths: Vector
     delay: int
+    loaded: bool = False
 
 
 def sensor_limits(recording: Recording) -> Matrix:
@@ -143,6 +146,9 @@ class Records:
             motors = np.vstack([np.repeat(motors[:1], held + made.delay, axis=0), motors])[: held + len(run)]
             V = np.empty((len(motors), len(T) * (1 + widths.size)))
             functions.nss_signals(T, widths, motors, V)
+            if made.loaded:
+                payload = payload_of(run)
+                V = np.column_stack([V, payload * V, np.full(len(V), payload)])
             since = np.arange(len(V)) - held
             Y = np.vstack([np.full((held, run.outputs.shape[1]), np.nan), run.outputs])
             inputs.append(V)

@@ -17,7 +17,7 @@ from ..models._arrays import memory_array
 from ..models._directions import directions_of
 from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
-from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
+from ..models._fitting import SAME_EXCITATION, fitted_model, payload_of, training_recording
 from ..models._model import Model
 from ..models._state_space import history_array
 from ._contraction import Contraction
@@ -103,7 +103,10 @@ class NeuralStateSpace:
                 recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()]
             )
             fits, delay = linear_start(recording, drive, directions, self.order)
-            made = Inputs(drive, directions, directions.inputs(recording), np.array(self.widths), delay)
+            loads = [payload_of(run) for run in recording.runs()] if recording.robot.is_neck else [0.0]
+            made = Inputs(
+                drive, directions, directions.inputs(recording), np.array(self.widths), delay, len(set(loads)) > 1
+            )
             records = Records.of(recording, made)
             shape, linear, gain = whitened(fits, records, made, self.neurons)
             contraction = Contraction(shape.states, self.neurons, largest_rate(records.sample_time))
@@ -115,6 +118,8 @@ class NeuralStateSpace:
             theta, found = job.run(progress)
             weights = shape.arrays(job.weights(theta))
             arrays = _arrays(recording, made, records, weights, (self.echo, gain))
+            if made.loaded:
+                arrays["payload"] = np.array([min(loads), max(loads)])
         findings: dict[str, Any] = {"delay": delay, "parameters": theta.size, **found}
         if not recording.robot.is_neck:
             findings |= directions.findings()

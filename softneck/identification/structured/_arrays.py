@@ -9,8 +9,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix
 
-from ..models._arrays import within
-from ..models._ports import MOST_PAYLOAD
+from ..models._arrays import check_payloads, within
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +106,7 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
 
 
 def _check_payload(load: Matrix) -> None:
-    least, most = load[:2]
-    if not 0.0 <= least <= most <= MOST_PAYLOAD:
-        raise FileFormatError(f"its payloads from {least:g} to {most:g} kg are not between 0 and {MOST_PAYLOAD:g}.")
+    check_payloads(*load[:2])
     for number, value in zip(LOADS, load[2:], strict=True):
         if not number.low <= value <= number.high:
             raise FileFormatError(f"its {number.name} of {value:g} {number.unit} is out of range.")

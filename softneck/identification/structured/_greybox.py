@@ -23,9 +23,9 @@ from ..models._arrays import memory_array
 from ..models._directions import Directions, directions_of
 from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_echo
-from ..models._fitting import row_hashes, training_recording
+from ..models._fitting import payload_of, row_hashes, training_recording
 from ..models._model import Model
-from ..models._ports import MOST_PAYLOAD, trained_set_points
+from ..models._ports import trained_set_points
 from ..models._state_space import history_array
 from ..models._validity import grounded
 from ._arrays import ACROSS, LOADS, NUMBERS, Number
@@ -151,7 +151,7 @@ class _FitProblem:
             for run in recording.runs()
         ]
         across = ACROSS if recording.outputs.shape[1] == 1 else ()
-        payloads = [_payload(run) for run in recording.runs()]
+        payloads = [payload_of(run) for run in recording.runs()]
         loads = LOADS if len(set(payloads)) > 1 else ()
         numbers = (*(number for number in NUMBERS if number.name not in across), *loads)
         return cls(
@@ -224,17 +224,6 @@ class _FitProblem:
 
         inside = np.clip(start, low + 1e-6 * (high - low), high - 1e-6 * (high - low))
         return least_squares(errors, inside, bounds=(low, high), x_scale="jac", max_nfev=evaluations, xtol=1e-5)
-
-
-def _payload(run: Recording) -> float:
-    """Return the payload of a run [kg]; none logged is none."""
-    payload = run.channels.get("payload", np.zeros(1))
-    low, high = float(np.nanmin(payload)), float(np.nanmax(payload))
-    if low != high:
-        raise DataError(f"the payload changes within a run, from {low:g} to {high:g} kg; cut the recording there.")
-    if not 0.0 <= low <= MOST_PAYLOAD:
-        raise DataError(f"a run's payload is {low:g} kg and must be 0 to {MOST_PAYLOAD:g}; is its column in grams?")
-    return low
 
 
 def _tendons(robot: Robot) -> Vector:

@@ -22,6 +22,7 @@ _NECKS = (
     "softneck.identification.structured._play_runtime",
     "softneck.design.linear._linear_controller_runtime",
     "softneck.identification.networks._nss_runtime",
+    "softneck.identification.networks._loaded_nss_runtime",
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.structured._loaded_greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
