@@ -131,7 +131,10 @@ def _size(stepped: Port, role: str) -> float:
 
 
 def _shown(block: Block) -> list[int]:
-    """Return which outputs answer: set-points of a controller, references, else what is measured and its rate."""
+    """Return which outputs answer: set-points of a controller, references, else what is measured and its rate.
+
+    All numbers of an observer that tells none of these, as a change detector.
+    """
     measured = {port.name.removesuffix("_measured") for port in (*block.inputs, *block.outputs)
                 if port.name.endswith("_measured")}  # fmt: skip
     found = {
@@ -140,7 +143,8 @@ def _shown(block: Block) -> list[int]:
         "observer": lambda name: name.removesuffix("_rate") in measured,
         "plant": lambda name: name in measured,
     }[block.role]
-    return [i for i, port in enumerate(block.outputs) if not port.boolean and found(port.name)]
+    numbers = [i for i, port in enumerate(block.outputs) if not port.boolean]
+    return [i for i in numbers if found(block.outputs[i].name)] or (numbers if block.role == "observer" else [])
 
 
 def _answers(block: Block, u: Matrix) -> Matrix:
