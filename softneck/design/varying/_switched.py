@@ -44,7 +44,7 @@ class SwitchedSettings(LoopSettings):
 
     Attributes:
         payloads: [kg] of the models or families, one each.
-        max_sensitivity: bound on Ms at every payload, on every plant there.
+        max_sensitivity: bound on Ms of the gains of each payload, on every plant there and at the next payloads.
         phase_margin: least phase margin [rad] there.
         dwell_time: between two switches [s], at the least; longer where the design needs it.
         margin: by which the estimate must be past the middle between two payloads, as a part of their distance.
@@ -110,7 +110,9 @@ class SwitchedSettings(LoopSettings):
              for payload, item in zip(self.payloads, plants, strict=True)),
             key=lambda point: point.inclination,
         )  # fmt: skip
-        gains = [tuple(self._tune(point, axis, name) for axis, name in enumerate(names)) for point in points]
+        gains = [
+            tuple(self._tune(points, i, axis, name) for axis, name in enumerate(names)) for i in range(len(points))
+        ]
         found = self._elsewhere(points, gains, names)
         longest = _LONGEST_DWELL * max(axis.nominal.stretch for axis in plants[0].axes.values())
         needed = max(
@@ -155,11 +157,15 @@ class SwitchedSettings(LoopSettings):
         shared = {field.name for field in fields(ScheduledSettings)} & {field.name for field in fields(self)}
         return ScheduledSettings(**{name: getattr(self, name) for name in shared})
 
-    def _tune(self, point: OperatingPoint, axis: int, name: str) -> Gains:
+    def _tune(self, points: Sequence[OperatingPoint], i: int, axis: int, name: str) -> Gains:
+        """Return the gains of one payload; they keep the bounds at the next ones too, to which it may be on the way."""
+        plants = points[i].plants[axis]
+        for other in (*points[max(i - 1, 0) : i], *points[i + 1 : i + 2]):
+            plants += other.plants[axis]
         try:
-            return tune_pi(point.plants[axis], self.extra_delay, self.max_sensitivity, self.phase_margin)
+            return tune_pi(plants, self.extra_delay, self.max_sensitivity, self.phase_margin)
         except SettingsError as error:
-            raise SettingsError(f"{name} at {point.inclination:g} kg: {error}") from error
+            raise SettingsError(f"{name} at {points[i].inclination:g} kg: {error}") from error
 
     def _elsewhere(
         self, points: Sequence[OperatingPoint], gains: Sequence[Sequence[Gains]], names: tuple[str, ...]
