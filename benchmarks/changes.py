@@ -1,13 +1,15 @@
 """How soon a change detector over a `greybox` finds a payload, how often it cries wolf, and how it was chosen.
 
-`python benchmarks/changes.py choose|found|alarms [--several] [--necks NECK...] [--hours H]`
+`python benchmarks/changes.py choose|found|alarms|curve [--several] [--necks NECK...] [--hours H]`
 
 Models are of 140 s of Eq. 22; thresholds of some 200 s of other motion of the same neck. `choose` leaves each neck out
 in turn: seconds until a payload put on at 60 s is found during the paper's rotation (60 where it is not), and as many
 again for each false alarm over other motion. `found` prints these seconds, and those of the next motion after a hold
 at 14 deg. `alarms` counts false alarms over independent minutes of motion; it goes on where it was stopped
-(`build/changes`). With `--several` the model is one of 0, 0.5 and 1 kg, so that the detector tells the payload: found
-is then `changed`, or a payload of more than 0.16 kg (half of the least that is put on) where there was less before.
+(`build/changes`). `curve` prints both for several budgets of false alarms. With `--several` the model is one of 0, 0.5
+and 1 kg, so that the detector tells the payload: found is then `changed`, or a payload of more than 0.16 kg (half of
+the least that is put on) where there was less before. `choose` then adds the seconds until what is told stays within
+0.16 kg, and takes another 12 minutes of motion than `alarms`.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ from payload import log as logged
 from softneck.core import Matrix, Vector, load
 from softneck.estimation.changes._change import ChangeDetector
 from softneck.estimation.changes._settings import ChangeSettings
-from softneck.identification import GreyBox
+from softneck.identification import GreyBox, Model
 from softneck.signals import Recording, concatenate, signal
 from tests.foreign_necks.choosing import leave_one_out
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record_under
@@ -36,6 +38,11 @@ CANDIDATES = [
     for period in (0.2, 0.5)
     for clip in (1.5, 2.0, 3.0)
     for ratio in (2.0, 4.0)
+]
+CANDIDATES_OF_SEVERAL = [
+    ChangeSettings(payload_sight=sight, payload_memory=memory)
+    for sight in (1.5, 3.0, 5.0, 8.0)
+    for memory in (0.5, 1.0, 2.0)
 ]
 PUT_ON, NEXT = 60.0, 70.0
 # [kg] A payload told beyond it is one that was found.
@@ -84,16 +91,28 @@ def first(detector: ChangeDetector, run: Recording, since: float) -> float:
     return float(alarms[0]) * TS - since if alarms.size else np.inf
 
 
-def detector_of(neck: str, *, several: bool) -> ChangeDetector:
-    """Return a detector over a model without payload, or over one of several."""
+def settled(detector: ChangeDetector, run: Recording, payload: float) -> float:
+    """Return the seconds from `PUT_ON` until the payload that is told stays near the true one."""
+    away = np.flatnonzero(np.abs(detector.watch(run)[:, 3] - payload) > TOLD)
+    return max(0.0, (away[-1] + 1) * TS - PUT_ON)
+
+
+@cache
+def learnt(neck: str, *, several: bool) -> tuple[Model, list[Recording]]:
+    """Return a model without payload or of several, and undisturbed motion."""
     if not several:
-        return ChangeSettings().design(trained(neck, "greybox"), baseline(neck))
+        return trained(neck, "greybox"), [baseline(neck)]
     path = OUT / f"{neck}.several.npz"
     if not path.exists():
         OUT.mkdir(parents=True, exist_ok=True)
         GreyBox().fit([logged(neck, kg).rows(0, 5000) for kg in (0.0, 0.5, 1.0)]).save(path)
-    runs = [moved(neck, P, kg, 5) for kg in (0.0, 0.5, 1.0) for P in motions(3)]
-    return ChangeSettings().design(load(path, role="model"), runs)
+    return load(path, role="model"), [moved(neck, P, kg, 5) for kg in (0.0, 0.5, 1.0) for P in motions(3)]
+
+
+def detector_of(neck: str, settings: ChangeSettings, *, several: bool) -> ChangeDetector:
+    """Return a detector over a model without payload, or over one of several."""
+    model, undisturbed = learnt(neck, several=several)
+    return settings.design(model, undisturbed)
 
 
 def loaded(neck: str, P: Matrix, payload: float, seed: int = 9) -> Recording:
@@ -101,31 +120,66 @@ def loaded(neck: str, P: Matrix, payload: float, seed: int = 9) -> Recording:
     return moved(neck, P, np.where(np.arange(len(P)) * TS >= PUT_ON, payload, 0.0), seed)
 
 
-def choose(necks: list[str]) -> None:
+def minute(neck: str, seed: int) -> Recording:
+    """Return undisturbed motion that a seed makes anew."""
+    name, size = ("aprbs", "multisine", "mixed")[seed % 3], np.random.default_rng(seed).uniform(0.5, 1.0)
+    return moved(neck, size * signal(name, duration=60.0, seed=seed).set_points, 0.0, seed)
+
+
+def choose(necks: list[str], *, several: bool) -> None:
     """Print what each neck left out gets from the others' choice."""
-    default, scores = next(i for i, c in enumerate(CANDIDATES) if c == ChangeSettings()), {}
+    candidates = CANDIDATES_OF_SEVERAL if several else CANDIDATES
+    default, scores = next(i for i, c in enumerate(candidates) if c == ChangeSettings()), {}
     for neck in necks:
-        runs = [loaded(neck, rotation(80.0), payload) for payload in LOADS]
+        runs = [(loaded(neck, rotation(80.0), payload), payload, PUT_ON) for payload in LOADS]
         quiet = [moved(neck, P, 0.0, seed) for seed in (11, 12) for P in motions(seed)]
+        if several:
+            runs += [(loaded(neck, hold(80.0), payload), payload, NEXT) for payload in LOADS]
+            quiet += [minute(neck, seed) for seed in range(5000, 5012)]
         row = []
-        for candidate in CANDIDATES:
-            detector = candidate.design(trained(neck, "greybox"), baseline(neck))
-            delays = [first(detector, run, PUT_ON) for run in runs]
+        for candidate in candidates:
+            detector = detector_of(neck, candidate, several=several)
+            delays = [first(detector, run, since) for run, _, since in runs]
             false = sum(np.isfinite(first(detector, run, 0.0)) for run in quiet)
-            row.append(float(np.mean([d if 0.0 < d < np.inf else PUT_ON for d in delays]) + PUT_ON * false))
+            mean = np.mean([d if 0.0 < d < np.inf else PUT_ON for d in delays])
+            late = np.mean([settled(detector, run, kg) for run, kg, _ in runs[:3]]) if several else 0.0
+            row.append(float(mean + late + PUT_ON * false))
         scores[neck] = np.array([row])
         print(neck, np.round(row, 1), flush=True)
     for fold in leave_one_out(scores, default):
-        c = CANDIDATES[fold.chosen]
-        print(f"left out {fold.left_out:8} others choose period {c.period:g} s, clip {c.clip:g}, ratio {c.ratio:g}: "
-              f"{fold.ratios[fold.chosen]:.2f} of the code's; its own best {fold.ratios[fold.best]:.2f}")  # fmt: skip
+        print(f"left out {fold.left_out:8} others choose {said(candidates[fold.chosen], several=several)}: "
+              f"{fold.ratios[fold.chosen]:.2f} of the code's; its own best {fold.ratios[fold.best]:.2f}, "
+              f"{said(candidates[fold.best], several=several)}")  # fmt: skip
+
+
+def said(c: ChangeSettings, *, several: bool) -> str:
+    """Return a candidate in words."""
+    if several:
+        return f"sight {c.payload_sight:g}, memory {c.payload_memory:g} s"
+    return f"period {c.period:g} s, clip {c.clip:g}, ratio {c.ratio:g}"
+
+
+def curve(necks: list[str], hours: float, *, several: bool) -> None:
+    """Print delays and false alarms for budgets of false alarms."""
+    print(f"{'':10}{'budget':>12}{'false, of minutes':>20}{'rotation [s]':>26}{'after a hold [s]':>26}")
+    for neck in necks:
+        cases = [(loaded(neck, P, kg), since) for P, since in ((rotation(80.0), PUT_ON), (hold(80.0), NEXT))
+                 for kg in LOADS]  # fmt: skip
+        quiet = [minute(neck, 1000 + number) for number in range(round(60.0 * hours))]
+        for budget in (1.0, 30.0, 300.0, 10_000.0):
+            detector = detector_of(neck, ChangeSettings(hours=budget), several=several)
+            false = sum(np.isfinite(first(detector, run, 0.0)) for run in quiet)
+            delays = [first(detector, run, since) for run, since in cases]
+            print(f"{neck:10}{budget:10g} h{f'{false} of {len(quiet)}':>20}"
+                  + "".join(f"{'none' if d == np.inf else f'{d:.2f}':>{12 if i == 3 else 8}}"
+                            for i, d in enumerate(delays)), flush=True)  # fmt: skip
 
 
 def found(necks: list[str], *, several: bool) -> None:
     """Print how soon a payload is found."""
     print(f"{'':22}" + "".join(f"{payload:>9g} kg" for payload in (0.0, *LOADS)))
     for neck in necks:
-        detector = detector_of(neck, several=several)
+        detector = detector_of(neck, ChangeSettings(), several=several)
         for name, P, since in (("rotation", rotation(80.0), PUT_ON), ("hold", hold(80.0), NEXT)):
             delays = [first(detector, loaded(neck, P, payload), since) for payload in (0.0, *LOADS)]
             print(f"{neck:14}{name:8}" + "".join(f"{'none' if d == np.inf else f'{d:.2f} s':>12}" for d in delays),
@@ -136,15 +190,11 @@ def alarms(necks: list[str], hours: float, *, several: bool) -> None:
     """Count false alarms, minute by minute of motion that each seed makes anew; kept where it stopped."""
     OUT.mkdir(parents=True, exist_ok=True)
     for neck in necks:
-        detector = detector_of(neck, several=several)
+        detector = detector_of(neck, ChangeSettings(), several=several)
         path = OUT / f"{neck}{'.several' if several else ''}.alarms.json"
         done: list[bool] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
         while len(done) < 60.0 * hours:
-            seed = 1000 + len(done)
-            rng = np.random.default_rng(seed)
-            name = ("aprbs", "multisine", "mixed")[seed % 3]
-            P = rng.uniform(0.5, 1.0) * signal(name, duration=60.0, seed=seed).set_points
-            done.append(bool(np.isfinite(first(detector, moved(neck, P, 0.0, seed), 0.0))))
+            done.append(bool(np.isfinite(first(detector, minute(neck, 1000 + len(done)), 0.0))))
             part = path.with_suffix(".part")
             part.write_text(json.dumps(done), encoding="utf-8")
             part.replace(path)
@@ -154,15 +204,17 @@ def alarms(necks: list[str], hours: float, *, several: bool) -> None:
 def main() -> None:
     """Print what was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("what", choices=["choose", "found", "alarms"])
+    parser.add_argument("what", choices=["choose", "found", "alarms", "curve"])
     parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=list(CHOOSING))
     parser.add_argument("--hours", type=float, default=30.0, help="of motion of each neck")
     parser.add_argument("--several", action="store_true", help="a model of several payloads, which is told as well")
     asked = parser.parse_args()
     if asked.what == "choose":
-        choose(asked.necks)
+        choose(asked.necks, several=asked.several)
     elif asked.what == "found":
         found(asked.necks, several=asked.several)
+    elif asked.what == "curve":
+        curve(asked.necks, asked.hours, several=asked.several)
     else:
         alarms(asked.necks, asked.hours, several=asked.several)
 

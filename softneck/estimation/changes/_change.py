@@ -37,7 +37,7 @@ KIND = "change"
 #: What undisturbed motion says of a model.
 NAMES = ("spread", "thresholds", "chart")
 #: How payloads are weighed, over a model of several.
-BANK = "bank"
+BANK = ("bank", "telling")
 _OUTPUTS = (
     Port(name="changed", description="the neck is not the one that the model was identified from", boolean=True),
     Port(name="since_s", unit="s", description="time since that was found; 0 while it is not", minimum=0.0),
@@ -50,12 +50,12 @@ _OUTPUTS = (
 class ChangeDetector(Shown):
     """Says whether the neck is still the one that the model was identified from; `ChangeSettings.design` makes it.
 
-    Over a model of several payloads with a `bank`, it tells the payload as well, and `changed` says that none explains
+    Over a model of several payloads with `BANK`, it tells the payload as well, and `changed` says that none explains
     the neck.
 
     Attributes:
         model: of any kind; nothing corrects its state.
-        arrays: see `ChangeArrays`, those of `NAMES`; `BANK` as well where the payload is told.
+        arrays: see `ChangeArrays`, those of `NAMES`; of `BANK` as well where the payload is told.
         order: of the loop it is for.
         findings: what the undisturbed motion was.
     """
@@ -107,12 +107,12 @@ class ChangeDetector(Shown):
     @property
     def names(self) -> tuple[str, ...]:
         """Names of its arrays."""
-        return (*NAMES, BANK) if BANK in self.arrays else NAMES
+        return (*NAMES, *BANK) if BANK[0] in self.arrays else NAMES
 
     @property
     def payloads(self) -> tuple[float, float] | None:
         """Least and most payload [kg] that it tells; None where it tells none."""
-        return payloads(self.model.arrays) if BANK in self.arrays else None
+        return payloads(self.model.arrays) if BANK[0] in self.arrays else None
 
     def initial_state(self, **parameters: float) -> State:
         """Return the state at the start; the payload then is a parameter of a detector that tells it."""
@@ -167,7 +167,10 @@ class ChangeDetector(Shown):
         ]
         if self.payloads is not None:
             least, most = self.payloads
-            lines.append(f"  it tells the payload, from {least:g} to {most:g} kg, while the neck moves far enough")
+            lines.append(f"  it tells the payload, from {least:g} to {most:g} kg, while the neck moves")
+            if self.findings.get("alike_kg"):
+                alike = ", ".join(f"{kg:g}" for kg in self.findings["alike_kg"])
+                lines.append(f"  what the model misses looks like {alike} kg: none of these alone has it told anew")
         if "seconds" in self.findings:
             lines.append(
                 f"  from {self.findings['seconds']:.3g} s of undisturbed motion, a false alarm in "
@@ -197,7 +200,7 @@ class ChangeDetector(Shown):
         found = cls(
             model=nested_model(header["model"], arrays),
             arrays={
-                name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in (*NAMES, BANK) if name in arrays
+                name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in (*NAMES, *BANK) if name in arrays
             },
             order=str(header["order"]),
             findings=header["findings"],

@@ -83,8 +83,7 @@ def change_see(p: ChangeArrays, x: ChangeCells, measured: np.ndarray) -> None:
     rest_variance = 0.0
     for i in range(p.outputs):
         error = measured[i] - x.angles[i]
-        spread = p.spread[i, 0] + p.spread[i, 1] * x.fastest * x.fastest + p.spread[i, 2] * x.angles[i] * x.angles[i]
-        x.scaled[i] += error / math.sqrt(spread)
+        x.scaled[i] += error / change_missed(p, x, i)
         x.level[i] = keep * x.level[i] + measured[i]
         x.power[i] = keep * x.power[i] + measured[i] * measured[i]
         x.missed[i] = keep * x.missed[i] + error * error
@@ -95,6 +94,12 @@ def change_see(p: ChangeArrays, x: ChangeCells, measured: np.ndarray) -> None:
     # While the neck hardly moves the last fit stands.
     if varied > CHANGE_MOVES * rest_variance:
         x.fit = max(100.0 * (1.0 - math.sqrt(off / varied)), -100.0)
+
+
+def change_missed(p: ChangeArrays, x: ChangeCells, i: int) -> float:
+    """Return the standard deviation of what the known neck's model misses of an output in such a motion."""
+    spread = p.spread[i, 0] + p.spread[i, 1] * x.fastest * x.fastest + p.spread[i, 2] * x.angles[i] * x.angles[i]
+    return math.sqrt(spread)
 
 
 def change_score(p: ChangeArrays, x: ChangeCells) -> None:

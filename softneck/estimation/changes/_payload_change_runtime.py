@@ -1,10 +1,11 @@
 """A model of several payloads in free run beside the loop under each of them: which one it is, or that it is none.
 
-What each copy misses is summed with exponential weights, over how much the model misses in such a motion of the neck
-that it knows, and less an offset that a sensor may have. The payload is where a parabola through the least of these
-costs and its neighbours is lowest. It is told anew only while the copies part far enough in what was measured of late:
-while the neck stands or hardly moves nothing is learnt of it. The cumulative sums are over what the model misses at
-that payload: a change that no payload explains.
+Each copy has a cumulative sum of its likelihood ratio against the payload that is told (`chart_shift`, over averages
+of a period and over how much the model misses in such a motion of the neck that it knows). Where one is beyond its
+threshold, which undisturbed motion gave, the payload is told anew: where a parabola through the least cost of all
+copies and its neighbours is lowest. A cost is what a copy misses, squared and summed with exponential weights, less an
+offset that a sensor may have. While the neck stands nothing is learnt of it. The other cumulative sums are over what
+the model misses at that payload: a change that no payload explains.
 """
 
 import math
@@ -19,26 +20,28 @@ from softneck.estimation.changes._change_parts_runtime import (
     CHANGE_STILL,
     ChangeArrays,
     ChangeCells,
+    change_missed,
     change_period,
     change_see,
 )
 from softneck.runtime._layout import array, cells, rest, value
 from softneck.runtime._members_runtime import member_size
+from softneck.signals.detection._charts_runtime import chart_shift
 
 # Places in `bank`.
 BANK_LEAST = 0  # [kg]
 BANK_MOST = 1  # [kg]
 BANK_COPIES = 2  # of the model, at as many payloads from least to most
 BANK_KEEP = 3  # part of the sums that a sample keeps
-BANK_INFORMED = 4  # squared distance of the outermost copies, over the spread, from which on they tell
-BANK_OFFSET = 5  # an offset of each output counts as so many samples that were measured to be zero
+BANK_SIGHT = 4  # standard deviations for which a copy's distance counts at most in a period
 
 
 class PayloadChangeArrays(ChangeArrays):
     """As without payloads, then how the copies are weighed."""
 
-    bank = array("6", "see BANK_*")
+    bank = array("5", "see BANK_*")
     copies = value("bank", BANK_COPIES)
+    telling = array("copies", "thresholds of the copies' sums")
 
 
 class PayloadChangeState(ChangeCells):
@@ -48,8 +51,8 @@ class PayloadChangeState(ChangeCells):
     told = cells("copies, outputs", "angles of each copy")
     missed_by = cells("copies, outputs", "sum of what each misses, over the spread")
     squares = cells("copies, outputs", "sum of its squares")
-    apart = cells("outputs", "sum of the outermost copies' distance, over the spread")
-    apart_squares = cells("outputs", "sum of its squares")
+    apart = cells("copies, outputs", "how far each is from the payload told, over the spread, summed in this period")
+    shifts = cells("copies", "cumulative sums of each against the payload told")
     seen = cells("", "weight of these sums")
     models = rest("states of the copies")
 
@@ -95,11 +98,12 @@ def step(
         usable = usable and math.isfinite(measured[i])
     if usable:
         change_see(p, x, measured)
+        payload_change_part(p, x)
         if x.fastest > p.chart[CHANGE_STILL] and x.samples >= p.chart[CHANGE_QUIET]:
             payload_change_weigh(p, x, measured)
-    ends = x.elapsed + 1.0 >= p.chart[CHANGE_PERIOD]
+    told = payload_change_ends(p, x)
     change_period(p, x)
-    if ends:
+    if told:
         payload_change_find(p, x)
     outputs[0] = x.changed
     outputs[1] = x.since
@@ -138,38 +142,55 @@ def payload_change_blend(p: PayloadChangeArrays, x: PayloadChangeState) -> None:
 
 
 def payload_change_weigh(p: PayloadChangeArrays, x: PayloadChangeState, measured: np.ndarray) -> None:
-    """Take in what each copy misses, and how far the outermost are apart."""
+    """Take in what each copy misses."""
     keep, m, told = p.bank[BANK_KEEP], p.outputs, x.told
     missed, squares = x.missed_by, x.squares
     x.seen = keep * x.seen + 1.0
     for i in range(m):
-        y = x.angles[i]
-        spread = math.sqrt(p.spread[i, 0] + p.spread[i, 1] * x.fastest * x.fastest + p.spread[i, 2] * y * y)
+        spread = change_missed(p, x, i)
         for copy in range(p.copies):
             at = copy * m + i
             e = (measured[i] - told[at]) / spread
             missed[at] = keep * missed[at] + e
             squares[at] = keep * squares[at] + e * e
-        d = (told[(p.copies - 1) * m + i] - told[i]) / spread
-        x.apart[i] = keep * x.apart[i] + d
-        x.apart_squares[i] = keep * x.apart_squares[i] + d * d
+
+
+def payload_change_part(p: PayloadChangeArrays, x: PayloadChangeState) -> None:
+    """Take in how far each copy is from the payload that is told."""
+    m, told, apart = p.outputs, x.told, x.apart
+    for i in range(m):
+        spread = change_missed(p, x, i)
+        for copy in range(p.copies):
+            apart[copy * m + i] += (told[copy * m + i] - x.angles[i]) / spread
+
+
+def payload_change_ends(p: PayloadChangeArrays, x: PayloadChangeState) -> bool:
+    """Return whether a period ends with this sample in which a copy's sum passes its threshold."""
+    if x.elapsed + 1.0 < p.chart[CHANGE_PERIOD]:
+        return False
+    m, apart, shifts, beyond = p.outputs, x.apart, x.shifts, False
+    moved = x.moved > 0.5 or x.fastest > p.chart[CHANGE_STILL]
+    if x.counted > 0.5 and moved and x.samples >= p.chart[CHANGE_QUIET]:
+        for copy in range(p.copies):
+            score = 0.0
+            for i in range(m):
+                score += chart_shift(x.scaled[i] / x.counted, apart[copy * m + i] / x.counted, 1.0, p.bank[BANK_SIGHT])
+            shifts[copy] = max(0.0, shifts[copy] + score)
+            beyond = beyond or shifts[copy] > p.telling[copy]
+    apart[:] = 0.0
+    return beyond
 
 
 def payload_change_find(p: PayloadChangeArrays, x: PayloadChangeState) -> None:
-    """Tell the payload anew, if what was measured of late says something of it."""
+    """Tell the payload anew; nothing has been learnt of it, nor of what it leaves over."""
+    m, missed, squares = p.outputs, x.missed_by, x.squares
     if x.seen < 0.5:
-        return
-    weight, m = x.seen + p.bank[BANK_OFFSET], p.outputs
-    missed, squares, informed = x.missed_by, x.squares, 0.0
-    for i in range(m):
-        informed += x.apart_squares[i] - x.apart[i] * x.apart[i] / weight
-    if informed < p.bank[BANK_INFORMED]:
         return
     cost, best = np.zeros(p.copies), 0
     for copy in range(p.copies):
         for i in range(m):
             at = copy * m + i
-            cost[copy] += squares[at] - missed[at] * missed[at] / weight
+            cost[copy] += squares[at] - missed[at] * missed[at] / x.seen
         if cost[copy] < cost[best]:
             best = copy
     # A parabola through three costs; of an outermost one through the last three.
@@ -181,3 +202,5 @@ def payload_change_find(p: PayloadChangeArrays, x: PayloadChangeState) -> None:
     away = min(max(middle + away, best - 1.0), best + 1.0)
     x.payload = min(max(payload_change_of(p, 0) + away * (payload_change_of(p, 1) - payload_change_of(p, 0)),
                         p.bank[BANK_LEAST]), p.bank[BANK_MOST])  # fmt: skip
+    x.shifts[:] = 0.0
+    x.sums[:] = 0.0

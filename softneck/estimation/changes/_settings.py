@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from softneck.identification import Model
 from softneck.identification.models._fitting import known_rows, one_recording
 from softneck.identification.models._ports import payloads
 from softneck.signals import Recording
+from softneck.signals.detection._cusum import shift_score
 from softneck.signals.detection._threshold import Budget, thresholds
 
-from ._change import BANK, ChangeDetector
+from ._change import ChangeDetector
 from ._change_parts_runtime import CHANGE_PERIOD, CHANGE_QUIET, CHANGE_STILL
 
 # [s] of a neck's time: what a block of the bootstrap lasts (about a motion, whose misses belong together), its windows,
@@ -21,8 +23,8 @@ from ._change_parts_runtime import CHANGE_PERIOD, CHANGE_QUIET, CHANGE_STILL
 _BLOCK, _WINDOW, _QUIET = 5.0, 20.0, 3.0
 # Motion below this part of the mean one is none.
 _STILL = 0.1
-# Copies of a model of several payloads; misses of this time [s of a neck] belong together.
-_COPIES, _TOGETHER = 5, 1.0
+# Copies of a model of several payloads; a threshold that no sum reaches.
+_COPIES, _NEVER = 5, 1e9
 # Above this part of rows that the model was trained on, it misses less than it will elsewhere.
 _MOST_KNOWN = 0.5
 
@@ -38,7 +40,7 @@ class ChangeSettings:
         hours: of motion in which all sums together raise one false alarm [h].
         memory: of the output `fit` [s].
         payload_memory: over which a model of several payloads tells which one it is [s].
-        payload_doubt: as a part of their range, its standard deviation; in motion that leaves more nothing is told.
+        payload_sight: standard deviations of what it misses for which a payload counts at most in a period.
         order: of the loop it is for.
         seed: of the bootstrap.
     """
@@ -48,13 +50,13 @@ class ChangeSettings:
     clip: float = 1.5
     hours: float = 300.0
     memory: float = 10.0
-    payload_memory: float = 2.0
-    payload_doubt: float = 0.15
+    payload_memory: float = 1.0
+    payload_sight: float = 5.0
     order: str = "sequential"
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("ratio", "period", "clip", "hours", "memory", "payload_memory", "payload_doubt"):
+        for name in ("ratio", "period", "clip", "hours", "memory", "payload_memory", "payload_sight"):
             require_positive(name, getattr(self, name))
         if self.ratio <= 1.0:
             raise SettingsError(f"`ratio` must be above 1, for a change makes a model worse; got {self.ratio:g}.")
@@ -83,28 +85,48 @@ class ChangeSettings:
         still = _STILL * float(np.mean(np.concatenate([states["fastest"] for _, states in runs])))
         draft.arrays["chart"][CHANGE_STILL] = still
         spread = _spread(runs, still)
-        if payloads(model.arrays) is not None:
-            draft = replace(draft, arrays={**draft.arrays, "spread": spread, BANK: self._bank(draft)})
+        draft = replace(draft, arrays={**draft.arrays, "spread": spread, **self._bank(draft)})
+        if draft.payloads is not None:
             runs = [(run.outputs, draft.states(run, payload_start=payload))
                     for run, payload in zip(recording.runs(), told, strict=True)]  # fmt: skip
-        scores = [self.scores(*_averages(draft, outputs, states, spread)) for outputs, states in runs]
-        period = draft.arrays["chart"][0] * draft.sample_time
-        budget = Budget(rate=1.0 / (3600.0 * self.hours), charts=len(spread) + 1, step=period,
-                        block=_BLOCK * draft.stretch, window=_WINDOW * draft.stretch)  # fmt: skip
-        limits = thresholds(scores, budget, np.random.default_rng(self.seed))
-        seconds = len(recording) * recording.sample_time
-        return replace(
-            draft,
-            arrays={**draft.arrays, "spread": spread, "thresholds": limits},
-            findings={"seconds": seconds, "hours": self.hours},
-        )
+        errors = [_averages(draft, (outputs - states["angles"])[:, None], states) for outputs, states in runs]
+        limits = self._thresholds(draft, [self.scores(average[:, 0], moved) for average, moved in errors])
+        found: dict[str, Any] = {"seconds": len(recording) * recording.sample_time, "hours": self.hours}
+        if draft.payloads is None:
+            return replace(draft, arrays={**draft.arrays, "thresholds": limits}, findings=found)
+        scores = [self.shifts(*_averages(draft, _apart(outputs, states), states)) for outputs, states in runs]
+        telling = self._thresholds(draft, scores)
+        alike = _alike(draft, scores, told)
+        telling[alike] = _NEVER
+        found["alike_kg"] = [float(kg) for kg in np.linspace(*draft.payloads, _COPIES)[alike]]
+        return replace(draft, arrays={**draft.arrays, "thresholds": limits, "telling": telling}, findings=found)
 
-    def _bank(self, draft: ChangeDetector) -> Vector:
-        """Return how a model of several payloads is weighed, see BANK_*."""
-        least, most = payloads(draft.model.arrays) or (0.0, 0.0)
-        second = draft.sample_time / draft.stretch
-        return np.array([least, most, _COPIES, np.exp(-second / self.payload_memory),
-                         _TOGETHER / second / self.payload_doubt**2, 0.0])  # fmt: skip
+    def _thresholds(self, draft: ChangeDetector, scores: list[Matrix]) -> Vector:
+        """Return those of some charts, whose scores on undisturbed motion these are (periods, charts) of each run."""
+        charts = len(draft.arrays["thresholds"]) + len(draft.arrays.get("telling", ()))
+        period = draft.arrays["chart"][CHANGE_PERIOD] * draft.sample_time
+        budget = Budget(rate=1.0 / (3600.0 * self.hours), charts=charts, step=period,
+                        block=_BLOCK * draft.stretch, window=_WINDOW * draft.stretch)  # fmt: skip
+        return thresholds(scores, budget, np.random.default_rng(self.seed))
+
+    def _bank(self, draft: ChangeDetector) -> dict[str, Vector]:
+        """Return how a model of several payloads is weighed, which tells nothing yet; nothing for other models."""
+        known = payloads(draft.model.arrays)
+        if known is None:
+            return {}
+        keep = np.exp(-draft.sample_time / draft.stretch / self.payload_memory)
+        return {"bank": np.array([*known, _COPIES, keep, self.payload_sight]), "telling": np.full(_COPIES, _NEVER)}
+
+    def shifts(self, averages: Matrix, moved: np.ndarray) -> Matrix:
+        """Return the scores (periods, copies) of what the model misses against each copy.
+
+        Args:
+            averages: (periods, 1 + copies, outputs) of what the model misses and how far copies are apart from it.
+            moved: (periods,) whether the neck moved in it; else nothing is counted.
+        """
+        one = np.ones(averages.shape[2])
+        found = [shift_score(row[0], row[1:], one, sight=self.payload_sight) for row in averages]
+        return moved[:, None] * np.array(found).reshape(-1, averages.shape[1] - 1)
 
     def scores(self, averages: Matrix, moved: np.ndarray) -> Matrix:
         """Return the scores (periods, charts) of averages (periods, outputs), in the order of the charts.
@@ -120,7 +142,7 @@ class ChangeSettings:
     def _draft(self, model: Model) -> ChangeDetector:
         """Return a detector that knows nothing of undisturbed motion yet, and says nothing."""
         m = len(model.robot.outputs.names)
-        none = {"spread": np.tile([1.0, 0.0, 0.0], (m, 1)), "thresholds": np.full(m + 1, 1e9), "chart": np.zeros(7)}
+        none = {"spread": np.tile([1.0, 0.0, 0.0], (m, 1)), "thresholds": np.full(m + 1, _NEVER), "chart": np.zeros(7)}
         draft = ChangeDetector(model=model, arrays=none, order=self.order)
         Ts, stretch = model.sample_time, draft.stretch
         period, quiet = max(1, round(self.period * stretch / Ts)), round(_QUIET * stretch / Ts)
@@ -169,19 +191,46 @@ def _spread(runs: list[tuple[Matrix, dict[str, Matrix]]], still: float) -> Matri
     return np.array(found)
 
 
-def _averages(
-    draft: ChangeDetector, outputs: Matrix, states: dict[str, Matrix], spread: Matrix
-) -> tuple[Matrix, np.ndarray]:
-    """Return what the model misses over its spread, averaged (periods, outputs), and whether the neck moved then."""
-    motion, y, chart = states["fastest"], states["angles"], draft.arrays["chart"]
-    scaled = (outputs - y) / np.sqrt(spread[:, 0] + spread[:, 1] * motion**2 + spread[:, 2] * y**2)
+def _averages(draft: ChangeDetector, values: np.ndarray, states: dict[str, Matrix]) -> tuple[np.ndarray, np.ndarray]:
+    """Return values over the spread, averaged over periods, and whether the neck moved then (periods,).
+
+    Args:
+        draft: whose periods and spread these are.
+        values: (time, kinds, outputs); the averages have the same shape.
+        states: of the run.
+    """
+    motion, y, (chart, spread) = states["fastest"], states["angles"], (draft.arrays["chart"], draft.arrays["spread"])
+    scaled = values / np.sqrt(spread[:, 0] + spread[:, 1] * motion**2 + spread[:, 2] * y**2)[:, None]
     period = int(chart[CHANGE_PERIOD])
     averages, moved = [], []
     for first in range(0, len(scaled) - period + 1, period):
         block, rows = scaled[first : first + period], slice(first, first + period)
-        there = np.isfinite(block).all(axis=1)
+        there = np.isfinite(block).all(axis=(1, 2))
         # As the runtime has it: by the last sample of a period.
         if there.any() and first + period > chart[CHANGE_QUIET]:
             averages.append(block[there].mean(axis=0))
             moved.append(bool((motion[rows] > chart[CHANGE_STILL]).any()))
-    return np.array(averages).reshape(-1, scaled.shape[1]), np.array(moved, dtype=bool)
+    return np.array(averages).reshape(-1, *scaled.shape[1:]), np.array(moved, dtype=bool)
+
+
+def _apart(outputs: Matrix, states: dict[str, Matrix]) -> np.ndarray:
+    """Return (time, 1 + copies, outputs) what the model misses, and how far each copy is from it."""
+    y = states["angles"]
+    copies = states["told"].reshape(len(y), -1, y.shape[1])
+    return np.concatenate([(outputs - y)[:, None], copies - y[:, None]], axis=1)
+
+
+def _alike(draft: ChangeDetector, scores: list[Matrix], told: list[float]) -> np.ndarray:
+    """Return (copies,) which of them what the model misses looks like.
+
+    In some motion without a change their sums rise for as long as it goes on, and no threshold would hold.
+    """
+    least, most = draft.payloads or (0.0, 0.0)
+    copies = np.linspace(least, most, _COPIES)
+    long = max(1, round(_WINDOW * draft.stretch / (draft.arrays["chart"][CHANGE_PERIOD] * draft.sample_time)))
+    found = np.zeros(_COPIES, dtype=bool)
+    for part, payload in zip(scores, told, strict=True):
+        other = np.abs(copies - payload) > 0.5 * (most - least) / (_COPIES - 1)
+        for first in range(0, len(part) - long + 1, long):
+            found |= other & (part[first : first + long].sum(axis=0) > 0.0)
+    return found
