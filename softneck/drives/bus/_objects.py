@@ -9,7 +9,14 @@ from softneck.core import FileFormatError
 
 from ._file import DriveEntry, DrivesFile
 from ._sdo import is_integer
-from ._units import acceleration_to_internal, current_to_internal, internal_to_current, position_to_counts
+from ._units import (
+    acceleration_to_internal,
+    current_to_internal,
+    internal_to_current,
+    internal_to_speed,
+    position_to_counts,
+    speed_to_internal,
+)
 
 if TYPE_CHECKING:
     from canopen.objectdictionary import ObjectDictionary
@@ -81,8 +88,6 @@ def require_eds(dictionary: ObjectDictionary, profile: str, name: str) -> None:
 
 def speed_units(speed: float, entry: DriveEntry, profile: str) -> int:
     """Return a speed [rad/s] in the drive's units."""
-    from ._units import speed_to_internal
-
     if profile == _PLAIN:
         return round(speed * entry.scale.counts_per_radian)
     return speed_to_internal(speed, entry.scale)
@@ -90,8 +95,6 @@ def speed_units(speed: float, entry: DriveEntry, profile: str) -> int:
 
 def speed_of_units(units: int, entry: DriveEntry, profile: str) -> float:
     """Return a speed [rad/s] of the drive's units."""
-    from ._units import internal_to_speed
-
     return units / entry.scale.counts_per_radian if profile == _PLAIN else internal_to_speed(units, entry.scale)
 
 

@@ -19,9 +19,8 @@ from ..running._scan import scan
 from ._findings import Finding
 from ._identify import LATE, Expected, Identified, identify, proposed
 from ._known import fatal, known_before, require_answers, typed
-from ._measure import SAMPLE_TIME, measure
+from ._measure import SAMPLE_TIME, expected_of, measure
 from ._moves import PULLED, Guards, Moves
-from ._plant import expected_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,6 @@
-"""The moves of a commissioning on drives: over the master of every run, with limits of their own."""
+"""The moves of a commissioning: on drives, over the master of every run, with limits of their own; and on the virtual
+plant that stands for them, which says what to expect.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from softneck.core import CheckFailedError
+from softneck.plant import NeckParameters
+from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
@@ -15,6 +19,8 @@ from ..master import Frame, Master, MasterSettings
 from ..master._settings import ChannelSettings
 from ..running._bus_loop import RunEnd, Session, run_session
 from ..running._stop import wait
+from ..running._virtual import physics_of, simulated_neck
+from ._identify import Expected, seen_by
 from ._mover import Mover
 from ._moves import Guards, Moves
 
@@ -74,6 +80,25 @@ def measure(
     return Moves(tuple(mover.done), SAMPLE_TIME, stopped=stopped), ended
 
 
+def expected_of(file: DrivesFile, guards: Guards, neck: NeckParameters | None = None) -> Expected | None:
+    """Return what the virtual plant of the robot shows with drives as `file` has them; None where there is none.
+
+    Args:
+        file: as believed.
+        guards: as for the moves themselves.
+        neck: physics of the virtual plant; None: those that the robot names.
+    """
+    physics = physics_of(file.moves, neck)
+    if physics is None:
+        return None
+    # A sensor that sits as it should, next to no noise; every drive as the first, for a mistake would be in it as well.
+    physics = physics.replace(noise_std=1e-6, noise_quantum=0.0, drift_std=0.0, dropout_rate=0.0)
+    file = replace(file, sensor_axes=())
+    link = VirtualLink(simulated_neck(file, physics, sample_time=SAMPLE_TIME, homed=False))
+    moves, _ = measure(Session(file=file, link=link), guards, motors=tuple(range(1, len(file.drives) + 1)))
+    return seen_by(moves, file, "the virtual plant, with drives as the file has them")
+
+
 def cautious(file: DrivesFile, guards: Guards) -> DrivesFile:
     """Return `file` with the limits of the moves: little current, slow ramps, no limit at what is still unknown."""
     current = file.zero.current if guards.current is None else guards.current
@@ -85,15 +110,12 @@ def cautious(file: DrivesFile, guards: Guards) -> DrivesFile:
         limits=replace(file.limits, position=far, speed=2.0, slack_unwind=20.0),
         watch=replace(file.watch, **_OPEN),
         ramps=replace(file.ramps, speed=0.3, settle=0.2, tolerance=0.2),
-        robot=None if file.robot is None else _unlimited(file, far),
+        robot=None if file.robot is None else _unlimited(file.robot),
     )
 
 
-def _unlimited(file: DrivesFile, far: float) -> Any:
-    robot = file.moves
-    motors = replace(robot.motors, setpoint_min=None, setpoint_max=None, rate_limit=None)
-    del far
-    return replace(robot, motors=motors)
+def _unlimited(robot: Robot) -> Robot:
+    return replace(robot, motors=replace(robot.motors, setpoint_min=None, setpoint_max=None, rate_limit=None))
 
 
 def _from_here(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from softneck.core import SettingsError
 from softneck.plant import NeckParameters
@@ -12,8 +14,9 @@ from ..bus._axes import Axes, axes_of, inverse, said_of
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
 from ..running._virtual import physics_of, simulated_plant
-from ..simulated._drives import twin
-from ..simulated._mounted import MountedOtherwise
+from ..simulated import SimulatedNeck
+from ..simulated._drives import OutputSample, TiltSample, sample_at, twin
+from ..simulated._springs import SimulatedSprings
 
 # How a mistake is written, for people.
 KINDS = ("reversed:N", "exchanged:N:M", "gear:N:FACTOR", "lines:N:FACTOR", "current:N:FACTOR", "axes", "sign:OUTPUT",
@@ -119,3 +122,37 @@ def planted_link(
     link.axes = axes_of(believed.sensor_axes, outputs)
     turns.drives = (*turns.drives, *(twin(node, turns.settings) for node in planted.twins))
     return link
+
+
+class MountedOtherwise:
+    """A neck, or springs, whose sensor has other axes and signs, and tells what was `late` [s] before.
+
+    All else is that of what it stands around.
+    """
+
+    def __init__(
+        self, neck: SimulatedNeck | SimulatedSprings, axes: Sequence[tuple[int, float]], *, late: float = 0.0
+    ) -> None:
+        """Let output k of the sensor be `sign` times the true output `number`: (number, sign) is `axes[k]`."""
+        count = len(neck.newest.values)
+        if sorted(number for number, _ in axes) != list(range(count)):
+            raise SettingsError(f"`axes` must name each of the {count} outputs once.")
+        self._neck, self._axes = neck, tuple(axes)
+        samples = round(late / neck.settings.sample_time)
+        self._past: deque[TiltSample | OutputSample] = deque([neck.newest] * (samples + 1), samples + 1)
+        self.newest: TiltSample | OutputSample = self._turned(neck.newest)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._neck, name)
+
+    def sample(self, now: float) -> TiltSample | OutputSample:
+        """Take one sample, and tell the one that is due."""
+        self._past.append(self._neck.sample(now))
+        self.newest = self._turned(self._past[0]._replace(time=now))
+        return self.newest
+
+    def _turned(self, sample: TiltSample | OutputSample) -> TiltSample | OutputSample:
+        values, rates = (
+            tuple(sign * given[number] for number, sign in self._axes) for given in (sample.values, sample.rates)
+        )
+        return sample_at(sample.time, values, rates, valid=sample.valid)

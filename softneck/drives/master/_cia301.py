@@ -49,16 +49,6 @@ class Command(IntEnum):
     RESET_COMMUNICATION = 0x82
 
 
-# What a command leads to.
-AFTER = {
-    Command.START: NodeState.OPERATIONAL,
-    Command.STOP: NodeState.STOPPED,
-    Command.PRE_OPERATIONAL: NodeState.PRE_OPERATIONAL,
-    Command.RESET_NODE: NodeState.PRE_OPERATIONAL,
-    Command.RESET_COMMUNICATION: NodeState.PRE_OPERATIONAL,
-}
-
-
 def nmt_frame(command: Command, node: int) -> Frame:
     """Return the frame that commands `node` (0: all)."""
     return Frame(0x000, bytes([command, node]))

@@ -9,7 +9,7 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.drives.master import Frame, Phase
-from softneck.drives.master._cia301 import AFTER, Command, NodeState, nmt_frame, node_state
+from softneck.drives.master._cia301 import Command, NodeState, nmt_frame, node_state
 from softneck.drives.master._events import IDLE_TOO, RULES, Event, Reaction
 from softneck.drives.master._fieldbus import BusSettings
 from softneck.drives.master._settings import (
@@ -170,7 +170,3 @@ def test_network_management_speaks_cia_301() -> None:
     for code in range(128):
         for toggle in (0, 0x80):
             assert node_state(code | toggle) is NodeState[states.get(code, "UNKNOWN")]
-    after = {"START": "OPERATIONAL", "STOP": "STOPPED"}
-    assert {command.name: state.name for command, state in AFTER.items()} == {
-        name: after.get(name, "PRE_OPERATIONAL") for name in numbers
-    }
