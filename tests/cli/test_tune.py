@@ -9,6 +9,7 @@ import pytest
 
 import softneck
 from softneck.cli._main import run
+from softneck.cli._tune import way_on
 from softneck.estimation import KalmanSettings
 
 from ..data import ROOT
@@ -148,6 +149,14 @@ def test_no_certificate_where_the_loops_of_tuning_alone_do_not_hold(
     assert run([*looped, "--budget", "3", "--requirements", str(tmp_path / "wanted.toml")]) == 1
     assert "What stands in the way is track.ahead_rms_deg" in capsys.readouterr().err
     assert not (tmp_path / "out" / "best.certificate.json").exists()
+
+
+def test_nobody_is_told_to_loosen_a_margin() -> None:
+    assert "Loosen it" in way_on("neck.rise_s", unheard=False)
+    for margin in ("axes.gain_margin", "mimo.disk_margin", "robust.mu", "stability.radius"):
+        assert "slower rise" in way_on(margin, unheard=False)
+        assert "oosen" not in way_on(margin, unheard=False)
+    assert "Record" in way_on("axes.gain_margin", unheard=True)
 
 
 @pytest.mark.parametrize(
