@@ -151,7 +151,7 @@ def way_on(binding: str | None, *, unheard: bool) -> str:
         return "Record what is said above, no setting mends it"
     if binding.startswith(_MARGINS):
         return (
-            "It stands for what the models do not know: allow a slower rise, give a family of more recordings, or go on "
-            "with a larger --budget"
+            "It stands for what the models do not know: allow a slower rise, give a family of more recordings, or go "
+            "on with a larger --budget"
         )
     return "Loosen it, or go on with a larger --budget"
