@@ -15,7 +15,7 @@ from softneck.drives.logs._log_file import read_run_log
 from softneck.drives.logs._replay import logged_motion, replay
 from softneck.drives.logs._run_log import RunLogger, run_facts
 from softneck.drives.master import Phase
-from softneck.drives.supervision._calibrate import _tracking, calibrate
+from softneck.drives.supervision._calibrate import _tracking, calibrate, require_loops
 from softneck.drives.supervision._motor_models import Motion
 from softneck.drives.supervision._tracking import _SETTLE, LoopRun, TrackingCharts, fit_tracking, tracking_scores
 from softneck.signals.detection._threshold import Budget
@@ -142,6 +142,12 @@ def test_a_few_minutes_of_a_loop_are_refused() -> None:
     motions = [*experiments(None, 0.0)[:2], looped(15, "step", 0.0, 40.0), looped(16, "ramp", 0.0, 40.0)]
     with pytest.raises(DataError, match=r"^7\d s of a loop's motion .* at least 600 s, or leave its runs out"):
         calibrate(motions, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
+
+
+def test_ten_minutes_of_a_loop_are_enough() -> None:
+    require_loops(600.0)
+    with pytest.raises(DataError, match=r"^599 s of a loop's motion"):
+        require_loops(599.0)
 
 
 def test_loops_alone_are_not_enough_to_compare_with() -> None:
