@@ -1,6 +1,6 @@
 """The plausibility supervisor over many runs in virtual time; each part goes on where it was stopped.
 
-`python benchmarks/supervisor.py baseline` writes what the tests compare with (480 s of motion, half a minute).
+`python benchmarks/supervisor.py baseline` writes what the tests compare with (1,440 s of motion, half a minute).
 `... faults [--seeds 1000] [--row NAME]` plays every row of the table, each from a fork of the run before its fault.
 `... undisturbed [--hours 30]` looks for false alarms at 0 to 1 kg: it keeps the motion (`... motion` plays that alone),
 which no supervisor changes that says nothing, and asks the charts again where the baseline or the code changed. Results
