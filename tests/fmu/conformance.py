@@ -1,6 +1,6 @@
 """Run every kind of FMU, of both backends, in every independent tool that is here: `make conformance`.
 
-    python -m tests.fmu.conformance [--out build/conformance.md] [--add] [--backend B]... [KIND...]
+    python -m tests.fmu.conformance [--out build/conformance.md] [--add] [--backend B]... [--tool T]... [KIND...]
 
 Tools that registries offer come with the dependency group `importers`; others are taken where PATH has them. One that
 is not here is "not run". What a tool computes is held against the block's own run; a checker is
@@ -36,6 +36,8 @@ from softneck.fmu.describe._description import described_block
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 from softneck.runtime._compile import load_runtime
+
+from ._omsimulator import outputs_in_omsimulator
 
 HERE = Path(__file__).parent
 GOLDEN = HERE.parent / "golden"
@@ -102,11 +104,16 @@ def case(kind: str, backend: str, folder: Path) -> Case:
     for i, port in enumerate(block.inputs):
         if not port.boolean and port.unit == "rad":
             u[:, i] = 0.05 * rng.standard_normal(ROWS).cumsum()
+    return Case(block, path, u, steps_of(block, u))
+
+
+def steps_of(block: Block, u: np.ndarray) -> np.ndarray:
+    """Return the outputs after each step, by Python's own text."""
     step, state = load_runtime(block.runtime, compiled=False).step, block.initial_state()
-    x, expected = state.values.copy(), np.zeros((ROWS, len(block.outputs)))
-    for k in range(ROWS):
-        step(block.arrays, state.parameters, x, u[k].copy(), expected[k])
-    return Case(block, path, u, expected)
+    x, expected = state.values.copy(), np.zeros((len(u), len(block.outputs)))
+    for k, row in enumerate(u):
+        step(block.arrays, state.parameters, x, row.copy(), expected[k])
+    return expected
 
 
 def ran(command: list[str], **more: str) -> subprocess.CompletedProcess[str]:
@@ -220,6 +227,16 @@ def on_path(command: str, *arguments: str) -> Callable[[Case], str]:
     return ask
 
 
+def omsimulator_says(case: Case) -> str:
+    """Return where OMSimulator sees something else; its command line holds the inputs, so here those of one row."""
+    held = case.inputs[ROWS // 2]
+    with tempfile.TemporaryDirectory() as name:
+        with zipfile.ZipFile(case.path) as archive:
+            more = {} if "resources/model.bin" in archive.namelist() else PYTHON
+        seen = outputs_in_omsimulator(case.block, case.path, held, ROWS, Path(name), more)
+    return compared(Case(case.block, case.path, case.inputs, steps_of(case.block, np.tile(held, (ROWS, 1)))), seen)
+
+
 def packaged(name: str) -> Callable[[], str]:
     """Return how a package's version is found."""
 
@@ -263,10 +280,7 @@ TOOLS = (
     ),
     Tool("vdmcheck2", command_version("vdmcheck2", "-h"), TWO, on_path("vdmcheck2", "{fmu}")),
     Tool("vdmcheck3", command_version("vdmcheck3", "-h"), BACKENDS[2:], on_path("vdmcheck3", "{fmu}")),
-    Tool(
-        "OMSimulator", command_version("OMSimulator", "--version"), ALL,
-        on_path("OMSimulator", "--stopTime={stop}", "--stepSize={step}", "{fmu}"),
-    ),
+    Tool("OMSimulator", command_version("OMSimulator", "--version"), ALL, omsimulator_says),
 )  # fmt: skip
 
 
@@ -285,8 +299,9 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("build/conformance.md"))
     parser.add_argument("--add", action="store_true")
     parser.add_argument("--backend", action="append", choices=BACKENDS)
+    parser.add_argument("--tool", action="append", choices=[tool.name for tool in TOOLS], help="none: all")
     told = parser.parse_args()
-    here = {tool.name: tool.found() for tool in TOOLS}
+    here = {tool.name: tool.found() if tool.name in (told.tool or (tool.name,)) else "" for tool in TOOLS}
     found = earlier(told.out.with_suffix(".json"), here) if told.add else {}
     with tempfile.TemporaryDirectory() as name:
         for kind in told.kinds:

@@ -271,7 +271,7 @@ def test_without_library_and_compiler_the_error_says_what_to_do(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(_library, "BINARIES", tmp_path)
-    monkeypatch.setattr(_library, "packaged_library", lambda: None)
+    monkeypatch.setattr(_library, "packaged_library", lambda *_: None)
     monkeypatch.setattr(_library, "local_compiler", lambda: None)
     with pytest.raises(SettingsError, match="no compiled library here and no C compiler"):
         build_compiled_fmu(block_of("rls"), tmp_path / "X.fmu")

@@ -11,6 +11,7 @@ from softneck.core import SettingsError
 from softneck.fmu.compiled import _compilers, _library
 from softneck.fmu.compiled._platforms import PLATFORMS, Platform
 from softneck.fmu.compiled._sources import GENERATED, Sources
+from softneck.fmu.compiled.translate._kinds import LIBRARIES
 
 SOURCES = Sources({GENERATED: "/* none */"}, {})
 
@@ -27,15 +28,16 @@ def test_a_second_call_takes_up_what_the_first_left_behind(tmp_path: Path, monke
     monkeypatch.setattr(_library, "compile_for", compile_for)
     monkeypatch.setattr(_library, "c_sources", lambda **_: SOURCES)
     names = list(PLATFORMS)
+    parts = names * len(LIBRARIES)  # after the whole ones
     with pytest.raises(SettingsError, match="power"):
         _library.build_all(tmp_path)
     assert _library.packaged_library(tmp_path) is None  # not all: an FMU would lack platforms without a word
     (tmp_path / "aarch64-linux.so.deflate").write_bytes(b"half of it")
     library = _library.build_all(tmp_path)
-    assert asked == [*names[:3], *names[1:]]  # the damaged one again
+    assert asked == [*names[:3], *names[1:], *parts]  # the damaged one again
     assert library.binaries == {name: name.encode() for name in names}
     assert _library.packaged_library(tmp_path) == library
-    assert len(list(tmp_path.iterdir())) == len(names) + 2  # the generated source and the manifest
+    assert len(list(tmp_path.iterdir())) == len(names + parts) + 2  # the generated source and the manifest
 
 
 @pytest.mark.parametrize("name", list(PLATFORMS))

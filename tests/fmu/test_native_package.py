@@ -24,7 +24,8 @@ from softneck.fmu.compiled._library import packaged_library
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
 from softneck.fmu.compiled.translate._chunks import only_kinds
-from softneck.fmu.compiled.translate._kinds import ranks_of
+from softneck.fmu.compiled.translate._kinds import LIBRARIES, RUNTIMES, ranks_of
+from softneck.fmu.describe._description import described_block
 from softneck.fmu.python._zip import deflated, write_zip
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
@@ -35,8 +36,19 @@ library = packaged_library()
 needs_all = pytest.mark.skipif(library is None, reason="the libraries of these sources are not built: make native")
 
 
+@pytest.mark.parametrize("kind", NATIVE)
+def test_a_part_of_the_library_holds_each_kind(kind: str) -> None:
+    block = described_block(block_of(kind))
+    modules = node_of(block.runtime, block.arrays).modules
+    assert any(modules <= held for held in LIBRARIES.values()), modules
+
+
+def test_the_parts_hold_all_kinds_between_them() -> None:
+    assert frozenset(RUNTIMES).union(*LIBRARIES.values()) == frozenset().union(*LIBRARIES.values())
+
+
 @needs_all
-@pytest.mark.parametrize("kind", ["rls", "nlsm", "mpc", "neck", "ensemble"])
+@pytest.mark.parametrize("kind", NATIVE)
 def test_five_platforms_weigh_less_than_400_kilobytes(kind: str, tmp_path: Path) -> None:
     build_compiled_fmu(block_of(kind), tmp_path / "Model.fmu", fmi=3)
     with zipfile.ZipFile(tmp_path / "Model.fmu") as archive:

@@ -6,7 +6,8 @@ import sys
 
 from softneck.core import SoftneckError
 
-from ._library import BINARIES, SENSITIVE, build_all
+from ._library import BINARIES, SENSITIVE, build_all, packaged_library
+from .translate._kinds import LIBRARIES
 
 
 def main() -> int:
@@ -19,6 +20,10 @@ def main() -> int:
             return 2
         for name, data in library.binaries.items():
             sys.stdout.write(f"{name}: {len(data) / 1e3:.0f} kB\n")
+        for part, held in LIBRARIES.items():
+            found = packaged_library(folder, set(held))
+            kilobytes = sum(map(len, found.streams.values())) / 1e3 if found else 0.0
+            sys.stdout.write(f"{part}: {kilobytes:.0f} kB for all platforms, deflated\n")
         for module, reason in library.sources.refused.items():
             sys.stdout.write(f"left out: {module}: {reason}\n")
         sys.stdout.write(f"{folder}\n")

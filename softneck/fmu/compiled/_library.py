@@ -1,7 +1,8 @@
 """Where the libraries of the platforms come from: those that `make native` built, else this machine's compiler.
 
-`make native` writes `binaries/`: one library a platform, the generated source, and a manifest with the digest of all
-that they were made of. A wheel carries that folder, so that exporting needs no compiler.
+`make native` writes `binaries/`: for each platform a library of all kinds and one of each part of them, the generated
+source, and a manifest with the digest of all that they were made of. A wheel carries that folder, so that exporting
+needs no compiler.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 import hashlib
 import json
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 
 import platformdirs
@@ -21,7 +23,8 @@ from ..python._zip import deflated
 from ._compilers import compile_for, compile_here, local_compiler
 from ._platforms import PLATFORMS, here
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
-from .translate._kinds import RUNTIMES
+from .translate._chunks import only_kinds
+from .translate._kinds import LIBRARIES, RUNTIMES
 
 BINARIES = HERE / "binaries"
 # With the derivatives of the kinds' steps: half as large again, and no business of other FMUs.
@@ -61,12 +64,17 @@ def find_library(modules: set[str] | None = None, *, sensitivities: bool = False
     if modules and not modules <= set(RUNTIMES):
         return _local_library(tuple(sorted(modules)), sensitivities=sensitivities)
     if sensitivities:
-        return packaged_library(SENSITIVE) or _local_library(tuple(sorted(modules or RUNTIMES)), sensitivities=True)
-    return packaged_library() or _local_library()
+        local = tuple(sorted(modules or RUNTIMES))
+        return packaged_library(SENSITIVE, modules) or _local_library(local, sensitivities=True)
+    return packaged_library(BINARIES, modules) or _local_library()
 
 
-def packaged_library(folder: Path = BINARIES) -> Library | None:
+def packaged_library(folder: Path = BINARIES, modules: set[str] | None = None) -> Library | None:
     """Return what `make native` built, if it is there and was made of the sources of now.
+
+    Args:
+        folder: where.
+        modules: that it must hold: the first part that has them all; None, or where no part has, the whole.
 
     Raises:
         FileFormatError: a file is damaged.
@@ -74,12 +82,19 @@ def packaged_library(folder: Path = BINARIES) -> Library | None:
     manifest = _manifest(folder)
     if manifest is None or manifest["key"] != sources_key(sensitivities=folder == SENSITIVE):
         return None
-    return _read(folder, manifest)
+    return _read(folder, manifest, _part(modules))
 
 
-def _read(folder: Path, manifest: dict) -> Library:
+def _part(modules: set[str] | None) -> str:
+    """Return the name of the part that holds these modules; "" for the whole."""
+    return next((part for part, held in LIBRARIES.items() if modules and modules <= held), "")
+
+
+def _read(folder: Path, manifest: dict, part: str = "") -> Library:
     content: dict[str, bytes] = {}
-    for name, digest in manifest["files"].items():
+    packed_names = {name: _file_name(name, part) for name in manifest["platforms"]}
+    for name in (*packed_names.values(), GENERATED):
+        digest = manifest["files"].get(name, "")
         path = folder / name
         data = path.read_bytes() if path.is_file() else b""
         if hashlib.sha256(data).hexdigest() != digest:
@@ -87,14 +102,14 @@ def _read(folder: Path, manifest: dict) -> Library:
         content[name] = data
     files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
     files[GENERATED] = content[GENERATED].decode()
-    packed = {name: content[_file_name(name)] for name in manifest["platforms"]}
+    packed = {name: content[file] for name, file in packed_names.items()}
     binaries = {name: zlib.decompress(data, -zlib.MAX_WBITS) for name, data in packed.items()}
     streams = {binaries[name]: data for name, data in packed.items()}
     return Library(binaries, Sources(files, manifest["refused"]), "built with this softneck", streams)
 
 
-def _file_name(platform: str) -> str:
-    return f"{platform}{PLATFORMS[platform].suffix}.deflate"
+def _file_name(platform: str, part: str = "") -> str:
+    return f"{platform}{part and '-'}{part}{PLATFORMS[platform].suffix}.deflate"
 
 
 def platforms_built() -> tuple[list[str], str]:
@@ -117,9 +132,9 @@ def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Librar
     sources, key = c_sources(sensitivities=sensitivities), sources_key(sensitivities=sensitivities)
     folder.mkdir(parents=True, exist_ok=True)
     digests = _begun(folder, key)
-    for name, platform in PLATFORMS.items():
-        if _file_name(name) not in digests:
-            _keep(folder, _file_name(name), _packed(compile_for(sources, platform)), digests)
+    for part, name in product(("", *LIBRARIES), PLATFORMS):
+        if (file := _file_name(name, part)) not in digests:
+            _keep(folder, file, _packed(compile_for(_of_part(sources, part), PLATFORMS[name])), digests)
             (folder / _BEGUN).write_text(json.dumps({"key": key, "files": digests}), encoding="utf-8")
     _keep(folder, GENERATED, sources.files[GENERATED].encode(), digests)
     manifest = {"key": key, "platforms": list(PLATFORMS), "files": digests, "refused": sources.refused}
@@ -128,6 +143,12 @@ def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Librar
             path.unlink()
     (folder / _MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     return _read(folder, manifest)
+
+
+def _of_part(sources: Sources, part: str) -> Sources:
+    if not part:
+        return sources
+    return replace(sources, files=sources.files | {GENERATED: only_kinds(sources.files[GENERATED], LIBRARIES[part])})
 
 
 def _keep(folder: Path, name: str, data: bytes, digests: dict[str, str]) -> None:

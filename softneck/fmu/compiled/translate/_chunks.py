@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 
 _DEFINED = re.compile(r"^(?:SN_SMALL )?static [^(\[=;]*?(\w+)[(\[]", re.MULTILINE)
 _NUMBERED = re.compile(r"\w+\d\b")
@@ -43,7 +43,7 @@ def nested_loops(piece: str) -> int:
     return most
 
 
-def only_kinds(text: str, modules: set[str]) -> str:
+def only_kinds(text: str, modules: Set[str]) -> str:
     """Return `sn_kinds.h` with the runtimes `modules` alone."""
     left_out = [entry[0] for entry in _ENTRY.finditer(text) if entry[1] not in modules]
     for entry in left_out:

@@ -20,7 +20,6 @@ _NECKS = (
     "softneck.identification.set_membership._online_nlsm_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.structured._play_runtime",
-    "softneck.design.linear._linear_controller_runtime",
     "softneck.identification.networks._nss_runtime",
     "softneck.identification.networks._loaded_nss_runtime",
     "softneck.identification.structured._greybox_runtime",
@@ -70,6 +69,20 @@ RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
 # Its tuples have the robot's sizes: one text for all there is none, and whoever wants one compiles it (see `_library`).
 _EACH_SIZE = "softneck.plant._neck_runtime"
 _SIZE = re.compile(r"[1-8]x[1-4]")
+
+
+_SIZED = frozenset(module for module in RUNTIMES if module.endswith(f"@{ANY_SIZE}"))
+_DRIVES = frozenset({"softneck.fmu.describe._modelled_drives_runtime"})
+_CONTROL = _DRIVES | {m for m in RUNTIMES if ".design." in m or "kalman" in m or ".loop." in m}
+# An observer has a model of either size, modelled drives a controller.
+_OBSERVERS = frozenset(module for module in RUNTIMES if ".estimation." in module) - _CONTROL
+# Parts of the library: an FMU carries one that holds all its kinds, which weighs half as much as the whole.
+LIBRARIES = {
+    "models": frozenset(RUNTIMES) - _CONTROL - _SIZED,
+    "control": _CONTROL - _SIZED,
+    "robot_models": _SIZED - _CONTROL | _OBSERVERS,
+    "robot_control": _CONTROL & _SIZED | _DRIVES,
+}
 
 # Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other.
 # A network, a search among thousands of points and a quadratic program spend their time in every loop; the neck in
