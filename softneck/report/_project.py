@@ -100,6 +100,11 @@ def _is_worst(entry: Path) -> bool:
     return stem != entry.name and entry.with_name(f"{stem}.certificate.json").is_file()
 
 
+def _is_front(entry: Path) -> bool:
+    """Return whether a table is that of a search by `softneck tune`, whose folder says the same as JSON."""
+    return entry.name == "pareto.csv" and entry.with_name("pareto.json").is_file()
+
+
 def _files(root: Path) -> Iterator[Path]:
     """Yield files in the order of their names; a study's folder as its `study.json` alone."""
     entries = sorted(root.iterdir())
@@ -111,7 +116,7 @@ def _files(root: Path) -> Iterator[Path]:
             continue
         if entry.is_dir():
             yield from _files(entry)
-        elif entry.suffix.lower() in _READERS:
+        elif entry.suffix.lower() in _READERS and not _is_front(entry):
             yield entry
 
 

@@ -191,3 +191,9 @@ def test_reports_of_nothing(call: Call, tmp_path: Path) -> None:
     assert "is not a folder" in call("report", "nowhere").error
     (tmp_path / "empty").mkdir()
     assert "holds no softneck files" in call("report", "empty").error
+    # The front of a search is no recording that cannot be read.
+    (tmp_path / "empty" / "pareto.json").write_text("[]")
+    (tmp_path / "empty" / "pareto.csv").write_text("kind\npi\n")
+    assert "holds no softneck files" in call("report", "empty").error
+    (tmp_path / "empty" / "pareto.json").unlink()
+    assert call("report", "empty").code == 0
