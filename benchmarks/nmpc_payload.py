@@ -1,11 +1,11 @@
 """Print why nonlinear predictive control loses to linear as soon as there is payload: one thing changed at a time.
 
-`python benchmarks/nmpc_payload.py [--necks NECK...] [--kind play] [--told]`: the circle of 12 deg at 1.2 rad/s of
-`mpc_following.py`, and a step of 18 deg of pitch over 8 s, rms of the worse axis [deg], under 0 and 1 kg. `mpc` is over
-the family, `nmpc` over models of 80 s of Eq. 22, around zero or pulled taut by 2 rad of co-contraction. `--told`: over
-a `greybox` of 0, 0.5 and 1 kg, pulled taut, that is told its payload, against linear ones as taut
-(`rise_s=0.2`; with preview the default), and the circle with preview. `--ahead`: the same over one observer for all,
-over the `greybox`, that looks 50 ms ahead, which all designs know.
+`python benchmarks/nmpc_payload.py [--necks NECK...] [--kind play] [--told|--ahead] [--seed N]`: the circle of 12 deg at
+1.2 rad/s of `mpc_following.py`, and a step of 18 deg of pitch over 8 s, rms of the worse axis [deg], under 0 and 1 kg.
+`mpc` is over the family, `nmpc` over models of 80 s of Eq. 22, around zero or pulled taut by 2 rad of co-contraction.
+`--told`: over a `greybox` of 0, 0.5 and 1 kg, pulled taut, that is told its payload, against linear ones as taut
+(`rise_s` of 0.2 and 0.15; with preview the default), and the circle with preview. `--ahead`: the same over one observer
+for all, over the `greybox`, that looks 50 ms ahead, which all designs know.
 """
 
 from __future__ import annotations
@@ -62,13 +62,14 @@ def recorded(name: str, payload: float, common: float) -> Recording:
     return record(excitation, ForeignNeck(name=name), seed=6, payload=payload)
 
 
-def errors(on: Specimen, controllers: list[Any], common: float) -> list[float]:
+def errors(on: Specimen, controllers: list[Any], common: float, seed: int = 0) -> list[float]:
     """Return the rms errors of circle and large step under each payload and a co-contraction [rad].
 
     Args:
         on: the neck.
         controllers: one for each payload of `JUDGED`.
         common: co-contraction that is asked for.
+        seed: of the sensor's noise.
     """
 
     def around(time: float, /) -> tuple[float, float, float]:
@@ -80,7 +81,7 @@ def errors(on: Specimen, controllers: list[Any], common: float) -> list[float]:
     found = []
     for reference, duration, since in ((around, CIRCLE_S, SETTLED), (stepped, AT + STEP_S, AT)):
         for controller, kg in zip(controllers, JUDGED, strict=True):
-            loop = Loop(plant=BlockPart(on.block(0)), controller=BlockPart(controller.block()),
+            loop = Loop(plant=BlockPart(on.block(seed)), controller=BlockPart(controller.block()),
                         observer=BlockPart(on.observer), reference=reference, duration=duration,
                         plant_inputs={"payload": kg})  # fmt: skip
             found.append(rms_deg(run_loop(loop), reference, since))
@@ -116,7 +117,7 @@ def rows(name: str, kind: str) -> Iterator[tuple[str, list[float]]]:
         yield what, errors(on, [settings.design(model) for model in models], common)
 
 
-def rows_told(name: str, look: float = 0.0) -> Iterator[tuple[str, list[float]]]:
+def rows_told(name: str, look: float = 0.0, seed: int = 0) -> Iterator[tuple[str, list[float]]]:
     """Yield the errors of controllers that know the payload, by how taut tendons are; `look` is their look-ahead."""
     on, file = neck(name), OUT / f"{name}-taut-greybox.npz"
     if not file.exists():
@@ -127,22 +128,25 @@ def rows_told(name: str, look: float = 0.0) -> Iterator[tuple[str, list[float]]]
         on = replace(on, observer=KalmanSettings().design(several).block())
     for taut in (TAUT, 3.5):
         wish = MpcSettings(minimum_tautness=NeckDefault(taut), look_ahead=look)
-        quick, ahead = (replace(wish, **more).design(on.family) for more in ({"rise_s": 0.2}, {"preview": PREVIEW}))
+        ahead = replace(wish, preview=PREVIEW).design(on.family)
         # With less dead time as quick as it was is not as quick as it could be.
         for bandwidth in (QUICK.bandwidth, *((20.0,) if look > 0.0 else ())):
             pulled = replace(QUICK, minimum_tautness=taut, look_ahead=look, bandwidth=bandwidth)
             which = f", {bandwidth:g} rad/s" if look > 0.0 else ""
             yield f"`nmpc`, payload told, {taut:g} rad{which}", [
-                *errors(on, [pulled.design(model) for model in models], 0.0),
-                *previewed(on, [replace(pulled, preview=PREVIEW).design(model) for model in models]),
+                *errors(on, [pulled.design(model) for model in models], 0.0, seed),
+                *previewed(on, [replace(pulled, preview=PREVIEW).design(model) for model in models], seed),
             ]  # fmt: skip
-        yield f"`mpc`, {taut:g} rad", [*errors(on, [quick] * 2, 0.0), *previewed(on, [ahead] * 2)]
+        known = previewed(on, [ahead] * 2, seed)
+        for rise in (0.2, 0.15):
+            quick = replace(wish, rise_s=rise).design(on.family)
+            yield f"`mpc`, {taut:g} rad, `rise_s={rise:g}`", [*errors(on, [quick] * 2, 0.0, seed), *known]
 
 
-def previewed(on: Specimen, controllers: list[Any]) -> list[float]:
+def previewed(on: Specimen, controllers: list[Any], seed: int) -> list[float]:
     """Return the rms errors of the circle under each payload where it is known ahead [deg]."""
     return [
-        rms_deg(run(on, item, circle, CIRCLE_S, kg), circle, SETTLED)
+        rms_deg(run(on, item, circle, CIRCLE_S, kg, seed), circle, SETTLED)
         for item, kg in zip(controllers, JUDGED, strict=True)
     ]  # fmt: skip
 
@@ -154,13 +158,16 @@ def main() -> None:
     parser.add_argument("--kind", default="play", help="of model (play)")
     parser.add_argument("--told", action="store_true", help="controllers that know the payload")
     parser.add_argument("--ahead", action="store_true", help="the same, over an observer that looks ahead")
+    parser.add_argument("--seed", type=int, default=0, help="of the sensor's noise (0)")
     options = parser.parse_args()
     knows = options.told or options.ahead
     for name in options.necks:
         columns = ("circle", "step", *(("ahead",) if knows else ()))
         heads = [f"{what}, {kg:g} kg" for what in columns for kg in JUDGED]
         print(f"\n| `{name}` | {' | '.join(heads)} |\n|{'---|' * (1 + len(heads))}")
-        for what, found in rows_told(name, LOOK if options.ahead else 0.0) if knows else rows(name, options.kind):
+        for what, found in (
+            rows_told(name, LOOK if options.ahead else 0.0, options.seed) if knows else rows(name, options.kind)
+        ):
             print(f"| {what} | " + " | ".join(f"{value:.2f}" for value in found) + " |", flush=True)
 
 

@@ -67,7 +67,7 @@ def initialise(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, output
     x[:] = 0.0
     kalman_clear(p.constants, x)
     outputs[:] = 0.0
-    outputs[2 * p.outputs + 2] = 0.5 * (p.load[PAYLOAD_LEAST] + p.load[PAYLOAD_MOST])
+    outputs[2 * p.outputs + 2] = p.load[PAYLOAD_MOST]
 
 
 def step(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, inputs: np.ndarray, outputs: np.ndarray) -> None:
@@ -118,12 +118,15 @@ def payload_free(p: PayloadArrays, payload: float) -> np.ndarray:
 
 
 def payload_start(p: PayloadArrays, x: PayloadState, asked: np.ndarray) -> None:
-    """Start in the middle of the payloads, as unsure of it as half of their range is wide."""
+    """Start at the heaviest payload, as unsure of it as the range is wide.
+
+    A controller keeps tendons taut for what is told; those that hang do not move the neck, and so nothing would tell.
+    """
     start, models, size = p.setup[NONLINEAR_START], x.models, member_size(p, 0)
-    x.payload = 0.5 * (p.load[PAYLOAD_LEAST] + p.load[PAYLOAD_MOST])
+    x.payload = p.load[PAYLOAD_MOST]
     for i in range(p.outputs):
         x.P[i, i] = start * start
-    x.P[p.outputs, p.outputs] = (0.5 * (p.load[PAYLOAD_MOST] - p.load[PAYLOAD_LEAST])) ** 2
+    x.P[p.outputs, p.outputs] = (p.load[PAYLOAD_MOST] - p.load[PAYLOAD_LEAST]) ** 2
     x.held[:] = asked
     more = np.empty(p.outputs)
     nonlinear_settle(p, payload_free(p, x.payload), models[:size], asked, x.angles)

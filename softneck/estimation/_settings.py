@@ -113,7 +113,7 @@ class KalmanSettings:
     motion_noise_ratio: float = 1.0
     sample_time: float | None = None
     sensor_period: float | None = None
-    # A look-ahead by 50 ms made default `hinf` of a neck oscillate by 0.6 deg: no design knows of it yet.
+    # A look-ahead by 50 ms makes designs on one `oe` swing, whether they know of it or not: `docs/howto/observer.md`.
     sensor_delay: float = NeckDefault(0.0)
     gyro_delay: float = NeckDefault(0.0)
     gate_level: float = 0.9999

@@ -100,6 +100,18 @@ def test_in_darkness_it_says_what_the_model_will_say(play: Model, run: Recording
     np.testing.assert_allclose(estimates.rates[: len(rates)][at_rest], rates[at_rest], rtol=0, atol=1e-10)
 
 
+def test_a_push_is_what_the_model_misses(play: Model, run: Recording) -> None:
+    """What a push adds to the angles is all that angles tell of it, and the disturbance is that, whatever its force."""
+    rng, pushed = np.random.default_rng(0), np.zeros((len(run), 2))
+    pushed[200:] = np.radians([3.0, -2.0])
+    z = free_run(play, run) + pushed + math.radians(0.05) * rng.standard_normal(pushed.shape)
+    observer = designed(replace(OURS, sensor_delay=0.0), play)
+    _, states = observer._rows(run.with_channels(pitch=z[:, 0], roll=z[:, 1]))
+    found = states[:, observer._parts["disturbance"]]
+    # Within a second; noise of 0.05 deg, most of which a disturbance as large as the motion lets through.
+    np.testing.assert_allclose(found[250:], pushed[250:], atol=math.radians(0.25))
+
+
 def test_a_disturbance_walks_as_far_as_the_model_moves(play: Model, run: Recording) -> None:
     """What is gained from a measurement after a gap: all of it in motion, little at rest."""
     dark = run.with_channels(pitch=np.full(480, math.nan), roll=np.full(480, math.nan))

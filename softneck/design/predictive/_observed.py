@@ -16,7 +16,7 @@ from softneck.signals import redefinition_matrix
 _MOVE, _SETTLED = 0.3, 3.0
 # Tendons are taut where such a move does this part of the most that it does anywhere.
 _TAUT = 0.9
-# Co-contractions that are tried, from the tautness without payload on [rad].
+# Co-contractions that are tried, from rest on [rad].
 _STEP, _MOST = 0.25, 4.0
 
 S = TypeVar("S", bound=Any)
@@ -37,17 +37,18 @@ def over(settings: S, observer: Any) -> S:
     found: dict[str, float] = {}
     if isinstance(settings.look_ahead, NeckDefault):
         found["look_ahead"] = observer.lead
-    least, told = settings.minimum_tautness, getattr(observer, "payloads", None)
+    told, wished = getattr(observer, "payloads", None), settings.minimum_tautness is not None
     asks = isinstance(getattr(settings, "payload_tautness", None), NeckDefault)
-    if asks and told is not None and least is not None and told[1] > 0.0:
+    if asks and wished and told is not None and told[1] > 0.0:
         inverse = np.linalg.inv(redefinition_matrix(np.array(settings.tendon_angles)))
-        found["payload_tautness"] = (taut_from(observer.model, told[1], least, inverse) - least) / told[1]
+        # On top of `minimum_tautness`: what is in reserve without payload is there with it.
+        found["payload_tautness"] = taut_from(observer.model, told[1], inverse) / told[1]
     return replace(settings, **found)
 
 
-def taut_from(model: Model, payload: float, least: float, inverse: Matrix) -> float:
-    """Return the least co-contraction [rad] from `least` on at which small moves do under a payload what they can."""
-    tried = np.arange(least, _MOST + _STEP / 2, _STEP)
+def taut_from(model: Model, payload: float, inverse: Matrix) -> float:
+    """Return the least co-contraction [rad] from rest on at which small moves do under a payload what they can."""
+    tried = np.arange(0.0, _MOST + _STEP / 2, _STEP)
     gains = np.array([_gain(model, payload, common, inverse) for common in tried])
     return float(tried[np.argmax(gains >= _TAUT * gains.max())])
 
