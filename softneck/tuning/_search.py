@@ -25,7 +25,7 @@ from softneck.verification._requirements import Requirement
 
 from ._judge import LEVELS, Judgement, judge_candidate
 from ._log import Job, Log
-from ._space import Space
+from ._space import COSTLY, Space
 from ._task import Task
 
 # Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
@@ -265,10 +265,15 @@ class Search:
                 away /= 2.0
 
     def _fewer(self, alive: list[Space]) -> list[Space]:
-        """Return the better third of the kinds, in their order."""
+        """Return the better third of the kinds, in their order: of more than two a costly one only if it is the best.
+
+        What a search is given is a number of judgements, whatever each of them costs.
+        """
         keep = max(_LEAST_KINDS, math.ceil(len(alive) / _OF))
-        best = sorted(alive, key=lambda space: min(self._key(item) for item in self._of(space.kind)))[:keep]
-        return [space for space in alive if space in best]
+        best = sorted(alive, key=lambda space: min(self._key(item) for item in self._of(space.kind)))
+        if len(alive) > _LEAST_KINDS:
+            best = best[:1] + [space for space in best[1:] if space.kind not in COSTLY]
+        return [space for space in alive if space in best[:keep]]
 
     def _asked(self, space: Space, optimiser: Any) -> list[Candidate]:
         """Return a generation."""

@@ -17,6 +17,8 @@ from softneck.core._kinds import kinds_of
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptive", "mpc")
 #: Of these nothing is certified beside recordings, since they have no linear form: named, they are searched there too.
 UNCERTIFIED = ("scheduled", "adaptive")
+#: A design of these takes ten times as long as one of the others.
+COSTLY = ("mpc", "nmpc")
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from softneck.loop import SensorFault
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.tuning import tune
-from softneck.tuning._cases import loop_of
+from softneck.tuning._cases import loop_of, quietly
 from softneck.tuning._judge import made_ready
 from softneck.tuning._tune import Tuned, task_of
 from softneck.verification._neck_loops import direction
@@ -94,13 +94,14 @@ def test_a_plant_of_another_robot_is_refused_before_anything_is_searched(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_every_step_that_is_judged_has_a_noisy_sensor_and_each_direction_its_own() -> None:
+def test_every_step_is_judged_as_verify_does_and_with_a_noisy_sensor_each_direction_its_own() -> None:
     robot = Robot.preset("trunk4")
     task = task_of({"model": plant(robot), "own": plant(robot).block()}, QUICK | {"track": {}}, 3)
     ready, controller = made_ready(task), PiSettings().design(plant(robot))
-    assert all(case.noise for case in ready.all)
+    quiet = {case.orientation for case in ready.all if case == quietly(case)}
+    assert quiet == {case.orientation for case in ready.all if case.noise}
     assert {case.late for case in ready.all} == {False, True}
-    plain = [case for case in ready.all if case.part == 1.0 and not case.late]
+    plain = [case for case in ready.all if case.noise and case.part == 1.0 and not case.late]
     loops = [loop_of(case, ready.own[0], controller.block(), "sequential", task) for case in plain]
     noise = [fault for loop in loops for fault in loop.faults if isinstance(fault, SensorFault)]
     assert len({fault.seed for fault in noise}) == len(loops) == 3
