@@ -27,7 +27,7 @@ from ._neck_loops import (
     run_necks,
     step_at,
 )
-from ._own_plants import OwnPlant
+from ._own_plants import OwnPlant, payloads_left_out
 from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
 from ._requirements import Requirements
 from ._search import SearchResult, search
@@ -171,8 +171,7 @@ def gather(
     evidence = Evidence(
         plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
     )
-    if why and not own:
-        evidence.not_computed["neck"] = why
+    evidence.not_computed |= {"neck": why} if why and not own else payloads_left_out(own, asked)
     _tell(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence

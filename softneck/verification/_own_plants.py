@@ -16,6 +16,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block
 
+from ._requirements import Requirements
 from ._steps import Steps
 
 # Set by hand [rad]: pretension changes by some 3 % of itself.
@@ -125,6 +126,18 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
                     "`least_cocontraction`, or record around the loop's (`softneck record --cocontraction`)"
                 )
     return found
+
+
+def payloads_left_out(own: Sequence[OwnPlant], asked: Requirements) -> dict[str, str]:
+    """Return which of the payloads asked for no loop of a plant carried, as it knows none; nothing where all did."""
+    blind = [plant.name for plant in own if not plant.payload]
+    heavy = [f"{kg:g}" for kg in asked.neck["payloads_kg"] if kg > 0.0]
+    if not (blind and heavy and asked.robot.is_neck):
+        return {}
+    return {
+        "loops with payload": f"no payload is known to {', '.join(blind)}, so no loop carries {', '.join(heavy)} kg; "
+        "`softneck identify greybox` recordings that say theirs, in a column `payload [kg]`"
+    }
 
 
 def _carries(plant: OwnPlant, kg: float, held: float) -> bool:

@@ -25,7 +25,14 @@ from softneck.verification._evidence import Values, worst_row
 from softneck.verification._experiments import Crossing, LoopUnderTest, _Case
 from softneck.verification._linear import LinearLaw, margins
 from softneck.verification._neck_loops import step_at
-from softneck.verification._own_plants import ALONE, OwnPlant, is_own_plant, not_recorded, own_plant
+from softneck.verification._own_plants import (
+    ALONE,
+    OwnPlant,
+    is_own_plant,
+    not_recorded,
+    own_plant,
+    payloads_left_out,
+)
 from softneck.verification._plants import all_plants, neck_of_family
 from softneck.verification._steps import Steps
 from softneck.verification._structured import structured
@@ -251,6 +258,16 @@ def test_margins_by_experiment_stand_beside_the_linear_ones_and_the_smaller_is_c
     # On the user's own plant neck.* decides, and one run is enough: one payload, one orientation.
     assert [run.name for run in found.evidence.necks] == ["own, 0 kg, 0 deg"]
     assert rows["neck.overshoot_pct"]["holds"] is not None
+
+
+@pytest.mark.parametrize(
+    ("knows", "asked", "said"), [(False, [0.0, 1.0], True), (True, [0.0, 1.0], False), (False, [0.0], False)]
+)
+def test_payloads_that_no_loop_carries_are_said(knows: bool, asked: list[float], said: bool) -> None:
+    plant = replace(own_plant(NeckParameters.paper(), "own"), payload=knows)
+    found = payloads_left_out([plant], make_requirements({**QUICK, "neck": {"payloads_kg": asked}}))
+    assert bool(found) == said
+    assert all("own" in why and "1 kg" in why for why in found.values())
 
 
 @pytest.mark.slow
