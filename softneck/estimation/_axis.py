@@ -163,7 +163,7 @@ class AxisPlant(Shown):
         return control.TransferFunction(self.numerator, denominator, self.sample_time)
 
 
-def main_pole(numerator: Vector, denominator: Vector) -> tuple[Vector, int]:
+def main_pole(numerator: Vector, denominator: Vector) -> tuple[np.ndarray, int]:
     """Return the poles of B/A, the slowest first, and which of them makes most of where a step ends.
 
     B(p)/(A'(p) (1 - p)) is the part of the pole p in the sum that is the static gain (Kailath 1980, sec. 2.2); of two
