@@ -287,9 +287,11 @@ def _of_robot(job: _Job, robot: Robot, robot_out: Path | None) -> tuple[ImportRe
 
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
+    remarks: dict[str, str] = {}
     if robot_out is not None:
         refuse_existing(robot_out, force=job.force)
         found = guess_robot(job.log)
+        remarks[found.robot.set_points[0]] = found.remark
         layout, text = found.layout, f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
         job.texts[robot_out] = (text + tomli_w.dumps(found.robot.as_dict()), job.force)
         facts |= {"robot_file": str(robot_out), "reasons": list(found.lines)}
@@ -297,7 +299,7 @@ def _of_robot(job: _Job, robot: Robot, robot_out: Path | None) -> tuple[ImportRe
             note(line)
     else:
         layout = layout_for(job.log, robot)
-    text = layout_toml(layout)
+    text = layout_toml(layout, remarks=remarks)
     job.texts[proposal] = (text, job.replace)
     imported = import_log(job.log, layout)
     return imported, layout, {**facts, "layout": tomllib.loads(text), "robot": imported.recording.robot.label()}

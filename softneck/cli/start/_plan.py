@@ -11,11 +11,15 @@ from pathlib import Path
 from softneck.core import SettingsError
 from softneck.core._budget import MOST_TOML, settings_text
 
+from ._possible import FILE, possible
 from ._step import Step, Unmet
 
 AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
 PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu", "fmus/Controller.fmu"
 _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
+# Of `tune`: without `scheduled`, which needs several models, and `adaptive`, which was the best on none of the foreign
+# necks `column`, `spring` and `chain`, and takes a fifth of a search with empty caches.
+_KINDS = "pi,pid,fopi,hinf,ncf,lqg,mpc"
 _TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"
 
 
@@ -27,7 +31,7 @@ class Asked:
         logs: absolute paths, as the commands run in the project's folder.
         robot: a preset, or the absolute path of a robot file; None: the neck, or what the log shows.
         requirements: absolute path of the file for `tune`; None: the defaults.
-        kinds: of controllers to search; None: those of `tune`.
+        kinds: of controllers to search; None: those of `tune` but `scheduled` and `adaptive`.
         sample_time: of logs without a clock [s].
         budget: of `tune`: by default half its own, so that a sitting ends within minutes.
         seed: of kinds of models and of the search.
@@ -72,6 +76,7 @@ def _robot(source: str) -> Step:
 
 
 def _import(log: str, recording: str, asked: Asked) -> Step:
+    from softneck.signals.importing._robot_guess import is_of_another_robot
     from softneck.signals.importing.formats._mcap import is_run_log
 
     layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
@@ -82,6 +87,8 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
     else:
         guess = ["--guess", *(["--yes"] if asked.yes else [])]
         guess += [] if asked.sample_time is None else ["--sample-time", asked.sample_time]
+        if asked.robot is None and asked.sample_time is None and is_of_another_robot(log):
+            guess = ["--robot-out", robot.as_posix()]
         by_layout = layout.is_file() and not (asked.sample_time is not None and _lacks_clock(layout))
         words = ["--layout", layout.as_posix()] if by_layout else guess
         words += ["--html", page] + ([] if whose is None else ["--robot", whose])
@@ -141,15 +148,18 @@ def nonlinear_model() -> str | None:
 def _controller(asked: Asked) -> Iterator[Step]:
     linear, nonlinear = linear_model(), nonlinear_model()
     plants = (linear,) if nonlinear is None else (linear, nonlinear)
-    wanted = () if asked.requirements is None else (asked.requirements,)
-    words = [word for name, value in (("--requirements", asked.requirements), ("--kinds", asked.kinds),
+    # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
+    finding = possible(plants) if asked.requirements is None else ""
+    stated = FILE if finding else asked.requirements
+    wanted = () if stated is None else (stated,)
+    words = [word for name, value in (("--requirements", stated), ("--kinds", asked.kinds or _KINDS),
                                       ("--budget", asked.budget), ("--seed", asked.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
     # --force goes on with the judgements of the same search, and replaces another one. In this process: with empty
     # caches each further one compiles the same again, which is most of what a search of 80 judgements takes.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"),
-               reads=(*plants, OBSERVER, *wanted))  # fmt: skip
+               reads=(*plants, OBSERVER, *wanted), finding=finding)  # fmt: skip
     eyes = (OBSERVER,) if observed() else ()
     certificate = "certificates/best.certificate.json"
     command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,

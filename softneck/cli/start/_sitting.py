@@ -100,15 +100,16 @@ class Sitting:
         click.echo(f"\n{line}\n$ {step.shown}", err=self.as_json)
 
     def _run(self, step: Step, words: tuple[str, ...]) -> None:
-        entry, begin = self.done[step.key], _processor_time()
-        entry |= {"holds": True, "said": ""}
+        entry, begin, ended = self.done[step.key], _processor_time(), True
+        entry |= {"holds": not step.finding, "said": step.finding}
         try:
             with _ctrl_c_ends(), contextlib.redirect_stdout(io.StringIO() if self.as_json else sys.stdout):
                 (_pytest if words[0] == "python" else _softneck)(words, as_json=self.as_json)
         except CheckFailedError as error:
-            entry |= {"holds": False, "said": str(error)}
+            ended = False
+            entry |= {"holds": False, "said": " ".join(filter(None, [step.finding, str(error)]))}
         lacking = [name for name in step.makes if not Path(name).is_file()]
-        if lacking and entry["holds"]:
+        if lacking and ended:
             raise OutputFileError(f"{lacking[0]}: was not made by `{step.shown}`.")
         # What was read is looked at again: a layout that an import proposed is one of its files from here on.
         entry |= {"reads": {name: _hash(name) for name in step.reads}, "ended": True,

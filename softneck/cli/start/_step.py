@@ -28,6 +28,7 @@ class Step:
         makes: files by which it is known to be done.
         reads: files that it is done again for where they change.
         unmet: what it means where it does not hold, or where a model is refused.
+        finding: what does not hold whatever comes of it; empty where that is open.
         settings: what it is done again for beside `reads`; the command where it says nothing.
         resumes: file that an interrupted run leaves, with which `--resume` in the place of `--force` goes on.
     """
@@ -37,6 +38,7 @@ class Step:
     makes: tuple[str, ...]
     reads: tuple[str, ...] = ()
     unmet: Unmet = Unmet.FINDING
+    finding: str = ""
     settings: str = ""
     resumes: str = ""
 

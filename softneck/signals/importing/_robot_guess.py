@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, to_si
+from softneck.core import DataError, SettingsError, SoftneckError, to_si
 from softneck.robot import Robot
 
 from ._column_titles import read_title
@@ -23,6 +23,10 @@ _MOVERS = {
     "voltage", "volt", "chamber", "tendon", "cable", "servo", "actuator", "winch", "pwm", "duty", "control", "force",
     "torque", "heater",
 }  # fmt: skip
+# Of these none turns a winch: where titles speak of one, and of nothing that a neck has, it is another robot's log.
+_NO_WINCH = {"pressure", "pump", "valve", "voltage", "volt", "chamber", "pwm", "duty", "heater"}
+_OF_A_NECK = ("pitch", "roll", "inclination", "orientation", "pitch_reference", "roll_reference", "position",
+              "set-point", "velocity")  # fmt: skip
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 _WORD = re.compile(r"[a-z]+|\d+")
 
@@ -40,6 +44,22 @@ class RobotGuess:
     robot: Robot
     layout: Layout
     lines: tuple[str, ...]
+
+    @property
+    def remark(self) -> str:
+        """What the layout says of it."""
+        moved, outputs = (", ".join(part.names) for part in (self.robot.motors, self.robot.outputs))
+        return f"NOT SURE: robot: {moved} move, {outputs} are outputs (80 % sure): by words in the titles"
+
+
+def is_of_another_robot(path: str | Path) -> bool:
+    """Return whether a log's titles speak of pressures, pumps or voltages, and of no motor or angle of a neck."""
+    try:
+        titles = [title for title in sniff(path, fewest=2).columns if isinstance(title, str)]
+        spoken = any(_words(title) & _NO_WINCH for title in titles)
+        return spoken and not any(read_title(t).role in _OF_A_NECK for t in titles) and bool(guess_robot(path))
+    except SoftneckError:
+        return False
 
 
 def guess_robot(path: str | Path) -> RobotGuess:

@@ -16,6 +16,7 @@ from softneck.cli.start import _plan, _start
 from softneck.cli.start._plan import Asked
 from softneck.cli.start._step import STAGES, Step
 from softneck.signals import read_recording
+from softneck.signals.importing._robot_guess import is_of_another_robot
 
 from ...data import neck_recording
 from ..conftest import Call, Said
@@ -222,3 +223,43 @@ def test_one_angle_of_two_is_doubted_in_the_verdict_of_terminal_json_and_page(
     kept = [line for line in layout.read_text().splitlines() if "NOT SURE" not in line]
     layout.write_text("\n".join(kept) + "\n")
     assert json.loads(call("start", "log.csv", "-o", "p", "--yes", "--json").out)["doubts"] == {}
+
+
+def of_tanks(path: Path) -> None:
+    """A pump and a level: no winch, no angle."""
+    u = NECK.set_points[:, 0]
+    table = {"time [s]": 4.0 * np.arange(len(u)), "pump [V]": 3.0 + u, "level [V]": 5.0 + NECK.outputs[:, 0]}
+    pd.DataFrame(table).to_csv(path, index=False)
+
+
+def of_pressures(path: Path) -> None:
+    pressures = {f"pressure_{j}": NECK.set_points[:, j - 1] for j in (1, 2, 3)}
+    tip = dict(zip("xy", NECK.outputs.T, strict=True))
+    pd.DataFrame({"time [s]": NECK.time, **pressures, **tip}).to_csv(path, index=False)
+
+
+@pytest.mark.parametrize(("write", "outputs"), [(of_tanks, ("level",)), (of_pressures, ("x", "y"))])
+def test_a_log_whose_titles_are_of_another_robot_is_taken_for_one_and_that_is_doubted(
+    call: Call, tmp_path: Path, until: Callable[[str], None], write: Callable[[Path], None], outputs: tuple[str, ...]
+) -> None:
+    until("quality")
+    said = begun(call, "log.csv", write)
+    assert said.code == 0, said.err
+    facts = json.loads(said.out)
+    assert "--robot-out" in facts["steps"][0]["command"]
+    (doubt,) = facts["doubts"]["recordings/log.layout.toml"]
+    assert doubt.startswith("robot: ")
+    recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
+    assert recording.robot.outputs.names == outputs
+    # What was proposed is read again by its layout, and nothing is done twice.
+    again = json.loads(call("start", "log.csv", "-o", "p", "--yes", "--json").out)
+    assert all(step["done_before"] for step in again["steps"][1:])
+
+
+def test_titles_of_a_neck_are_a_neck_s_whatever_else_was_logged(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    table = {"time": NECK.time, **{f"target_motor{j}": NECK.set_points[:, j - 1] for j in (1, 2, 3)}}
+    pd.DataFrame({**table, "pitch": NECK.outputs[:, 0], "roll": NECK.outputs[:, 1], "voltage": 24.0}).to_csv(path)
+    assert not is_of_another_robot(path)
+    path.write_bytes(b"\x89PNG")
+    assert not is_of_another_robot(path)

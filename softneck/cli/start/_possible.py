@@ -1,0 +1,54 @@
+"""What the default requirements ask that no controller of these plants can keep is not asked in a sitting, and said."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import tomli_w
+
+from softneck.core import SettingsError, atomic_write
+
+#: In the folder: what `tune` is asked where some of its defaults cannot be.
+FILE = "requirements.toml"
+_METRIC = re.compile(r"`([\w.]+)`.* cannot be: ")
+
+
+def possible(plants: tuple[str, ...]) -> str:
+    """Write `FILE` without the defaults of `tune` that cannot be, and return why they cannot; empty where all can.
+
+    Args:
+        plants: files of the models that `tune` is given.
+
+    Raises:
+        SettingsError: what is asked cannot be, and no requirement is to blame.
+    """
+    refused = impossible(plants)
+    if refused:
+        said = "".join(f"# {why}\n" for why in refused.values())
+        table = {"version": 1, "require": dict.fromkeys(refused, False)}
+        with atomic_write(FILE, force=True) as temporary:
+            head = f"# The defaults of `softneck tune` that cannot be are left out:\n{said}"
+            temporary.write_text(head + tomli_w.dumps(table), encoding="utf-8")
+    return " ".join(refused.values())
+
+
+def impossible(plants: tuple[str, ...]) -> dict[str, str]:
+    """Return metric -> why no controller keeps what the defaults of `tune` ask of it."""
+    from softneck.tuning._beforehand import refuse_impossible
+    from softneck.tuning._tune import task_of
+
+    from ..shared._plants import opened_plants
+
+    things, refused = opened_plants(tuple(map(Path, plants)), None), dict[str, str]()
+    while True:
+        task = task_of(things, {"require": dict.fromkeys(refused, False)}, 0)
+        try:
+            refuse_impossible(task.asked, task.plant)
+        except SettingsError as error:
+            metric = _METRIC.match(str(error))
+            if metric is None or metric[1] in refused:
+                raise
+            refused[metric[1]] = str(error)
+        else:
+            return refused

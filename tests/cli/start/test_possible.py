@@ -1,0 +1,87 @@
+"""Defaults of `tune` that cannot be are left out, and the verdict says that they do not hold."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from softneck.cli.start import _possible, _sitting, _start
+from softneck.cli.start._plan import Asked
+from softneck.cli.start._step import Step
+from softneck.core import SettingsError
+from softneck.tuning import _beforehand
+
+from ..conftest import Call
+
+# Of a linear model alone, whose steps are asked of it.
+WHY = {
+    "step.rise_s": "`step.rise_s` <= 0.4 s cannot be: too slow.",
+    "track.circle_rms_deg": "`track.circle_rms_deg` cannot be: late.",
+}
+
+
+def refuse(asked: Any, _: Any) -> None:
+    for metric, why in WHY.items():
+        if asked.wanted(metric) is not None:
+            raise SettingsError(why)
+
+
+def test_each_default_that_cannot_be_is_left_out_with_its_reason(
+    tmp_path: Path, rls_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(_beforehand, "refuse_impossible", refuse)
+    assert _possible.possible((str(rls_file),)) == " ".join(WHY.values())
+    text = Path(_possible.FILE).read_text(encoding="utf-8")
+    assert tomllib.loads(text)["require"] == dict.fromkeys(WHY, False)
+    assert all(f"# {why}" in text for why in WHY.values())
+    # Nothing is left out, and no file made, where all can be.
+    Path(_possible.FILE).unlink()
+    monkeypatch.setattr(_beforehand, "refuse_impossible", lambda *_: None)
+    assert _possible.possible((str(rls_file),)) == ""
+    assert not Path(_possible.FILE).exists()
+
+
+def test_what_is_no_requirement_s_fault_is_refused(rls_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*_: Any) -> None:
+        raise SettingsError("the plant cannot be: it is no plant.")
+
+    monkeypatch.setattr(_beforehand, "refuse_impossible", never)
+    with pytest.raises(SettingsError, match="it is no plant"):
+        _possible.impossible((str(rls_file),))
+
+
+@pytest.mark.parametrize("ends", ["holds", "fails"])
+def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, ends: str
+) -> None:
+    def plan(asked: Asked) -> Iterator[Step]:
+        command = ("softneck", "robot", "new", "robot.toml", "--preset", "neck", "--force")
+        why = "The circle cannot be."
+        yield Step(stage="tune", command=command, makes=("robot.toml",), reads=asked.logs, finding=why)
+
+    def facts(sitting: _sitting.Sitting, folder: Path) -> dict[str, Any]:
+        rows = [{"stage": "tune", "done_before": False, **entry} for entry in sitting.done.values()]
+        return {"folder": str(folder), "models": {}, "report": "", "doubts": {}, "failed": ["tune"], "steps": rows}
+
+    def failing(words: tuple[str, ...], *, as_json: bool) -> None:
+        inner(words, as_json=as_json)
+        raise _sitting.CheckFailedError("rise_s stands in the way.")
+
+    inner = _sitting._softneck
+    if ends == "fails":
+        monkeypatch.setattr(_sitting, "_softneck", failing)
+    monkeypatch.setattr(_start, "steps", plan)
+    monkeypatch.setattr(_start, "_facts", facts)
+    said = call("start", short, "-o", "p", "--yes", "--json")
+    assert said.code == 1
+    (step,) = json.loads(said.out)["steps"]
+    assert not step["holds"]
+    more = " rise_s stands in the way." if ends == "fails" else ""
+    assert re.search(re.escape(f"tune does not hold: The circle cannot be.{more}"), said.err)
