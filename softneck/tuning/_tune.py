@@ -223,9 +223,11 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
     if looped and task.own:
         holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
     stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=task.tested)
-    if not holds and stuck is None:
-        # The search saw nothing broken, the certificate of the whole box does.
-        stuck = next((v.requirement.metric for v in verification.failed), None)
+    paid = [] if stuck is None else prices(compared, bounds, stuck, tested=task.tested)
+    if not holds and stuck is None and verification.failed:
+        # The search saw nothing broken, and knows no price; the certificate of the whole box does.
+        stuck = verification.failed[0].requirement.metric
+        nearest = verification.failed[0].value if len(verification.failed) == 1 else None
     return Tuned(
         best=best, controller=controller, observer=eyes,
         assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
@@ -233,7 +235,7 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
         observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
         verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
-        prices=[] if stuck is None else prices(compared, bounds, stuck, tested=task.tested),
+        prices=paid,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
 
