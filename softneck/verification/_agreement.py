@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -148,7 +149,10 @@ def _by_control(plants: Plants, law: LinearLaw, axis: int, row: int) -> list[flo
         remove_useless_states=True,
     )
     loop: Any = control.minreal(control.ss(plant) * control.minreal(own, verbose=False), verbose=False)
-    gains, phases = (np.asarray(item) for item in control.stability_margins(loop, returnall=True)[:2])
+    with warnings.catch_warnings():
+        # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
+        warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
+        gains, phases = (np.asarray(item) for item in control.stability_margins(loop, returnall=True)[:2])
     gain = float(np.exp(np.abs(np.log(gains[gains > 0.0])).min(initial=math.inf)))
     # The nearest of all crossings, as `classical` takes it.
     phase = float(np.abs((phases + 180.0) % 360.0 - 180.0).min(initial=math.inf))
