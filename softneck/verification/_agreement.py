@@ -151,7 +151,7 @@ def _by_control(plants: Plants, law: LinearLaw, axis: int, row: int) -> list[flo
     loop: Any = control.minreal(control.ss(plant) * control.minreal(own, verbose=False), verbose=False)
     with warnings.catch_warnings():
         # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
-        warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
+        warnings.filterwarnings("ignore", "(stability_margins: Falling back|Badly conditioned)", UserWarning)
         gains, phases = (np.asarray(item) for item in control.stability_margins(loop, returnall=True)[:2])
     gain = float(np.exp(np.abs(np.log(gains[gains > 0.0])).min(initial=math.inf)))
     # The nearest of all crossings, as `classical` takes it.
