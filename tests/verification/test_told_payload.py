@@ -12,8 +12,9 @@ import pytest
 
 from softneck.core import SettingsError, Vector
 from softneck.cosim import load_loop, simulate
-from softneck.design import VaryingController
+from softneck.design import MpcSettings, VaryingController
 from softneck.design.varying._switched import SwitchedSettings
+from softneck.estimation import KalmanSettings
 from softneck.estimation.changes._change import ChangeDetector
 from softneck.estimation.changes._settings import ChangeSettings
 from softneck.identification import GreyBox
@@ -154,3 +155,32 @@ def test_verify_has_the_estimate_in_its_loops(
 def test_without_an_estimate_it_is_refused_in_one_line(controller: VaryingController) -> None:
     with pytest.raises(SettingsError, match=r"switched acts by the payload that it is told; give --observer"):
         verify(controller, {"line": neck(5.5)}, make_requirements(ASKED))
+
+
+@pytest.mark.slow
+def test_verify_has_the_estimate_of_an_observer_in_the_loops_of_an_mpc() -> None:
+    """By hand, to the bit: the observer over a model of several payloads tells the controller what it thinks."""
+    model = GreyBox(evaluations=2, sensor_delay=2).fit([log("eq22", 0.0), log("eq22", 1.0)])
+    observer = KalmanSettings().design(model)
+    controller = MpcSettings(bandwidth=6.0, minimum_tautness=0.5, payload_tautness=2.0).design(neck(5.5))
+    found = verify(controller, {"line": neck(5.5)}, make_requirements(ASKED), observer=observer)
+    runs: list[Any] = found.evidence.necks
+    assert [run.payload for run in runs] == [0.0, 1.0]
+    size = math.radians(float(found.requirements.neck["size_deg"]))
+    for run in runs:
+        assert run.result is not None
+        ends = size * math.cos(run.orientation), size * math.sin(run.orientation)
+        at = float(np.flatnonzero(run.result["pitch_reference"])[0]) * 0.02
+        by_hand = run_loop(Loop(
+            plant=BlockPart(PAPER.block(noise_seed=run.seed)), controller=BlockPart(controller.block()),
+            observer=BlockPart(observer.block()), plant_inputs={"payload": run.payload},
+            reference=StepReference(pitch=ends[0], roll=ends[1], at=at), duration=at + 2.5,
+        ))  # fmt: skip
+        np.testing.assert_array_equal(by_hand["pitch"], run.result["pitch"])
+        # An estimate by which the controller acts: that of the light neck is another than that of the heavy one.
+        np.testing.assert_array_equal(by_hand["payload_estimate"], run.result["payload_estimate"])
+    light, heavy = (run.result["payload_estimate"] for run in runs)
+    assert not np.array_equal(light, heavy)
+    # What it is told matters: another payload pulls the tendons otherwise.
+    mean = [np.mean([run.result[f"motor_setpoint_{j}"][-1] for j in (1, 2, 3)]) for run in runs]
+    np.testing.assert_allclose(mean[1] - mean[0], 2.0 * (heavy[-1] - light[-1]), atol=0.3)
