@@ -171,7 +171,7 @@ def gather(
     evidence = Evidence(
         plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
     )
-    evidence.not_computed |= {"neck": why} if why and not own else payloads_left_out(own, asked)
+    evidence.not_computed.update({"neck": why} if why and not own else payloads_left_out(own, asked))
     _tell(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence
