@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, Vector, to_si, write_archive
+from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
 from softneck.core._shown import Shown
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
@@ -197,6 +197,10 @@ class ChangeDetector(Shown):
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> ChangeDetector:
         """Return the detector that `save` wrote; `softneck.core.load` calls this."""
+        if BANK[0] in arrays and BANK[1] not in arrays:
+            raise FileFormatError(
+                "it has no thresholds for what tells the payload (an older version); design it again."
+            )
         found = cls(
             model=nested_model(header["model"], arrays),
             arrays={

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from softneck.core import SettingsError
+from softneck.core import FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.estimation.changes._change import ChangeDetector
 from softneck.estimation.changes._settings import ChangeSettings
 from softneck.identification import GreyBox, Model
@@ -124,6 +125,16 @@ def test_missing_samples_tell_nothing(model: Model, detector: ChangeDetector) ->
     told = detector.watch(run.with_channels(pitch=pitch))
     assert (told[:1000, 3] == 0.0).all()
     np.testing.assert_allclose(told[-1, 3], 1.0, atol=0.125)
+
+
+def test_a_file_keeps_it_and_one_from_before_is_refused(model: Model, detector: ChangeDetector, tmp_path: Path) -> None:
+    detector.save(tmp_path / "change.npz")
+    again, run = load(tmp_path / "change.npz", role="observer"), moved(model, "rotation", 0.5, 7)
+    np.testing.assert_array_equal(again.watch(run), detector.watch(run))
+    header, arrays = read_archive(tmp_path / "change.npz")
+    write_archive(tmp_path / "old.npz", header, {name: a for name, a in arrays.items() if name != "telling"})
+    with pytest.raises(FileFormatError, match="design it again"):
+        load(tmp_path / "old.npz")
 
 
 @pytest.mark.parametrize("wrong", [{"payload_memory": 0.0}, {"payload_sight": float("nan")}])
