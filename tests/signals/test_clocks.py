@@ -21,6 +21,7 @@ from softneck.signals.importing.formats._dates import is_date, seconds
 from softneck.signals.importing.formats._mat import mat_arrays
 from softneck.signals.recording._resampling import Samples
 
+from ..data import neck_recording
 from .log_writers import from_angles
 from .test_formats import columns, named
 
@@ -120,3 +121,23 @@ def test_drives_that_hardly_moved_are_no_other_unit() -> None:
     """Set-points and positions of one log are in one unit unless it is said or all but sure."""
     found = judge({"set-points": 115.0, "positions": 4.0, "tilt": 2.0}, {})
     assert (found["set-points"].unit, found["positions"].unit) == ("deg", "deg")
+
+
+def test_rows_that_a_logger_dropped_again_and_again_are_missed_samples_and_not_gaps(tmp_path: Path) -> None:
+    neck, path = neck_recording(1500), tmp_path / "log.csv"
+    frame = pd.DataFrame({"time": neck.time, **{f"target_motor{j}": neck.set_points[:, j - 1] for j in (1, 2, 3)},
+                          "pitch": neck.outputs[:, 0], "roll": neck.outputs[:, 1]})  # fmt: skip
+    dropped = np.random.default_rng(2).choice(np.arange(1, 1499), 60, replace=False)
+    frame.drop(index=dropped).to_csv(path, index=False, float_format="%.17g")
+    done = import_log(path, guess_layout(path).layout)
+    assert any(note.startswith("60 row(s) that were not logged, in ") for note in done.notes)
+    found, rows = done.recording, np.isin(np.arange(1500), dropped)
+    assert (len(found), len(found.runs())) == (1500, 1)
+    assert np.isnan(found.outputs[rows]).all()
+    # The rest is as it was logged; a set-point that was not is the last one before it.
+    np.testing.assert_allclose(found.outputs[~rows], neck.outputs[~rows], rtol=1e-12)
+    last = np.maximum.accumulate(np.where(rows, 0, np.arange(1500)))
+    np.testing.assert_allclose(found.set_points, neck.set_points[last], rtol=1e-12)
+    # Few or long gaps split runs as ever.
+    frame.drop(index=[300, 700]).to_csv(path, index=False)
+    assert len(import_log(path, guess_layout(path).layout).recording.runs()) == 3

@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import DataError, Vector, to_si
 
-from ..recording._channels import is_held
+from ..recording._channels import is_held, may_miss
 from ..recording._files import numbers
 from ..recording._resampling import Samples
 from ._layout import Layout, Source
@@ -19,8 +19,14 @@ from .formats._dates import DATE, EPOCH, seconds
 if TYPE_CHECKING:
     import pandas as pd
 
+    from softneck.robot import Robot
+
 # Measured values between two messages further apart than this many usual ones are missed, not interpolated.
 _FAR = 2.5
+# A step of 1.5 usual ones lacks a row, as where gaps split runs. Gaps of up to 3 rows (60 ms at 20 ms, less than the
+# dead time of a neck), 10 of them at least, nearly all gaps of the log, and pieces of 3 s at 20 ms or less on average:
+# a hold-out of them is a second.
+_LOST, _FEW, _OFTEN, _NEARLY_ALL, _PIECE, _WHOLE = 1.5, 3, 10, 0.9, 150, 0.2
 
 
 def time_of(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple[str, ...]]:
@@ -100,6 +106,40 @@ def _between(time: Vector, values: Vector) -> Vector:
     after = np.clip(np.searchsorted(t, time), 1, t.size - 1)
     far = (t[after] - t[after - 1] > _FAR * usual) | (time < t[0]) | (time > t[-1])
     return np.where(seen, values, np.where(far, np.nan, np.interp(time, t, x)))
+
+
+def filled(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]]:
+    """Return the samples with rows that a logger dropped again and again as missed samples, and a note.
+
+    A gap splits a run, since nobody knows what was asked in it. Where a row or a few are lost so often that the pieces
+    would be too short to judge a model by, set-points and flags hold their last value there instead.
+    """
+    step, inside = np.diff(samples.time), np.diff(samples.run) == 0
+    steps = step[inside & (step > 0)]
+    if not steps.size:
+        return samples, ()
+    usual = step / float(np.median(steps))
+    gap, lost = inside & (usual > _LOST), np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
+    # A clock that jitters loses nothing: its long steps are no whole numbers of usual ones.
+    few = gap & (lost >= 1) & (lost <= _FEW) & (np.abs(usual - lost - 1) < _WHOLE)
+    if few.sum() < _OFTEN or few.sum() < _NEARLY_ALL * gap.sum() or samples.time.size > _PIECE * few.sum():
+        return samples, ()
+    before = np.repeat(np.flatnonzero(few), lost[few])
+    part = np.concatenate([np.arange(1, count + 1) / (count + 1.0) for count in lost[few]])
+    channels = {}
+    for name, values in samples.channels.items():
+        missed = values[before] + part * (values[before + 1] - values[before])
+        if is_held(name):
+            missed = values[before]
+        elif may_miss(name, robot):
+            missed = np.full(before.size, np.nan)
+        channels[name] = np.insert(values, before + 1, missed)
+    time = np.insert(samples.time, before + 1, samples.time[before] + part * step[before])
+    note = (
+        f"{before.size} row(s) that were not logged, in {few.sum()} gaps of {_FEW} or fewer, are missed samples, in "
+        "which set-points hold"
+    )
+    return Samples(time, np.insert(samples.run, before + 1, samples.run[before]), channels), (note,)
 
 
 def integrated(samples: Samples, sources: Mapping[str, Source]) -> tuple[Samples, tuple[str, ...]]:

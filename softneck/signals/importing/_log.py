@@ -16,7 +16,7 @@ from ..recording._files import integers, numbers
 from ..recording._recording import Recording
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
 from ..recording._times import check_rising, median_step, uneven
-from ._clocks import clocked, integrated, merged, time_of
+from ._clocks import clocked, filled, integrated, merged, time_of
 from ._layout import Column, Layout, Source
 from ._sample_time import estimate_sample_time
 from ._tilt import pitch_roll, turns
@@ -165,11 +165,12 @@ def _clocked(
         samples, note = merged(samples, layout.robot.outputs.names)
         notes += (note,)
     samples, left_out = without_duplicates(samples, layout.duplicates)
+    samples, lost = filled(samples, layout.robot)
     samples, gaps = split_at_gaps(samples)
     samples, summed = integrated(samples, layout.channels)
     nominal = median_step(samples.time, samples.run)
     sample_time, remarks = _sample_time(layout, samples.channels, samples.run, nominal)
-    notes += left_out + gaps + summed + remarks
+    notes += left_out + lost + gaps + summed + remarks
     if sample_time is None:
         return _evened(samples, nominal, notes)
     return _recounted(layout, samples, nominal, sample_time, notes)
