@@ -16,7 +16,7 @@ from softneck.core import CheckFailedError, FileFormatError, OutputFileError, Se
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import json_option
 from ..shared._settle import is_terminal
-from ._plan import BEST, Asked, linear_model, nonlinear_model, steps
+from ._plan import BEST, PI, Asked, linear_model, nonlinear_model, steps
 from ._sitting import FILE, Sitting
 from ._step import STAGES, Step
 
@@ -158,6 +158,9 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[s
     said = str(error)
     for log in logs:
         said = said.replace(log, Path(log).name)
+    if next(reversed(sitting.ran)).endswith(PI) and "to design on" not in said:
+        note("the models are kept: `softneck validate` and `softneck fmu` take them, and `softneck design` other kinds")
+        return type(error)(_shortened(f"first controller: {said}"))
     if stage == "identification":  # what the recordings lack was said before it
         note(_MIXED)
         first = _FIRST_SENTENCE.match(said)

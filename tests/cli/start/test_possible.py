@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from softneck.cli.start import _possible, _sitting, _start
-from softneck.cli.start._plan import Asked
+from softneck.cli.start._plan import PI, Asked
 from softneck.cli.start._step import Step
 from softneck.core import SettingsError
 from softneck.tuning import _beforehand
@@ -85,3 +85,21 @@ def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
     assert not step["holds"]
     more = " rise_s stands in the way." if ends == "fails" else ""
     assert re.search(re.escape(f"tune does not hold: The circle cannot be.{more}"), said.err)
+
+
+@pytest.mark.parametrize(("why", "records"), [("30 % is the least to design on.", True), ("it has no rise.", False)])
+def test_a_log_is_asked_for_only_where_the_model_is_at_fault(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, why: str, records: bool
+) -> None:
+    def plan(asked: Asked) -> Iterator[Step]:
+        yield Step(stage="identification", command=("softneck", "design", "pi"), makes=(PI,), reads=asked.logs)
+
+    def refuse_design(*_: Any, **__: Any) -> None:
+        raise SettingsError(why)
+
+    monkeypatch.setattr(_start, "steps", plan)
+    monkeypatch.setattr(_sitting, "_softneck", refuse_design)
+    said = call("start", short, "-o", "p", "--yes")
+    assert ("Record 60 s of `mixed`" in said.err.splitlines()[-1]) == records
+    assert why in said.err.splitlines()[-1]
+    assert said.code == (1 if records else 2)
