@@ -13,7 +13,7 @@ from softneck.core import FileFormatError, SettingsError, atomic_write
 from softneck.core._budget import MOST_JSON, settings_text
 
 _KIND, _VERSION = "softneck supervision", 2
-_LATER = {"seconds", "tracking"}
+_LATER = {"seconds", "tracking", "level_low"}
 Row = tuple[float, ...]
 Rows = tuple[Row, ...]
 
@@ -52,7 +52,8 @@ class Baseline:
         current_top: largest tension seen of each, where its current may be cut off [N].
         current_reach: how far each motor was behind its set-points in nearly all cycles [rad].
         level: of each motor, its tension from the same features, the mean of the others' tensions, and one: a payload
-            is in all of them. level_spread: variance of the residual [N^2].
+            is in all of them. level_spread: variance of the residual [N^2]; level_low: the others' mean in nearly all
+            cycles is above this [N], () where that is not known.
         tilt: (outputs, lags x motors) tilt from the motors' positions so many samples ago.
         lags: these [samples].
         tilt_whitening: of each output's residual.
@@ -95,6 +96,7 @@ class Baseline:
     missing_threshold: float = math.inf
     reach: Rows
     slack: Row
+    level_low: Row = ()
     motor_thresholds: Row = ()
     tilt_thresholds: Row = ()
     tracking: Tracking = field(default_factory=Tracking)

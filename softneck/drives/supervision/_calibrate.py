@@ -172,7 +172,7 @@ def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles
     lags = _lags(step)
     # At rest nobody knows which way friction holds: a tendon is taut for certain above that much only.
     least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
-    level, level_spread = level_rows(known, least, top, reach)
+    level, level_spread, level_low = level_rows(known, least, top, reach, seldom=1.0 - _NEARLY)
     samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
     tilt = _tilt_gains(samples, lags)
     residuals = [s.values - _predicted(s, tilt, lags, n) for s in samples]
@@ -190,7 +190,7 @@ def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles
         drive_fastest=row_of((1.0 + _MARGIN) * np.max([np.nanmax(np.abs(f.moved), axis=0) for f in features], axis=0)),
         current=current, current_whitening=current_white, current_spread=current_spread,
         current_top=row_of(top), current_reach=row_of(reach),
-        level=level, level_spread=level_spread, tilt=_table(tilt), lags=lags,
+        level=level, level_spread=level_spread, level_low=level_low, tilt=_table(tilt), lags=lags,
         tilt_whitening=white, tilt_spread=spread, tilt_bias=(0.0,) * m,
         gyro_whitening=gyro[0], gyro_spread=gyro[1], gyro_wander=gyro[2],
         noise=row_of(np.concatenate(bends).var(axis=0)),

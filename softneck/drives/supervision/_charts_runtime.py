@@ -113,10 +113,11 @@ def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, re
     """Fill the scores (scales x motors,) of each tension against those of the other tendons, which share a payload.
 
     Args:
-        model: level, its spread, top, reach, and below what tension a tendon may hang.
+        model: level, its spread, top, reach, below what tension a tendon may hang, and below what mean of the others
+            nobody knows how they share what is left.
         rules, past, x, rest, scales, scores: as in `supervised_motors`.
     """
-    level, spread, top, reach, slack = model
+    level, spread, top, reach, slack, low = model
     sight, near_top = rules[2], rules[5]
     s, p, tension = past
     n, features = rest.shape[0], x.shape[2]
@@ -126,15 +127,16 @@ def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, re
         for k in range(s.shape[0]):
             overloaded = overloaded or abs(s[k, i] - p[0, i]) > reach[i]
     for i in range(n):
-        expected, quiet = level[i, features + 1], overloaded
+        expected, quiet, others = level[i, features + 1], overloaded, 0.0
         for j in range(features):
             expected += level[i, j] * x[0, i, j]
         for j in range(n):
             quiet = quiet or rest[j] > 0.0
             if j != i:
-                expected += level[i, features] * tension[0, j] / (n - 1)
+                others += tension[0, j] / (n - 1)
+        expected += level[i, features] * others
         # What hangs has no scale: half of a tension must be well above that.
-        quiet = quiet or expected < 3.0 * slack[i]
+        quiet = quiet or expected < 3.0 * slack[i] or others < low[i]
         for k in range(scales.shape[0]):
             score = chart_shift(tension[0, i] - expected, (scales[k] - 1.0) * expected, spread[i], sight)
             # What was added up before is of another moment: half an answer each time is none.

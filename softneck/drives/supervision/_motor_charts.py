@@ -147,7 +147,9 @@ class MotorCharts:
             b.slack,
         )
         self._model = tuple(np.array(row) for row in rows)
-        self._levels = tuple(np.array(row) for row in (b.level, b.level_spread, *rows[-3:]))
+        # Baselines from before it was known judge all levels.
+        low = b.level_low or (0.0,) * n
+        self._levels = tuple(np.array(row) for row in (b.level, b.level_spread, *rows[-3:], low))
         self._rules = tuple(rules or MotorRules())
         filter_ = Filter([Whitening(row) for row in b.current_whitening], 1 + len(SCALES))
         self._white = (filter_.coefficients, filter_.past, np.zeros((1 + len(SCALES), n)))

@@ -96,10 +96,15 @@ def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most:
     return tuple(gains), tuple(white), tuple(spread)
 
 
-def level_rows(known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector) -> tuple[Rows, Row]:
-    """Fit each tension by the motors' places and the other tensions, where all may be believed; not for one motor."""
+def level_rows(
+    known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector, *, seldom: float
+) -> tuple[Rows, Row, Row]:
+    """Fit each tension by the motors' places and the other tensions, where all may be believed; not for one motor.
+
+    Return coefficients, variance, and the mean of the others below which they are in the part `seldom` of the cycles.
+    """
     n = len(slack)
-    rows, spread = [], []
+    rows, spread, low = [], [], []
     for i in range(n):
         X, y = [], []
         for motion, f in known:
@@ -115,7 +120,8 @@ def level_rows(known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vec
         theta = _robust(regressors, target) if told else np.zeros(regressors.shape[1])
         rows.append(row_of(theta))
         spread.append(float(np.var(target - regressors @ theta)) if told else 1.0)
-    return tuple(rows), tuple(spread)
+        low.append(float(np.quantile(regressors[:, -2], seldom)) if told else 0.0)
+    return tuple(rows), tuple(spread), tuple(low)
 
 
 def _robust(X: Matrix, y: Vector) -> Vector:

@@ -18,7 +18,7 @@ TOP, REACH, SLACK = 10.0, 1.0, 0.5
 GATES = (np.full(N, TOP), np.full(N, REACH), np.full(N, SLACK))
 
 
-def levels(tensions: list[float], *, behind: float = 0.0, rest: int | None = None) -> np.ndarray:
+def levels(tensions: list[float], *, behind: float = 0.0, rest: int | None = None, low: float = 0.0) -> np.ndarray:
     """Return scores (scales, motors) where each tension should be the mean of the others."""
     level = np.zeros((N, FEATURES + 2))
     level[:, FEATURES] = 1.0
@@ -27,7 +27,7 @@ def levels(tensions: list[float], *, behind: float = 0.0, rest: int | None = Non
     if rest is not None:
         resting[rest] = 1.0
     scores = np.full(len(SCALES) * N, np.nan)
-    model = (level, np.full(N, 0.01), *GATES)
+    model = (level, np.full(N, 0.01), *GATES, np.full(N, low))
     supervised_levels(model, tuple(MotorRules()), past, np.zeros((4, N, FEATURES)), resting, np.array(SCALES), scores)
     return scores.reshape(len(SCALES), N)
 
@@ -41,6 +41,7 @@ def test_a_tension_twice_those_of_the_others_is_rather_a_scale_of_two_than_any_o
     assert np.max(found.ravel()[1:]) == pytest.approx(1.5)
     assert (levels([3.0, 3.0, 3.0]) < 0.0).all()
     assert levels([1.5, 3.0, 3.0])[1, 0] == pytest.approx(4.5)
+    assert np.array_equal(levels([6.0, 3.0, 3.0], low=2.99), found)
 
 
 @pytest.mark.parametrize(
@@ -52,8 +53,10 @@ def test_a_tension_twice_those_of_the_others_is_rather_a_scale_of_two_than_any_o
         lambda: levels([0.96 * TOP, 4.8, 4.8]),
         # The others say 1.4 N, which is not well above what may hang.
         lambda: levels([2.8, 1.4, 1.4]),
+        # Such a load was carried in none of the experiments.
+        lambda: levels([6.0, 3.0, 3.0], low=3.01),
     ],
-    ids=["far behind", "its tendon hung", "another one hung", "at the limit", "near hanging"],
+    ids=["far behind", "its tendon hung", "another one hung", "at the limit", "near hanging", "unknown load"],
 )
 def test_levels_are_forgotten_where_they_say_nothing(scores: Callable[[], np.ndarray]) -> None:
     assert scores()[0, 0] == SUPERVISED_NOT
