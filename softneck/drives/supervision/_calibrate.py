@@ -23,8 +23,8 @@ _LAGS = 8
 # Motors further out than this part of the seen range are not known ground, and none is so much faster.
 _MARGIN = 0.2
 _LEAST = 20.0
-# Runs of a loop, of all together [s]: four minutes show half of the slow error that a quarter of an hour does, and the
-# tracking cried wolf once in eight hours.
+# Runs of a loop, of all together [s]: four minutes showed a third of the slow error that a quarter of an hour does, and
+# the tracking cried wolf once in eight hours.
 _LEAST_LOOPS = 600.0
 # See `calibrate`; by `benchmarks/supervisor_choice.py`.
 _KNOWN_BIAS = 0.25

@@ -138,7 +138,7 @@ def test_logs_keep_references_and_give_them_back(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_few_minutes_of_a_loop_are_refused() -> None:
-    """From four of them the tracking cried wolf once in eight hours: they show half of its slow errors."""
+    """From four of them the tracking cried wolf once in eight hours: they showed a third of its slow errors."""
     motions = [*experiments(None, 0.0)[:2], looped(15, "step", 0.0, 40.0), looped(16, "ramp", 0.0, 40.0)]
     with pytest.raises(DataError, match=r"^7\d s of a loop's motion .* at least 600 s, or leave its runs out"):
         calibrate(motions, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
