@@ -129,12 +129,21 @@ def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, 
     """Return what to train on, what to hold out, and whether that is another experiment."""
     from softneck.signals import concatenate
 
-    if len(parts) > 1:
+    if len(parts) > 1 and not _heavier_or_lighter(parts[-1], parts[:-1]):
         return concatenate(parts[:-1]), parts[-1], True
     if not 0.0 < train < 1.0:
         raise SettingsError(f"--train: `auto` has to hold rows out; give a part below 1, got {train:g}.")
-    head, tail = parts[0].split(train)
+    # The end of each run: a payload that was held out whole is one that the model would know nothing of.
+    head, tail = concatenate(parts).split(train)
     return head, tail, False
+
+
+def _heavier_or_lighter(one: Recording, others: list[Recording]) -> bool:
+    """Return whether a recording has a payload beyond those of the others."""
+    from softneck.identification.models._fitting import payload_of
+
+    known = [payload_of(run) for part in others for run in part.runs()]
+    return any(not min(known) <= payload_of(run) <= max(known) for run in one.runs())
 
 
 def _title(robot: Robot) -> str:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from softneck.cli._auto import _split
 from softneck.core import load
 from softneck.identification.selection import _auto
 from softneck.signals import write_recording
@@ -42,6 +44,24 @@ def test_rows_held_out_that_stand_still_are_refused_before_anything_is_trained(c
     assert said.code == 2
     assert "step.csv: the rows held out stand still: pitch moves by 0.0 % of what it does in all rows" in said.error
     assert not Path("n.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("payloads", "whole"), [((0.0, 1.0), False), ((0.0, 1.0, 0.5), True), ((1.0, 0.0), False), ((0.0, 0.0), True)]
+)
+def test_no_payload_is_held_out_whole(payloads: tuple[float, ...], whole: bool) -> None:
+    """What nobody else carries is trained on as well, or the model would not know it."""
+    one = neck_recording(300, seed=3)
+    parts = [replace(one, channels={**one.channels, "payload": np.full(300, kg)}) for kg in payloads]
+    head, tail, other = _split(parts, 0.7)
+    assert other == whole
+    trained = set(np.unique(head.channels["payload"]))
+    assert min(trained) == min(payloads)
+    assert max(trained) == max(payloads)
+    if whole:
+        np.testing.assert_array_equal(tail.outputs, parts[-1].outputs)
+    else:
+        assert head.time.size + tail.time.size == 300 * len(payloads)
 
 
 @pytest.mark.slow
