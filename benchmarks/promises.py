@@ -242,11 +242,11 @@ def truth(neck: str, controller: Block) -> dict[str, float]:
     """
     loops = [
         LoopUnderTest(name=neck, plant=lambda: BlockPart(block_of(neck, noise=False)), controller=controller,
-                      inputs={"payload": kg}) for kg in PAYLOADS
+                      constants={"plant_inputs": {"payload": kg}}) for kg in PAYLOADS
     ]  # fmt: skip
     found = crossing_values(crossings(loops, overall=True))
     own = OwnPlant(
-        name=neck, payload=True, make=lambda seed, _: Sensed(block_of(neck, noise=True, seed=seed)),
+        name=neck, payload="inputs", make=lambda seed, _: Sensed(block_of(neck, noise=True, seed=seed)),
         quiet=lambda _: Sensed(block_of(neck, noise=False)),
     )  # fmt: skip
     runs = run_necks(controller, make_requirements(FEW), order="sequential", observer=None, seed=0,

@@ -56,7 +56,7 @@ def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tup
     angles = [math.radians(a) for a in table["orientations_deg"]] if len(robot.outputs.names) > 1 else [0.0]
     found = []
     for number, plant in enumerate(own):
-        for kg in payloads if plant.payload else [0.0]:
+        for kg in plant.payloads(payloads):
             # Those of `verify` have no noise, which crosses 90 % sooner than the angle does.
             found += [Case(number, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)]
             found += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
@@ -117,7 +117,7 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task) -
     return Loop(
         plant=plant.quiet(Ts), controller=BlockPart(block), reference=_Together(reference, together),
         duration=duration, order=order,
-        robot=robot, plant_inputs={"payload": case.payload} if plant.payload else {}, faults=tuple(faults),
+        robot=robot, **plant.carrying(case.payload), faults=tuple(faults),
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
         connections={
             f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"

@@ -39,7 +39,7 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
         found = run_steps(ready.plants.take(0), block, test, workers=1, robot=task.robot, weights=ready.weights)
         half = found.time.size // 2
         return found.time[:half], found.angles[0, 0, :half] / per, np.full(half, step / per)
-    case = Case(len(ready.own) - 1, max(map(float, asked.neck["payloads_kg"])))
+    case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.neck["payloads_kg"]))))
     result = run_loop(loop_of(case, ready.own[case.plant], block, order, task), compiled=True)
     reference = result[f"{name}_reference"]
     first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))

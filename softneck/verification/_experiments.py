@@ -14,7 +14,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -70,7 +70,7 @@ class LoopUnderTest:
         plant: returns a new part.
         controller, observer: blocks.
         order: of the loop.
-        inputs: constants of the plant, such as `payload`.
+        constants: `plant_inputs` or `plant_parameters` of its `Loop`, such as a payload.
         compiled: as one function where all parts are blocks; that takes some ten seconds once, and each run a tenth.
         axes: that are raised.
         robot: whose loop it is.
@@ -82,7 +82,7 @@ class LoopUnderTest:
     controller: Block
     observer: Block | None = None
     order: str = "sequential"
-    inputs: Mapping[str, float] | None = None
+    constants: Mapping[str, Any] = field(default_factory=dict)
     compiled: bool = True
     axes: tuple[str, ...] = ("pitch", "roll", "both")
     robot: Robot = _NECK
@@ -294,7 +294,7 @@ class _Case:
                 plant=loop.plant(), controller=BlockPart(loop.controller), observer=eyes,
                 reference=_Kicked(posture, tuple(float(v) for v in kick), loop.time, middle), robot=loop.robot,
                 duration=loop.time * (_REST + _FORGOTTEN + 2.0 * _WINDOW), order=loop.order,
-                plant_inputs=dict(loop.inputs or {}), other_parameters={"louder": parameters},
+                **loop.constants, other_parameters={"louder": parameters},
                 others={"louder": BlockPart(block), **beside}, connections=connections,
                 # A rate has no reference: it is wanted to be zero.
                 other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},

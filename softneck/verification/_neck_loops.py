@@ -115,7 +115,7 @@ def run_necks(
     angles = table["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
     cases = [
         (plant, payload, angle) for plant in plants
-        for payload in (table["payloads_kg"] if plant.payload else (0.0,)) for angle in angles
+        for payload in plant.payloads(table["payloads_kg"]) for angle in angles
     ]  # fmt: skip
     runs = []
     for number, (plant, payload, angle) in enumerate(cases):
@@ -178,7 +178,7 @@ def _loop(
         duration=at + float(asked.neck["duration_s"]),
         order=order,
         robot=robot,
-        plant_inputs={"payload": payload} if plant.payload else {},
+        **plant.carrying(payload),
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
         connections={
             f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
@@ -233,17 +233,17 @@ def loops_under_test(
     """
     names = robot.outputs.names
     axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
-    payloads = sorted({float(kg) for kg in (min(asked.neck["payloads_kg"]), max(asked.neck["payloads_kg"]))})
+    known = [(plant, plant.payloads(asked.neck["payloads_kg"])) for plant in own]
     return [
         LoopUnderTest(
             name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller,
             plant=lambda plant=plant: plant.quiet(controller.sample_time), observer=observer,
-            order=order, inputs={"payload": kg} if plant.payload else {},
+            order=order, constants=plant.carrying(kg),
             # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
-            axes=axes if kg == payloads[0] or not plant.payload else axes[-1:], robot=robot, time=asked.scale[0],
+            axes=axes if kg == min(payloads) else axes[-1:], robot=robot, time=asked.scale[0],
             size=1.0 if robot.is_neck else asked.si(math.degrees(asked.scale[1])),
         )
-        for plant in own for kg in (payloads if plant.payload else (0.0,))
+        for plant, payloads in known for kg in sorted({float(min(payloads)), float(max(payloads))})
     ]  # fmt: skip
 
 

@@ -36,7 +36,7 @@ class OwnPlant:
         name: of its file.
         make: returns a new part, given the seed of its sensor's noise and the loop's sample time [s].
         quiet: as `make`, without noise where the plant knows how.
-        payload: whether it takes one.
+        payload: "inputs" or "parameters", as what it takes one; "" for none.
         parameters: of a virtual neck; None of another plant.
         conditions: payload and co-contraction that a model was trained at; nothing where it does not say.
     """
@@ -44,9 +44,20 @@ class OwnPlant:
     name: str
     make: Callable[[int, float], Part]
     quiet: Callable[[float], Part]
-    payload: bool
+    payload: str
     parameters: NeckParameters | None = None
     conditions: Mapping[str, list[float]] = field(default_factory=dict)
+
+    def payloads(self, asked: Sequence[float]) -> list[float]:
+        """Return which of the payloads asked for loops of it carry [kg]; one that is not said is 0."""
+        if self.payload == "parameters":  # a model knows those between its recordings
+            seen = self.conditions["payload_kg"]
+            return [kg for kg in asked if _within(kg, seen)] or [min(seen)]
+        return list(asked) if self.payload else [0.0]
+
+    def carrying(self, payload: float) -> dict[str, Any]:
+        """Return what says a payload [kg] to a `Loop` whose plant it is."""
+        return {f"plant_{self.payload}": {"payload": payload}} if self.payload else {}
 
 
 def is_own_plant(thing: Any) -> bool:
@@ -73,7 +84,7 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
         still = VirtualNeck(neck.parameters.without_noise(), neck.robot)
         return OwnPlant(
-            name=name, payload=True, parameters=neck.parameters,
+            name=name, payload="inputs", parameters=neck.parameters,
             make=lambda seed, Ts: BlockPart(neck.block(noise_seed=seed, sample_time=Ts)),
             quiet=lambda Ts: BlockPart(still.block(sample_time=Ts)),
         )  # fmt: skip
@@ -90,8 +101,10 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
         raise SettingsError(
             f"{name}: is no plant with the outputs {' and '.join(outputs)} (it has {', '.join(names)})."
         )
-    payload = any(port.name == "payload" for port in part.inputs)
     known = getattr(thing, "findings", {}).get("conditions", {})
+    settable = part.block.parameters if isinstance(part, BlockPart) and "payload_kg" in known else ()
+    taken = {"inputs": part.inputs, "parameters": settable}
+    payload = next((how for how, ports in taken.items() if any(port.name == "payload" for port in ports)), "")
     return OwnPlant(
         name=name, make=lambda _seed, _Ts: make(), quiet=lambda _Ts: make(), payload=payload, conditions=known
     )  # fmt: skip
@@ -130,20 +143,23 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
 
 def payloads_left_out(own: Sequence[OwnPlant], asked: Requirements) -> dict[str, str]:
     """Return which of the payloads asked for no loop of a plant carried, as it knows none; nothing where all did."""
-    blind = [plant.name for plant in own if not plant.payload]
-    heavy = [f"{kg:g}" for kg in asked.neck["payloads_kg"] if kg > 0.0]
-    if not (blind and heavy and asked.robot.is_neck):
+    wanted = [kg for kg in asked.neck["payloads_kg"] if kg > 0.0]
+    left = {plant.name: [f"{kg:g}" for kg in wanted if kg not in plant.payloads(wanted)] for plant in own}
+    said = [
+        f"no loop of {name} carries {', '.join(heavy)} kg, which it does not know"
+        for name, heavy in left.items()
+        if heavy
+    ]
+    if not (said and asked.robot.is_neck):
         return {}
-    return {
-        "loops with payload": f"no payload is known to {', '.join(blind)}, so no loop carries {', '.join(heavy)} kg; "
-        "`softneck identify greybox` recordings that say theirs, in a column `payload [kg]`"
-    }
+    way = "`softneck identify greybox` recordings that say theirs, in a column `payload [kg]`"
+    return {"loops with payload": f"{'; '.join(said)}; {way}"}
 
 
 def _carries(plant: OwnPlant, kg: float, held: float) -> bool:
     """Return whether a plant takes any payload, or was made from recordings with this one and where the loop is."""
     known = plant.conditions
-    return plant.payload or (
+    return plant.payload == "inputs" or (
         _within(kg, known.get("payload_kg", [0.0])) and _within(held, known.get("cocontraction", [held]), _SAME)
     )
 

@@ -31,7 +31,6 @@ from softneck.verification._own_plants import (
     is_own_plant,
     not_recorded,
     own_plant,
-    payloads_left_out,
 )
 from softneck.verification._plants import all_plants, neck_of_family
 from softneck.verification._steps import Steps
@@ -207,7 +206,7 @@ def test_what_nobody_recorded_is_not_supported(
     tested = {"f.npz": {"conditions": [{"payload_kg": [1.0, 1.0], "cocontraction": [-0.5, 0.5]}]}}
     known = {} if payload is None else {"payload_kg": payload, "cocontraction": at}
     part: Any = None
-    plant = OwnPlant(name="p", make=part, quiet=part, payload=payload is None, conditions=known)
+    plant = OwnPlant(name="p", make=part, quiet=part, payload="inputs" if payload is None else "", conditions=known)
     found = not_recorded(tested, [plant], held_at(loop))
     assert found.keys() == said.keys()
     for group, words in said.items():
@@ -258,16 +257,6 @@ def test_margins_by_experiment_stand_beside_the_linear_ones_and_the_smaller_is_c
     # On the user's own plant neck.* decides, and one run is enough: one payload, one orientation.
     assert [run.name for run in found.evidence.necks] == ["own, 0 kg, 0 deg"]
     assert rows["neck.overshoot_pct"]["holds"] is not None
-
-
-@pytest.mark.parametrize(
-    ("knows", "asked", "said"), [(False, [0.0, 1.0], True), (True, [0.0, 1.0], False), (False, [0.0], False)]
-)
-def test_payloads_that_no_loop_carries_are_said(knows: bool, asked: list[float], said: bool) -> None:
-    plant = replace(own_plant(NeckParameters.paper(), "own"), payload=knows)
-    found = payloads_left_out([plant], make_requirements({**QUICK, "neck": {"payloads_kg": asked}}))
-    assert bool(found) == said
-    assert all("own" in why and "1 kg" in why for why in found.values())
 
 
 @pytest.mark.slow
@@ -364,7 +353,10 @@ def test_an_fmu_stands_as_much_as_the_plant_that_it_is_made_of(tmp_path: Path, m
     monkeypatch.chdir(Path("/"))
     swings = [
         _Case(
-            LoopUnderTest(name="p", plant=part, controller=pi().block(), inputs={"payload": 0.0}, compiled=False),
+            LoopUnderTest(
+                name="p", plant=part, controller=pi().block(), compiled=False,
+                constants={"plant_inputs": {"payload": 0.0}},
+            ),
             "both", "gain_up", math.radians(1.0), (0.0, 0.0),
         )._windows(1.5, 0.0)
         for part in (lambda: own.quiet(TS), lambda: BlockPart(block))

@@ -40,7 +40,11 @@ def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
     )  # fmt: skip
     inputs = {"load_pitch": 0.0, "load_roll": 0.0}
     return LoopUnderTest(
-        name="p", plant=lambda: BlockPart(block), controller=pi().block(), inputs=inputs, compiled=False
+        name="p",
+        plant=lambda: BlockPart(block),
+        controller=pi().block(),
+        constants={"plant_inputs": inputs},
+        compiled=False,
     )
 
 
@@ -116,7 +120,12 @@ def test_the_least_over_plants_axes_and_kinds_is_each_metric_s() -> None:
 
 
 def neck_loop(block: Block) -> LoopUnderTest:
-    return LoopUnderTest(name="paper", plant=lambda: BlockPart(block), controller=pi().block(), inputs={"payload": 0.5})
+    return LoopUnderTest(
+        name="paper",
+        plant=lambda: BlockPart(block),
+        controller=pi().block(),
+        constants={"plant_inputs": {"payload": 0.5}},
+    )
 
 
 @pytest.mark.nightly
