@@ -68,8 +68,8 @@ def identify_auto(
         raise DataError(f"{recordings[-1]}: {still}. Record motion to the end, or hold out other rows by --train.")
     with progress("identify auto", quiet=as_json) as report:
         choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
-    other, sort = _other(choice)
-    saved = {path: choice} if other is None else {path: choice, beside[sort]: other}
+    others = _others(choice)
+    saved = {path: choice, **{beside[sort]: other for sort, other in others.items()}}
     models: list[Model] = []
     for file, taken in saved.items():
         model = _model(taken)
@@ -83,7 +83,7 @@ def identify_auto(
     for file in beside.values():
         if file not in saved:
             file.unlink(missing_ok=True)  # of another choice, which --force replaces
-    said = [] if other is None else [_OTHER[sort].format(kind=other.chosen.kind, path=beside[sort])]
+    said = [_OTHER[sort].format(kind=other.chosen.kind, path=beside[sort]) for sort, other in others.items()]
     if html is not None:
         write_page(html, _page(choice), force=force)
     judged = choice.chosen.judged
@@ -115,14 +115,12 @@ def _model(choice: Choice) -> Model:
     return choice.chosen.model
 
 
-def _other(choice: Choice) -> tuple[Choice | None, str]:
-    """Return the choice of the best kind of the other sort, None where none ran free, and what sort that is."""
-    from softneck.identification.models._linear_systems import KINDS
-    from softneck.identification.selection._auto import best_other
+def _others(choice: Choice) -> dict[str, Choice]:
+    """Return the choices of the best kinds of other sorts, by their sort."""
+    from softneck.identification.selection._auto import best_others
 
-    one = best_other(choice.ranking, choice.chosen.kind)
-    sort = "nonlinear" if choice.chosen.kind in KINDS else "linear"
-    return (None if one is None or one.model is None else replace(choice, chosen=one)), sort
+    found = best_others(choice.ranking, choice.chosen)
+    return {sort: replace(choice, chosen=one) for sort, one in found.items() if one.model is not None}
 
 
 def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, bool]:

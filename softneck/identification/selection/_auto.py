@@ -162,13 +162,29 @@ def _wanted(train: Recording, kinds: Sequence[str]) -> list[str]:
     return sorted(kinds or usual, key=_SIMPLE_FIRST.index)
 
 
-def best_other(ranking: Sequence[KindTrial], chosen: str) -> KindTrial | None:
-    """Return the best linear kind beside one that is not, and the other way round; None where none ran free.
+def best_others(ranking: Sequence[KindTrial], chosen: KindTrial) -> dict[str, KindTrial]:
+    """Return the best "linear" kind where the chosen one cannot stand for it, and the best "nonlinear" one likewise.
 
-    A median of others may be one of linear kinds, so it does not stand for what bends.
+    A linear one is to have a transfer function for each output, which most designs ask for: `subspace` of a robot
+    without directions has none. A median of others may be one of linear kinds, so it does not stand for what bends.
     """
-    sought = [one for one in ranking if (one.kind in LINEAR) != (chosen in LINEAR) and one.kind != "ensemble"]
-    return max((one for one in sought if one.fit > float("-inf")), key=lambda one: one.fit, default=None)
+    free = [one for one in ranking if one.fit > float("-inf") and one.kind != "ensemble"]
+    sought = {
+        "linear": [] if _has_axes(chosen) else [one for one in free if _has_axes(one)],
+        "nonlinear": [one for one in free if one.kind not in LINEAR] if chosen.kind in LINEAR else [],
+    }
+    return {sort: max(known, key=lambda one: one.fit) for sort, known in sought.items() if known}
+
+
+def _has_axes(one: KindTrial) -> bool:
+    """Return whether a kind is linear, and each output answers to an input of its own."""
+    if one.kind not in LINEAR or one.model is None:
+        return False
+    try:
+        one.model.tf(one.model.robot.outputs.names[0])
+    except SoftneckError:
+        return False
+    return True
 
 
 class _Race:
@@ -282,10 +298,10 @@ class _Race:
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
 
     def train_other(self, chosen: KindTrial) -> None:
-        """Train the best linear kind on all rows where the chosen one is not linear, else the best that is not."""
-        other = best_other(self.ranking(), chosen.kind)
-        if other is not None and not other.whole:
-            self.whole(other.kind)
+        """Train on all rows what `best_others` finds beside the chosen one."""
+        for other in best_others(self.ranking(), chosen).values():
+            if not other.whole:
+                self.whole(other.kind)
 
     def whole(self, kind: str) -> None:
         """Train a kind on all rows to train on, and judge it again on the hold-out."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError, silent
+from softneck.core import DataError, SettingsError, load, silent
 from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose, refit
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
-from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, best_other, kinds_to_try
+from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, best_others, kinds_to_try
 from softneck.identification.selection._choice_words import guarded_why
 from softneck.identification.selection._exam import agreement, exams, weighted_median
 from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
@@ -23,7 +25,7 @@ from softneck.identification.uncertainty._guarded import Guarded
 from softneck.identification.uncertainty._guarded_base import Base
 from softneck.signals import Recording, concatenate
 
-from ...data import neck_recording, slow_but
+from ...data import ROOT, neck_recording, slow_but
 
 TRAIN, OTHER = neck_recording(900), neck_recording(500, seed=12)
 
@@ -123,13 +125,35 @@ def test_nothing_to_try_and_nothing_that_works_are_errors() -> None:
 
 def test_the_best_of_the_other_sort_is_no_median_and_ran_free() -> None:
     fits = {"rls": 80.0, "oe": 85.0, "ensemble": 99.0, "play": 70.0, "nn": 75.0, "nss": float("-inf")}
-    ranking = [KindTrial(kind, 0.0, left_out={"hold-out": fit}) for kind, fit in fits.items()]
-    for chosen, other in (("rls", "nn"), ("play", "oe"), ("ensemble", "oe")):
-        found = best_other(ranking, chosen)
-        assert found is not None
-        assert found.kind == other
-    assert best_other(ranking[:2], "rls") is None
-    assert best_other(ranking[-1:], "rls") is None, "what diverged is no plant"
+    linear = load(ROOT / "tests" / "golden" / "oe.npz")
+    trials = {
+        kind: KindTrial(kind, 0.0, left_out={"hold-out": fit}, model=linear if kind in ("rls", "oe") else None)
+        for kind, fit in fits.items()
+    }
+    ranking = list(trials.values())
+    for chosen, sort, other in (("rls", "nonlinear", "nn"), ("play", "linear", "oe"), ("ensemble", "linear", "oe")):
+        found = best_others(ranking, trials[chosen])
+        assert {name: one.kind for name, one in found.items()} == {sort: other}
+    assert best_others(ranking[:2], trials["rls"]) == {}
+    assert best_others(ranking[-1:], trials["rls"]) == {}, "what diverged is no plant"
+
+
+def test_a_linear_kind_without_transfer_functions_has_one_that_has_them_beside_it() -> None:
+    """`subspace` of a robot whose directions nobody knows: most designs refuse it."""
+    oe = load(ROOT / "tests" / "golden" / "oe.npz")
+
+    def tf(_: str) -> None:
+        raise SettingsError("no directions")
+
+    blind: Any = SimpleNamespace(robot=oe.robot, tf=tf)
+    ranking = [
+        KindTrial(kind, 0.0, left_out={"hold-out": fit}, model=model)
+        for kind, fit, model in (("subspace", 90.0, blind), ("nss", 88.0, None), ("oe", 80.0, oe), ("rls", 70.0, oe))
+    ]
+    assert {sort: one.kind for sort, one in best_others(ranking, ranking[0]).items()} == {
+        "linear": "oe", "nonlinear": "nss"
+    }  # fmt: skip
+    assert {sort: one.kind for sort, one in best_others(ranking, ranking[1]).items()} == {"linear": "oe"}
 
 
 def test_what_a_fold_judges_is_missing_from_its_training_and_no_set_point_is() -> None:
