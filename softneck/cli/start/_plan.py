@@ -10,8 +10,9 @@ from pathlib import Path
 
 from softneck.core import SettingsError
 from softneck.core._budget import MOST_TOML, settings_text
+from softneck.robot import Robot
 
-from ._possible import FILE, possible
+from ._possible import FILE, possible, require_known
 from ._step import Step, Unmet
 
 AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
@@ -125,6 +126,7 @@ def _models(recordings: list[str], asked: Asked) -> Iterator[Step]:
     command = ("softneck", "identify", "auto", *recordings, "-o", AUTO, "--html", "build/models.html", "--seed", seed,
                "--force")  # fmt: skip
     yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL)
+    require_known(Robot.read("robot.toml"))
     linear = linear_model()
     command = ("softneck", "design", "pi", linear, "-o", PI, "--force")
     yield Step(stage="identification", command=command, makes=(PI,), reads=(linear,), unmet=Unmet.NO_MODEL)

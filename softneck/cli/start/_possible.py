@@ -1,4 +1,4 @@
-"""What the default requirements ask that no controller of these plants can keep is not asked in a sitting, and said."""
+"""What a sitting can ask of a robot: what its file has to say, and which default requirements can be kept."""
 
 from __future__ import annotations
 
@@ -8,10 +8,23 @@ from pathlib import Path
 import tomli_w
 
 from softneck.core import SettingsError, atomic_write
+from softneck.robot import Robot
 
 #: In the folder: what `tune` is asked where some of its defaults cannot be.
 FILE = "requirements.toml"
 _METRIC = re.compile(r"`([\w.]+)`.* cannot be: ")
+
+
+def require_known(robot: Robot) -> None:
+    """Raise SettingsError with all at once that controller and observer ask of a robot's file and it does not say."""
+    said = {
+        "motors.setpoint_min": robot.motors.setpoint_min, "motors.setpoint_max": robot.motors.setpoint_max,
+        "motors.rate_limit": robot.motors.rate_limit, "sensor.delay_s": robot.delay_s, "sensor.rate_hz": robot.rate_hz,
+        "sensor.noise_std": robot.noise_std,
+    }  # fmt: skip
+    absent = [name for name, value in said.items() if value is None]
+    if absent:
+        raise SettingsError(f"robot.toml: add {', '.join(absent)}; controller and observer need them.")
 
 
 def possible(plants: tuple[str, ...]) -> str:

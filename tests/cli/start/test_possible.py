@@ -15,6 +15,7 @@ from softneck.cli.start import _possible, _sitting, _start
 from softneck.cli.start._plan import PI, Asked
 from softneck.cli.start._step import Step
 from softneck.core import SettingsError
+from softneck.robot import Robot
 from softneck.tuning import _beforehand
 
 from ..conftest import Call
@@ -30,6 +31,17 @@ def refuse(asked: Any, _: Any) -> None:
     for metric, why in WHY.items():
         if asked.wanted(metric) is not None:
             raise SettingsError(why)
+
+
+def test_all_that_a_robots_file_lacks_is_named_at_once() -> None:
+    for name in ("neck", "antagonist", "finger", "trunk4"):
+        _possible.require_known(Robot.preset(name))
+    bare = {"name": "pump", "motors": {"names": ["pump"], "unit": "V"}, "outputs": {"names": ["level"], "unit": "V"},
+            "sensor": {"delay_s": 0.0}}  # fmt: skip
+    lacks = "motors.setpoint_min, motors.setpoint_max, motors.rate_limit, sensor.rate_hz, sensor.noise_std"
+    with pytest.raises(SettingsError, match=re.escape(f"robot.toml: add {lacks};")) as said:
+        _possible.require_known(Robot.from_dict(bare))
+    assert len(str(said.value)) <= 160
 
 
 def test_each_default_that_cannot_be_is_left_out_with_its_reason(
