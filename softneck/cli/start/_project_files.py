@@ -11,6 +11,7 @@ import tomli_w
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.core._budget import settings_text
+from softneck.robot import Robot, find_robot
 
 from ._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
 
@@ -34,11 +35,12 @@ def project_of_loop(loop_file: Path, folder: Path) -> dict[str, str]:
         FileFormatError: not a loop file.
         SettingsError: a loop with another reference than a step.
     """
-    loop = _over_fmus(_read(loop_file), _noise(folder))
+    robot = find_robot(beside=folder / "loop.toml")
+    loop = _over_fmus(_read(loop_file), robot.noise_std)
     texts = {name: _text("softneck.cli", source) for name, source in _SHARED.items()}
     texts |= {name: _text("softneck.cli.start", source) for name, source in _OWN.items()}
     said = "# The loop that `softneck tune` judged, over FMUs that need no Python.\n"
-    return {**texts, "loop.toml": said + tomli_w.dumps(loop), "study.toml": tomli_w.dumps(_study(loop))}
+    return {**texts, "loop.toml": said + tomli_w.dumps(loop), "study.toml": tomli_w.dumps(_study(loop, robot))}
 
 
 def _text(package: str, name: str) -> str:
@@ -55,12 +57,6 @@ def _read(path: Path) -> dict[str, Any]:
     if table["reference"].get("kind") != "step":
         raise SettingsError(f"{path}: a project is made around a loop with a step; take the loop.toml of `tune`.")
     return table
-
-
-def _noise(folder: Path) -> float | None:
-    from softneck.robot import find_robot
-
-    return find_robot(beside=folder / "loop.toml").noise_std
 
 
 def _over_fmus(table: dict[str, Any], noise: float | None) -> dict[str, Any]:
@@ -84,7 +80,9 @@ def _sizes(table: dict[str, Any]) -> dict[str, float]:
             if key not in _NO_SIZES and isinstance(value, int | float) and value}  # fmt: skip
 
 
-def _study(loop: dict[str, Any]) -> dict[str, Any]:
+def _study(loop: dict[str, Any], robot: Robot) -> dict[str, Any]:
+    from softneck.loop._result import metric_names
+
     vary: dict[str, Any] = {
         f"reference.{key}": {"grid": [round(part * size, 6) for part in _PARTS_OF_STEP]}
         for key, size in _sizes(loop).items()
@@ -94,6 +92,7 @@ def _study(loop: dict[str, Any]) -> dict[str, Any]:
         vary["reference.roll_deg"] = {"uniform": [-half, half]}
     if "parameters" in loop["plant"]:
         vary["plant.parameters.noise_seed"] = {"seed": True}
-    first = next((key.partition(".")[0] for key in loop.get("limits", {})), "pitch")
-    objectives = [f"{first}.settling_s", "motors.total_variation_rad"]
+    first = next((key.partition(".")[0] for key in loop.get("limits", {})), robot.outputs.names[0])
+    moves = next(name for name in metric_names(robot) if name.startswith("motors.total_variation_"))
+    objectives = [f"{first}.settling_s", moves]
     return {"loop": "loop.toml", "runs": _RUNS, "seed": 1, "objectives": objectives, "vary": vary}

@@ -37,7 +37,7 @@ def test_all_that_a_robots_file_lacks_is_named_at_once() -> None:
     for name in ("neck", "antagonist", "finger", "trunk4"):
         _possible.require_known(Robot.preset(name))
     bare = {"name": "pump", "motors": {"names": ["pump"], "unit": "V"}, "outputs": {"names": ["level"], "unit": "V"},
-            "sensor": {"delay_s": 0.0}}  # fmt: skip
+            "directions": {"kind": "identified"}, "sensor": {"delay_s": 0.0}}  # fmt: skip
     lacks = "motors.setpoint_min, motors.setpoint_max, motors.rate_limit, sensor.rate_hz, sensor.noise_std"
     with pytest.raises(SettingsError, match=re.escape(f"robot.toml: add {lacks};")) as said:
         _possible.require_known(Robot.from_dict(bare))

@@ -10,6 +10,7 @@ import pytest
 import tomli_w
 
 from softneck.cli.start._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
+from softneck.loop._result import metric_names
 from softneck.robot import Robot
 from softneck.signals import signal
 
@@ -33,6 +34,18 @@ def table(name: str) -> dict[str, Any]:
 def made(call: Call, loop: dict[str, Any], *more: str) -> int:
     Path("tuned.toml").write_text(tomli_w.dumps(loop), encoding="utf-8")
     return call("new", "p", "--loop", "tuned.toml", *more).code
+
+
+def test_the_study_of_another_robot_asks_in_its_units(call: Call) -> None:
+    tables = {"name": "arm", "motors": {"names": ["a", "b"], "unit": "V"}, "outputs": {"names": ["x"], "unit": "m"},
+              "directions": {"kind": "identified"}}  # fmt: skip
+    Path("p").mkdir()
+    Path("p/robot.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+    loop = {**TUNED, "reference": {"kind": "step", "x_m": 0.1, "at_s": 1.0}, "limits": {}}
+    assert made(call, loop, "--force") == 0
+    study = table("study.toml")
+    assert study["objectives"] == ["x.settling_s", "motors.total_variation_V"]
+    assert set(study["objectives"]) <= set(metric_names(Robot.read("p/robot.toml")))
 
 
 def test_the_project_of_a_loop_keeps_what_was_judged_and_takes_fmus(call: Call) -> None:
