@@ -270,18 +270,23 @@ def _loops(project: Project) -> Section | None:
         if len(charts) < _MOST_CHARTS:
             signals = result.signals
             charts.append(loop_chart(signals.time, signals.signals, name, limits=result.bounds, robot=result.robot))
-    head = ["loop", "overshoot [%]", "settling [s]", "rms error [deg]", "largest set-point [rad]"]
-    tables = [Table("Loops, pitch/roll", head, metrics)]
+    robot = next(iter(project.loops.values())).robot  # a project is of one
+    head = ["loop", "overshoot [%]", "settling [s]", f"rms error [{robot.outputs.display_unit}]",
+            f"largest set-point [{robot.motors.unit}]"]  # fmt: skip
+    tables = [Table(f"Loops, {'/'.join(robot.outputs.names)}", head, metrics)]
     if limits:
         tables.append(Table("Limits", ["loop", "metric", "value", "limit", "verdict"], limits, text=2))
     return Section("Loops", tables=tables, charts=charts, method=["Run anew for this page."])
 
 
 def _metrics(result: Result) -> list[str]:
-    table = result.metrics
-    names = ("overshoot_pct", "settling_s", "rms_error_deg")
-    cells = [_pair({axis: table[axis][name] for axis in ("pitch", "roll")}, 2) for name in names]
-    return [*cells, _cell(table["motors"]["max_rad"])]
+    """Return what the head of `_loops` says; names of metrics end in the robot's units."""
+    axes = [result.metrics[axis] for axis in result.robot.outputs.names]
+    cells = [
+        _pair(dict(enumerate(value for table in axes for name, value in table.items() if name.startswith(start))), 2)
+        for start in ("overshoot_pct", "settling_s", "rms_error_")
+    ]
+    return [*cells, _cell(next(v for name, v in result.metrics["motors"].items() if name.startswith("max_")))]
 
 
 def _studies(project: Project) -> list[Section]:
@@ -300,7 +305,7 @@ def _problems(project: Project) -> Section | None:
     return Section("Problems", tables=[table])
 
 
-def _pair(values: Mapping[str, float | None], digits: int) -> str:
+def _pair(values: Mapping[Any, float | None], digits: int) -> str:
     return "/".join("-" if value is None else f"{value:.{digits}f}" for value in values.values())
 
 
