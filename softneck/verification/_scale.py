@@ -23,12 +23,16 @@ _LOAD = 1.0 / 12.0
 def scaled(asked: Requirements, sources: Sequence[UncertainNeck]) -> Requirements:
     """Return the requirements with their defaults for the robot of `sources`; what the user's file says stays.
 
+    What was stretched before, as `tune` does for all that it judges, stays as well.
+
     Times go by the slowest pole over the neck's 0.2 s, sizes by the least that an output reaches and may over the
     neck's 40 deg, the load by what the motors can give.
 
     Raises:
         SettingsError: the robot does not say where its set-points end.
     """
+    if asked.scale != (1.0, 1.0):
+        return asked
     robot = asked.robot
     boxes = [box for source in sources for box in source.axes]
     slowest = max(1.0 / float(box.nominal[1]) for box in boxes)

@@ -21,7 +21,10 @@ from softneck.tuning import tune
 from softneck.tuning._cases import loop_of, quietly
 from softneck.tuning._judge import made_ready
 from softneck.tuning._tune import Tuned, task_of
+from softneck.verification import read_requirements
 from softneck.verification._neck_loops import direction
+from softneck.verification._scale import scaled
+from softneck.verification._verify import sources_of
 from tests.design.test_robots import BELLOWS, plant
 
 QUICK: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "step": {"duration_s": 2.0},
@@ -44,6 +47,17 @@ def test_a_robots_own_plant_steps_as_the_linear_one_that_it_is(name: str) -> Non
     assert 0.0 < metrics["neck.rise_s"] <= metrics["step.rise_s"] + 0.02
     assert metrics["neck.overshoot_pct"] <= metrics["step.overshoot_pct"] + 0.5
     assert not [metric for metric in metrics if metric.startswith("track.circle")], "a circle is a neck's"
+
+
+def test_verify_judges_by_what_tune_stretched_and_not_by_more() -> None:
+    """Times of another robot are stretched once, not twice."""
+    model = plant(BELLOWS)
+    asked = task_of({"model": model}, None, 0).asked.certificate
+    sources = sources_of({"model": model}, asked)
+    assert abs(asked.scale[0] - 1.0) > 0.02
+    assert scaled(asked, sources) is asked
+    plain = read_requirements(robot=model.robot)
+    assert asked.uncertainty["delay_ms"] == pytest.approx(asked.scale[0] * plain.uncertainty["delay_ms"])
 
 
 @pytest.mark.slow
