@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -162,7 +163,8 @@ def test_verify_has_the_estimate_of_an_observer_in_the_loops_of_an_mpc() -> None
     """By hand, to the bit: the observer over a model of several payloads tells the controller what it thinks."""
     model = GreyBox(evaluations=2, sensor_delay=2).fit([log("eq22", 0.0), log("eq22", 1.0)])
     observer = KalmanSettings().design(model)
-    controller = MpcSettings(bandwidth=6.0, minimum_tautness=0.5, payload_tautness=2.0).design(neck(5.5))
+    settings = MpcSettings(bandwidth=6.0, minimum_tautness=0.5, payload_tautness=2.0)
+    controller, deaf = settings.design(neck(5.5)), replace(settings, payload_tautness=0.0).design(neck(5.5))
     found = verify(controller, {"line": neck(5.5)}, make_requirements(ASKED), observer=observer)
     runs: list[Any] = found.evidence.necks
     assert [run.payload for run in runs] == [0.0, 1.0]
@@ -171,16 +173,15 @@ def test_verify_has_the_estimate_of_an_observer_in_the_loops_of_an_mpc() -> None
         assert run.result is not None
         ends = size * math.cos(run.orientation), size * math.sin(run.orientation)
         at = float(np.flatnonzero(run.result["pitch_reference"])[0]) * 0.02
-        by_hand = run_loop(Loop(
-            plant=BlockPart(PAPER.block(noise_seed=run.seed)), controller=BlockPart(controller.block()),
+        by_hand, not_told = (run_loop(Loop(
+            plant=BlockPart(PAPER.block(noise_seed=run.seed)), controller=BlockPart(one.block()),
             observer=BlockPart(observer.block()), plant_inputs={"payload": run.payload},
             reference=StepReference(pitch=ends[0], roll=ends[1], at=at), duration=at + 2.5,
-        ))  # fmt: skip
+        )) for one in (controller, deaf))  # fmt: skip
         np.testing.assert_array_equal(by_hand["pitch"], run.result["pitch"])
         # An estimate by which the controller acts: that of the light neck is another than that of the heavy one.
         np.testing.assert_array_equal(by_hand["payload_estimate"], run.result["payload_estimate"])
+        # What it is told matters: one that does not listen moves the motors otherwise.
+        assert not np.array_equal(not_told["motor_setpoint_1"], run.result["motor_setpoint_1"])
     light, heavy = (run.result["payload_estimate"] for run in runs)
     assert not np.array_equal(light, heavy)
-    # What it is told matters: another payload pulls the tendons otherwise.
-    mean = [np.mean([run.result[f"motor_setpoint_{j}"][-1] for j in (1, 2, 3)]) for run in runs]
-    np.testing.assert_allclose(mean[1] - mean[0], 2.0 * (heavy[-1] - light[-1]), atol=0.3)
