@@ -15,7 +15,7 @@ static void *counted_realloc(void *p, size_t n) { taken++; return realloc(p, n);
 #define malloc counted_malloc
 #define calloc counted_calloc
 #define realloc counted_realloc
-#define SN_FUEL 100000LL /* rounds of loops: enough for what is honest here, little where it is not */
+#define SN_FUEL 200000LL /* rounds of loops: enough for what is honest here, little where it is not */
 #include "softneck.c"
 
 static uint64_t noise;
