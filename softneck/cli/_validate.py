@@ -84,7 +84,7 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     # `--data a.csv b.csv`: click gives what follows the first to MODELs.
-    data += tuple(path for path in models if path.suffix in (".csv", ".parquet"))
+    data += tuple(path for path in models if path.suffix.lower() in (".csv", ".parquet"))
     models = tuple(path for path in models if path not in data)
     if not models:
         raise SettingsError("recordings only; expected a model before them: softneck validate MODEL --data REC...")

@@ -288,8 +288,7 @@ def needed_lines(measured: AxisMeasured, names: Sequence[str], axis: str) -> lis
     for name, row in zip(names, measured.needed, strict=True):
         known = np.where(np.isfinite(row), row, 0.0)
         band = int(np.argmax(known)) if known.size else 0
-        # What a line of three digits shows: the weight was raised to what these records need.
-        if known.size and known[band] > 1.005:
+        if known.size and known[band] > 1.0:
             low, high = measured.borders[band], measured.borders[band + 1]
-            lines.append(f"{axis}: {name} needs {known[band]:.3g} times the weight at {low:.2g} to {high:.2g} rad/s")
+            lines.append(f"{axis}: {name} needs {known[band]:.4g} times the weight at {low:.2g} to {high:.2g} rad/s")
     return lines
