@@ -311,7 +311,9 @@ def terminated(world: World) -> dict[str, Any]:
 def undisturbed(world: World) -> dict[str, Any]:
     """Nothing happens: the cycles."""
     code, result, _ = world.ended(seconds=120.0)
-    return {"reaction_s": None, "exit": code, "times": result["times"], **rest(world, math.inf)}
+    fault = result["fault"] or {}
+    return {"reaction_s": None, "exit": code, "event": fault.get("event"), "text": fault.get("text"),
+            "times": result["times"], **rest(world, math.inf)}  # fmt: skip
 
 
 CASES: dict[str, tuple[Callable[[World], dict[str, Any]], dict[str, Any]]] = {

@@ -48,7 +48,7 @@ def played(case: str, *options: str) -> dict[str, Any]:
 @pytest.mark.parametrize("case", CASES)
 def test_the_end_state_is_exact(case: str) -> None:
     found = played(case)
-    assert found["exact"], found
+    assert found["exact"], json.dumps(found)
     if found["reaction_s"] is not None:
         assert 0.0 < found["reaction_s"] < 0.5
 
@@ -59,7 +59,7 @@ def test_a_log_of_a_real_bus_gives_the_same_decisions(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     found = played("terminated", "--extra=--log", f"--extra={path}", "--extra=--log", f"--extra={tmp_path / 'run.blf'}",
                    "--extra=--force")  # fmt: skip
-    assert found["exact"], found
+    assert found["exact"], json.dumps(found)
     log = read_run_log(path)
     assert log.cut == ""
     assert log.cycles[-1].phase == "done"
