@@ -153,6 +153,22 @@ def test_between_samples_the_next_one_is_settled(path: Path, running: Any) -> No
         assert fmu.get("pitch", "roll") == said
 
 
+def test_a_step_behind_a_derivative_takes_the_inputs_of_its_own(path: Path, running: Any) -> None:
+    with running(path) as fmu, running(path) as blind:
+        for one in (fmu, blind):
+            one.begin()
+            move(one, 10)
+        derivatives(fmu, MOTORS)  # works the step out, which must not be taken any more
+        for one in (fmu, blind):
+            one.set(motor_setpoint_1=1.0)
+            one.fmu.doStep(10 * TS, TS)
+        assert fmu.get("pitch", "roll") == blind.get("pitch", "roll")
+        derivatives(fmu, MOTORS)
+        for one in (fmu, blind):
+            one.fmu.doStep(11 * TS, 3 * TS)  # the first of three samples alone was worked out
+        assert fmu.get("pitch", "roll") == blind.get("pitch", "roll")
+
+
 def test_a_state_brings_its_next_sample_back(path: Path, running: Any) -> None:
     with running(path) as fmu:
         fmu.begin()

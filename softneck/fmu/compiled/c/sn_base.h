@@ -17,6 +17,7 @@
 #define SN_APART __attribute__((noinline)) /* called so often that copies of it would be most of the library */
 #define SN_MERGED inline __attribute__((always_inline))
 #define SN_RARE(x) __builtin_expect(!!(x), 0)
+#define SN_SOON(p) __builtin_prefetch(p)
 #if defined(__has_attribute)
 #if __has_attribute(minsize)
 #define SN_SMALL __attribute__((minsize)) /* short before fast */
@@ -27,6 +28,7 @@
 #define SN_APART
 #define SN_MERGED inline
 #define SN_RARE(x) (x)
+#define SN_SOON(p) (void)(p)
 #endif
 #ifndef SN_SMALL
 #define SN_SMALL
@@ -85,6 +87,10 @@ typedef struct sn_node {
     int32_t array_count, member_count;
 } sn_node;
 
+/* The leaves in which a tree's bounds were found last: the next search begins there, and finds the same as from anywhere. */
+typedef struct { const double *nodes; int64_t low, high; } sn_found;
+enum { SN_FOUND = 16 };
+
 typedef struct {
     unsigned char *base;
     size_t size, top, peak;
@@ -92,6 +98,8 @@ typedef struct {
     const char *fault; /* why the step is worth nothing, NULL while it is */
     int wide;          /* this processor takes four numbers at a time */
     sn_way out;        /* where a step goes that is worth nothing */
+    sn_found found[SN_FOUND];
+    unsigned searched; /* trees */
 } sn_work;
 
 typedef struct sn_kind {

@@ -21,7 +21,7 @@ typedef struct {
     double start, time, stop;
     int64_t count, states;
     int running, stale, stepping;
-    /* State, outputs and what moves them, of a step that is looked at and not taken; `looked`: the outputs hold. */
+    /* State, outputs and what moves them, of a step that is looked at and not taken yet; `looked` says what of it holds. */
     sn_v1 next_state, next;
     sn_v2 state_rows, input_rows, next_rows;
     int looked;
@@ -70,6 +70,7 @@ static void sn_ready(sn_work *w)
 }
 
 enum { SN_SIZE, SN_INITIALISE, SN_STEP, SN_LOOK, SN_MOVE };
+enum { SN_SHOWN = 1, SN_WORKED_OUT = 2 }; /* the outputs of the next sample are shown; state and outputs are there */
 
 /* Let the kind do one of its things; 0 where it broke a rule, `fault` then says which. Nothing else may stand
  * here: what is in this function's registers is gone when `sn_fault` comes back to it. */
@@ -231,8 +232,13 @@ static int sn_take_sample(sn_instance *s)
     size_t bytes = (size_t)s->pending.n * sizeof(double);
     if (s->model.plant)
         memcpy(s->outputs.p, s->pending.p, bytes);
-    if (!sn_worked(s, SN_STEP))
+    if (s->looked & SN_WORKED_OUT) { /* whoever asked for a derivative has paid for this step */
+        memcpy(s->state.p, s->next_state.p, (size_t)s->state.n * sizeof(double));
+        memcpy(s->pending.p, s->next.p, bytes);
+    } else if (!sn_worked(s, SN_STEP)) {
         return 0;
+    }
+    s->looked = 0;
     s->count++;
     if (!s->model.plant)
         memcpy(s->outputs.p, s->pending.p, bytes);
@@ -274,19 +280,29 @@ static int sn_awaits(const sn_instance *s)
     return s->start + (double)s->count * period <= s->time + SN_SAME_TIME * period;
 }
 
+/* State and outputs of the next sample, if the inputs are held; with `SN_MOVE` what moves them as well. */
+static int sn_work_out(sn_instance *s, int how)
+{
+    memcpy(s->next.p, s->pending.p, (size_t)s->next.n * sizeof(double));
+    if (!sn_awaits(s))
+        return 1;
+    memcpy(s->next_state.p, s->state.p, (size_t)s->state.n * sizeof(double));
+    s->looked &= ~SN_WORKED_OUT; /* nothing of a step that fails */
+    if (!sn_worked(s, how))
+        return 0;
+    s->looked |= SN_WORKED_OUT;
+    return 1;
+}
+
 /* The outputs of the next sample, if the inputs are held. */
 static int sn_look_ahead(sn_instance *s)
 {
     const sn_model *m = &s->model;
     double *shown = s->outputs.p + s->next.n;
-    if (s->looked)
+    if (s->looked & SN_SHOWN)
         return 1;
-    memcpy(s->next.p, s->pending.p, (size_t)s->next.n * sizeof(double));
-    if (sn_awaits(s)) {
-        memcpy(s->next_state.p, s->state.p, (size_t)s->state.n * sizeof(double));
-        if (!sn_worked(s, SN_LOOK))
-            return 0;
-    }
+    if (!(s->looked & SN_WORKED_OUT) && !sn_work_out(s, SN_LOOK))
+        return 0;
     for (uint32_t i = 0; i < m->ahead; i++) {
         shown[i] = s->next.p[i];
         if (!sn_finite(shown[i])) {
@@ -294,7 +310,7 @@ static int sn_look_ahead(sn_instance *s)
             return 0;
         }
     }
-    s->looked = 1;
+    s->looked |= SN_SHOWN;
     return 1;
 }
 
@@ -320,8 +336,7 @@ static int sn_derivative(sn_instance *s, const uint32_t *unknown, size_t n, cons
         }
         s->input_rows.p[known[i]] += seeds[i];
     }
-    memcpy(s->next_state.p, s->state.p, (size_t)s->state.n * sizeof(double));
-    if (sn_awaits(s) && !sn_worked(s, SN_MOVE))
+    if (!sn_work_out(s, SN_MOVE))
         return 0;
     for (size_t i = 0; i < n; i++) {
         if (unknown[i] < m->n_in || unknown[i] >= m->n_in + m->n_out) {

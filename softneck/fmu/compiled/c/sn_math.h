@@ -17,6 +17,7 @@
 #define SN_HALF_PI_2 0x1.0b4611a6p-34
 #define SN_HALF_PI_3 0x1.3198a2e037073p-69
 #define SN_PER_HALF_PI 0x1.45f306dc9c883p-1
+#define SN_EIGHTH 0.785 /* of a turn, less a little: no quarter is taken off, and the bits are those of doing so */
 /* Added and taken off again it rounds to whole numbers; its last bits then hold that number. */
 #define SN_ROUNDER 6755399441055744.0
 
@@ -151,6 +152,8 @@ static double sn_sin(double x)
 {
     double r, t, y;
     int n;
+    if (fabs(x) < SN_EIGHTH)
+        return sn_sin_small(x, 0.0);
     if (!sn_finite(x))
         return x - x;
     n = sn_quarters(x, &r, &t);
@@ -162,6 +165,8 @@ static double sn_cos(double x)
 {
     double r, t, y;
     int n;
+    if (fabs(x) < SN_EIGHTH)
+        return sn_cos_small(x, 0.0);
     if (!sn_finite(x))
         return x - x;
     n = sn_quarters(x, &r, &t);
@@ -196,8 +201,9 @@ static inline double sn_tanh(double x)
 /* atan of |t| <= 1/16 beyond its first term. */
 static inline double sn_atan_small(double t)
 {
-    double z = t * t;
-    return -t * z * (1.0 / 3.0 - z * (1.0 / 5.0 - z * (1.0 / 7.0 - z * (1.0 / 9.0 - z * (1.0 / 11.0 - z * (1.0 / 13.0))))));
+    double z = t * t, z2 = z * z;
+    return -t * z * ((1.0 / 3.0 - z * (1.0 / 5.0)) + z2 * ((1.0 / 7.0 - z * (1.0 / 9.0))
+        + z2 * (1.0 / 11.0 - z * (1.0 / 13.0))));
 }
 
 /* atan(y / x) for 0 <= y <= x, x > 0: next to the nearest eighth. */

@@ -46,28 +46,42 @@ static void sn_leaf_few(double *best, const double *p, const double *values, int
 }
 
 /* `slant_descend`: its branches are guessed right more often than not, and what follows a guess is worked out meanwhile;
- * without branches it took 1.4 times as long. One node a level is left for later: a tree of 2^31 nodes has 31. */
+ * without branches it took 1.4 times as long. One node a level is left for later: a tree of 2^31 nodes has 31. It begins
+ * with the leaves `low` and `high`, where they are known: bounds that are good from the start leave out more. Nodes
+ * after the next come from memory while this one is worked on. */
 #define SN_DESCEND(name, attribute, children, leaf)                                                                 \
-    attribute static void name(sn_work *w, const sn_v2 *points, sn_v1 values, const sn_v2 *nodes, const double *at, \
-                               int64_t sides, const double *plane, double gamma, sn_v1 x, double *best)             \
+    attribute static SN_MERGED void name##_leaf(sn_work *w, const sn_v2 *points, sn_v1 values, int64_t node,        \
+                                                int64_t leaves, double gamma, sn_v1 x, double *best)                \
     {                                                                                                               \
-        int64_t waiting[64], rows = values.n, leaves = nodes->n0 / 2, top = 0, node = 1;                            \
+        int64_t rows = values.n, first = (node - leaves) * rows / leaves;                                           \
+        int64_t count = (node + 1 - leaves) * rows / leaves - first;                                                \
+        double low = best[0], high = best[1];                                                                       \
+        sn_rounds(w, count + 1);                                                                                    \
+        (count < 4 ? sn_leaf_few : leaf)(best, points->p + first, values.p + first, points->s0, count, x.p, x.n,    \
+                                         gamma);                                                                    \
+        best[2] = best[0] > low ? (double)node : best[2];                                                           \
+        best[3] = best[1] < high ? (double)node : best[3];                                                          \
+    }                                                                                                               \
+    attribute static void name(sn_work *w, const sn_v2 *points, sn_v1 values, const sn_v2 *nodes, const double *at, \
+                               int64_t sides, const double *plane, double gamma, sn_v1 x, double *best,              \
+                               sn_found was)                                                                        \
+    {                                                                                                               \
+        int64_t waiting[64], leaves = nodes->n0 / 2, top = 0, node = 1;                                             \
         double later[64][2], found[4], high = -HUGE_VAL, low = HUGE_VAL;                                            \
         best[2] = best[3] = (double)leaves;                                                                         \
+        if (was.low >= leaves)                                                                                      \
+            name##_leaf(w, points, values, was.low, leaves, gamma, x, best);                                        \
+        if (was.high >= leaves && was.high != was.low)                                                              \
+            name##_leaf(w, points, values, was.high, leaves, gamma, x, best);                                       \
         for (;;) {                                                                                                  \
-            while (high < best[1] || low > best[0]) {                                                            \
+            while (high < best[1] || low > best[0]) {                                                               \
                 if (node >= leaves) {                                                                               \
-                    int64_t first = (node - leaves) * rows / leaves, count = (node + 1 - leaves) * rows / leaves;   \
-                    count -= first;                                                                                 \
-                    sn_rounds(w, count + 1);                                                                        \
-                    low = best[0];                                                                                  \
-                    high = best[1];                                                                                 \
-                    (count < 4 ? sn_leaf_few : leaf)(best, points->p + first, values.p + first, points->s0, count,  \
-                                                     x.p, x.n, gamma);                                              \
-                    best[2] = best[0] > low ? (double)node : best[2];                                               \
-                    best[3] = best[1] < high ? (double)node : best[3];                                              \
+                    if (node != was.low && node != was.high)                                                        \
+                        name##_leaf(w, points, values, node, leaves, gamma, x, best);                               \
                     break;                                                                                          \
                 }                                                                                                   \
+                for (int64_t i = 0; 2 * node < leaves && i < 4 * nodes->s0; i += 8)                                 \
+                    SN_SOON(nodes->p + 4 * node * nodes->s0 + i);                                                   \
                 children(nodes->p + 2 * node * nodes->s0, nodes->p + (2 * node + 1) * nodes->s0, at, sides, plane,  \
                          found);                                                                                    \
                 double other_high = found[2], other_low = found[3];                                                 \
@@ -345,7 +359,8 @@ SN_AVX2 static void sn_leaf_wide(double *best, const double *p, const double *va
     best[1] = sn_min(sn_min(ends[4], ends[6]), sn_min(ends[5], ends[7]));
 }
 
-/* Four sides of a box at a time, then both bounds of both children. Nothing that a step puts out is a sum of these. */
+/* Four sides of a box at a time, then both bounds of both children. Nothing that a step puts out is a sum of these: they
+ * differ from Python's by rounding, which the last of `plane` allows for. */
 SN_PART __m128d sn_apart(const double *node, const double *at, int64_t sides)
 {
     __m256d sum = _mm256_setzero_pd();
@@ -367,14 +382,19 @@ SN_PART void sn_children_wide(const double *a, const double *b, const double *at
     __m128d both = _mm_add_pd(_mm_unpacklo_pd(left, right), _mm_unpackhi_pd(left, right));
     __m256d squared = _mm256_permute4x64_pd(_mm256_castpd128_pd256(both), 0x50);
     __m256d x = _mm256_broadcast_sd(at), A = _mm256_loadu_pd(a), B = _mm256_loadu_pd(b), r, start, stop, d, cone;
-    start = _mm256_permute2f128_pd(_mm256_unpacklo_pd(A, A), _mm256_unpacklo_pd(B, B), 0x20);
-    stop = _mm256_permute2f128_pd(_mm256_unpackhi_pd(A, A), _mm256_unpackhi_pd(B, B), 0x20);
+    const __m256d minus = _mm256_set1_pd(-0.0), steep = _mm256_broadcast_sd(plane + 2);
+    start = _mm256_sub_pd(_mm256_permute2f128_pd(_mm256_unpacklo_pd(A, A), _mm256_unpacklo_pd(B, B), 0x20), x);
+    stop = _mm256_sub_pd(_mm256_permute2f128_pd(_mm256_unpackhi_pd(A, A), _mm256_unpackhi_pd(B, B), 0x20), x);
     r = _mm256_permute2f128_pd(A, B, 0x31);
-    d = _mm256_mul_pd(_mm256_broadcast_sd(plane + 2), _mm256_sqrt_pd(squared));
+    /* d |d| rises with d: its limits are known before `squared`, and both roots are taken at once. */
+    start = _mm256_mul_pd(start, _mm256_andnot_pd(minus, start));
+    stop = _mm256_mul_pd(stop, _mm256_andnot_pd(minus, stop));
+    d = _mm256_mul_pd(_mm256_mul_pd(steep, steep), squared);
     /* down the plane for what is below all cones, up for what is above them */
-    d = _mm256_xor_pd(d, _mm256_xor_pd(other, _mm256_set1_pd(-0.0)));
-    d = _mm256_min_pd(_mm256_max_pd(d, _mm256_sub_pd(start, x)), _mm256_sub_pd(stop, x));
-    cone = _mm256_sqrt_pd(_mm256_add_pd(_mm256_mul_pd(d, d), squared));
+    d = _mm256_xor_pd(d, _mm256_xor_pd(other, minus));
+    d = _mm256_min_pd(_mm256_max_pd(d, start), stop);
+    cone = _mm256_sqrt_pd(_mm256_add_pd(_mm256_andnot_pd(minus, d), squared));
+    d = _mm256_or_pd(_mm256_sqrt_pd(_mm256_andnot_pd(minus, d)), _mm256_and_pd(minus, d));
     cone = _mm256_sub_pd(_mm256_mul_pd(_mm256_broadcast_sd(plane + 3), cone), _mm256_broadcast_sd(plane + 4));
     r = _mm256_add_pd(_mm256_add_pd(r, _mm256_broadcast_sd(plane)), _mm256_mul_pd(_mm256_broadcast_sd(plane + 1), d));
     _mm256_storeu_pd(result, _mm256_add_pd(r, _mm256_xor_pd(cone, other)));
@@ -446,6 +466,20 @@ static void sn_tanh_each(const sn_work *w, int64_t n, const double *x, double *y
     memcpy(y, to, (size_t)n * sizeof *y);
 }
 
+/* Where this tree's last search ended; a tree that is new here takes the place of the one that came first. */
+static sn_found *sn_found_of(sn_work *w, const sn_v2 *nodes)
+{
+    sn_found *found = w->found;
+    while (found < w->found + SN_FOUND && found->nodes != nodes->p)
+        found++;
+    if (found == w->found + SN_FOUND) {
+        found = w->found + w->searched++ % SN_FOUND;
+        found->nodes = nodes->p;
+        found->low = found->high = 0; /* no leaf */
+    }
+    return found;
+}
+
 /* What the runtimes' functions of these names do, with their checks made once for all entries; see `_translate.py`. */
 static SN_INSIDE void sn_slant_descend(sn_work *w, const sn_v2 *points, sn_v1 values, const sn_v2 *nodes, sn_v1 at,
                                        sn_v1 plane, double gamma, sn_v1 x, sn_v1 best)
@@ -455,13 +489,16 @@ static SN_INSIDE void sn_slant_descend(sn_work *w, const sn_v2 *points, sn_v1 va
                 || nodes->s1 != 1 || at.s != 1 || plane.s != 1 || values.n > points->n1 || x.n > points->n0
                 || best.n < 4 || points->s1 != 1 || x.s != 1 || values.s != 1 || best.s != 1))
         sn_outside(w);
+    /* Bounds that are known already ask for the first leaf in the tree's order: that search takes its own way. */
+    sn_found nowhere = {0}, *was = best.p[0] == -HUGE_VAL && best.p[1] == HUGE_VAL ? sn_found_of(w, nodes) : &nowhere;
 #ifdef SN_LANES
-    if (w->wide) {
-        sn_descend_wide(w, points, values, nodes, at.p, sides, plane.p, gamma, x, best.p);
-        return;
-    }
+    if (w->wide)
+        sn_descend_wide(w, points, values, nodes, at.p, sides, plane.p, gamma, x, best.p, *was);
+    else
 #endif
-    sn_descend_plain(w, points, values, nodes, at.p, sides, plane.p, gamma, x, best.p);
+        sn_descend_plain(w, points, values, nodes, at.p, sides, plane.p, gamma, x, best.p, *was);
+    was->low = (int64_t)best.p[2];
+    was->high = (int64_t)best.p[3];
 }
 
 #endif
