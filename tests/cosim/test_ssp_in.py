@@ -288,6 +288,55 @@ def test_what_cannot_be_run_is_named(text: str, words: str, foreign: Path, tmp_p
     assert "\n" not in str(error.value)
 
 
+LISTED = {  # u3 becomes an item of a list
+    "0": (
+        "<ModelVariables>",
+        '<TypeDefinitions><SimpleType name="Mode"><Enumeration><Item name="off" value="0"/><Item name="on" value="1"/>'
+        "</Enumeration></SimpleType></TypeDefinitions><ModelVariables>",
+        '<TypeDefinitions><EnumerationType name="Mode"><Item name="off" value="0"/><Item name="on" value="1"/>'
+        "</EnumerationType></TypeDefinitions><ModelVariables>",
+    ),
+    "2": (
+        '<ScalarVariable name="u3" valueReference="2" causality="input"><Real start="0"/>',
+        '<ScalarVariable name="u3" valueReference="2" causality="input"><Enumeration declaredType="Mode" start="0"/>',
+    ),
+    "3": (
+        '<Float64 name="u3" valueReference="2" causality="input" start="0"/>',
+        '<Enumeration name="u3" valueReference="2" causality="input" declaredType="Mode" start="0"/>',
+    ),
+}
+
+
+def _with_list(foreign: Path, folder: Path) -> Path:
+    """Return the FMU with an enumeration for `u3`: the same binary."""
+    path = folder / "Listed.fmu"
+    version = foreign.stem[-1]
+    before, *after = LISTED["0"]
+    with zipfile.ZipFile(foreign) as old, zipfile.ZipFile(path, "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            if name == "modelDescription.xml":
+                text = data.decode().replace(before, after[int(version) - 2]).replace(*LISTED[version])
+                assert text.count("numeration") >= 3
+                data = text.encode()
+            new.writestr(name, data)
+    return path
+
+
+@pytest.mark.parametrize("said", ["", '<ssd:Connector name="u3" kind="input"><ssc:Integer/></ssd:Connector>'])
+def test_an_enumeration_of_an_fmu_is_connected_to_nothing(said: str, foreign: Path, tmp_path: Path) -> None:
+    # Whatever the structure calls it: the FMU knows.
+    said = f"<ssd:Connectors>{said}</ssd:Connectors>" if said else ""
+    fmu = _with_list(foreign, tmp_path)
+    path = archive(tmp_path, fmu, ssd(COMPONENT.format(said), LINK.format("alpha", "u3"), ""))
+    with pytest.raises(SettingsError, match=r"`a\.u3`, which is of type Enumeration; softneck connects numbers"):
+        load_ssp(path)
+    # Left alone it stands in nobody's way, here and in what is written of it.
+    path = archive(tmp_path, fmu, ssd(COMPONENT.format(said), LINK.format("alpha", "u1"), ""))
+    again = write_ssp(load_ssp(path), tmp_path / "Again.ssp")
+    np.testing.assert_array_equal(simulate(load_ssp(path))["a.alpha"], simulate(load_ssp(again))["a.alpha"])
+
+
 TYPES = {
     "real": Port(name="real"),
     "whole": Port(name="whole", integer=True),

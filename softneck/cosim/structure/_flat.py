@@ -51,12 +51,19 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """What an FMU's description says of its variables: those that a loop moves, and the names of all others."""
+    """What an FMU's description says of its variables: those that a loop moves, and the names of all others.
+
+    Attributes:
+        inputs, outputs, parameters: name -> port.
+        others: names of variables that are none of these.
+        enumerations: names of those above whose numbers stand for items of a list.
+    """
 
     inputs: Mapping[str, Port]
     outputs: Mapping[str, Port]
     parameters: Mapping[str, Port]
     others: frozenset[str]
+    enumerations: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,10 +221,9 @@ class _Flattening:
             component = self.components[path]
             ports = self.ports[component.source]
             said = component.connectors.get(name)
-            if said is not None and said.type in ("Enumeration", "String", "Binary", "Clock"):
-                raise self._wrong(
-                    f"connects `{_named(place)}`, which is of type {said.type}; softneck connects numbers"
-                )
+            kind = "Enumeration" if name in ports.enumerations else said.type if said is not None else ""
+            if kind in ("Enumeration", "String", "Binary", "Clock"):
+                raise self._wrong(f"connects `{_named(place)}`, which is of type {kind}; softneck connects numbers")
             for kind, table in (("input", ports.inputs), ("output", ports.outputs), ("parameter", ports.parameters)):
                 if name in table:
                     unit = "" if table[name].unit == "1" else table[name].unit

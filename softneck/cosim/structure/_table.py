@@ -78,7 +78,8 @@ def _ports(description: Description) -> Ports:
     )
     known = {*inputs, *outputs, *parameters}
     others = frozenset(variable.name or "" for variable in description.model.modelVariables) - known
-    return Ports(inputs, outputs, parameters, others)
+    lists = frozenset(name for name, variable in description.variables.items() if variable.type == "Enumeration")
+    return Ports(inputs, outputs, parameters, others, lists)
 
 
 @dataclass(frozen=True, slots=True)

@@ -119,6 +119,10 @@ API STATUS fmi3SetInt32(INSTANCE c, const fmi3ValueReference r[], size_t n, cons
     if (n) ((Plant *)c)->mode = x[0];
     return OK;
 }
+API STATUS fmi3SetInt64(INSTANCE c, const fmi3ValueReference r[], size_t n, const fmi3Int64 x[], size_t m) {
+    if (n) ((Plant *)c)->mode = (INTEGER)x[0]; /* an enumeration in its place */
+    return OK;
+}
 API STATUS fmi3GetInt32(INSTANCE c, const fmi3ValueReference r[], size_t n, INTEGER x[], size_t m) {
     if (n) x[0] = ((Plant *)c)->mode;
     return OK;
