@@ -69,9 +69,9 @@ static void sn_leaf_few(double *best, const double *p, const double *values, int
         int64_t waiting[64], leaves = nodes->n0 / 2, top = 0, node = 1;                                             \
         double later[64][2], found[4], high = -HUGE_VAL, low = HUGE_VAL;                                            \
         best[2] = best[3] = (double)leaves;                                                                         \
-        if (was.low >= leaves)                                                                                      \
+        if (was.low >= leaves && was.low < nodes->n0)                                                               \
             name##_leaf(w, points, values, was.low, leaves, gamma, x, best);                                        \
-        if (was.high >= leaves && was.high != was.low)                                                              \
+        if (was.high >= leaves && was.high < nodes->n0 && was.high != was.low)                                      \
             name##_leaf(w, points, values, was.high, leaves, gamma, x, best);                                       \
         for (;;) {                                                                                                  \
             while (high < best[1] || low > best[0]) {                                                               \
