@@ -115,6 +115,23 @@ class AxisPlant(Shown):
         numerator = self.numerator * (1.0 - moved) / (1.0 - a)
         return replace(self, numerator=numerator, denominator=np.convolve(rest, [1.0, -moved]))
 
+    def shown(self) -> AxisPlant:
+        """Return the plant without the poles slower than its main one, each with the zero that hides it; gain kept.
+
+        Itself where the main pole is the slowest, or where no zeros hide the others.
+        """
+        poles, main = main_pole(self.numerator, self.denominator)
+        zeros = np.roots(self.numerator)
+        if main == 0 or abs(poles[main].imag) > 0.0 or zeros.size < main:
+            return self
+        for pole in poles[:main]:
+            zeros = np.delete(zeros, np.argmin(np.abs(zeros - pole)))
+        numerator, denominator = np.atleast_1d(np.poly(zeros)), np.atleast_1d(np.poly(poles[main:]))
+        if max(np.abs(numerator.imag).max(), np.abs(denominator.imag).max()) > 0.0:
+            return self  # a pair of which one alone is hidden
+        scale = self.static_gain * denominator.real.sum() / numerator.real.sum()
+        return replace(self, numerator=scale * numerator.real, denominator=denominator.real)
+
     def delayed(self, least: float) -> AxisPlant:
         """Return the same plant with a dead time of at least `least` [s], in whole samples."""
         return replace(self, delay=max(self.delay, round(least / self.sample_time)))

@@ -16,6 +16,7 @@ from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.verification._neck_loops import direction, judge_loop, step_at
 from softneck.verification._own_plants import OwnPlant
+from softneck.verification._steps import eyes_of
 
 from ._requirements import TuneRequirements
 from ._task import Task
@@ -67,10 +68,10 @@ def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tup
 
 
 def run_case(
-    case: Case, plant: OwnPlant, block: Block, order: str, task: Task
+    case: Case, plant: OwnPlant, block: Block, order: str, task: Task, observer: Block | None = None
 ) -> tuple[dict[str, float], Vector | None]:
     """Return the metrics of a loop by the names of requirements; of a circle its distance for each lead [deg]."""
-    loop = loop_of(case, plant, block, order, task)
+    loop = loop_of(case, plant, block, order, task, observer)
     if case.circle:
         return {}, _distances(loop, task)
     # What is asked of a robot is seen by its sensor: a quiet angle overshoots less.
@@ -86,7 +87,7 @@ def run_case(
     return found, None
 
 
-def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task) -> Loop:
+def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, observer: Block | None = None) -> Loop:
     """Return the loop of a case."""
     asked, track, robot = task.asked.certificate, task.asked.track, task.robot
     at = step_at(block)
@@ -114,8 +115,10 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task) -
         reference = StepReference(pitch=ends[0], roll=ends[1], at=at)
     else:
         reference = RobotReference(kind="step", values=ends, at=at)
+    eyes, beside = eyes_of(observer)
     return Loop(
-        plant=plant.quiet(Ts), controller=BlockPart(block), reference=_Together(reference, together),
+        plant=plant.quiet(Ts), controller=BlockPart(block), observer=eyes, others=beside,
+        reference=_Together(reference, together),
         duration=duration, order=order,
         robot=robot, **plant.carrying(case.payload), faults=tuple(faults),
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.

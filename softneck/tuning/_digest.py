@@ -11,6 +11,7 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
+from softneck.core import KINDS, resolve
 from softneck.design.plants._uncertain import uncertain_plant
 from softneck.plant import NeckParameters
 
@@ -30,12 +31,20 @@ def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, s
         "asked": [(b.metric, b.bound, b.limit, b.asked) for b in asked.bounds], "track": dict(asked.track),
         "tables": [dict(getattr(asked.certificate, name)) for name in ("uncertainty", "sampling", "step", "neck")],
         "kinds": list(kinds), "seed": task.seed, "robot": task.robot.hash, "plants": [*task.linear, *task.own],
+        "observer": _observer(task, kinds),
         "files": None if files is None else [digest for _, digest in files.values()],
     }  # fmt: skip
     found = hashlib.sha256(json.dumps(told, sort_keys=True, default=str).encode())
     for part in _plants(task) if files is None else ():
         found.update(part)
     return found.hexdigest()
+
+
+def _observer(task: Task, kinds: Sequence[str]) -> str:
+    """Return the digest of the observer; "" where no kind is designed for one."""
+    if task.observer is None or not any(hasattr(resolve(KINDS[kind].settings), "over") for kind in kinds):
+        return ""
+    return hashlib.sha256(b"".join(_of_block(task.observer.block()))).hexdigest()
 
 
 def _plants(task: Task) -> Iterator[bytes]:

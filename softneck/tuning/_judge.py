@@ -82,11 +82,11 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
         controller = designed(task, ready, kind, settings)
         if level == "linear":
             return Judgement(linear_metrics(task, ready, controller))
-        block = controller.block()
+        block, order = controller.block(), str(getattr(controller, "order", "sequential"))
+        eyes = watched(task, kind)
         if level == "margins":
-            return Judgement(margin_metrics(task, ready, block, str(getattr(controller, "order", "sequential"))))
-        order = str(getattr(controller, "order", "sequential"))
-        return Judgement(loop_metrics(task, ready, block, order, ready.all))
+            return Judgement(margin_metrics(task, ready, block, order, eyes))
+        return Judgement(loop_metrics(task, ready, block, order, ready.all, eyes))
     except SoftneckError as error:
         return Judgement({}, " ".join(str(error).split()))
 
@@ -118,9 +118,18 @@ def designed(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -
     key = json.dumps([kind, dict(settings)], sort_keys=True)
     if key not in ready.kept:
         made = make_settings(resolve(KINDS[kind].settings), settings)
+        if task.observer is not None and hasattr(made, "over"):
+            made = made.over(task.observer)
         # The others read more of a family than its plants.
         ready.kept[key] = made.design(ready.uncertain if isinstance(made, AxisSettings | PiSettings) else task.plant)
     return ready.kept[key]
+
+
+def watched(task: Task, kind: str) -> Block | None:
+    """Return the observer that loops of a kind have: those that are designed for one are judged with it."""
+    if task.observer is None or not hasattr(resolve(KINDS[kind].settings), "over"):
+        return None
+    return task.observer.block()
 
 
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:
@@ -158,12 +167,14 @@ def worse(found: dict[str, float], name: str, value: float) -> None:
     found[name] = pick(found[name], value) if name in found else value
 
 
-def loop_metrics(task: Task, ready: Ready, block: Block, order: str, chosen: Sequence[Case]) -> dict[str, float]:
+def loop_metrics(
+    task: Task, ready: Ready, block: Block, order: str, chosen: Sequence[Case], observer: Block | None = None
+) -> dict[str, float]:
     """Return the worst of all loops."""
     found: dict[str, float] = {}
     shifts: list[Vector] = []
     for case in chosen:
-        values, distances = run_case(case, ready.own[case.plant], block, order, task)
+        values, distances = run_case(case, ready.own[case.plant], block, order, task, observer)
         for name, value in values.items():
             worse(found, name, value)
         if distances is not None:
@@ -178,8 +189,10 @@ def loop_metrics(task: Task, ready: Ready, block: Block, order: str, chosen: Seq
     return found
 
 
-def margin_metrics(task: Task, ready: Ready, block: Block, order: str) -> dict[str, float]:
+def margin_metrics(
+    task: Task, ready: Ready, block: Block, order: str, observer: Block | None = None
+) -> dict[str, float]:
     """Return the margins by experiment on the plants that step."""
-    loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=None, robot=task.robot)
+    loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer, robot=task.robot)
     found = crossing_values(crossings(loops, overall=True)) if loops else {}
     return {name: float(values.min()) for name, (values, _) in found.items() if name.startswith("axes.")}

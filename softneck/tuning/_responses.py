@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from softneck.core import SoftneckError, Vector
-from softneck.loop import BlockPart, run_loop
+from softneck.loop import run_loop
 from softneck.loop._result import shown_unit
 from softneck.verification._neck_loops import judge_loop
 from softneck.verification._requirements import Requirement
 from softneck.verification._steps import StepTest, run_steps
 
 from ._cases import Case, loop_of
-from ._judge import designed, made_ready
+from ._judge import designed, made_ready, watched
 from ._search import Candidate, ratio
 from ._task import Task
 
@@ -40,7 +39,7 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
         half = found.time.size // 2
         return found.time[:half], found.angles[0, 0, :half] / per, np.full(half, step / per)
     case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.neck["payloads_kg"]))))
-    result = run_loop(loop_of(case, ready.own[case.plant], block, order, task), compiled=True)
+    result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, watched(task, item.kind)), compiled=True)
     reference = result[f"{name}_reference"]
     first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))
     return result.time[first:] - result.time[first], result.angle(name)[first:] / per, reference[first:] / per
@@ -55,7 +54,7 @@ def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirem
     worst: dict[str, float] = {}
     try:
         for case in (case for case in ready.all if not case.circle and not case.late and case.part == 1.0):
-            loop = replace(loop_of(case, ready.own[case.plant], block, order, task), observer=BlockPart(eyes))
+            loop = loop_of(case, ready.own[case.plant], block, order, task, eyes)
             worst |= _worst(worst, judge_loop(loop)[0])
     except SoftneckError:
         return False

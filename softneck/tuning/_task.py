@@ -23,6 +23,7 @@ class Task:
         robot: whose controller is tuned.
         cocontraction: at which the loops are held [rad]; None: by the controller's own rule.
         seed: of the noise.
+        observer: of the loops of kinds that are designed for one (`mpc`, `nmpc`); None: they have none either.
     """
 
     digest: str
@@ -32,6 +33,7 @@ class Task:
     robot: Robot
     cocontraction: float | None = None
     seed: int = 0
+    observer: Any = None
 
     @property
     def tested(self) -> bool:

@@ -11,6 +11,8 @@ from softneck.core import CheckFailedError, Progress, SettingsError, require_who
 from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import robot_of
+from softneck.identification import Model
+from softneck.identification.models._ports import payloads
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
 from softneck.verification._own_plants import OwnPlant, is_own_plant
@@ -19,7 +21,7 @@ from softneck.verification._verify import sources_of, standing_for
 
 from ._beforehand import quickest, refuse_impossible
 from ._digest import digest_of
-from ._judge import LEVELS, designed, made_ready
+from ._judge import LEVELS, designed, made_ready, watched
 from ._log import Log
 from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
 from ._responses import kept_with
@@ -136,6 +138,7 @@ def tune(
     each = spaces(
         chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck, least=quickest(task.plant)
     )
+    task = replace(task, observer=_observer(task) if observer is None else observer)
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, resume=resume, force=force)
@@ -143,8 +146,7 @@ def tune(
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
         search.dropped |= dropped
         search.run()
-    eyes = _observer(task) if observer is None else observer
-    return _finished(search, eyes, files, lambda done, text: progress(0.9 + 0.1 * done, text))
+    return _finished(search, files, lambda done, text: progress(0.9 + 0.1 * done, text))
 
 
 def task_of(
@@ -204,9 +206,10 @@ def _aimed(task: Task) -> float:
     return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
-def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
     """Return the result of a search: its best verified, and what it means for the requirements."""
     task, ranked = search.task, search.ranked()
+    eyes = task.observer
     if not ranked:
         why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
         if any(space.kind not in search.dropped for space in search.spaces):
@@ -232,7 +235,8 @@ def _finished(search: Search, eyes: Any, files: Mapping[str, tuple[str, str]] | 
         best=best, controller=controller, observer=eyes,
         assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
         own=made_ready(task).own,
-        observed=eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds),
+        observed=watched(task, best.kind) is not None
+        or (eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds)),
         verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         prices=paid,
@@ -255,7 +259,12 @@ def _verified(
         controller = designed(task, ready, item.kind, item.settings)
         progress(number / len(promising), f"verify {item.kind}")
         verification = verify(
-            controller, {**task.linear, **task.own}, task.asked.certificate, files=files, progress=silent
+            controller,
+            {**task.linear, **task.own},
+            task.asked.certificate,
+            files=files,
+            progress=silent,
+            observer=task.observer if watched(task, item.kind) is not None else None,
         )
         if verification.holds:
             return item, verification, controller
@@ -264,8 +273,11 @@ def _verified(
 
 
 def _observer(task: Task) -> Any:
-    """Return the filter over the nominal plant; None where it has none."""
-    try:
-        return KalmanSettings().design(next(iter(task.linear.values())))
-    except SettingsError:
-        return None
+    """Return the filter over a model of several payloads, which tells them, else over the nominal plant, or None."""
+    several = [thing for thing in task.own.values() if isinstance(thing, Model) and payloads(thing.arrays) is not None]
+    for model in (*several, next(iter(task.linear.values()))):
+        try:
+            return KalmanSettings().design(model)
+        except SettingsError:
+            continue
+    return None

@@ -164,3 +164,21 @@ def test_a_slow_pole_that_hides_behind_a_zero_spoils_no_design(kind: str) -> Non
     )
     # Searches end within some percent, and that of `pid` in another optimum, 16 % away.
     assert with_it == pytest.approx(plain, rel=0.25)
+
+
+def test_a_slow_pole_that_hides_behind_a_zero_is_asked_nothing_of_by_mpc() -> None:
+    """No weight on moves makes it faster: none of a bandwidth of 1 rad/s on kept any bound."""
+    plain, with_it = (
+        MpcSettings().design(_hiding(pole, zero)).design["bandwidth_rad_s"]
+        for pole, zero in ((0.0, 0.0), (HIDDEN, HIDES))
+    )
+    # Bounds bind elsewhere by what the pair itself adds: 2.9 and 2.3 rad/s.
+    assert with_it == pytest.approx(plain, rel=0.25)
+
+
+def test_what_the_output_shows_is_the_plant_without_the_pole_that_hides() -> None:
+    plain, with_it = (axis_plant(_hiding(pole, zero), "pitch") for pole, zero in ((0.0, 0.0), (HIDDEN, HIDES)))
+    assert plain.shown() is plain
+    shown = with_it.shown()
+    assert shown.static_gain == pytest.approx(with_it.static_gain, rel=1e-9)
+    np.testing.assert_allclose(np.roots(shown.denominator), [math.exp(-3.0 * 0.02)], atol=1e-9)

@@ -65,9 +65,10 @@ def samples_ahead(look_ahead: float, sample_time: float) -> int:
 def move_weight(plant: AnyAxis, bandwidth: float) -> float:
     """Return the weight on moves of an axis' input with which the slowest pole of its LQR is as fast as `bandwidth`.
 
-    The error is weighted by one over the squared static gain, so that both count in rad of the input.
+    The error is weighted by one over the squared static gain, so that both count in rad of the input. Of poles that the
+    output hardly shows nothing is asked: no weight moves them.
     """
-    plant = plant.lag() if isinstance(plant, CoupledAxis) else plant
+    plant = plant.lag() if isinstance(plant, CoupledAxis) else plant.shown()
     low, high = _WEIGHTS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)

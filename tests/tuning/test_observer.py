@@ -1,0 +1,77 @@
+"""What plans by an observer is designed for it and judged in loops that have it; other kinds are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.design import MpcSettings
+from softneck.estimation import KalmanSettings, NonlinearObserver
+from softneck.identification import GreyBox, Model
+from softneck.loop import BlockPart
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import Recording, signal
+from softneck.tuning._cases import Case, loop_of
+from softneck.tuning._digest import digest_of
+from softneck.tuning._judge import designed, made_ready, watched
+from softneck.tuning._space import spaces
+from softneck.tuning._task import Task
+from softneck.tuning._tune import _observer, task_of
+
+from .test_requirements import neck
+
+
+def log(payload: float) -> Recording:
+    found = record(signal("eq22"), VirtualNeck(NeckParameters.paper()), seed=1, payload=payload).rows(0, 800)
+    return found.with_channels(payload=np.full(800, payload))
+
+
+@pytest.fixture(scope="module")
+def several() -> Model:
+    """Two coarse steps of the search: enough for a law, not for a fit."""
+    return GreyBox(evaluations=2, sensor_delay=2).fit([log(0.0), log(1.0)])
+
+
+@pytest.fixture(scope="module")
+def task(several: Model) -> Task:
+    made = task_of({"linear": neck(), "own": several}, {}, 0)
+    made = replace(made, observer=_observer(made))
+    return replace(made, digest=digest_of(made, ("pi", "mpc"), None))
+
+
+def controller(task: Task, kind: str) -> Any:
+    (space,) = spaces((kind,), rise=0.4, cocontraction=None, neck=True)
+    return designed(task, made_ready(task), kind, space.settings(space.start))
+
+
+def test_the_observer_is_over_the_model_that_knows_payloads(task: Task) -> None:
+    assert isinstance(task.observer, NonlinearObserver)
+    assert task.observer.payloads == (0.0, 1.0)
+
+
+def test_a_planner_takes_the_observers_lead_and_payload_into_its_design(task: Task) -> None:
+    found, plain = controller(task, "mpc"), controller(replace(task, observer=None, digest="plain"), "mpc")
+    assert found.design["settings"]["look_ahead"] == task.observer.lead > 0.0
+    assert plain.design["settings"]["look_ahead"] == 0.0
+    assert found.design["settings"]["payload_tautness"] == MpcSettings().over(task.observer).payload_tautness
+
+
+@pytest.mark.parametrize("kind", ["pi", "mpc"])
+def test_loops_have_the_observer_that_their_kind_is_designed_for(task: Task, kind: str) -> None:
+    case, block = Case(0, 1.0), controller(task, kind).block()
+    loop = loop_of(case, made_ready(task).own[0], block, "sequential", task, watched(task, kind))
+    if kind == "pi":
+        assert loop.observer is None
+    else:
+        assert isinstance(loop.observer, BlockPart)
+        told = {port.name for port in loop.observer.block.outputs}
+        assert "payload" in told
+
+
+def test_another_observer_is_another_search_only_for_kinds_that_plan_by_it(task: Task) -> None:
+    other = replace(task, observer=KalmanSettings(sensor_delay=0.0).design(neck()))
+    assert digest_of(task, ("pi", "lqg"), None) == digest_of(other, ("pi", "lqg"), None)
+    assert digest_of(task, ("pi", "mpc"), None) != digest_of(other, ("pi", "mpc"), None)
