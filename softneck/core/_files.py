@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-from ._errors import OutputFileError
+from ._errors import FileFormatError, OutputFileError
 
 # Beside every target: `.NAME-softneck-RANDOM.SUFFIX`; readers and listings of `*.SUFFIX` pass over hidden files.
 _MARK = "-softneck-"
@@ -101,6 +101,13 @@ def refuse_existing(path: str | Path, *, force: bool) -> None:
         raise OutputFileError(f"{target}: is a folder; name a file.")
     if target.exists() and not force:
         raise OutputFileError(f"{target}: exists already; use --force to replace it or choose another name.")
+
+
+def require_file(path: str | Path) -> None:
+    """Raise FileFormatError where there is no file, and say so of a folder."""
+    if not Path(path).is_file():
+        what = "is a folder; name a file in it" if Path(path).is_dir() else "no such file"
+        raise FileFormatError(f"{path}: {what}.")
 
 
 def file_hash(path: str | Path) -> str:

@@ -19,7 +19,7 @@ from softneck.signals.importing._tilt import turns
 from softneck.signals.importing._unit_odds import judge
 from softneck.signals.importing.formats._dates import is_date, seconds
 from softneck.signals.importing.formats._mat import mat_arrays
-from softneck.signals.recording._resampling import Samples
+from softneck.signals.recording._resampling import Samples, gaps
 
 from ..data import neck_recording
 from .log_writers import from_angles
@@ -141,3 +141,39 @@ def test_rows_that_a_logger_dropped_again_and_again_are_missed_samples_and_not_g
     # Few or long gaps split runs as ever.
     frame.drop(index=[300, 700]).to_csv(path, index=False)
     assert len(import_log(path, guess_layout(path).layout).recording.runs()) == 3
+
+
+@pytest.mark.parametrize("late", ["uniform", "normal", "loop"])
+def test_a_clock_that_jitters_splits_nothing_and_is_doubted(late: str, tmp_path: Path) -> None:
+    neck, path = neck_recording(1500), tmp_path / "log.csv"
+    rng, k = np.random.default_rng(4), np.arange(1500)
+    time = {
+        "uniform": lambda: k + rng.uniform(-0.3, 0.3, 1500),  # steps of 0.4 to 1.6
+        "normal": lambda: np.maximum.accumulate(k + 0.2 * rng.standard_normal(1500)) + 1e-4 * k,
+        "loop": lambda: np.cumsum(np.exp(0.2 * rng.standard_normal(1500))),  # of which each takes its time
+    }[late]()
+    outputs = [np.interp(time, k, neck.outputs[:, i]) for i in (0, 1)]
+    frame = pd.DataFrame({"time": 0.02 * (time - time[0]), "pitch": outputs[0], "roll": outputs[1]})
+    for j in (1, 2, 3):
+        frame[f"target_motor{j}"] = neck.set_points[:, j - 1]
+    frame.to_csv(path, index=False, float_format="%.9f")
+    found = guess_layout(path)
+    [doubt] = [doubt for doubt in found.doubts if doubt.about == "clock"]
+    assert "the clock jitters" in doubt.why
+    # Medians of 1,500 steps that scatter by 30 %: 1 % of it.
+    assert float(doubt.why.split("sample_time_s = ")[1].split("`")[0]) == pytest.approx(0.02, rel=0.04)
+    recording = import_log(path, found.layout).recording
+    assert len(recording.runs()) == 1
+    # A pause is a gap on any clock.
+    frame["time"] += np.where(k >= 700, 0.4, 0.0)
+    frame.to_csv(path, index=False, float_format="%.9f")
+    assert len(import_log(path, guess_layout(path).layout).recording.runs()) == 2
+
+
+def test_two_rows_at_once_are_no_gap(tmp_path: Path) -> None:
+    # A logger that writes some rows late, and the next one right behind.
+    k = np.arange(600)
+    time = 0.02 * (k + np.where(k % 20 == 7, 0.9, 0.0))
+    samples = Samples(time, np.zeros(600, dtype=np.int64), {})
+    assert not gaps(samples)[0].any()
+    assert gaps(samples.rows(k != 300))[0].sum() == 1

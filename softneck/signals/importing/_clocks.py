@@ -12,7 +12,7 @@ from softneck.core import DataError, Vector, to_si
 
 from ..recording._channels import is_held, may_miss
 from ..recording._files import numbers
-from ..recording._resampling import Samples
+from ..recording._resampling import Samples, gaps
 from ._layout import Layout, Source
 from .formats._dates import DATE, EPOCH, seconds
 
@@ -23,10 +23,9 @@ if TYPE_CHECKING:
 
 # Measured values between two messages further apart than this many usual ones are missed, not interpolated.
 _FAR = 2.5
-# A step of 1.5 usual ones lacks a row, as where gaps split runs. Gaps of up to 3 rows (60 ms at 20 ms, less than the
-# dead time of a neck), 10 of them at least, nearly all gaps of the log, and pieces of 3 s at 20 ms or less on average:
-# a hold-out of them is a second.
-_LOST, _FEW, _OFTEN, _NEARLY_ALL, _PIECE, _WHOLE = 1.5, 3, 10, 0.9, 150, 0.2
+# Gaps of up to 3 rows (60 ms at 20 ms, less than the dead time of a neck), 10 of them at least, nearly all gaps of the
+# log, and pieces of 3 s at 20 ms or less on average: a hold-out of them is a second.
+_FEW, _OFTEN, _NEARLY_ALL, _PIECE, _WHOLE = 3, 10, 0.9, 150, 0.2
 
 
 def time_of(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple[str, ...]]:
@@ -119,7 +118,7 @@ def filled(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]]:
     if not steps.size:
         return samples, ()
     usual = step / float(np.median(steps))
-    gap, lost = inside & (usual > _LOST), np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
+    gap, lost = gaps(samples)[0], np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
     # A clock that jitters loses nothing: its long steps are no whole numbers of usual ones.
     few = gap & (lost >= 1) & (lost <= _FEW) & (np.abs(usual - lost - 1) < _WHOLE)
     if few.sum() < _OFTEN or few.sum() < _NEARLY_ALL * gap.sum() or samples.time.size > _PIECE * few.sum():

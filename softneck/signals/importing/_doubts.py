@@ -115,6 +115,15 @@ def duplicates_doubt(rows: int, first: int) -> Doubt:
     return Doubt("rows of one time stamp", ("time",), "the first", 0.8, why, ("last",))
 
 
+def jitter_doubt(shortest: float, longest: float, usual: float) -> Doubt:
+    """Return the doubt in a clock whose steps [s] are of all lengths: rows may be even and their stamps late."""
+    why = (
+        f"steps are {1e3 * shortest:.3g} to {1e3 * longest:.3g} ms, of all lengths between: the clock jitters and no "
+        f"gap is seen; if rows were taken evenly write `sample_time_s = {usual:.4g}` into [time]"
+    )
+    return Doubt("clock", ("time",), "rows as they are stamped, resampled", 0.8, why)
+
+
 def one_axis_doubt(axis: str) -> Doubt:
     """Return the doubt in a log of one angle: a neck has two, and the other may have got lost on its way."""
     other = "roll" if axis == "pitch" else "pitch"

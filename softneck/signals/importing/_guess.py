@@ -14,6 +14,7 @@ from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTORS, NECK, OUTPUTS, SET_POINTS
 from ..recording._redefinition import redefine
+from ..recording._resampling import jitter
 from ._column_shapes import lagged
 from ._doubts import (
     ONE_AXIS,
@@ -21,6 +22,7 @@ from ._doubts import (
     Doubt,
     doubts_of,
     duplicates_doubt,
+    jitter_doubt,
     one_axis_doubt,
     percent,
     settled,
@@ -183,6 +185,9 @@ def _clocked(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple[Layo
             layout = replace(layout, duplicates="first")
             if not layout.merge:
                 doubts.append(duplicates_doubt(int((step == 0).sum()), int(np.argmax(step == 0)) + 1))
+        if one and not layout.merge and (limits := jitter(draft.values("time"))) is not None:
+            scale = nominal_step(draft, found) / limits[2]
+            doubts.append(jitter_doubt(*(scale * limit for limit in limits)))
     speed = _estimated(draft, found)
     if speed is None:
         return layout, lines, doubts

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
+from softneck.core import FileFormatError, SettingsError, SoftneckError, require_file, to_si
 from softneck.core._budget import settings_text
 from softneck.core._shown import Shown
 from softneck.robot import Robot
@@ -123,10 +123,9 @@ def read_layout(path: str | Path, *, robot: Robot = NECK) -> Layout:
         SettingsError: a key, channel or unit that a layout does not have.
     """
     source = Path(path)
+    require_file(source)
     try:
         text = settings_text(source)
-    except FileNotFoundError:
-        raise FileFormatError(f"{source}: no such file.") from None
     except (UnicodeDecodeError, OSError, ValueError) as error:  # ValueError: a null character in the path
         raise FileFormatError(f"{source}: is not a TOML file ({error}).") from error
     try:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
+from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, require_file, to_si
 from softneck.core._budget import MOST_TOML, require_numbers, require_size, require_table
 from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
@@ -229,8 +229,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
     """
     import pandas as pd
 
-    if not source.is_file():
-        raise FileFormatError(f"{source}: no such file.")
+    require_file(source)
     if suffix == ".parquet":
         return _read_parquet(source)
     require_table(source, zeros=form.encoding.startswith("utf-16") or form.encoding == "utf-32")

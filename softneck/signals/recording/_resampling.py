@@ -13,8 +13,9 @@ from softneck.core import DataError, Vector, require_positive
 from ._channels import is_held
 from ._recording import Recording
 
-# A step of 1.5 usual ones: at least one sample is not there.
-_GAP = 1.5
+# A step of 1.5 usual ones lacks a sample, unless the clock's own steps reach so far: no hole of 1.15 times between
+# them, chosen by leaving out clocks (benchmarks/clock_gaps.py). Beyond 4 usual ones it is a pause of any clock.
+_GAP, _HOLE, _PAUSE = 1.5, 1.15, 4.0
 # Lags of 2 to 4 and a delay of as much again: a shorter piece gives a model not one row to learn from.
 SHORTEST = 10
 # Of the new Nyquist frequency, what is passed; damping beyond it [dB].
@@ -67,6 +68,45 @@ def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tup
     return samples.rows(keep), (note,)
 
 
+def gaps(samples: Samples, hole: float = _HOLE) -> tuple[np.ndarray, float]:
+    """Return (time - 1,) whether rows are missing between one and the next, and beyond how many seconds they are.
+
+    A stamp that came late is made up for by a short step beside it: what counts is a step with the shorter of its
+    neighbours. A clock that jitters has long steps of all lengths; those behind a hole in their lengths are gaps.
+    """
+    step = np.diff(samples.time)
+    inside = np.diff(samples.run) == 0
+    if not (inside & (step > 0)).any():
+        return np.zeros(step.size, dtype=bool), np.inf
+    usual = float(np.median(step[inside & (step > 0)]))
+    beside = np.concatenate([[np.inf], np.where(inside, step, np.inf), [np.inf]])
+    shorter = np.minimum(beside[:-2], beside[2:])
+    length = (step + np.where(np.isfinite(shorter), shorter, usual)) / usual - 1.0
+    long = np.sort(length[inside & (length > 1.0)])
+    behind = long[1:][long[1:] > hole * long[:-1]] if long.size else long
+    behind = behind[behind > _GAP]
+    if long.size and long[0] > _GAP:  # all others are alike
+        behind = long
+    bound = min(float(behind[0]) if behind.size else np.inf, _PAUSE)
+    return inside & (length >= bound), bound * usual
+
+
+def jitter(time: Vector) -> tuple[float, float, float] | None:
+    """Return the shortest, longest and median step where some are as long as gaps are and yet none; None elsewhere.
+
+    A time that goes back is a new run, and rows of one stamp count once.
+    """
+    time = time[np.append(True, np.diff(time) != 0)]
+    run = np.cumsum(np.append(False, np.diff(time) < 0))
+    step, inside = np.diff(time), np.diff(run) == 0
+    if not inside.any():
+        return None
+    usual, steps = float(np.median(step[inside])), step[inside & ~gaps(Samples(time, run, {}))[0]]
+    if not (steps > (_GAP + _SAME) * usual).any():
+        return None
+    return float(steps.min()), float(steps.max()), usual
+
+
 def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
     """Return the samples with a new run after each gap, and notes; pieces shorter than 10 samples are dropped.
 
@@ -75,10 +115,7 @@ def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
     """
     step = np.diff(samples.time)
     inside = np.diff(samples.run) == 0
-    if not (inside & (step > 0)).any():
-        return samples, ()
-    typical = float(np.median(step[inside & (step > 0)]))
-    gap = inside & (step > _GAP * typical)
+    gap, bound = gaps(samples)
     if not gap.any():
         return samples, ()
     number = np.concatenate([[0], np.cumsum(gap | ~inside)])
@@ -99,7 +136,7 @@ def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
     kept = Samples(samples.time, number, samples.channels).rows(~dropped[number])
     if kept.time.size == 0:
         raise DataError(
-            f"`time` has {gap.sum()} gaps (steps beyond {_GAP} x {typical:.4g} s) and no {SHORTEST} samples in a row "
+            f"`time` has {gap.sum()} gaps (steps of {bound:.4g} s and more) and no {SHORTEST} samples in a row "
             "between them; is the unit of the time column right, and is it the clock of these samples?"
         )
     return Samples(kept.time, np.unique(kept.run, return_inverse=True)[1], kept.channels), tuple(notes)
