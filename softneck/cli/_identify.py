@@ -137,10 +137,12 @@ def command(
     why = None if held_out is None else useless(held_out)
     if why is not None:
         why = (tail and stands_still(tail, whole)) or why
-        raise CheckFailedError(
-            f"{path}: no model of the rows held out: {why}. Try another kind or settings, or record longer; "
-            "`softneck identify auto` compares kinds."
+        advice = (
+            poor[0]
+            if poor
+            else "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
         )
+        raise CheckFailedError(f"{path}: no model of the rows held out: {why}. {advice}")
 
 
 def _guarded_form(kind: str, recordings: tuple[Path, ...]) -> str | None:

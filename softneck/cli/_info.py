@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, read_archive, refuse_existing
+from softneck.core import (
+    DataError,
+    FileFormatError,
+    SettingsError,
+    file_hash,
+    load,
+    read_archive,
+    refuse_existing,
+    require_file,
+)
 from softneck.core._budget import MOST_JSON, open_zip, settings_text
 from softneck.core._kinds import KINDS, fitting
 
@@ -121,8 +130,7 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     For a recording it also reports the quality: faults of its channels, and what its inputs can teach a model. For a
     log it reports what `softneck import --guess` would take each column for.
     """
-    if not file.is_file():
-        raise FileFormatError(f"{file}: {'is a folder; name a file in it' if file.is_dir() else 'no such file'}.")
+    require_file(file)
     if html is not None:
         if file.suffix.lower() not in _RECORDINGS:
             raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")

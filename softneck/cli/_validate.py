@@ -74,7 +74,7 @@ def command(
 ) -> None:
     """Validate MODELs on the rows of recordings that they were not trained on.
 
-    Exit code 1 if a free run diverges or a fit is below -100 %.
+    Exit code 1 if a free run diverges or a fit is below 0 %.
     """
     from softneck.identification import Rules, compare
     from softneck.plots import write_page

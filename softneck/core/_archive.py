@@ -12,7 +12,7 @@ import numpy as np
 
 from ._budget import MOST_JSON, open_zip
 from ._errors import FileFormatError
-from ._files import atomic_write
+from ._files import atomic_write, require_file
 
 FORMAT_VERSION = 1
 _HEADER = "header"
@@ -41,8 +41,7 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
         FileFormatError: no such file, not a softneck file, another version, damaged.
     """
     source = Path(path)
-    if not source.is_file():
-        raise FileFormatError(f"{source}: no such file.")
+    require_file(source)
     if not zipfile.is_zipfile(source):
         raise FileFormatError(
             f"{source}: is not a softneck file or is damaged; expected a model, family, controller or observer (.npz)."

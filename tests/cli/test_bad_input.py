@@ -175,6 +175,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "unknown setting `luck`"),
         (("observer", "MODEL", "-o", "o.npz", "--sensor", "nose"), "nose"),
         (("simulate", "none.toml"), "none.toml: no such file"),
+        (("linearize", "none.ssp"), "none.ssp: is several FMUs; unzip it"),
         (("fmu", "none.npz", "-o", "M.fmu"), "none.npz: no such file"),
         (("fmu",), ""),
         (("dance",), "no such command `dance`; the commands are start, "),
@@ -188,6 +189,26 @@ def test_wrong_arguments(
     files = {"REC": recording, "MODEL": rls_file}
     said = call(*[files.get(word, word) for word in arguments])
     refused(said, message, tmp_path, set())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("identify", "rls", "D.csv", "-o", "m.npz"), ("validate", "MODEL", "--data", "D.csv"), ("simulate", "D.toml"),
+        ("simulate", "D.ssp"), ("linearize", "D.fmu"), ("linearize", "D.npz"), ("info", "D.csv"),
+        ("import", "REC", "--layout", "D.toml"), ("start", "D.csv"), ("start", "REC", "--requirements", "D.toml"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_a_folder_in_the_place_of_a_file_is_called_one(
+    call: Call, tmp_path: Path, recording: Path, rls_file: Path, arguments: tuple[str, ...]
+) -> None:
+    folder = next(word for word in arguments if word.startswith("D."))
+    (tmp_path / folder).mkdir()
+    files = {"REC": recording, "MODEL": rls_file}
+    refused(
+        call(*[files.get(word, word) for word in arguments]), f"{folder}: is a folder; name a file", tmp_path, set()
+    )
 
 
 @pytest.mark.parametrize("content", ["[1, 2]", "5", "{", "null", "\xff"])

@@ -48,6 +48,18 @@ def test_a_model_that_moves_the_wrong_way_gives_exit_code_1(call: Call, rls_file
     assert "its fit in free run is -1" in said.error
 
 
+def test_identify_of_outputs_that_follow_no_motor_gives_exit_code_1_and_what_to_do(call: Call) -> None:
+    # Another neck's angles beside motors that move: the mean of the rows held out knows more than any model.
+    moving, other = neck_recording(3000), neck_recording(3000, seed=5)
+    angles = {name: np.roll(other.channels[name], 1300) for name in ("pitch", "roll")}
+    write_recording("foreign.csv", replace(moving, channels={**moving.channels, **angles}))
+    said = call("identify", "oe", "foreign.csv", "-o", "m.npz")
+    assert said.code == 1
+    assert "m.npz: no model of the rows held out: its fit in free run is -" in said.error
+    assert "does not follow the motors" in said.error
+    assert call("identify", "oe", "foreign.csv", "-o", "m.npz", "--json", "--force").code == 1
+
+
 def test_identify_says_that_its_model_diverges_and_keeps_it(
     call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

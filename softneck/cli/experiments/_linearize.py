@@ -50,6 +50,8 @@ def command(
 
     path, replace = target(output, f"linear/{Path(file).stem}.mat", force=force, ending=".mat")
     refuse_existing(path, force=replace)
+    if Path(file).suffix == ".ssp":
+        raise SettingsError(f"{file}: is several FMUs; unzip it and linearize one of those in `resources`.")
     source = Path(file) if Path(file).suffix == ".fmu" else open_buildable(file, robot).block()
     if sample_time is not None and not isinstance(source, Path):
         raise SettingsError("--sample-time is for FMUs; a file of softneck has its own.")

@@ -12,7 +12,8 @@ from softneck.core import SettingsError
 from softneck.core._budget import MOST_TOML, settings_text
 from softneck.robot import Robot
 
-from ._possible import FILE, possible, require_known
+from ..shared._console import note
+from ._possible import FILE, lacking, possible, require_known
 from ._step import Step, Unmet
 
 AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
@@ -125,6 +126,9 @@ def _models(recordings: list[str], asked: Asked) -> Iterator[Step]:
     seed = str(asked.seed)
     command = ("softneck", "identify", "auto", *recordings, "-o", AUTO, "--html", "build/models.html", "--seed", seed,
                "--force")  # fmt: skip
+    robot = Robot.read("robot.toml")
+    if absent := lacking(robot):
+        note(f"robot.toml lacks {', '.join(absent)}: add them now, or the sitting ends behind the models")
     yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL)
     require_known(Robot.read("robot.toml"))
     linear = linear_model()

@@ -9,21 +9,23 @@ import tomli_w
 
 from softneck.core import SettingsError, atomic_write
 from softneck.robot import Robot
+from softneck.robot._file import KEYS
 
 #: In the folder: what `tune` is asked where some of its defaults cannot be.
 FILE = "requirements.toml"
 _METRIC = re.compile(r"`([\w.]+)`.* cannot be: ")
 
 
+def lacking(robot: Robot) -> list[str]:
+    """Return what a robot's file does not say and controller and observer ask for: of motors and sensor all."""
+    told = robot.as_dict()
+    asked = [(table, key) for table in ("motors", "sensor") for key in KEYS[table] if key != "sign"]  # 1 where not said
+    return [f"{table}.{key}" for table, key in asked if key not in told.get(table, {})]
+
+
 def require_known(robot: Robot) -> None:
-    """Raise SettingsError with all at once that controller and observer ask of a robot's file and it does not say."""
-    said = {
-        "motors.setpoint_min": robot.motors.setpoint_min, "motors.setpoint_max": robot.motors.setpoint_max,
-        "motors.rate_limit": robot.motors.rate_limit, "sensor.delay_s": robot.delay_s, "sensor.rate_hz": robot.rate_hz,
-        "sensor.noise_std": robot.noise_std,
-    }  # fmt: skip
-    absent = [name for name, value in said.items() if value is None]
-    if absent:
+    """Raise SettingsError with all that a robot's file lacks at once."""
+    if absent := lacking(robot):
         raise SettingsError(f"robot.toml: add {', '.join(absent)}; controller and observer need them.")
 
 

@@ -11,7 +11,14 @@ from typing import Any
 
 import click
 
-from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SettingsError, SoftneckError, find_kind
+from softneck.core import (
+    CheckFailedError,
+    OutputFileError,
+    SettingsError,
+    SoftneckError,
+    find_kind,
+    require_file,
+)
 
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import json_option
@@ -85,8 +92,7 @@ def command(
 
 def _require_logs(logs: tuple[Path, ...]) -> None:
     for log in logs:
-        if not log.is_file():
-            raise FileFormatError(f"{log}: {'is a folder; name a log in it' if log.is_dir() else 'no such file'}.")
+        require_file(log)
     stems = [log.stem for log in logs]
     twice = next((log for log in logs if stems.count(log.stem) > 1), None)
     if twice is not None:
@@ -95,8 +101,8 @@ def _require_logs(logs: tuple[Path, ...]) -> None:
 
 def _require_known(requirements: Path | None, kinds: str | None) -> None:
     """Refuse at once what `tune` would refuse after minutes."""
-    if requirements is not None and not requirements.is_file():
-        raise FileFormatError(f"{requirements}: no such file.")
+    if requirements is not None:
+        require_file(requirements)
     for kind in kinds.split(",") if kinds else ():
         find_kind(kind, "controller")
 

@@ -7,15 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError
+from softneck.core import FileFormatError, SettingsError, require_file
 from softneck.core._budget import settings_text
 from softneck.loop._wiring import Link
 
 
 def read_toml(source: Path) -> dict[str, Any]:
     """Return the content of a TOML file; raise FileFormatError if there is none."""
-    if not source.is_file():
-        raise FileFormatError(f"{source}: no such file.")
+    require_file(source)
     try:
         return tomllib.loads(settings_text(source))
     except (ValueError, RecursionError) as error:

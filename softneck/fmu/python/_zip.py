@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from softneck.core import FileFormatError, OutputFileError, SettingsError
+from softneck.core import FileFormatError, OutputFileError, SettingsError, require_file
 from softneck.core._budget import open_zip
 
 # PKWARE's APPNOTE 6.3: local header, entry of the directory, end of the directory.
@@ -80,8 +80,7 @@ def unpack(path: str | Path, *, main: str = "modelDescription.xml", what: str = 
         FileFormatError: no FMU, or one with members that reach out of the folder or are too large.
     """
     source = Path(path)
-    if not source.is_file():
-        raise FileFormatError(f"{source}: no such file.")
+    require_file(source)
     try:
         with open_zip(source) as archive:
             _check_members(source, archive, main, what)

@@ -38,10 +38,14 @@ def test_all_that_a_robots_file_lacks_is_named_at_once() -> None:
         _possible.require_known(Robot.preset(name))
     bare = {"name": "pump", "motors": {"names": ["pump"], "unit": "V"}, "outputs": {"names": ["level"], "unit": "V"},
             "directions": {"kind": "identified"}, "sensor": {"delay_s": 0.0}}  # fmt: skip
-    lacks = "motors.setpoint_min, motors.setpoint_max, motors.rate_limit, sensor.rate_hz, sensor.noise_std"
+    lacks = "motors.setpoint_min, motors.setpoint_max, motors.rate_limit, sensor.noise_std, sensor.rate_hz"
     with pytest.raises(SettingsError, match=re.escape(f"robot.toml: add {lacks};")) as said:
         _possible.require_known(Robot.from_dict(bare))
     assert len(str(said.value)) <= 160
+    # A preset may lack some as well, and only those are named.
+    arm = "robot.toml: add motors.rate_limit, sensor.noise_std, sensor.delay_s, sensor.rate_hz; controller"
+    with pytest.raises(SettingsError, match=re.escape(arm)):
+        _possible.require_known(Robot.preset("arm"))
 
 
 def test_each_default_that_cannot_be_is_left_out_with_its_reason(
