@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -287,6 +288,9 @@ QUESTIONS = {
     ),
     "nonlinear.motion_noise_ratio": Question(
         "motion_noise_ratio", (0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0), KalmanSettings(), observed_grey
+    ),
+    "nonlinear.slew_ratio": Question(
+        "slew_ratio", (0.6, 0.8, 1.0, 1.25, 1.6, 2.2, math.inf), KalmanSettings(), observed_grey
     ),
     "mpc.taut_pole": Question("taut_pole", (6.0, 9.0, 12.0), MpcSettings(), follows),
     "mpc.least_delay": Question("least_delay", (0.08, 0.1, 0.12), MpcSettings(), follows),

@@ -40,6 +40,8 @@ FORM = "nonlinear"
 # Samples of a neck until its model stands, and what 20 ms leave of the fastest motion: half of it after 0.27 s, as long
 # as a neck is on its way. Of another robot both are stretched by its time constant.
 _SETTLE, _KEEP, _NECK_SAMPLE = 300, 0.95, 0.02
+# A number that files and C know, beyond any set-point.
+_UNLIMITED = 1e12
 
 
 # How far the payload walks in a second, of a robot's time, as a part of the range that the model knows.
@@ -63,6 +65,7 @@ class NonlinearObserver(Shown):
         noise: standard deviations, named as `noise_names`, in SI.
         constants: see KALMAN_* of `_kalman_parts_runtime`.
         start: standard deviation of the disturbance when nothing is known, in SI.
+        slew: (motors,) how fast set-points move the model at most, in SI a second; None: a jump is one to it.
         sensor: name of the preset, "none" where the noise was given, "robot" where the robot's file says it.
         order: of the loop it is for.
         gate_level: chi-square level of the gate.
@@ -77,6 +80,7 @@ class NonlinearObserver(Shown):
     order: str
     gate_level: float
     delay_source: str = "given"
+    slew: tuple[float, ...] | None = None
     form: str = FORM
 
     @property
@@ -146,7 +150,7 @@ class NonlinearObserver(Shown):
 
     def _own_arrays(self, plant: Block) -> tuple[Matrix, ...]:
         stretch = max(self.model.findings.get("time_constants_s", [NECK_SECONDS])) / NECK_SECONDS
-        setup = model_setup(self.robot, plant, self.sample_time, stretch, self.start)
+        setup = model_setup(self.robot, plant, self.sample_time, stretch, self.start, self.slew)
         arrays = (setup, self.constants, plant.initial_state(use_measurement=0.0).parameters)
         if self.payloads is None:
             return arrays
@@ -236,6 +240,11 @@ class NonlinearObserver(Shown):
             f"{self.noise[2]:.3g} times the model's motion",
             *filter_lines(self.gate_level, self.constants, self.sample_time, self.delay_source),
         ]
+        if self.slew is not None:
+            si = to_si(self.robot.motors.unit)[1]
+            lines.append(
+                f"  set-points move the model by {min(self.slew):.3g} {si}/s at most: drives take time over a jump"
+            )
         if self.payloads is not None:
             least, most = self.payloads
             lines.append(f"  the payload, from {least:g} to {most:g} kg, is estimated: while the neck moves far")
@@ -250,6 +259,7 @@ class NonlinearObserver(Shown):
             "sample_time": self.sample_time,
             "noise": dict(zip(self.noise_names, self.noise, strict=True)),
             "start": self.start,
+            **({} if self.slew is None else {"slew": list(self.slew)}),
             "sensor": self.sensor,
             "order": self.order,
             "gate_level": self.gate_level,
@@ -275,6 +285,7 @@ class NonlinearObserver(Shown):
             noise=(levels[0], levels[1], levels[2]),
             constants=constants,
             start=float(header["start"]),
+            slew=_slew(header),
             sensor=str(header["sensor"]),
             order=str(header["order"]),
             gate_level=float(header["gate_level"]),
@@ -282,12 +293,22 @@ class NonlinearObserver(Shown):
         )
 
 
-def model_setup(robot: Robot, plant: Block, sample_time: float, stretch: float, start: float) -> Vector:
+def _slew(header: Mapping[str, Any]) -> tuple[float, ...] | None:
+    """Return how fast set-points move the model; of files of earlier versions as fast as they come."""
+    found = header.get("slew")
+    return None if found is None else tuple(float(value) for value in found)
+
+
+def model_setup(
+    robot: Robot, plant: Block, sample_time: float, stretch: float, start: float, slew: Sequence[float] | None = None
+) -> Vector:
     """Return the array `setup` of a runtime over a model (see `NonlinearArrays`)."""
     samples = _NECK_SAMPLE * stretch / sample_time  # for one of the neck's
+    motors = len(robot.motors.names)
     return np.array([
-        len(robot.motors.names), len(robot.outputs.names), len(plant.outputs),
+        motors, len(robot.outputs.names), len(plant.outputs),
         max(1, round(_SETTLE * samples)), start, _KEEP ** (1.0 / samples),
+        *(sample_time * most for most in slew or (_UNLIMITED,) * motors),
     ])  # fmt: skip
 
 

@@ -13,15 +13,17 @@ NONLINEAR_TOLD = 2
 NONLINEAR_SETTLE = 3
 NONLINEAR_START = 4
 NONLINEAR_KEEP = 5
+NONLINEAR_SLEW = 6  # one a motor
 
 
 class NonlinearArrays(Arrays):
     """Those of the model follow."""
 
     setup = array(
-        "6",
+        "places",
         "motors, outputs, outputs of the model, samples until it stands, standard deviation of the disturbance at "
-        "the start, part of the fastest motion that a sample keeps",
+        "the start, part of the fastest motion that a sample keeps, then of each motor the most that its set-point "
+        "moves the model in a sample",
     )
     constants = array("numbers", "see KALMAN_*; a lag of 1: the set-points come a sample early")
     free = array("parameters", "of the model in free run")
@@ -50,6 +52,13 @@ def nonlinear_move(
     angles[:] = out[: p.outputs]
 
 
+def nonlinear_slew(p: NonlinearArrays, reached: np.ndarray, motors: np.ndarray) -> None:
+    """Bring `reached`, the set-points that move the model, towards `motors`: a drive takes its time over a jump."""
+    for j in range(p.motors):
+        most = p.setup[NONLINEAR_SLEW + j]
+        reached[j] += min(max(motors[j] - reached[j], -most), most)
+
+
 def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, before: np.ndarray) -> float:
     """Return the fastest motion of late, from what it was and the outputs of now and of the sample before."""
     motion = p.setup[NONLINEAR_KEEP] * fastest
@@ -64,12 +73,13 @@ def nonlinear_tell(
     model: np.ndarray,
     angles: np.ndarray,
     disturbance: np.ndarray,
+    reached: np.ndarray,
     motors: np.ndarray,
     outputs: np.ndarray,
 ) -> None:
     """Carry the estimate from the filter's time to now, under the newest set-points; fill angles and rates.
 
-    `model` and `angles` are spent.
+    `model`, `angles` and `reached` are spent.
     """
     c, m = p.constants, p.outputs
     whole = int(c[KALMAN_LEAD])
@@ -77,7 +87,8 @@ def nonlinear_tell(
     before = np.empty(m)
     for _ in range(whole + 1):
         before[:] = angles
-        nonlinear_move(p, free, model, motors, angles)
+        nonlinear_slew(p, reached, motors)
+        nonlinear_move(p, free, model, reached, angles)
     for i in range(m):
         # Between samples by a straight line, whose slope is the rate.
         outputs[i] = before[i] + part * (angles[i] - before[i]) + disturbance[i]

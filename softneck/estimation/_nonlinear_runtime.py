@@ -24,6 +24,7 @@ from softneck.estimation._nonlinear_parts_runtime import (
     nonlinear_faster,
     nonlinear_move,
     nonlinear_settle,
+    nonlinear_slew,
     nonlinear_tell,
 )
 from softneck.runtime._layout import cells, rest
@@ -38,6 +39,7 @@ class NonlinearState(KalmanCounters):
     angles = cells("outputs", "of the model at the filter's time")
     disturbance = cells("outputs", "what it misses")
     held = cells("motors", "set-points that came last")
+    reached = cells("motors", "set-points that moved the model last: no faster than the drives take them")
     model = rest("state of the model")
 
 
@@ -67,6 +69,7 @@ def step(
     start = p.setup[NONLINEAR_START]
     if x.samples == 0.0:
         x.held[:] = asked
+        x.reached[:] = asked
         nonlinear_settle(p, p.free, x.model, asked, x.angles)
         x.variance = start * start
     usable = kalman_usable(c, x, measured, float(inputs[n + m]), parameters[0])
@@ -80,7 +83,7 @@ def step(
         innovation, accepted = nonlinear_correct(p, parameters[0], x, measured, forced)
     kalman_count(c, x, usable, accepted)
     # Copies: the filter's own model stays at the time of the measurement.
-    nonlinear_tell(p, p.free, x.model.copy(), x.angles.copy(), x.disturbance, asked, outputs)
+    nonlinear_tell(p, p.free, x.model.copy(), x.angles.copy(), x.disturbance, x.reached.copy(), asked, outputs)
     outputs[2 * m] = innovation
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
     x.samples += 1.0
@@ -90,9 +93,10 @@ def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearSt
     """Move the model on under what acted since the last sample, and widen what it may miss by how far it went."""
     before = x.angles.copy()
     if p.constants[KALMAN_LAG] > 0.5:
-        nonlinear_move(p, p.free, x.model, x.held, x.angles)
+        nonlinear_slew(p, x.reached, x.held)
     else:
-        nonlinear_move(p, p.free, x.model, asked, x.angles)
+        nonlinear_slew(p, x.reached, asked)
+    nonlinear_move(p, p.free, x.model, x.reached, x.angles)
     x.held[:] = asked
     x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
     x.variance += parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2

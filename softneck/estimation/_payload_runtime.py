@@ -25,6 +25,7 @@ from softneck.estimation._nonlinear_parts_runtime import (
     nonlinear_faster,
     nonlinear_move,
     nonlinear_settle,
+    nonlinear_slew,
     nonlinear_tell,
 )
 from softneck.runtime._layout import array, cells, rest
@@ -54,6 +55,7 @@ class PayloadState(KalmanCounters):
     disturbance = cells("outputs", "what the model misses")
     P = cells("outputs + 1, outputs + 1", "covariance of the disturbances and the payload")
     held = cells("motors", "set-points that came last")
+    reached = cells("motors", "set-points that moved the model last: no faster than the drives take them")
     models = rest("states of both copies")
 
 
@@ -101,6 +103,7 @@ def step(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, inputs: np.n
         models[: member_size(p, 0)].copy(),
         x.angles.copy(),
         x.disturbance,
+        x.reached.copy(),
         asked,
         outputs,
     )
@@ -128,6 +131,7 @@ def payload_start(p: PayloadArrays, x: PayloadState, asked: np.ndarray) -> None:
         x.P[i, i] = start * start
     x.P[p.outputs, p.outputs] = (p.load[PAYLOAD_MOST] - p.load[PAYLOAD_LEAST]) ** 2
     x.held[:] = asked
+    x.reached[:] = asked
     more = np.empty(p.outputs)
     nonlinear_settle(p, payload_free(p, x.payload), models[:size], asked, x.angles)
     nonlinear_settle(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], asked, more)
@@ -136,9 +140,12 @@ def payload_start(p: PayloadArrays, x: PayloadState, asked: np.ndarray) -> None:
 def payload_predict(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, asked: np.ndarray) -> None:
     """Move both copies on under what acted since the last sample, and widen what may be missed."""
     models, size, before, more = x.models, member_size(p, 0), x.angles.copy(), np.empty(p.outputs)
-    acted = x.held.copy() if p.constants[KALMAN_LAG] > 0.5 else asked.copy()
-    nonlinear_move(p, payload_free(p, x.payload), models[:size], acted, x.angles)
-    nonlinear_move(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], acted, more)
+    if p.constants[KALMAN_LAG] > 0.5:
+        nonlinear_slew(p, x.reached, x.held)
+    else:
+        nonlinear_slew(p, x.reached, asked)
+    nonlinear_move(p, payload_free(p, x.payload), models[:size], x.reached, x.angles)
+    nonlinear_move(p, payload_free(p, x.payload + PAYLOAD_STEP), models[size:], x.reached, more)
     x.held[:] = asked
     x.fastest = nonlinear_faster(p, x.fastest, x.angles, before)
     walked = parameters[1] * parameters[1] + (parameters[2] * x.fastest) ** 2

@@ -77,6 +77,8 @@ class KalmanSettings:
         bias_noise_std: "gyro": step of the bias's walk, each sample [rad/s].
         rest_noise_std: "nonlinear": step of the disturbance's walk at rest, each sample [rad].
         motion_noise_ratio: "nonlinear": that step over the model's fastest motion in a sample of late.
+        slew_ratio: "nonlinear": set-points move the model by at most so many times `motors.rate_limit` of the robot's
+            file, where it has one; inf: as they come.
         sample_time: of the loop [s]; None for that of the model. Must divide the model's.
         sensor_period: of the inclinometer [s], a multiple of the sample time; None: a new sample each time.
         sensor_delay: how late measurements are [s]; the estimate is then of the angle now. 0 estimates the angle at
@@ -111,6 +113,7 @@ class KalmanSettings:
     # is worth 2 % between 0.02 and 0.5 deg (`.rest_noise_std`), and this one is quiet.
     rest_noise_std: float = NeckDefault(math.radians(0.1))
     motion_noise_ratio: float = 1.0
+    slew_ratio: float = 1.0
     sample_time: float | None = None
     sensor_period: float | None = None
     # A look-ahead by 50 ms makes designs on one `oe` swing, whether they know of it or not: `docs/howto/observer.md`.
@@ -131,6 +134,8 @@ class KalmanSettings:
             for name, unit in names:
                 if getattr(self, name) is not None:
                     require_positive(name, getattr(self, name), unit)
+        if not self.slew_ratio > 0.0:
+            raise SettingsError(f"`slew_ratio` must be positive, or inf; got {self.slew_ratio:g}.")
         for name in ("sample_time", "sensor_period"):
             if getattr(self, name) is not None:
                 require_positive(name, getattr(self, name), "s")
@@ -195,11 +200,19 @@ class KalmanSettings:
             noise=noise,
             constants=asked.robot_timing(robot, period).constants((0,) * len(robot.outputs.names), period),
             start=reach.start,
+            slew=self._slew(robot),
             sensor=sensor,
             order=self.order,
             gate_level=self.gate_level,
             delay_source=asked._delay_source(robot),
         )
+
+    def _slew(self, robot: Robot) -> tuple[float, ...] | None:
+        """Return how fast set-points move the model at most [SI/s], None without a limit."""
+        limits, factor = robot.motors.rate_limit, to_si(robot.motors.unit)[0]
+        if limits is None or math.isinf(self.slew_ratio):
+            return None
+        return tuple(self.slew_ratio * factor * limit for limit in limits)
 
     def _over_linear(self, model: HasTransferFunctions) -> KalmanObserver:
         robot = robot_of(model)

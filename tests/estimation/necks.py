@@ -87,3 +87,17 @@ def changed(record: Recording, rows: slice | list[int], value: float, *channels:
         replaced[name] = record.channels[name].copy()
         replaced[name][rows] = value
     return record.with_channels(**replaced)
+
+
+def ramped(run: Recording, rate: float) -> Recording:
+    """The same set-points, but that each rises by `rate` [rad/s] at most."""
+    P, most = run.set_points.copy(), rate * run.sample_time
+    for k in range(1, len(P)):
+        P[k] = P[k - 1] + np.clip(P[k] - P[k - 1], -most, most)
+    return run.with_channels(**{f"motor_setpoint_{j + 1}": P[:, j] for j in range(P.shape[1])})
+
+
+def jumping(run: Recording) -> Recording:
+    """The same, but that set-points stand for 0.4 s at a time."""
+    names = [name for name in run.channels if "setpoint" in name]
+    return run.with_channels(**{name: np.repeat(run.channels[name][::20], 20)[: len(run)] for name in names})

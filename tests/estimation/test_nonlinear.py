@@ -24,7 +24,7 @@ from softneck.signals import Recording, signal
 
 from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.spoiled import errors_deg, filtered, logged, motions, moved, spoiled
-from .necks import changed, neck
+from .necks import changed, jumping, neck, ramped
 
 # In time, and a disturbance whose walk does not depend on the motion.
 WALK, NOISE = math.radians(0.3), math.radians(0.05)
@@ -79,17 +79,31 @@ def test_its_disturbance_is_filterpys_walk_over_what_the_model_misses(play: Mode
     np.testing.assert_allclose(estimates.log_det[estimates.judged], log_det[estimates.judged], rtol=1e-9)
 
 
+@pytest.mark.parametrize("ratio", [0.5, 1.0, math.inf])
+def test_a_jump_moves_the_model_as_a_ramp_of_the_motors_rate_does(play: Model, run: Recording, ratio: float) -> None:
+    rate = ratio * (play.robot.motors.rate_limit or (math.nan,))[0]
+    slow, free = (designed(replace(PLAIN, slew_ratio=value), play) for value in (ratio, math.inf))
+    told = slow.estimate(jumping(run))
+    np.testing.assert_array_equal(told.outputs, free.estimate(ramped(jumping(run), rate)).outputs)
+
+
+def test_files_from_before_take_jumps_as_they_come(play: Model, run: Recording, tmp_path: Path) -> None:
+    observer = designed(PLAIN, play)
+    observer.save(tmp_path / "new.npz")
+    header, arrays = read_archive(tmp_path / "new.npz")
+    assert header.pop("slew") == [15.6, 15.6, 15.6]
+    write_archive(tmp_path / "old.npz", header, arrays)
+    expected = designed(replace(PLAIN, slew_ratio=math.inf), play).estimate(jumping(run))
+    np.testing.assert_array_equal(load(tmp_path / "old.npz").estimate(jumping(run)).outputs, expected.outputs)
+
+
 @pytest.mark.parametrize("lead", [0.0, 0.04, 0.05])
 def test_in_darkness_it_says_what_the_model_will_say(play: Model, run: Recording, lead: float) -> None:
     """Ahead by the sensor's delay, which is within the model's dead time; parts of a sample by a straight line."""
-    held = run.rows(0, 200)
-    held = held.with_channels(
-        **{name: np.repeat(held.channels[name][::20], 20) for name in held.channels if "setpoint" in name},
-        pitch=np.full(200, math.nan),
-        roll=np.full(200, math.nan),
-    )
+    dark = {axis: np.full(200, math.nan) for axis in ("pitch", "roll")}
+    held = jumping(run.rows(0, 200)).with_channels(**dark)
     estimates = designed(replace(PLAIN, sensor_delay=lead), play).estimate(held)
-    angles, at = free_run(play, held), np.arange(200) + lead / held.sample_time
+    angles, at = free_run(play, ramped(held, 15.6)), np.arange(200) + lead / held.sample_time
     expected = np.column_stack([np.interp(at, np.arange(200), column) for column in angles.T])
     # The set-points of the next four samples are known where they are held.
     known = np.arange(200) % 20 < 15

@@ -22,6 +22,7 @@ from softneck.signals import Recording, signal
 
 from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.necks import record as record_foreign
+from .necks import jumping, ramped
 
 NOISE, REST, RATIO, START = math.radians(0.05), math.radians(0.1), 1.0, math.radians(40.0)
 STEP = 0.02
@@ -49,6 +50,13 @@ def designed(settings: KalmanSettings, model: Model) -> NonlinearObserver:
     found = settings.design(model)
     assert isinstance(found, NonlinearObserver)
     return found
+
+
+def test_a_jump_moves_both_copies_as_a_ramp_of_the_motors_rate_does(model: Model, run: Recording) -> None:
+    slow, free = (designed(replace(PLAIN, slew_ratio=value), model) for value in (1.0, math.inf))
+    told, expected = slow.estimate(jumping(run)), free.estimate(ramped(jumping(run), 15.6))
+    np.testing.assert_array_equal(told.outputs, expected.outputs)
+    np.testing.assert_array_equal(told.covariance, expected.covariance)
 
 
 class _Copy:

@@ -39,7 +39,7 @@ def motions() -> list[Excitation]:
     return [signal("steps"), signal("sine"), signal("rotation"), signal("mixed", duration=40.0)]
 
 
-def moved(block: Block, excitation: Excitation, seed: int) -> Recording:
+def moved(block: Block, excitation: Excitation, seed: int, noise: float = NOISE) -> Recording:
     """Return a run of a neck without noise of its own, with white noise of 0.25 deg on what is measured."""
     P = np.asarray(excitation.set_points, dtype=np.float64)
     state = settle(block, P[0])
@@ -52,7 +52,7 @@ def moved(block: Block, excitation: Excitation, seed: int) -> Recording:
     kept |= {f"motor_position_{j}": rows[f"motor_position_{j}"].copy() for j in (1, 2, 3)}
     for axis in ("pitch", "roll"):
         kept[axis] = rows[axis].copy()
-        kept[f"{axis}_measured"] = rows[f"{axis}_measured"] + NOISE * rng.standard_normal(len(P))
+        kept[f"{axis}_measured"] = rows[f"{axis}_measured"] + noise * rng.standard_normal(len(P))
     return Recording(excitation.time, excitation.sample_time, kept)
 
 
