@@ -145,7 +145,7 @@ def test_a_layout_that_is_absent_or_no_toml(tmp_path: Path) -> None:
         (tmp_path / "bad.toml").write_bytes(content)
         with pytest.raises(FileFormatError, match="is not a TOML file"):
             read_layout(tmp_path / "bad.toml")
-    with pytest.raises(FileFormatError, match="is not a TOML file"):
+    with pytest.raises(FileFormatError, match="is a folder"):
         read_layout(tmp_path)
 
 

@@ -168,7 +168,7 @@ def test_json_is_one_object_on_stdout(call: Call, short: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "data", "says"),
     [
-        ("folder", None, "is a folder; name a log in it"),
+        ("folder", None, "is a folder; name a file in it"),
         ("absent.csv", b"", "no such file"),
         ("empty.csv", b"", "empty"),
         ("picture.png", b"\x89PNG\r\n\x1a\n" + bytes(200), "picture"),
