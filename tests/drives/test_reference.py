@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from softneck.cli._main import run
+from softneck.drives.master._events import RULES
 
 from ..data import ROOT
+from .broken import ROWS
 from .conftest import Project
 
 TEXT = (ROOT / "docs" / "reference" / "drives.md").read_text(encoding="utf-8")
@@ -56,3 +58,43 @@ def test_every_command_has_a_row() -> None:
 
     for name in command.commands:
         assert keys_of(name), name
+
+
+def rows_of(text: str, heading: str) -> list[list[str]]:
+    """Return the cells of the first table below a heading, without its head."""
+    below = text[text.index(f"\n## {heading}\n") :].split("\n## ")[1]
+    lines = [line for line in below.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines[1:]]
+
+
+def test_every_event_is_in_its_table_with_reaction_and_deadline() -> None:
+    rows = {
+        name.strip("`"): (reaction, deadline) for name, reaction, deadline, _ in rows_of(TEXT, "Events of the master")
+    }
+    deadlines = {
+        name: (rule.reaction.value, f"{rule.cycles} T" if rule.cycles else f"{1000 * rule.seconds:.0f} ms")
+        for name, rule in RULES.items()
+    }
+    assert rows == deadlines
+
+
+def test_the_fault_table_has_the_rows_of_the_supervisor_and_the_events_that_should_name_them() -> None:
+    told = {}
+    for _, who, _, end, tests in rows_of(TEXT, "Fault table"):
+        if "by its baseline" in who or who.startswith("the same"):
+            told.update({row: set(re.findall(r"`(\w+)`", end)) - {"zero"} for row in re.findall(r"`([^`]+)`", tests)})
+    assert set(told) == set(ROWS)
+    for name, row in ROWS.items():
+        assert row.names[0] in told[name], name
+    assert set().union(*told.values()) == {row.names[0] for row in ROWS.values()}
+
+
+@pytest.mark.parametrize("title", ["row, told as", "row   "])
+def test_the_page_of_the_supervisor_has_its_rows_and_its_events(title: str) -> None:
+    """What `benchmarks/supervisor.py report` prints, line by line in the order of the rows."""
+    lines = (ROOT / "docs" / "theory" / "plausibility.md").read_text(encoding="utf-8").splitlines()
+    begin = next(k for k, line in enumerate(lines) if line.startswith(title))
+    assert [line[:36].rstrip() for line in lines[begin + 1 : begin + 1 + len(ROWS)]] == list(ROWS)
+    legend = {line[5:] for line in lines[:begin] if re.match(r"  [a-z]: \w+$", line)}
+    named = {name for row in ROWS.values() for name in row.names}
+    assert {row.names[0] for row in ROWS.values()} <= legend <= named

@@ -154,6 +154,8 @@ class Watches:
         if due and found is None:
             values, rates = (None, ()) if sample is None else (sample.values, sample.rates)
             found = self._plausible.sample(positions, values, rates, reference)
+            if self._plausible.rests:
+                events.append(Event(now, "not_watched", 0, self._plausible.rests))
         if found is not None:
             events.append(Event(now, found.name, 0 if found.motor < 0 else nodes[found.motor], found.detail))
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 from softneck.core import FileFormatError, SettingsError, atomic_write
 from softneck.core._budget import MOST_JSON, settings_text
 
-_KIND, _VERSION = "softneck supervision", 2
-_LATER = {"seconds", "tracking", "level_low"}
+_KIND, _VERSION = "softneck supervision", 3
+_LATER = {"seconds", "tracking"}
 Row = tuple[float, ...]
 Rows = tuple[Row, ...]
 
@@ -51,9 +51,10 @@ class Baseline:
         current_whitening, current_spread: of its residual [N].
         current_top: largest tension seen of each, where its current may be cut off [N].
         current_reach: how far each motor was behind its set-points in nearly all cycles [rad].
-        level: of each motor, its tension from the same features, the mean of the others' tensions, and one: a payload
-            is in all of them. level_spread: variance of the residual [N^2]; level_low: the others' mean in nearly all
-            cycles is above this [N], () where that is not known.
+        load: of each motor, mean of the other tensions from the motors' positions and one [N]. What these are off by
+            over some seconds is what a payload makes of them. load_low: least of it that is known ground [N].
+        level: of each motor, its tension from the same features, that of the others by `load`, and one: a payload is in
+            all of them. level_spread: variance of the residual [N^2].
         tilt: (outputs, lags x motors) tilt from the motors' positions so many samples ago.
         lags: these [samples].
         tilt_whitening: of each output's residual.
@@ -81,6 +82,8 @@ class Baseline:
     current_spread: Rows
     current_top: Row
     current_reach: Row
+    load: Rows
+    load_low: float
     level: Rows
     level_spread: Row
     tilt: Rows
@@ -96,7 +99,6 @@ class Baseline:
     missing_threshold: float = math.inf
     reach: Rows
     slack: Row
-    level_low: Row = ()
     motor_thresholds: Row = ()
     tilt_thresholds: Row = ()
     tracking: Tracking = field(default_factory=Tracking)

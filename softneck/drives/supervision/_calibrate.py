@@ -20,7 +20,7 @@ from ._tracking import LoopRun, fit_tracking, tracking_scores
 # What the tilt may still answer to [s], in samples that lie closer together where it answers most.
 _REACH = 0.5
 _LAGS = 8
-# Motors further out than this part of the seen range are not known ground, and none is so much faster.
+# Motors and loads further out than this part of the seen range are not known ground, and no motor is so much faster.
 _MARGIN = 0.2
 _LEAST = 20.0
 # Runs of a loop, of all together [s]: four minutes showed a third of the slow error that a quarter of an hour does, and
@@ -73,14 +73,14 @@ def calibrate(
     motor, tilt, slow, fitted = [], [], [], []
     for number in range(len(parts)):
         others = [other for k, other in enumerate(known) if k != number]
-        fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack))
+        fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack, rules=rules))
         slow.append(_slow(fitted[-1], parts[number]))
     bias = row_of(known_bias * np.max(slow, axis=0))
     for part, model in zip(parts, fitted, strict=True):
         found = scores_of(replace(model, tilt_bias=bias), part, rules)
         motor.append(found[0])
         tilt.append(found[1])
-    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
+    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack, rules=rules)
     runs = _loops(loops, replace(whole, tilt_bias=bias))
     charts = motor[0].shape[1] + tilt[0].shape[1] + 1 + (2 * runs[0].values.shape[1] if runs else 0)
     shared = replace(budget or Budget(), charts=charts)
@@ -156,7 +156,14 @@ class _Walk:
         return True
 
 
-def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles: int, slack: float) -> Baseline:
+def fit(
+    known: Sequence[tuple[Motion, Features]],
+    *,
+    cycle: float,
+    sample_cycles: int,
+    slack: float,
+    rules: MotorRules | None = None,
+) -> Baseline:
     """Return the models of drives, tendons and tilt, without thresholds."""
     motions, features = [motion for motion, _ in known], [f for _, f in known]
     n, m = motions[0].positions.shape[1], motions[0].values.shape[1]
@@ -172,7 +179,7 @@ def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles
     lags = _lags(step)
     # At rest nobody knows which way friction holds: a tendon is taut for certain above that much only.
     least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
-    level, level_spread, level_low = level_rows(known, least, top, reach, seldom=1.0 - _NEARLY)
+    load, (least_load, most_load), level, level_spread = level_rows(known, least, top, reach, rules or MotorRules())
     samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
     tilt = _tilt_gains(samples, lags)
     residuals = [s.values - _predicted(s, tilt, lags, n) for s in samples]
@@ -190,7 +197,8 @@ def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles
         drive_fastest=row_of((1.0 + _MARGIN) * np.max([np.nanmax(np.abs(f.moved), axis=0) for f in features], axis=0)),
         current=current, current_whitening=current_white, current_spread=current_spread,
         current_top=row_of(top), current_reach=row_of(reach),
-        level=level, level_spread=level_spread, level_low=level_low, tilt=_table(tilt), lags=lags,
+        load=load, load_low=least_load - _MARGIN * (most_load - least_load),
+        level=level, level_spread=level_spread, tilt=_table(tilt), lags=lags,
         tilt_whitening=white, tilt_spread=spread, tilt_bias=(0.0,) * m,
         gyro_whitening=gyro[0], gyro_spread=gyro[1], gyro_wander=gyro[2],
         noise=row_of(np.concatenate(bends).var(axis=0)),

@@ -67,7 +67,7 @@ def supervised_motors(model: tuple, rules: tuple, past: tuple, x: np.ndarray, wh
         scores: out.
     """
     drive, drive_spread, fastest, current, current_spread, top, reach, slack = model
-    usual, excited, sight, known, stands, near_top, cut = rules
+    usual, excited, sight, known, stands, near_top, cut, _ = rules
     s, p, tension = past
     coefficients, before, values = white
     n, last = rest.shape[0], x.shape[0] - 1
@@ -108,35 +108,49 @@ def supervised_motors(model: tuple, rules: tuple, past: tuple, x: np.ndarray, wh
             scores[(2 + k) * n + i] = 0.0 if quiet else score
 
 
+def supervised_load(off: np.ndarray, load: np.ndarray, counted: np.ndarray, memory: float) -> None:
+    """Take what the other tensions of each motor are off by (motors,) [N] into their mean of the last cycles."""
+    counted[0] = min(counted[0] + 1.0, memory)
+    for i in range(load.shape[0]):
+        load[i] += (off[i] - load[i]) / counted[0]
+
+
 def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, rest: np.ndarray, scales: np.ndarray,
-                      scores: np.ndarray) -> None:  # fmt: skip
+                      carried: tuple, scores: np.ndarray) -> None:  # fmt: skip
     """Fill the scores (scales x motors,) of each tension against those of the other tendons, which share a payload.
 
     Args:
-        model: level, its spread, top, reach, below what tension a tendon may hang, and below what mean of the others
-            nobody knows how they share what is left.
+        model: level, its spread, mean of the others by place, top, reach, and below what tension a tendon may hang.
         rules, past, x, rest, scales, scores: as in `supervised_motors`.
+        carried: what the others are off by, its mean of the last cycles (motors,) each, and how many were counted.
     """
-    level, spread, top, reach, slack, low = model
-    sight, near_top = rules[2], rules[5]
+    level, spread, others, top, reach, slack = model
+    sight, near_top, memory = rules[2], rules[5], rules[7]
+    off, load, counted = carried
     s, p, tension = past
     n, features = rest.shape[0], x.shape[2]
-    overloaded = False
+    known = n > 1
     for i in range(n):
-        overloaded = overloaded or abs(tension[0, i]) > (1.0 - near_top) * top[i]
+        known = known and slack[i] <= tension[0, i] <= (1.0 - near_top) * top[i]
         for k in range(s.shape[0]):
-            overloaded = overloaded or abs(s[k, i] - p[0, i]) > reach[i]
+            known = known and abs(s[k, i] - p[0, i]) <= reach[i]
+        off[i] = -others[i, n]
+        for j in range(n):
+            off[i] -= others[i, j] * p[0, j]
+            if j != i:
+                off[i] += tension[0, j] / (n - 1)
+    if known:
+        supervised_load(off, load, counted, memory)
     for i in range(n):
-        expected, quiet, others = level[i, features + 1], overloaded, 0.0
+        # Of a few cycles friction has not averaged out.
+        expected, quiet = level[i, features + 1], not known or counted[0] < 0.1 * memory
         for j in range(features):
             expected += level[i, j] * x[0, i, j]
         for j in range(n):
             quiet = quiet or rest[j] > 0.0
-            if j != i:
-                others += tension[0, j] / (n - 1)
-        expected += level[i, features] * others
+        expected += level[i, features] * load[i]
         # What hangs has no scale: half of a tension must be well above that.
-        quiet = quiet or expected < 3.0 * slack[i] or others < low[i]
+        quiet = quiet or expected < 3.0 * slack[i]
         for k in range(scales.shape[0]):
             score = chart_shift(tension[0, i] - expected, (scales[k] - 1.0) * expected, spread[i], sight)
             # What was added up before is of another moment: half an answer each time is none.

@@ -44,6 +44,7 @@ class MotorRules(NamedTuple):
         stands: slower than this a motor stands [rad/s]: a few counts of its encoder a cycle.
         near_top: part of the largest tension of all within which it may be cut off.
         rest: so long that tells in what follows, and a tendon that hung [cycles].
+        carries: what the tendons carry is their mean over so long [cycles]: friction averages out, no payload changes.
     """
 
     usual: float = 4.0
@@ -53,6 +54,7 @@ class MotorRules(NamedTuple):
     stands: float = 0.05
     near_top: float = 0.05
     rest: float = 10.0
+    carries: float = 500.0
 
 
 class MotorFeatures:
@@ -147,9 +149,8 @@ class MotorCharts:
             b.slack,
         )
         self._model = tuple(np.array(row) for row in rows)
-        # Baselines from before it was known judge all levels.
-        low = b.level_low or (0.0,) * n
-        self._levels = tuple(np.array(row) for row in (b.level, b.level_spread, *rows[-3:], low))
+        self._levels = tuple(np.array(row) for row in (b.level, b.level_spread, b.load, *rows[-3:]))
+        self._load = (np.zeros(n), np.zeros(n), np.zeros(1))
         self._rules = tuple(rules or MotorRules())
         filter_ = Filter([Whitening(row) for row in b.current_whitening], 1 + len(SCALES))
         self._white = (filter_.coefficients, filter_.past, np.zeros((1 + len(SCALES), n)))
@@ -160,6 +161,11 @@ class MotorCharts:
         self.charts = Charts(np.array(b.motor_thresholds) if thresholds is None else thresholds)
         self._jump: tuple[int, float, float, float, float] | None = None
         self._jumped = 0
+
+    @property
+    def known_load(self) -> bool:
+        """Whether the tendons carry no more than in the experiments: a scale that is wrong shows in all but its own."""
+        return bool(self._load[1].max() >= self._b.load_low)
 
     @property
     def judging(self) -> bool:
@@ -179,7 +185,7 @@ class MotorCharts:
         )
         at = (2 + len(SCALES)) * n
         self._functions.supervised_levels(
-            self._levels, self._rules, f.past, f.x, self._rest, self._scales, self.scores[at:]
+            self._levels, self._rules, f.past, f.x, self._rest, self._scales, self._load, self.scores[at:]
         )
         found = self.charts.step(self.scores)
         if found < 0:

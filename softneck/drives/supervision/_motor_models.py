@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.runtime import load_functions
 from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Row, Rows
-from ._motor_charts import MotorFeatures, MotorRules
+from ._motor_charts import RUNTIME, MotorFeatures, MotorRules
 
 Flags = NDArray[np.bool_]
 
@@ -97,31 +98,55 @@ def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most:
 
 
 def level_rows(
-    known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector, *, seldom: float
-) -> tuple[Rows, Row, Row]:
-    """Fit each tension by the motors' places and the other tensions, where all may be believed; not for one motor.
+    known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector, rules: MotorRules
+) -> tuple[Rows, tuple[float, float], Rows, Row]:
+    """Fit each tension by the motors' places and what all carry, where all may be believed; not for one motor.
 
-    Return coefficients, variance, and the mean of the others below which they are in the part `seldom` of the cycles.
+    Return coefficients of the others' mean by positions, least and most that all were off by together, coefficients of
+    each tension, and its variance. What the others are off by is averaged: in least squares the friction that they have
+    at the moment would make any payload look smaller than it is.
     """
     n = len(slack)
-    rows, spread, low = [], [], []
+    if n < 2:
+        return ((0.0, 0.0),), (0.0, 0.0), (row_of(np.zeros(known[0][1].place.shape[2] + 2)),), (1.0,)
+    good = [_believed(motion, f, slack, top, reach, rules) for motion, f in known]
+    places = [np.column_stack([motion.positions, np.ones(len(motion.due))])[kept]
+              for (motion, _), kept in zip(known, good, strict=True)]  # fmt: skip
+    others = [
+        (motion.tensions @ (1.0 - np.eye(n)) / (n - 1.0))[kept] for (motion, _), kept in zip(known, good, strict=True)
+    ]
+    told = sum(map(len, others)) > 10 * (n + 1)
+    load = np.array([_robust(np.concatenate(places), column) if told else np.zeros(n + 1)
+                     for column in np.concatenate(others).T])  # fmt: skip
+    carried = [_carried(y - X @ load.T, rules.carries) for X, y in zip(places, others, strict=True)]
+    rows, spread = [], []
     for i in range(n):
-        X, y = [], []
-        for motion, f in known:
-            T = motion.tensions
-            others = np.delete(T, i, axis=1).mean(axis=1) if n > 1 else np.zeros(len(T))
-            x = np.column_stack([f.place[:, i], others, np.ones(len(T))])
-            good = ((slack <= T) & ((1.0 - MotorRules().near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
-            good &= np.isfinite(x).all(axis=1)
-            X.append(x[good])
-            y.append(T[good, i])
-        regressors, target = np.concatenate(X), np.concatenate(y)
-        told = n > 1 and len(target) > 10 * regressors.shape[1]
-        theta = _robust(regressors, target) if told else np.zeros(regressors.shape[1])
+        X = np.concatenate([np.column_stack([f.place[kept, i], loads[:, i], np.ones(len(loads))])
+                            for (_, f), kept, loads in zip(known, good, carried, strict=True)])  # fmt: skip
+        y = np.concatenate([motion.tensions[kept, i] for (motion, _), kept in zip(known, good, strict=True)])
+        theta = _robust(X, y) if len(y) > 10 * X.shape[1] else np.zeros(X.shape[1])
         rows.append(row_of(theta))
-        spread.append(float(np.var(target - regressors @ theta)) if told else 1.0)
-        low.append(float(np.quantile(regressors[:, -2], seldom)) if told else 0.0)
-    return tuple(rows), tuple(spread), tuple(low)
+        spread.append(float(np.var(y - X @ theta)) if theta.any() else 1.0)
+    # Of the first cycles friction has not averaged out.
+    seen = np.concatenate([[0.0], *(loads.max(axis=1)[round(0.1 * rules.carries) :] for loads in carried)])
+    return tuple(row_of(row) for row in load), (float(seen.min()), float(seen.max())), tuple(rows), tuple(spread)
+
+
+def _believed(motion: Motion, f: Features, slack: Vector, top: Vector, reach: Vector, rules: MotorRules) -> Flags:
+    """Return the cycles in which no tendon may hang, no motor is near its limit, and none far behind."""
+    T = motion.tensions
+    good = ((slack <= T) & ((1.0 - rules.near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
+    return np.asarray(good & np.isfinite(f.place).all(axis=(1, 2)))
+
+
+def _carried(off: Matrix, memory: float) -> Matrix:
+    """Return the mean of the last cycles, as the chart takes it."""
+    functions, load, counted = load_functions(RUNTIME), np.zeros(off.shape[1]), np.zeros(1)
+    rows = np.empty_like(off)
+    for k, row in enumerate(off):
+        functions.supervised_load(row, load, counted, memory)
+        rows[k] = load
+    return rows
 
 
 def _robust(X: Matrix, y: Vector) -> Vector:

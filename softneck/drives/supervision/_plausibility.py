@@ -19,6 +19,8 @@ _RATE_LEAST = 0.2
 _RIPE = 0.1
 # A current may be the first to show what is not its scale.
 _RIPE_CURRENT = 0.3
+# The tilt's model rests, or holds, for so long until it counts as said, or as over [s].
+_RESTS = 5.0
 # Or until it is so much likelier than the next, as a logarithm.
 _LEAD = 20.0
 
@@ -42,6 +44,7 @@ class Plausibility:
 
     Attributes:
         motors, tilt, tracking: the charts; the last where there is a loop to compare with.
+        rests: why the tilt is not compared, in the sample in which that is to be said; else "".
     """
 
     def __init__(self, baseline: Baseline, rules: MotorRules | None = None) -> None:
@@ -53,6 +56,7 @@ class Plausibility:
         step, known = baseline.cycle * baseline.sample_cycles, baseline.tracking
         self.tracking = TrackingCharts(known, baseline.outputs, step) if known.weights else None
         self._missing = 0.0
+        self.rests, self._why, self._rested, self._said_so = "", "", 0, False
         self._now = 0
         self._since: int | None = None
         self._current: Finding | None = None
@@ -96,7 +100,9 @@ class Plausibility:
             return None
         taut = self.motors.features.taut(self._gains)
         tilt = None if values is None else np.array(values)
-        if self.tilt.step(np.array(positions), taut, tilt, np.array(rates)) >= 0 and self._since is None:
+        beyond = self.tilt.step(np.array(positions), taut, tilt, np.array(rates), known_load=self.motors.known_load)
+        self._count_rest()
+        if beyond >= 0 and self._since is None:
             self._since = self._now
         if self.tracking is not None and self.tracking.step(reference, values, valid=self.tilt.valid) >= 0:
             off = ", ".join(f"{value:.1f}" for value in np.degrees(self.tracking.residual))
@@ -105,15 +111,26 @@ class Plausibility:
             self._since = self._now if self._since is None else self._since
         return None
 
+    def _count_rest(self) -> None:
+        """Say it once where the tilt's model rested for long, and again only after it held for as long."""
+        self.rests, self._why = "", self.tilt.off or self._why
+        most = round(_RESTS / (self._b.cycle * self._b.sample_cycles))
+        self._rested = max(0, self._rested - 1) if self.tilt.valid else min(most, self._rested + 1)
+        if self._rested == most and not self._said_so:
+            self.rests, self._said_so = self._why, True
+        elif not self._rested:
+            self._said_so = False
+
     def _ripe(self) -> Finding | None:
         """Return what explains best what was seen since the first chart spoke, once that is long enough ago."""
         if self._since is None:
             return None
         found, lead = self.tilt.likeliest()
         waited = (self._now - self._since) * self._b.cycle + 1e-9
-        if lead < _LEAD and waited < (_RIPE if found >= 0 else _RIPE_CURRENT):
-            return None
         current = self._current
+        alone = found < 0 and current is not None and current.name == "current_scale"
+        if lead < _LEAD and waited < (_RIPE_CURRENT if alone else _RIPE):
+            return None
         self._since = self._current = None
         if found < 0:
             return current

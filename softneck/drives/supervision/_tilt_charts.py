@@ -123,7 +123,7 @@ class TiltCharts:
     Attributes:
         scores: of the last sample, in the order of `tilt_names`.
         charts: their sums.
-        valid: whether the model is on known ground.
+        valid: whether the model is on known ground; off: why not in this sample, "" where it is.
         residual: tilt less model [rad]; gyro: tilt against its rates.
         bend: second difference of the residual [rad].
     """
@@ -163,7 +163,7 @@ class TiltCharts:
         self._explained, self._information = np.zeros(self._hypotheses), np.zeros(self._hypotheses)
         self._running, self._wait = False, _SETTLED * b.lags[-1]
         self.residual = self.bend = np.zeros(m)
-        self.valid = False
+        self.valid, self.off = False, ""
 
     def begin(self) -> None:
         """Take the mean of the last samples at rest for where tilt and model begin."""
@@ -203,7 +203,9 @@ class TiltCharts:
             found = names.index("sensor_drift") + 2 * self.names[found][1] + int(self.names[found][2] < 0.0)
         return found, lead
 
-    def step(self, positions: Vector, taut: Vector, values: Vector | None, rates: Vector) -> int:
+    def step(
+        self, positions: Vector, taut: Vector, values: Vector | None, rates: Vector, *, known_load: bool = True
+    ) -> int:
         """Take one sample; return the number of a chart beyond its threshold, -1 for none.
 
         Args:
@@ -211,11 +213,12 @@ class TiltCharts:
             taut: of the tendons, friction apart (motors,) [N].
             values: of the tilt (outputs,) [rad]; None where it did not come.
             rates: of its gyro (outputs,) [rad/s]; NaN without one.
+            known_load: whether the tendons carry what they did in the experiments.
         """
         parts = self._model.step(positions)
         angle = parts.sum(axis=0)
         self._angles.append(angle)
-        self._ground(positions, taut)
+        self._ground(positions, taut, known_load)
         turned = self.gyro.take(values, rates)
         if values is None:
             return -1
@@ -232,9 +235,16 @@ class TiltCharts:
 
     # -- parts --------------------------------------------------------------------------------------------------
 
-    def _ground(self, positions: Vector, taut: Vector) -> None:
-        """Tendons that hang, or motors beyond where they were seen: the tilt is not what the model says."""
-        out = bool((taut < self._slack).any() or (positions < self._low).any() or (positions > self._high).any())
+    def _ground(self, positions: Vector, taut: Vector, known_load: bool) -> None:
+        """Tendons that hang or carry more, motors beyond where they were seen: the tilt is not what the model says."""
+        self.off = ""
+        if not known_load:
+            self.off = "more is carried than in the experiments"
+        elif (taut < self._slack).any():
+            self.off = "a tendon may hang"
+        elif (positions < self._low).any() or (positions > self._high).any():
+            self.off = "a motor is beyond its range in the experiments"
+        out = bool(self.off)
         # And so long after as the model looks back, and again for the rest that it begins anew from.
         self._wait = _SETTLED * self._b.lags[-1] if out else max(0, self._wait - 1)
         before, self.valid = self.valid, self._wait == 0

@@ -166,6 +166,12 @@ def test_where_tendons_hang_the_tilt_is_not_judged() -> None:
         bench.step()
         known.append(charts.tilt.valid)
     assert not any(known)
+    assert not bench.master.counts["not_watched"]
+    bench.pass_time(1.5)
+    # Said once, after 5 s, and no fault.
+    assert bench.master.counts["not_watched"] == 1
+    assert [e.detail for e in bench.master.events if e.name == "not_watched"] == ["a tendon may hang"]
+    assert bench.phase is Phase.RUNNING
     assert np.all(charts.tilt.scores[: charts.tilt._hypotheses] == 0.0)
 
 
@@ -191,7 +197,7 @@ def test_a_baseline_comes_back_and_a_damaged_one_is_refused(tmp_path: Path) -> N
     for broken, match in (
         (text.replace('"softneck supervision"', '"x"'), "is not what"),
         (text.replace('"drive"', '"drove"'), "missing or unknown"),
-        (text.replace('"version": 2', '"version": 1'), "record it anew"),
+        (text.replace('"version": 3', '"version": 2'), "record it anew"),
         (re.sub(r'("noise": \[\s*)[^,\s]+', r"\1NaN", text), "is NaN"),
         (text[:100], "damaged"),
         ("[]", "is not what"),
