@@ -6,8 +6,9 @@ angle. Steps of 10 deg of pitch and of roll; a circle of 12 deg at 1.2 rad/s, rm
 turn, without and with preview. `python benchmarks/leave_one_neck_out.py mpc.taut_pole` (and the other `mpc.` settings)
 chooses by the same runs. With `payload_tautness` the observer is over a `greybox` of the same recordings and estimates
 the payload, which `--told` tells instead. With `--observer` it is so in any case, and the design knows it
-(`softneck design mpc FAMILY --observer OBSERVER`). `--inclined` prints what is left to schedule over the inclination:
-steps of 5 deg of pitch from 0, 5, 10 and 15 deg. Families and models are kept in `build/mpc_following`.
+(`softneck design mpc FAMILY --observer OBSERVER`); `--late` tells it how late the sensor is. `--inclined` prints what
+is left to schedule over the inclination: steps of 5 deg of pitch from 0, 5, 10 and 15 deg. Families and models are kept
+in `build/mpc_following`.
 """
 
 from __future__ import annotations
@@ -60,6 +61,7 @@ class Specimen:
         recorded: its recordings, one for each payload.
         family: what they tell.
         observer: of the loop.
+        late: how late the sensor is said to be [s]; None: as the robot's file has it.
     """
 
     name: str
@@ -67,6 +69,7 @@ class Specimen:
     recorded: Callable[[], list[Recording]]
     family: Family
     observer: Block
+    late: float | None = None
 
     def watched(self, controller: MpcController) -> Block:
         """Return the observer of a loop: one that tells the payload to a controller that asks for it."""
@@ -78,7 +81,8 @@ class Specimen:
         file = OUT / f"{self.name}-greybox.npz"
         if not file.exists():
             GreyBox().fit(self.recorded()).save(file, force=True)
-        return KalmanSettings().design(load(file))
+        settings = KalmanSettings() if self.late is None else KalmanSettings(sensor_delay=self.late)
+        return settings.design(load(file))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -243,6 +247,7 @@ def main() -> None:
     parser.add_argument("--necks", nargs="+", choices=everywhere, default=everywhere, help=", ".join(everywhere))
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings other than the defaults")
     parser.add_argument("--observer", action="store_true", help="a design that knows its observer, over a `greybox`")
+    parser.add_argument("--late", type=float, help="with --observer: how late the sensor is said to be [s]")
     parser.add_argument("--told", action="store_true", help="tell the payload, in the place of an estimate")
     parser.add_argument("--inclined", action="store_true", help="steps of 5 deg from several inclinations instead")
     parser.add_argument("--seed", type=int, default=0, help="of the sensor's noise (0)")
@@ -251,26 +256,23 @@ def main() -> None:
         key: None if value == "None" else float(value) for key, value in (item.split("=") for item in options.set)
     }
     settings = MpcSettings(**changed)  # type: ignore[arg-type]
+    heads = ("neck", "kg", "overshoot [%]", "rise [s]", "steady rms [deg]", "circle [deg]", "with preview [deg]")
     if options.inclined:
-        print("| neck | kg | " + " | ".join(f"from {least:g} deg: overshoot [%], rise [s]" for least in INCLINATIONS)
-              + " |\n" + "|---" * (2 + len(INCLINATIONS)) + "|")  # fmt: skip
-        for name, payload in itertools.product(options.necks, JUDGED):
-            on = neck(name)
-            cells = [f"{over:.0f}, {rise:.2f}" for over, rise in inclined(on, settings.design(on.family), payload)]
-            print(f"| `{name}` | {payload:g} | " + " | ".join(cells) + " |", flush=True)
-        return
-    print("| neck | kg | overshoot [%] | rise [s] | steady rms [deg] | circle [deg] | with preview [deg] |")
-    print("|---|---|---|---|---|---|---|")
+        heads = ("neck", "kg", *(f"from {least:g} deg: overshoot [%], rise [s]" for least in INCLINATIONS))
+    print("| " + " | ".join(heads) + " |\n" + "|---" * len(heads) + "|")
     for name in options.necks:
-        on = neck(name)
+        on = replace(neck(name), late=options.late)
         asked = settings
         if options.observer:
             eyes = on.estimates_payload()
             on, asked = replace(on, observer=eyes.block()), settings.over(eyes)
         for payload in JUDGED:
-            f = followed(on, told(asked, payload) if options.told else asked, payload, options.seed)
-            print(f"| `{name}` | {payload:g} | {f.overshoot:.0f} | {f.rise:.2f} | {f.steady:.2f} | {f.circle:.1f} | "
-                  f"{f.ahead:.1f} |", flush=True)  # fmt: skip
+            if options.inclined:
+                cells = [f"{over:.0f}, {rise:.2f}" for over, rise in inclined(on, asked.design(on.family), payload)]
+            else:
+                f = followed(on, told(asked, payload) if options.told else asked, payload, options.seed)
+                cells = [f"{f.overshoot:.0f}", f"{f.rise:.2f}", f"{f.steady:.2f}", f"{f.circle:.1f}", f"{f.ahead:.1f}"]
+            print(f"| `{name}` | {payload:g} | " + " | ".join(cells) + " |", flush=True)
 
 
 if __name__ == "__main__":

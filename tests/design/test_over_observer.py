@@ -71,6 +71,15 @@ def test_a_linear_observer_says_its_look_ahead_alone() -> None:
     assert MpcSettings().over(KalmanSettings(sensor_delay=0.04).design(model)).look_ahead == pytest.approx(0.04)
 
 
+def test_a_late_sensor_takes_no_more_than_half_of_the_least_delay(model: Model) -> None:
+    late = KalmanSettings(sensor_delay=0.08).design(model)
+    assert MpcSettings().over(late).look_ahead == pytest.approx(0.05)
+    assert MpcSettings(least_delay=0.2).over(late).look_ahead == pytest.approx(0.08)
+    assert MpcSettings(look_ahead=0.08).over(late).look_ahead == 0.08
+    # The nonlinear plan is over a model that has its dead time, not over one that hides it.
+    assert NmpcSettings().over(late).look_ahead == pytest.approx(0.08)
+
+
 def test_what_is_no_observer_is_refused(model: Model) -> None:
     with pytest.raises(SettingsError, match="an observer is needed, of `softneck observer`; got"):
         MpcSettings().over(model)

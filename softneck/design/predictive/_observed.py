@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -19,6 +20,9 @@ _TAUT = 0.9
 # Co-contractions that are tried, from rest on [rad].
 _STEP, _MOST = 0.25, 4.0
 
+# Part of `least_delay` that is a sensor's at most.
+_BEHIND = 0.5
+
 S = TypeVar("S", bound=Any)
 
 
@@ -27,7 +31,8 @@ def over(settings: S, observer: Any) -> S:
 
     Args:
         settings: of `mpc` or `nmpc`.
-        observer: whose `lead` becomes `look_ahead`; if it tells a payload, its model says `payload_tautness`.
+        observer: whose `lead` becomes `look_ahead`, of `mpc` at most half of `least_delay`; if it tells a payload, its
+            model says `payload_tautness`.
 
     Raises:
         SettingsError: what is no observer.
@@ -36,7 +41,8 @@ def over(settings: S, observer: Any) -> S:
         raise SettingsError(f"an observer is needed, of `softneck observer`; got {type(observer).__name__}.")
     found: dict[str, float] = {}
     if isinstance(settings.look_ahead, NeckDefault):
-        found["look_ahead"] = observer.lead
+        # What `least_delay` adds stands for a dead time that recordings hide, and no sensor is later for that.
+        found["look_ahead"] = min(observer.lead, _BEHIND * getattr(settings, "least_delay", math.inf))
     told, wished = getattr(observer, "payloads", None), settings.minimum_tautness is not None
     asks = isinstance(getattr(settings, "payload_tautness", None), NeckDefault)
     if asks and wished and told is not None and told[1] > 0.0:
