@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from softneck.drives.supervision._calibrate import _Samples, _tilt_noise
 from softneck.drives.supervision._charts_runtime import (
     SUPERVISED_NOT,
     supervised_levels,
@@ -14,7 +15,7 @@ from softneck.drives.supervision._charts_runtime import (
     supervised_motors,
 )
 from softneck.drives.supervision._motor_charts import SCALES, MotorCharts, MotorRules
-from softneck.drives.supervision._tilt_charts import GyroLevel
+from softneck.drives.supervision._tilt_charts import GyroLevel, TiltCharts
 
 from ..plausible import baseline
 
@@ -190,3 +191,28 @@ def test_a_drift_does_not_become_the_gyros_bias() -> None:
         assert known
         # 2 s of drift, of which a sixth of the time's part leaks away: 6 (1 - e^(-2/6)) = 1.70 s are left.
         assert np.degrees(level.level[0]) == pytest.approx(expected * 0.5 * 1.70, abs=0.02)
+
+
+def test_the_likeliest_fault_leads_the_next_of_another_name() -> None:
+    """One gear or the other is the same news: both must not keep the supervisor waiting."""
+    charts = TiltCharts(baseline())
+    names = [name for name, _, _ in charts.names]
+    stuck = names.index("sensor_stuck")
+    assert names[0] == names[1] == "gear_wrong"
+    charts.charts.sums[[0, 1, stuck]] = 1.1 * charts.charts.thresholds[[0, 1, stuck]]
+    # Each of its own size: a gain of half of what it explains.
+    charts._explained[[0, 1, stuck]] = charts._information[[0, 1, stuck]] = 100.0, 90.0, 40.0
+    assert charts.likeliest() == (0, pytest.approx(30.0))
+
+
+def test_the_variance_of_the_tilt_is_that_of_what_the_whitening_leaves() -> None:
+    rng, rows, lags = np.random.default_rng(0), 4000, (0, 1, 2)
+    noise = 0.01 * rng.standard_normal((rows, 2))
+    correlated = noise.copy()
+    for k in range(1, rows):
+        correlated[k] += 0.5 * correlated[k - 1]
+    all_good = np.ones(rows, dtype=bool)
+    samples = [_Samples(np.zeros((rows, N)), correlated, np.zeros((rows, 2)), all_good, all_good)]
+    _, spread = _tilt_noise(samples, [correlated], [all_good], np.zeros((2, len(lags) * N)), lags, N)
+    # Of 4,000 rows a variance is known to 2.2 %; four times that.
+    np.testing.assert_allclose([row[0] for row in spread], 1e-4, rtol=0.09)
