@@ -73,7 +73,7 @@ def faults(seeds: int, rows: list[str]) -> None:
         left = {name: ROWS[name] for name in rows if (name, seed) not in known}
         for name, found in play_all(left, seed, payload=payload) if left else ():
             add(path, {"row": name, "seed": seed, "payload": payload, "event": found.event, "after": found.after,
-                       "beyond": found.beyond, "excited": found.excited})  # fmt: skip
+                       "beyond": found.beyond, "excited": found.excited, "showed": found.showed})  # fmt: skip
 
 
 def undisturbed(hours: float, *, judge: bool = True) -> None:
@@ -154,6 +154,14 @@ def report() -> None:
         print(f"{name:36}{len(runs):6}{len(excited):9}{len(found):7}{len(soon):9}{least(len(soon), len(excited)):>8}"
               f"{len(named):7}{len(own):6}{len(near):9}{least(len(near), len(found)):>8}"
               f"{np.median(after):12.2f}{np.quantile(after, 0.95):10.2f}")  # fmt: skip
+    for name, row in ROWS.items():
+        runs = [item for item in items if item["row"] == name and row.shows]
+        if runs and row.shows:
+            shown = [item for item in runs if item["event"] or item["showed"] > row.limit]
+            soon = sum(item["event"] != "" and item["showed"] <= row.limit + 1e-6 for item in shown)
+            what = {"own": "of its own part of the tilt", "apart": "off the path without it"}[row.shows[0]]
+            print(f"  {name}, {row.limit:g} s after {math.degrees(row.shows[1]):.1f} deg {what}: "
+                  f"{soon} of {len(shown)}, at least {least(soon, len(shown))}")  # fmt: skip
     told_apart(items)
     calm = list(done(FOLDER / "undisturbed.jsonl"))
     known = max(PAYLOADS)

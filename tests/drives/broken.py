@@ -16,6 +16,7 @@ from softneck.drives.master import Phase
 from softneck.drives.master._measured import Measurement
 from softneck.drives.simulated._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_ZERO
 from softneck.drives.supervision._baseline import Baseline
+from softneck.drives.supervision._tilt_charts import TiltModel
 
 from .bench import TS, Bench, T
 from .direct import DirectBus
@@ -107,6 +108,8 @@ class Row:
         early: the fault is there before the run begins.
         gyro: whether the sensor has one.
         loop: whether it is a fault of loops only.
+        shows: where that excites less than the fault is, when it must show: "own" part of the tilt by motor 1, or how
+            far the neck is "apart" from its path without the fault, is so large [rad].
     """
 
     breaks: Callable[[Bench], object]
@@ -116,11 +119,15 @@ class Row:
     early: bool = False
     gyro: bool = True
     loop: bool = False
+    shows: tuple[str, float] | None = None
 
 
 DEG = math.radians(1.0)
 AT_ONCE, BY_TILT, BY_PULLS = ("", 0.0), ("tilt", 2 * DEG), ("pulls", 25.0)
 BY_WAY = ("way", 2 * DEG)
+# Half of the 3 deg that a fault may lead the neck; and as much beside the 0.6 deg of slow error that the tracking of
+# the baseline takes for none.
+OWN, APART = ("own", 1.5 * DEG), ("apart", 2.1 * DEG)
 
 
 def reversed_(bench: Bench) -> None:
@@ -141,8 +148,8 @@ ROWS: dict[str, Row] = {
     "ten bad TPDO frames": Row(misreads, ("position_bad",), AT_ONCE),
     "peak current x 2": Row(lambda b: peak_current(b, 2.0), ("current_scale",), BY_PULLS),
     "peak current x 1/2": Row(lambda b: peak_current(b, 0.5), ("current_scale", "following", "motor_jammed"), BY_PULLS),
-    "gear x 2": Row(lambda b: gear(b, 2.0), ("gear_wrong", "current_scale"), BY_TILT, early=True),
-    "gear x 1/2": Row(lambda b: gear(b, 0.5), ("gear_wrong", "current_scale"), BY_TILT, early=True),
+    "gear x 2": Row(lambda b: gear(b, 2.0), ("gear_wrong", "current_scale"), BY_TILT, early=True, shows=OWN),
+    "gear x 1/2": Row(lambda b: gear(b, 0.5), ("gear_wrong", "current_scale"), BY_TILT, early=True, shows=OWN),
     "sensor stuck, 0.005 deg of noise": Row(
         lambda b: stuck(b, 0.005 * DEG), ("sensor_noise", "sensor_stuck", "sensor_drift"), AT_ONCE
     ),
@@ -158,7 +165,7 @@ ROWS: dict[str, Row] = {
         lambda b: drifts(b, 0.5 * DEG), ("tilt_unexplained", "sensor_stuck"), AT_ONCE, limit=4.0, gyro=False
     ),
     # Of loops: an open one has no reference to follow.
-    "controller freezes": Row(freezes, ("astray",), BY_WAY, loop=True),
+    "controller freezes": Row(freezes, ("astray",), BY_WAY, loop=True, shows=APART),
 }
 
 
@@ -170,12 +177,14 @@ class Outcome:
         event: that ended it, "" for none; after: it was excited [s].
         beyond: farthest that the true tilt went from the path without the fault until then [rad].
         excited: whether the run excited the fault at all.
+        showed: by `Row.shows`, so long before the event, before the end without one [s]; -inf: not yet.
     """
 
     event: str
     after: float
     beyond: float
     excited: bool
+    showed: float = -math.inf
 
 
 NOTHING = Outcome("", math.inf, 0.0, False)
@@ -276,14 +285,29 @@ def _broken(row: Row, bench: Bench, calm: Calm, k: int, most: float) -> Outcome:
     first, last = k, k + round(most / T)
     excited = _excited(row, calm, first)
     beyond = 0.0
+    what, enough = row.shows or ("", math.inf)
+    own, shown = _own_part(calm, first) if what == "own" else np.zeros(last), last
     while bench.phase is Phase.RUNNING and k < last:
         bench.step()
-        beyond = max(beyond, float(np.hypot(*(tilt_of(bench) - calm.tilt[k]))))
+        apart = float(np.hypot(*(tilt_of(bench) - calm.tilt[k])))
+        beyond = max(beyond, apart)
+        if (own[k] if what == "own" else apart) > enough:
+            shown = min(shown, k)
         k += 1
+    showed = (k - 1 - shown) * T if shown < last else -math.inf
     fault = bench.master.supervisor.fault
     if fault is None:
-        return Outcome("", math.inf, beyond, excited < last)
-    return Outcome(fault.name, (k - 1 - min(excited, k - 1)) * T, beyond, excited < k)
+        return Outcome("", math.inf, beyond, excited < last, showed)
+    return Outcome(fault.name, (k - 1 - min(excited, k - 1)) * T, beyond, excited < k, showed)
+
+
+def _own_part(calm: Calm, first: int) -> np.ndarray:
+    """Return what motor 1 did of the output it moves most since cycle `first` (time,) [rad]."""
+    model = baseline()
+    walk = TiltModel(np.array(model.tilt), model.lags, model.motors)
+    parts = np.array([walk.step(p)[0] for p in calm.positions[:: model.sample_cycles]])
+    parts = np.repeat(parts, model.sample_cycles, axis=0)[: len(calm.positions)]
+    return np.abs(parts - parts[first]).max(axis=1)
 
 
 def _excited(row: Row, calm: Calm, first: int) -> int:
