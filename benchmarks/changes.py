@@ -1,6 +1,6 @@
 """How soon a change detector over a `greybox` finds a payload, how often it cries wolf, and how it was chosen.
 
-`python benchmarks/changes.py choose|found|alarms|curve [--several] [--necks NECK...] [--hours H]`
+`python benchmarks/changes.py choose|found|alarms|curve|oracle [--several] [--necks NECK...] [--hours H]`
 
 Models are of 140 s of Eq. 22; thresholds of some 200 s of other motion of the same neck. `choose` leaves each neck out
 in turn: seconds until a payload put on at 60 s is found during the paper's rotation (60 where it is not), and as many
@@ -9,7 +9,9 @@ at 14 deg. `alarms` counts false alarms over independent minutes of motion; it g
 (`build/changes`). `curve` prints both for several budgets of false alarms. With `--several` the model is one of 0, 0.5
 and 1 kg, so that the detector tells the payload: found is then `changed`, or a payload of more than 0.16 kg (half of
 the least that is put on) where there was less before. `choose` then adds the seconds until what is told stays within
-0.16 kg, and takes another 12 minutes of motion than `alarms`.
+0.16 kg, and takes another 12 minutes of motion than `alarms`. `oracle` puts the true neck in the place of the model,
+with and without the payload, sensor noise alone between them: what anyone could find, the rms shift that the payload
+makes in the 10 s after it was put on, and the rms error there of the model of several payloads without one.
 """
 
 from __future__ import annotations
@@ -201,10 +203,34 @@ def alarms(necks: list[str], hours: float, *, several: bool) -> None:
         print(f"{neck:14}{sum(done)} false alarms in {len(done) / 60.0:.2f} h of motion", flush=True)
 
 
+def oracle(necks: list[str]) -> None:
+    """Print how soon a cumulative sum of the true likelihood ratio finds a payload, and what hides it from a model."""
+    hours, after = ChangeSettings().hours, slice(round(PUT_ON / TS), round((PUT_ON + 10.0) / TS))
+    print(f"{'found after [s]; shift [deg]':30}" + "".join(f"{kg:>16g} kg" for kg in LOADS) + f"{'model misses':>18}")
+    for neck in necks:
+        P, still = rotation(80.0), ForeignNeck(name=neck, seed=1, noise=False)
+        without = record_under(P, still, np.zeros(len(P))).outputs
+        quiet = loaded(neck, P, 0.0)
+        noise = np.std(quiet.outputs - without, axis=0)
+        cells = []
+        for payload in LOADS:
+            bears = np.where(np.arange(len(P)) * TS >= PUT_ON, payload, 0.0)
+            apart = record_under(P, still, bears).outputs - without
+            missed = loaded(neck, P, payload).outputs - without
+            # Of each sample: ln p(y | payload)/p(y | none), summed from its least on.
+            total = np.concatenate([[0.0], np.cumsum(((missed - 0.5 * apart) * apart / noise**2).sum(axis=1))])
+            found = np.flatnonzero(total - np.minimum.accumulate(total) > np.log(3600.0 * hours / TS))
+            shift = np.degrees(np.sqrt(np.mean(apart[after] ** 2)))
+            cells.append(f"{found[0] * TS - PUT_ON:.2f}; {shift:.2f}" if found.size else f"none; {shift:.2f}")
+        off = (learnt(neck, several=True)[0].simulate(quiet)[:, :2] - quiet.outputs)[after]
+        misses = np.degrees(np.sqrt(np.mean(off**2)))
+        print(f"{neck:30}" + "".join(f"{cell:>19}" for cell in cells) + f"{misses:14.2f} deg", flush=True)  # fmt: skip
+
+
 def main() -> None:
     """Print what was asked for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("what", choices=["choose", "found", "alarms", "curve"])
+    parser.add_argument("what", choices=["choose", "found", "alarms", "curve", "oracle"])
     parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=list(CHOOSING))
     parser.add_argument("--hours", type=float, default=30.0, help="of motion of each neck")
     parser.add_argument("--several", action="store_true", help="a model of several payloads, which is told as well")
@@ -213,6 +239,8 @@ def main() -> None:
         choose(asked.necks, several=asked.several)
     elif asked.what == "found":
         found(asked.necks, several=asked.several)
+    elif asked.what == "oracle":
+        oracle(asked.necks)
     elif asked.what == "curve":
         curve(asked.necks, asked.hours, several=asked.several)
     else:

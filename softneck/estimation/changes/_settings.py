@@ -50,7 +50,7 @@ class ChangeSettings:
     clip: float = 1.5
     hours: float = 300.0
     memory: float = 10.0
-    payload_memory: float = 1.0
+    payload_memory: float = 0.5
     payload_sight: float = 5.0
     order: str = "sequential"
     seed: int = 0

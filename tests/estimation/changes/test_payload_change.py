@@ -64,8 +64,8 @@ def test_a_payload_put_on_or_taken_off_is_told(
     borne = np.where(np.arange(1500) * TS < 12.0, before, after)
     told = detector.watch(moved(model, "rotation", borne, 7), payload_start=before)
     assert (told[:600, 3] == before).all()
-    # The memory of a second holds some of the old payload for a while: after five of it less than a hundredth. A copy
-    # stands every 0.25 kg.
+    # The memory of half a second holds some of the old payload for a while: after five of it less than a hundredth. A
+    # copy stands every 0.25 kg.
     np.testing.assert_allclose(told[850:, 3], after, atol=0.125)
     assert not told[:, 0].any()
 
