@@ -1,10 +1,12 @@
 """Choose how large a hole in the lengths of a clock's steps tells a gap from jitter, by leaving out clocks.
 
-`python benchmarks/clock_gaps.py [--seeds N]`
+`python benchmarks/clock_gaps.py [--seeds N] [--models]`
 
 Stand-in clocks that lose nothing, that pause (5 to 60 rows, six times) and that lose rows one by one, of 300 and 3,000
 rows. A value's cost for a clock: the times that it splits what lost nothing, and the share of lost rows that it
 bridges. Each clock is judged by the value that is best for all others; the last line is the value that is best for all.
+`--models`: what models are worth (`oe` and `rls`, free run on another recording) where a logger drops single rows of
+80 s, one in so many, and these are missed samples, or split the run; minutes.
 """
 
 from __future__ import annotations
@@ -15,7 +17,11 @@ from collections.abc import Callable
 import numpy as np
 
 from softneck.core import Vector
-from softneck.signals.recording._resampling import Samples, gaps
+from softneck.identification import OutputError, Rls, validate
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import Recording, signal
+from softneck.signals.importing._clocks import filled
+from softneck.signals.recording._resampling import Samples, gaps, split_at_gaps
 
 HOLES = (1.02, 1.05, 1.1, 1.15, 1.2, 1.3, 1.5)
 SIZES = (300, 3000)
@@ -72,11 +78,36 @@ def _gaps(time: Vector, hole: float) -> np.ndarray:
     return gaps(Samples(time, np.zeros(time.size, dtype=np.int64), {}), hole)[0]
 
 
+def models(seeds: int) -> None:
+    """Print the fits of models of filled and of split recordings."""
+    neck = VirtualNeck(NeckParameters.paper())
+    whole, other = (record(signal("mixed", duration=t, seed=s), neck, seed=s) for t, s in ((80.0, 1), (40.0, 7)))
+    print("| one row lost in | of missed samples, oe/rls [%] | of split runs |\n|---|---|---|")
+    for rows in (15, 50, 150):
+        fits = []
+        for seed in range(seeds):
+            there = np.ones(len(whole), dtype=bool)
+            there[np.random.default_rng(seed).choice(np.arange(1, len(whole) - 1), len(whole) // rows)] = False
+            logged = Samples(whole.time, whole.run, whole.channels).rows(there)
+            for found in (filled(logged, whole.robot, always=True)[0], split_at_gaps(logged)[0]):
+                known = Recording(found.time, whole.sample_time, found.channels, found.run, whole.robot)
+                for kind in (OutputError, Rls):
+                    judged = validate(kind().fit(known), other, horizons=("inf",)).fits["inf"]
+                    fits.append(min(fit for fit in judged.values() if fit is not None))
+        missed, split = np.array(fits).reshape(seeds, 2, 2).mean(axis=0)
+        print(f"| {rows} | {missed[0]:.1f}/{missed[1]:.1f} | {split[0]:.1f}/{split[1]:.1f} |", flush=True)
+
+
 def main() -> None:
     """Print a row a clock, and the choice."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
-    seeds = parser.parse_args().seeds
+    parser.add_argument("--models", action="store_true")
+    asked = parser.parse_args()
+    seeds = asked.seeds
+    if asked.models:
+        models(seeds)
+        return
     table = {name: [cost(clock, hole, seeds) for hole in HOLES] for name, clock in clocks().items()}
     total = {name: np.array(row).sum(axis=1) for name, row in table.items()}
     print("| clock | best for the others | splits of a whole log | pauses bridged | lost rows bridged |")

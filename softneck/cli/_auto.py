@@ -13,10 +13,10 @@ from softneck.core import CheckFailedError, DataError, SettingsError, refuse_exi
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
-from .shared._validate_table import useless, with_fit
+from .shared._validate_table import left_out, useless, with_fit
 
 if TYPE_CHECKING:
-    from softneck.identification import Choice, Model
+    from softneck.identification import Choice, Model, Validation
     from softneck.identification.selection._kind_trial import KindTrial
     from softneck.robot import Robot
     from softneck.signals import Recording
@@ -92,21 +92,20 @@ def identify_auto(
         facts = _facts(choice, path)
         kept = {f"{name}_model": str(file) if file in saved else None for name, file in beside.items()}
         print_json({**facts, **kept, "refit": refit_all})
-        _refuse_useless(path, why)
+        _refuse_useless(path, why, judged)
         return
     print_table(_title(parts[0].robot), _HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
     for remark in [*said, *choice.remarks, *([REFITTED] if refit_all else [])]:
         note(remark)
-    _refuse_useless(path, why)
+    _refuse_useless(path, why, judged)
 
 
-def _refuse_useless(path: Path, why: str | None) -> None:
+def _refuse_useless(path: Path, why: str | None, judged: Validation | None) -> None:
     """Raise CheckFailedError where the best of all kinds is no model."""
     if why is not None:
-        raise CheckFailedError(
-            f"{path}: no kind is a model of the rows held out: {why}. `softneck info REC` says what it lacks."
-        )
+        advice = (judged and left_out(judged)) or "`softneck info REC` says what it lacks."
+        raise CheckFailedError(f"{path}: no kind is a model of the rows held out: {why}. {advice}")
 
 
 def _model(choice: Choice) -> Model:

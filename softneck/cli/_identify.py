@@ -36,13 +36,14 @@ from .shared._options import (
     tolerance_option,
 )
 from .shared._robot import robot_option
-from .shared._validate_table import useless, with_fit
+from .shared._validate_table import left_out, useless, with_fit
 
 if TYPE_CHECKING:
     from softneck.identification import Model, Search, Validation
     from softneck.signals import Recording
 
 
+_ANOTHER = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
 _KINDS += "\n  auto     tries them all and takes the best in free run"
 
@@ -136,12 +137,9 @@ def command(
         raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
     why = None if held_out is None else useless(held_out)
     if why is not None:
-        why = (tail and stands_still(tail, whole)) or why
-        advice = (
-            poor[0]
-            if poor
-            else "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
-        )
+        still = tail and stands_still(tail, whole)
+        why, advice = still or why, "" if still or held_out is None else left_out(held_out)
+        advice = advice or (poor[0] if poor else _ANOTHER)
         raise CheckFailedError(f"{path}: no model of the rows held out: {why}. {advice}")
 
 

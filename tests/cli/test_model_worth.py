@@ -58,6 +58,12 @@ def test_identify_of_outputs_that_follow_no_motor_gives_exit_code_1_and_what_to_
     assert "m.npz: no model of the rows held out: its fit in free run is -" in said.error
     assert "does not follow the motors" in said.error
     assert call("identify", "oe", "foreign.csv", "-o", "m.npz", "--json", "--force").code == 1
+    # One of the two alone: the robot may do without it.
+    write_recording("drift.csv", replace(moving, channels={**moving.channels, "pitch": angles["pitch"]}))
+    said = call("identify", "oe", "drift.csv", "-o", "d.npz")
+    assert said.code == 1
+    assert "leave pitch out of `outputs.names` in a robot.toml" in said.error
+    assert " roll alone fits " in said.error
 
 
 def test_identify_says_that_its_model_diverges_and_keeps_it(

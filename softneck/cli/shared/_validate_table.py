@@ -23,6 +23,8 @@ Cells = list[list[str]]
 _NAME = 18
 # [%] What the mean of the rows scores: a model that is further off knows less than one that never moves.
 _USELESS = 0.0
+# [%] What `design` asks for at least.
+_WORTH = 30.0
 
 
 def fit_table(results: Sequence[Validation]) -> tuple[Head, Cells]:
@@ -138,6 +140,17 @@ def useless(r: Validation) -> str | None:
             for h, table in r.fits.items() for axis, fit in table.items() if fit is not None]  # fmt: skip
     worst, horizon, axis = min(fits, default=(0.0, "", ""))
     return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _USELESS else None
+
+
+def left_out(r: Validation) -> str:
+    """Return the advice to go on without the outputs that spoil a model of the others; "" where that is no way out."""
+    fits = {axis: fit for axis, fit in r.fits.get("inf", {}).items() if fit is not None}
+    poor = [axis for axis, fit in fits.items() if fit < _USELESS]
+    good = [axis for axis in fits if axis not in poor]
+    if r.diverged is not None or not poor or not good or min(fits[axis] for axis in good) < _WORTH:
+        return ""
+    said = "/".join(percent(fits[axis]) for axis in good)
+    return f"{', '.join(good)} alone fits {said} %: leave {', '.join(poor)} out of `outputs.names` in a robot.toml."
 
 
 def _residuals(r: Validation) -> str:

@@ -107,11 +107,12 @@ def _between(time: Vector, values: Vector) -> Vector:
     return np.where(seen, values, np.where(far, np.nan, np.interp(time, t, x)))
 
 
-def filled(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]]:
+def filled(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Samples, tuple[str, ...]]:
     """Return the samples with rows that a logger dropped again and again as missed samples, and a note.
 
     A gap splits a run, since nobody knows what was asked in it. Where a row or a few are lost so often that the pieces
-    would be too short to judge a model by, set-points and flags hold their last value there instead.
+    would be too short to judge a model by, set-points and flags hold their last value there instead; `always`: wherever
+    they are lost (benchmarks/clock_gaps.py --models).
     """
     step, inside = np.diff(samples.time), np.diff(samples.run) == 0
     steps = step[inside & (step > 0)]
@@ -121,7 +122,8 @@ def filled(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]]:
     gap, lost = gaps(samples)[0], np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
     # A clock that jitters loses nothing: its long steps are no whole numbers of usual ones.
     few = gap & (lost >= 1) & (lost <= _FEW) & (np.abs(usual - lost - 1) < _WHOLE)
-    if few.sum() < _OFTEN or few.sum() < _NEARLY_ALL * gap.sum() or samples.time.size > _PIECE * few.sum():
+    seldom = few.sum() < _OFTEN or few.sum() < _NEARLY_ALL * gap.sum() or samples.time.size > _PIECE * few.sum()
+    if not few.any() or (seldom and not always):
         return samples, ()
     before = np.repeat(np.flatnonzero(few), lost[few])
     part = np.concatenate([np.arange(1, count + 1) / (count + 1.0) for count in lost[few]])
