@@ -150,7 +150,8 @@ def left_out(r: Validation) -> str:
     if r.diverged is not None or not poor or not good or min(fits[axis] for axis in good) < _WORTH:
         return ""
     said = "/".join(percent(fits[axis]) for axis in good)
-    return f"{', '.join(good)} alone fits {said} %: leave {', '.join(poor)} out of `outputs.names` in a robot.toml."
+    without = ", ".join(poor)
+    return f"Leave {without} out of `outputs.names` in a robot.toml: without it {', '.join(good)} fits {said} %."
 
 
 def _residuals(r: Validation) -> str:

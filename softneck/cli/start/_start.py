@@ -37,6 +37,7 @@ _LINE = 160 - len("softneck: ")
 _OWN_REQUIREMENTS = (
     "requirements of your own: `softneck tune --print-requirements` shows the form; give them by --requirements"
 )
+_WITHOUT = re.compile(r"Leave .* out of `outputs\.names` in a robot\.toml")
 # Sentences end where the next begins with a capital; `0.5 %.` within one does not.
 _FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+[`A-Z]|$)")
 
@@ -170,7 +171,10 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[s
     if stage == "identification":  # what the recordings lack was said before it
         note(_MIXED)
         first = _FIRST_SENTENCE.match(said)
-        return CheckFailedError(_shortened(f"{stage}: {first[1] if first else said}", _NEXT))
+        without = _WITHOUT.search(said)  # an output: that needs no other recording
+        return CheckFailedError(
+            _shortened(f"{stage}: {first[1] if first else said}", f"{without[0]}." if without else _NEXT)
+        )
     if stage == "tune":
         note(_OWN_REQUIREMENTS)
     note(f"paths are those in {folder}; once that is mended the same command goes on")

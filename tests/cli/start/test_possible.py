@@ -13,8 +13,8 @@ import pytest
 
 from softneck.cli.start import _possible, _sitting, _start
 from softneck.cli.start._plan import PI, Asked
-from softneck.cli.start._step import Step
-from softneck.core import SettingsError
+from softneck.cli.start._step import Step, Unmet
+from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
 from softneck.tuning import _beforehand
 
@@ -119,3 +119,25 @@ def test_a_log_is_asked_for_only_where_the_model_is_at_fault(
     assert ("Record 60 s of `mixed`" in said.err.splitlines()[-1]) == records
     assert why in said.err.splitlines()[-1]
     assert said.code == (1 if records else 2)
+
+
+def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leave = "Leave yaw out of `outputs.names` in a robot.toml"
+
+    def plan(asked: Asked) -> Iterator[Step]:
+        yield Step(stage="identification", command=("softneck", "identify", "auto"), makes=("m.npz",), reads=asked.logs,
+                   unmet=Unmet.NO_MODEL)  # fmt: skip
+
+    def refuse(*_: Any, **__: Any) -> None:
+        why = "no kind is a model of the rows held out: its fit in free run is -31.9 % in yaw."
+        raise CheckFailedError(f"models/auto.npz: {why} {leave}: without it pitch fits 76.5 %.")
+
+    monkeypatch.setattr(_start, "steps", plan)
+    monkeypatch.setattr(_sitting, "_softneck", refuse)
+    said = call("start", short, "-o", "p", "--yes")
+    last = said.err.splitlines()[-1]
+    assert said.code == 1
+    assert last.endswith(f"its fit in free run is -31.9 % in yaw. {leave}.")
+    assert len(last) <= 160
