@@ -5,7 +5,7 @@
 
 For each neck what docs/howto/payloads.md tells a user to do: the least co-contraction at which the large experiment is
 heard with 1 kg; from Eq. 22 and multisines of small and large amplitude at 0.32 and 1 kg, played around it, a family,
-and from Eq. 22 a grey box of each payload. `tune` gets those alone. What it returns, and the best of every other kind
+and from Eq. 22 a grey box of both payloads. `tune` gets those alone. What it returns, and the best of every other kind
 that it judged by all loops, is then run on the neck itself: steps of 15 deg in three directions with 0.32, 0.66 and 1
 kg, and a circle of 12 deg at 1.2 rad/s, known ahead by as much as `tune` says and not; beside each kind what its
 defaults do, unless --best. Angles are those that the neck's sensor tells. With --defaults what a plain `design` makes
@@ -50,16 +50,13 @@ GOALS = {"overshoot": 5.0, "rise": 0.4, "steady": 0.15, "circle": 3.0, "ahead": 
 
 
 def known(neck: str) -> dict[str, Any]:
-    """Return the family and the grey boxes of what a user would record; made once and kept."""
-    files = {
-        f"{name}.npz": OUT / f"{neck}_{name}.npz" for name in ("family", *(f"greybox_{kg:g}kg" for kg in PAYLOADS))
-    }
+    """Return the family and the grey box of what a user would record; made once and kept."""
+    files = {f"{name}.npz": OUT / f"{neck}_{name}.npz" for name in ("family", "greybox")}
     if not all(file.exists() for file in files.values()):
         begin = time.process_time()
         common = taut(neck)
         eq22 = [recorded(neck, signal("eq22", duration=80.0), n, kg, common) for n, kg in enumerate(PAYLOADS)]
-        for name, part in zip([*files][1:], eq22, strict=True):
-            GreyBox().fit(part).save(files[name], force=True)
+        GreyBox().fit(eq22).save(files["greybox.npz"], force=True)
         played = [
             experiments(neck, amplitude, 10 * n, kg, common)
             for n, amplitude in enumerate(AMPLITUDES)

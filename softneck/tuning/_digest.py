@@ -11,11 +11,10 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
-from softneck.core import KINDS, resolve
 from softneck.design.plants._uncertain import uncertain_plant
 from softneck.plant import NeckParameters
 
-from ._task import Task
+from ._task import Task, has_observer
 
 
 def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, str]] | None) -> str:
@@ -41,8 +40,8 @@ def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, s
 
 
 def _observer(task: Task, kinds: Sequence[str]) -> str:
-    """Return the digest of the observer; "" where no kind is designed for one."""
-    if task.observer is None or not any(hasattr(resolve(KINDS[kind].settings), "over") for kind in kinds):
+    """Return the digest of the observer; "" where no kind has one."""
+    if task.observer is None or not any(map(has_observer, kinds)):
         return ""
     return hashlib.sha256(b"".join(_of_block(task.observer.block()))).hexdigest()
 

@@ -16,6 +16,7 @@ from softneck.core._kinds import make_settings
 from softneck.design.linear._axis_settings import AxisSettings
 from softneck.design.linear._pi import PiSettings
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
+from softneck.identification.models._ports import payloads
 from softneck.runtime import Block
 from softneck.verification._experiments import crossing_values, crossings
 from softneck.verification._laws import ControllerUnderTest
@@ -29,7 +30,7 @@ from softneck.verification._tested import tested_axes
 from softneck.verification._verify import sources_of
 
 from ._cases import Case, cases, run_case
-from ._task import Task
+from ._task import Task, has_observer
 
 #: From quick to slow; each includes what those before it found.
 LEVELS = ("linear", "all", "margins")
@@ -120,16 +121,28 @@ def designed(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -
         made = make_settings(resolve(KINDS[kind].settings), settings)
         if task.observer is not None and hasattr(made, "over"):
             made = made.over(task.observer)
-        # The others read more of a family than its plants.
-        ready.kept[key] = made.design(ready.uncertain if isinstance(made, AxisSettings | PiSettings) else task.plant)
+        ready.kept[key] = made.design(_plant_for(task, ready, kind, made))
     return ready.kept[key]
 
 
+def _plant_for(task: Task, ready: Ready, kind: str, made: Any) -> Any:
+    """Return what a kind designs on: all linear plants, or the one that it begins from.
+
+    Of several nonlinear models the first that knows payloads.
+    """
+    if isinstance(made, AxisSettings | PiSettings):
+        return ready.uncertain
+    if kind == "nmpc":
+        models = sorted(task.models, key=lambda model: payloads(model.arrays) is None)
+        return models[0] if models else task.plant
+    if kind == "adaptive":
+        return next(iter(task.linear.values()))
+    return task.plant  # more of a family is read than its plants
+
+
 def watched(task: Task, kind: str) -> Block | None:
-    """Return the observer that loops of a kind have: those that are designed for one are judged with it."""
-    if task.observer is None or not hasattr(resolve(KINDS[kind].settings), "over"):
-        return None
-    return task.observer.block()
+    """Return the observer that loops of a kind have; None for most kinds."""
+    return task.observer.block() if task.observer is not None and has_observer(kind) else None
 
 
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:

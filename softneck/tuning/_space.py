@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,8 @@ from softneck.core._kinds import kinds_of
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptive", "mpc")
 #: Of these nothing is certified beside recordings, since they have no linear form: named, they are searched there too.
 UNCERTIFIED = ("scheduled", "adaptive")
+#: It wants families of one payload each, and is searched only where it is named.
+SWITCHED = "switched"
 #: A design of these takes ten times as long as one of the others.
 COSTLY = ("mpc", "nmpc")
 
@@ -58,6 +60,7 @@ _OWN: dict[str, tuple[Dimension, ...]] = {
             Dimension("input_noise", 1.0, 100.0, 5.0)),
     "scheduled": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
     "adaptive": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
+    SWITCHED: (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
     "mpc": (Dimension("max_sensitivity", 1.2, 2.5, 1.5),),
     "nmpc": (),
 }  # fmt: skip
@@ -107,7 +110,13 @@ class Space:
 
 
 def spaces(
-    kinds: tuple[str, ...], *, rise: float, cocontraction: float | None, neck: bool, least: float = 0.0
+    kinds: tuple[str, ...],
+    *,
+    rise: float,
+    cocontraction: float | None,
+    neck: bool,
+    least: float = 0.0,
+    payloads: Sequence[float] = (),
 ) -> list[Space]:
     """Return the space of every kind.
 
@@ -117,6 +126,7 @@ def spaces(
         cocontraction: at which the robot was recorded [rad]; None: no rule is set.
         neck: whether it is a neck: of another robot limits are those of its file.
         least: the rise that the motors can give at best [s].
+        payloads: of the linear plants [kg], where each has one of its own.
 
     Raises:
         SettingsError: an unknown kind, or one with nothing to search.
@@ -129,6 +139,11 @@ def spaces(
                 if kind in kinds_of("controller")
                 else f"unknown kind of controller `{kind}`; use some of {', '.join(_OWN)}."
             )
+        if kind == SWITCHED and len(set(payloads)) < 2:
+            raise SettingsError(
+                f"`{kind}` has a controller for each payload: give families of one payload each, at least two "
+                "(`softneck family` of recordings with a column `payload [kg]`)."
+            )
         names = {item.name for item in dataclasses.fields(resolve(KINDS[kind].settings))}
         speed: tuple[Dimension, ...] = (
             Dimension("rise_s", max(0.3 * rise, _ROOM * least), 1.2 * rise, max(_AIM * rise, _ROOM**2 * least)),
@@ -140,5 +155,10 @@ def spaces(
         fixed: dict[str, Any] = {"lead_limit": _LEAD} if neck and kind not in _PLANNED else {}
         if cocontraction is not None and "least_cocontraction" in names:
             fixed["least_cocontraction"] = cocontraction
+        if cocontraction is not None and kind == "nmpc":
+            # Its plan begins where the recordings were: elsewhere the tendons hang, and it is refused.
+            fixed["minimum_tautness"] = cocontraction
+        if kind == SWITCHED:
+            fixed["payloads"] = list(payloads)
         found.append(Space(kind, tuple(item for item in wanted if item.name in names), fixed))
     return found

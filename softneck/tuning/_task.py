@@ -6,9 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from softneck.core import KINDS, resolve
+from softneck.identification import Model
 from softneck.robot import Robot
 
 from ._requirements import TuneRequirements
+
+
+def has_observer(kind: str) -> bool:
+    """Return whether loops of a kind have an observer: designed for it, or acting by the payload that it tells."""
+    made = resolve(KINDS[kind].settings)
+    return hasattr(made, "over") or hasattr(made, "payloads")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -23,7 +31,7 @@ class Task:
         robot: whose controller is tuned.
         cocontraction: at which the loops are held [rad]; None: by the controller's own rule.
         seed: of the noise.
-        observer: of the loops of kinds that are designed for one (`mpc`, `nmpc`); None: they have none either.
+        observer: of the loops of kinds that have one (`mpc`, `nmpc`, `switched`); None: these have none either.
     """
 
     digest: str
@@ -39,6 +47,11 @@ class Task:
     def tested(self) -> bool:
         """Whether a family was tested against its recordings."""
         return any(getattr(thing, "measured", {}) for thing in self.linear.values())
+
+    @property
+    def models(self) -> list[Model]:
+        """Nonlinear models among the plants that step."""
+        return [thing for thing in self.own.values() if isinstance(thing, Model)]
 
     @property
     def plant(self) -> Any:

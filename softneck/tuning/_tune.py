@@ -11,7 +11,6 @@ from softneck.core import CheckFailedError, Progress, SettingsError, require_who
 from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import robot_of
-from softneck.identification import Model
 from softneck.identification.models._ports import payloads
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
@@ -136,8 +135,9 @@ def tune(
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
     each = spaces(
-        chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck, least=quickest(task.plant)
-    )
+        chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck,
+        least=quickest(task.plant), payloads=_payloads(task.linear),
+    )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
@@ -194,6 +194,18 @@ def _held(linear: Mapping[str, Any]) -> float | None:
     middles = [sum(part["cocontraction"]) / 2.0 for part in made if max(part["payload_kg"]) >= heaviest]
     common = round(sorted(middles)[len(middles) // 2], 3)
     return common if common > _TAUT else None
+
+
+def _payloads(linear: Mapping[str, Any]) -> list[float]:
+    """Return the payload [kg] of each linear plant; none where one was recorded with several, or does not say."""
+    found = []
+    for thing in linear.values():
+        made = getattr(thing, "findings", {}).get("tested", {}).get("conditions", [])
+        seen = {kg for part in made for kg in part["payload_kg"]}
+        if len(seen) != 1:
+            return []
+        found.append(float(seen.pop()))
+    return found
 
 
 def _aimed(task: Task) -> float:
@@ -274,7 +286,7 @@ def _verified(
 
 def _observer(task: Task) -> Any:
     """Return the filter over a model of several payloads, which tells them, else over the nominal plant, or None."""
-    several = [thing for thing in task.own.values() if isinstance(thing, Model) and payloads(thing.arrays) is not None]
+    several = [model for model in task.models if payloads(model.arrays) is not None]
     for model in (*several, next(iter(task.linear.values()))):
         try:
             return KalmanSettings().design(model)
