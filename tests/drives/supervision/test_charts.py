@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from softneck.drives.supervision._calibrate import _Samples, _tilt_noise
+from softneck.drives.supervision._calibrate import _Samples, _tilt_noise, fit
 from softneck.drives.supervision._charts_runtime import (
     SUPERVISED_NOT,
     supervised_levels,
@@ -15,6 +15,8 @@ from softneck.drives.supervision._charts_runtime import (
     supervised_motors,
 )
 from softneck.drives.supervision._motor_charts import SCALES, MotorCharts, MotorRules
+from softneck.drives.supervision._motor_models import Motion, features_of, level_rows
+from softneck.drives.supervision._plausibility import Finding, Plausibility
 from softneck.drives.supervision._tilt_charts import GyroLevel, TiltCharts
 
 from ..plausible import baseline
@@ -24,10 +26,12 @@ TOP, REACH, SLACK = 10.0, 1.0, 0.5
 GATES = (np.full(N, TOP), np.full(N, REACH), np.full(N, SLACK))
 
 
-def levels(tensions: list[float], *, behind: float = 0.0, rest: int | None = None, seen: int = 50) -> np.ndarray:
-    """Return scores (scales, motors) where each tension should be the mean of the others, in `seen` cycles."""
+def levels(
+    tensions: list[float], *, behind: float = 0.0, rest: int | None = None, seen: int = 50, share: float = 1.0
+) -> np.ndarray:
+    """Return scores (scales, motors) where each tension should be `share` of the others' mean, in `seen` cycles."""
     level = np.zeros((N, FEATURES + 2))
-    level[:, FEATURES] = 1.0
+    level[:, FEATURES] = share
     past = (np.full((12, N), behind), np.zeros((5, N)), np.tile(tensions, (4, 1)))
     resting = np.full(N, -1.0)
     if rest is not None:
@@ -51,6 +55,7 @@ def test_a_tension_twice_those_of_the_others_is_rather_a_scale_of_two_than_any_o
     assert np.max(found.ravel()[1:]) == pytest.approx(1.5)
     assert (levels([3.0, 3.0, 3.0]) < 0.0).all()
     assert levels([1.5, 3.0, 3.0])[1, 0] == pytest.approx(4.5)
+    assert levels([4.0, 4.0, 4.0], share=0.5)[0] == pytest.approx(4.5)
 
 
 @pytest.mark.parametrize(
@@ -88,15 +93,15 @@ def test_what_is_carried_is_the_mean_of_all_cycles_and_then_of_the_last() -> Non
 def test_where_the_others_may_not_be_believed_nothing_is_learnt_of_the_load() -> None:
     """A payload is told by taut tendons alone: a mean that took hanging ones in would be of a heavier one."""
     charts = MotorCharts(baseline())
-    tensions = np.array([2.0, 2.0, 2.0])
+    tensions, places = np.array([2.0, 2.0, 2.0]), np.array([0.3, -0.2, 0.1])
     for _ in range(100):
-        charts.step(np.zeros(N), np.zeros(N), tensions)
+        charts.step(places, places, tensions)
     before = charts._load[1].copy()
     # All of them gave the same: the mean is that.
     load = np.array(baseline().load)
-    np.testing.assert_allclose(before, 2.0 - load[:, N], atol=1e-12)
+    np.testing.assert_allclose(before, 2.0 - load[:, N] - load[:, :N] @ places, atol=1e-12)
     for bad in ([2.0, 2.0, 0.5], [2.0, 2.0, 99.0]):
-        charts.step(np.zeros(N), np.zeros(N), np.array(bad))
+        charts.step(places, places, np.array(bad))
     assert np.array_equal(charts._load[1], before)
 
 
@@ -216,3 +221,106 @@ def test_the_variance_of_the_tilt_is_that_of_what_the_whitening_leaves() -> None
     _, spread = _tilt_noise(samples, [correlated], [all_good], np.zeros((2, len(lags) * N)), lags, N)
     # Of 4,000 rows a variance is known to 2.2 %; four times that.
     np.testing.assert_allclose([row[0] for row in spread], 1e-4, rtol=0.09)
+
+
+def carrying(payload: float, rng: np.random.Generator, rows: int = 4000) -> Motion:
+    """Return motion of tendons that share a payload [N], with friction that changes about every 20 cycles."""
+    time = 0.01 * np.arange(rows)
+    places = np.column_stack([np.sin(pace * time) for pace in rng.uniform(0.5, 3.0, N)])
+    friction = 0.3 * np.repeat(rng.standard_normal((rows // 20, N)), 20, axis=0)
+    tensions = 4.0 + places @ (0.2 + 0.5 * np.eye(N)) - payload + friction
+    none = np.zeros((rows, 2))
+    return Motion(
+        setpoints=places, positions=places, tensions=tensions, values=none, rates=none, due=np.ones(rows, bool)
+    )
+
+
+def test_a_payload_counts_in_full_for_each_tension_whatever_friction_does() -> None:
+    """By what the others hold at the moment, friction with it, it counted for 0.6 on the paper's neck."""
+    rng = np.random.default_rng(0)
+    motions = [carrying(payload, rng) for payload in (0.0, 1.5)]
+    known = [(motion, features_of(motion, 0.01)) for motion in motions]
+    load, seen, level, spread = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0), MotorRules())
+    # A mean of 25 blocks of friction, and at first of fewer, is good to 0.1 N of 0.75.
+    np.testing.assert_allclose([row[-2] for row in level], 1.0, atol=0.1)
+    np.testing.assert_allclose([row[:-1] for row in load], 0.2 + 0.25 * (1.0 - np.eye(N)), atol=0.1)
+    np.testing.assert_allclose(seen, (-0.75, 0.75), atol=0.35)
+    # That of the friction, 0.09 N^2, and a little of the mean's.
+    assert all(0.07 < one < 0.12 for one in spread)
+
+
+def test_the_load_of_the_experiments_is_what_no_tension_alone_says() -> None:
+    """A tension that is 1 N off, by a wrong scale or its own friction, is in the loads of the others only."""
+    rng = np.random.default_rng(0)
+    motions = [carrying(0.0, rng), carrying(0.0, rng)]
+    motions[1].tensions[:, 0] -= 2.0
+    known = [(motion, features_of(motion, 0.01)) for motion in motions]
+    _, seen, _, _ = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0), MotorRules())
+    # Half of 2 N each, half of it to either side; motor 1 says that nothing changed. The mean's own error as above.
+    np.testing.assert_allclose(seen, (0.0, 0.5), atol=0.2)
+
+
+def test_known_ground_ends_a_fifth_beyond_the_loads_of_the_experiments() -> None:
+    rng = np.random.default_rng(0)
+    motions = [carrying(payload, rng) for payload in (0.0, 1.5)]
+    for motion in motions:
+        motion.values[:] = 0.01 * rng.standard_normal(motion.values.shape)
+    known = [(motion, features_of(motion, 0.01)) for motion in motions]
+    # 0.75 N to either side, the mean's own error, and a fifth of 1.5 N.
+    assert fit(known, cycle=0.01, sample_cycles=1, slack=0.5).load_low == pytest.approx(-1.05, abs=0.3)
+
+
+def test_a_single_tension_is_compared_with_nothing() -> None:
+    motion = carrying(0.0, np.random.default_rng(0), 200)
+    one = {name: getattr(motion, name)[:, :1] for name in ("setpoints", "positions", "tensions")}
+    alone = Motion(**one, values=motion.values, rates=motion.rates, due=motion.due)
+    known = [(alone, features_of(alone, 0.01))]
+    _, seen, level, _ = level_rows(known, np.full(1, 0.5), np.full(1, 20.0), np.full(1, 9.0), MotorRules())
+    assert seen == (0.0, 0.0)
+    assert not np.any(level)
+
+
+def test_beyond_the_load_of_the_experiments_the_tilt_is_not_on_known_ground() -> None:
+    charts = TiltCharts(baseline())
+    for known, off in ((True, ""), (False, "more is carried than in the experiments")):
+        for _ in range(100):
+            charts.step(np.zeros(N), np.full(N, 3.0), np.zeros(2), np.zeros(2), known_load=known)
+        assert (charts.valid, charts.off) == (known, off)
+
+
+def test_a_rest_is_said_once_it_lasts_and_again_only_after_as_long_a_watch() -> None:
+    charts, samples = Plausibility(baseline()), round(5.0 / 0.02)
+
+    def said(valid: bool, count: int) -> int:
+        charts.tilt.valid, charts.tilt.off = valid, "" if valid else "a tendon may hang"
+        told = 0
+        for _ in range(count):
+            charts._count_rest()
+            told += charts.rests == "a tendon may hang"
+        return told
+
+    assert said(False, samples - 1) == 0
+    assert said(False, 1) == 1
+    assert said(False, 3 * samples) == 0
+    # A short watch between is none.
+    assert said(True, samples - 1) == said(False, 3 * samples) == 0
+    assert said(True, samples) == 0
+    assert said(False, samples) == 1
+
+
+@pytest.mark.parametrize(("name", "after"), [("astray", 0.1), ("current_scale", 0.3)])
+def test_what_speaks_alone_is_named_when_it_is_ripe(name: str, after: float) -> None:
+    """Whatever goes wrong takes another current: its scale waits for others to speak, a loop astray does not."""
+    charts = Plausibility(baseline())
+    charts._current, charts._since = Finding(name, -1, ""), 0
+    while charts._ripe() is None:
+        charts._now += 1
+    assert charts._now * 0.01 == pytest.approx(after)
+
+
+def test_the_tilt_rests_where_all_tendons_carry_more() -> None:
+    charts = Plausibility(baseline())
+    for _ in range(100):
+        charts.cycle((0.0,) * N, (0.0,) * N, (1.3,) * N)
+        charts.sample((0.0,) * N, (0.0, 0.0), (0.0, 0.0))
+    assert charts.tilt.off == "more is carried than in the experiments"
