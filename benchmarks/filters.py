@@ -1,10 +1,12 @@
 """Print what filters that correct the state of a model are worth beside ours, which corrects none of it.
 
-`python benchmarks/filters.py [--necks NECK...] [--seed N] [--rows N]`: the necks, motions and spoiled measurements of
-`observer.py`, the first rows of each, and a `greybox` of the same recording for all. `ours` is `softneck observer` with
-defaults. `extended` and `unscented` are filterpy's, over the model's own step (and its exact derivatives) and a
-disturbance of each output that walks; process noise enters through the motors. Theirs are the noise levels, of a grid,
-with which `extended` is best on the very rows it is judged on. All tell the angle of now, 50 ms after the measurement.
+`python benchmarks/filters.py [--necks NECK...] [--seed N] [--rows N] [--quick]`: the necks, motions and spoiled
+measurements of `observer.py`, the first rows of each, and a `greybox` of the same recording for all. `ours` is the
+default of `softneck observer`. `extended` and `unscented` are filterpy's, over the model's own step (and its exact
+derivatives) and a disturbance of each output that walks; process noise enters through the motors. Theirs are the
+noise levels, of a grid, with which `extended` is best on the very rows it is judged on. All tell the angle of now, 50
+ms after the measurement, and take jumps of the set-points as ramps of the motors' rate. `--quick` leaves `unscented`
+out.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from softneck.estimation import KalmanSettings
 from softneck.identification import GreyBox, Model
 from softneck.runtime import State
 from softneck.signals import signal
+from tests.estimation.necks import ramped
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck
 from tests.foreign_necks.spoiled import NOISE, SCORED, Spoiled, filtered, logged, motions, moved, spoiled
 
@@ -144,8 +147,8 @@ def judged(told: Callable[[Spoiled], Matrix], runs: list[Spoiled]) -> tuple[floa
     return math.degrees(np.sqrt(np.mean(errors**2))), 1e3 * took / sum(len(run.dark) for run in runs)
 
 
-def row(name: str, seed: int, rows: int) -> str:
-    """Return a line of the table."""
+def row(name: str, seed: int, rows: int, peers: tuple[Any, ...]) -> str:
+    """Return a line of the table, with these peers."""
     block = ForeignNeck(name=name, seed=seed, noise=False).block()
     log = logged(moved(block, signal("eq22"), 1000 * seed + 1).rows(0, 7000))
     whole = [spoiled(block, motion, 1000 * seed + 10 + i) for i, motion in enumerate(motions())]
@@ -155,7 +158,7 @@ def row(name: str, seed: int, rows: int) -> str:
 
     def peer(make: Any, *levels: float) -> Callable[[Spoiled], Matrix]:
         def told(run: Spoiled) -> Matrix:
-            P = run.recording.set_points
+            P = ramped(run.recording, (model.robot.motors.rate_limit or (math.inf,))[0]).set_points
             Z = np.column_stack([run.recording.channels[f"{axis}_measured"] for axis in ("pitch", "roll")])
             return make(Stepped(model, P[0]), P, Z, *levels)
 
@@ -163,7 +166,7 @@ def row(name: str, seed: int, rows: int) -> str:
 
     best = min(product(MOTOR_NOISE, WALK), key=lambda levels: judged(peer(extended, *levels), runs)[0])
     cells = [judged(lambda run: filtered(own, run.recording), runs)]
-    cells += [judged(peer(make, *best), runs) for make in (extended, unscented)]
+    cells += [judged(peer(make, *best), runs) for make in peers]
     return f"{name:8}" + "".join(f"{f'{error:.3f} ({took:.2g})':>18}" for error, took in cells)
 
 
@@ -173,11 +176,13 @@ def main() -> None:
     parser.add_argument("--necks", nargs="*", default=list(CHOOSING), choices=CHOOSING, help="(all that choose)")
     parser.add_argument("--seed", type=int, default=1, help="specimen and noise (1)")
     parser.add_argument("--rows", type=int, default=300, help="of each motion (300)")
+    parser.add_argument("--quick", action="store_true", help="without the unscented filter")
     wanted = parser.parse_args()
+    peers = (extended,) if wanted.quick else (extended, unscented)
     print("rms error [deg] (processor time of a row [ms])")
-    print(f"{'':8}" + "".join(f"{name:>18}" for name in ("ours", "extended", "unscented")))
+    print(f"{'':8}" + "".join(f"{name:>18}" for name in ("ours", *(item.__name__ for item in peers))))
     for name in wanted.necks:
-        print(row(name, wanted.seed, wanted.rows), flush=True)
+        print(row(name, wanted.seed, wanted.rows, peers), flush=True)
 
 
 if __name__ == "__main__":

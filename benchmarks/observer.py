@@ -9,12 +9,13 @@ that model of the same recording, `fitted` with `--data`; `peer` is thirty lines
 samples of look-ahead. Nothing is chosen here: the two necks that are held out have lines
 of their own; defaults are chosen by `leave_one_neck_out.py observer.*`.
 
-`--grid`: of the defaults over `oe` and over `greybox` the rms error, that of the best of a grid of noise levels and
-sensor delays *on the very motions it is judged on*, and how much the defaults miss. `--unseen`: what `--data` makes of
-the filter over the `greybox` with 60 s of another motion that the model has not seen, as the poor sensor logs it:
-error on the rows that it held out itself, of the defaults and of what it kept, then against the truth. `--oracle`: the
-filter over the `greybox`; the same that knew at each sample, without noise, gaps or outliers, what its model misses at
-the sensor's time; and the error left in the blackouts under the best constant disturbance of each, in hindsight.
+`--grid`: of the defaults over `oe` and over `greybox` the rms error, the same told the sensor's noise, that of the best
+of a grid of noise levels and sensor delays *on the very motions it is judged on*, and by how much both miss it.
+`--unseen`: what `--data` makes of the filter over the `greybox` with 60 s of another motion that the model has not
+seen, as the poor sensor logs it: error on the rows that it held out itself, of the defaults and of what it kept, then
+against the truth. `--oracle`: the filter over the `greybox`; the same that knew at each sample, without noise, gaps or
+outliers, what its model misses at the sensor's time; and the error left in the blackouts under the best constant
+disturbance of each, in hindsight.
 """
 
 from __future__ import annotations
@@ -128,9 +129,12 @@ def grid(neck: str, seed: int) -> str:
         later = {delay: error(replace(best, sensor_delay=delay).design(model), runs)[0] for delay in DELAYS}
         delay = min(later, key=lambda item: later[item])
         said = ", ".join("-" if getattr(best, name) is None else f"{getattr(best, name):.2g}" for name in names)
+        told = error(KalmanSettings(measurement_noise_std=NOISE).design(model), runs)[0]
+        cells.append(f"{kind} {errors[0]:.3f} {told:.3f}")
         for what, least in ((f"({said})", min(errors)), (f"({delay:g} s)", min(*errors, later[delay]))):
-            cells.append(f"{least:.3f} {100.0 * (errors[0] / least - 1.0):+.0f} % {what}")
-        cells[-2] = f"{kind} {errors[0]:.3f}  {cells[-2]}"
+            cells.append(
+                f"{least:.3f} {100.0 * (errors[0] / least - 1.0):+.0f} {100.0 * (told / least - 1.0):+.0f} % {what}"
+            )
     return f"{neck:8}{seed:3}  " + "  ".join(cells)
 
 
@@ -179,7 +183,7 @@ def main() -> None:
     other.add_argument("--oracle", action="store_true", help="what a filter that were told all would reach")
     wanted = parser.parse_args()
     printed = {
-        grid: "of the defaults, of the best of the grid (its noise levels), and with its best delay",
+        grid: "of the defaults, told the sensor's noise, of the best of the grid (its levels), and with its best delay",
         unseen: "kept; on rows held out, of the defaults and of what was kept; the same against the truth",
         oracle: "(in blackouts) of the defaults, of the oracle, of hindsight in the blackouts",
     }

@@ -114,6 +114,18 @@ def test_in_darkness_it_says_what_the_model_will_say(play: Model, run: Recording
     np.testing.assert_allclose(estimates.rates[: len(rates)][at_rest], rates[at_rest], rtol=0, atol=1e-10)
 
 
+def test_a_jump_goes_on_as_a_ramp_on_the_way_to_now(play: Model, run: Recording) -> None:
+    """A sensor later than the model's dead time: what the set-points of now do is in what is told."""
+    dark = {axis: np.full(200, math.nan) for axis in ("pitch", "roll")}
+    held = jumping(run.rows(0, 200)).with_channels(**dark)
+    estimates = designed(replace(PLAIN, sensor_delay=0.2), play).estimate(held)
+    # The jump is known, and none comes within the ten samples.
+    known = np.flatnonzero((np.arange(190) % 20 >= 1) & (np.arange(190) % 20 <= 9))
+    expected, at_once = (free_run(play, item)[known + 10] for item in (ramped(held, 15.6), held))
+    assert np.abs(expected - at_once).max() > math.radians(1.0)
+    np.testing.assert_allclose(estimates.outputs[known], expected, rtol=0, atol=1e-12)
+
+
 def test_a_push_is_what_the_model_misses(play: Model, run: Recording) -> None:
     """What a push adds to the angles is all that angles tell of it, and the disturbance is that, whatever its force."""
     rng, pushed = np.random.default_rng(0), np.zeros((len(run), 2))
