@@ -1,21 +1,26 @@
 """A closed loop on a neck that changes, with the controller that switches by the estimated payload.
 
-`python benchmarks/changing_neck.py [--necks NECK...] [--cases CASE...]`
+`python benchmarks/changing_neck.py [table|choose] [--necks NECK...] [--cases CASE...] [--cocontraction RAD]`
 
-Of each foreign neck: logs of 100 s of Eq. 22 around a co-contraction of 1.5 rad with 0, 0.5 and 1 kg; a line of each,
+Of each foreign neck: logs of 100 s of Eq. 22 around a co-contraction of 3 rad with 0, 0.5 and 1 kg; a line of each,
 a `greybox` of all three, a detector over it from 200 s of other motion with each, and `switched` at the three. Beside
 it stands `first`: its own gains of 0 kg, never switched. Both follow the same random steps of 6 to 20 deg every 4 s
 (12 deg from upright at the most) on a noisy sensor, without observer. Printed are the largest overshoot of any step in
 % of it, the mean time until 90 % of it are gone, the largest mean error of a step's last second (not while `changed`
 slows the reference), the time with a set-point beyond its limit, the payload that is told at the end, and seconds of
 `changed`. The angle is the measured one: nobody sees a sensor's bias. Creep: tendon 1 grows by 5 % of 0.11 m in 10
-minutes, the others by half of that. Nothing is chosen here.
+minutes, the others by half of that.
+
+`choose` says where 3 rad come from: co-contractions and times of the reference filter, each neck left out in turn. The
+others choose the fastest with which none of them overshoots by more than 8 %, without detector: 0, 0.5 and 1 kg under
+their own gains, and 0 and 1 kg under those of the other. `slack` is the part of the time in which a tendon bears less
+than 1 mN with 1 kg.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -29,19 +34,22 @@ from softneck.estimation.changes._settings import ChangeSettings
 from softneck.identification import GreyBox, Model, Rls
 from softneck.loop import BlockPart, Loop, LoopResult, NeckFault, Part, RecordingReference, SensorFault, run_loop
 from softneck.signals import Recording, signal
-from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record_under
+from tests.foreign_necks.necks import CHOOSING, NECKS, ForeignNeck, record_under
 
-OUT, TS, LOADS, TAUT = Path("build/changing_neck"), 0.02, (0.0, 0.5, 1.0), 1.5
+OUT, TS, LOADS, TAUT = Path("build/changing_neck"), 0.02, (0.0, 0.5, 1.0), 3.0
 EVERY, AT = 4.0, 20.0
 # 5 % of 0.11 m on a winch of 7.5 mm.
 CREEP, CREPT = 0.05 * 0.11 / 0.0075, 600.0
 CASES = ("nothing", "put on", "taken off", "creep", "bias 2 deg")
 MOTIONS = ("steps", "sine", "rotation", "aprbs", "multisine", "mixed")
+# What may be chosen: co-contraction [rad], time of the reference filter [s]; loops it is chosen on: payload, told.
+CANDIDATES = [(taut, time) for taut in (1.5, 2.0, 2.5, 3.0, 4.0) for time in (0.06, 0.2, 0.4)]
+JUDGED, GOAL = ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (0.0, 1.0), (1.0, 0.0)), 8.0
 
 
-def moved(neck: str, P: Matrix, payload: float, seed: int) -> Recording:
-    """Return what a specimen does, with the payload that it bears."""
-    run = record_under(np.clip(P + TAUT, -6.0, 6.0), specimen(neck), np.full(len(P), payload), seed=seed)
+def moved(neck: str, P: Matrix, payload: float, taut: float, seed: int) -> Recording:
+    """Return what a specimen does around a co-contraction, with the payload that it bears."""
+    run = record_under(np.clip(P + taut, -6.0, 6.0), specimen(neck), np.full(len(P), payload), seed=seed)
     return run.with_channels(payload=np.full(len(P), payload))
 
 
@@ -51,32 +59,40 @@ def specimen(neck: str) -> ForeignNeck:
 
 
 @cache
-def logs(neck: str) -> list[Recording]:
+def logs(neck: str, taut: float) -> list[Recording]:
     """Return what models are made from."""
-    return [moved(neck, signal("eq22").set_points[:5000], kg, 1) for kg in LOADS]
+    return [moved(neck, signal("eq22").set_points[:5000], kg, taut, 1) for kg in LOADS]
 
 
-def several(neck: str) -> Model:
+@cache
+def lines(neck: str, taut: float) -> list[Model]:
+    """Return a line of each payload."""
+    return [Rls().fit(log) for log in logs(neck, taut)]
+
+
+def several(neck: str, taut: float) -> Model:
     """Return the model of all payloads, kept for the next time."""
-    path = OUT / f"{neck}.npz"
+    path = OUT / f"{neck}.{taut:g}.npz"
     if not path.exists():
         OUT.mkdir(parents=True, exist_ok=True)
-        GreyBox().fit(logs(neck)).save(path)
+        GreyBox().fit(logs(neck, taut)).save(path)
     return load(path, role="model")
 
 
-def detector(neck: str) -> ChangeDetector:
+def detector(neck: str, taut: float) -> ChangeDetector:
     """Return what tells the payload, from other motion than the model's."""
     motions = [signal(name).set_points if name in MOTIONS[:3] else signal(name, duration=40.0, seed=3).set_points
                for name in MOTIONS]  # fmt: skip
-    runs = [moved(neck, P, kg, 5) for kg in LOADS for P in motions]
-    return ChangeSettings().design(several(neck), runs)
+    runs = [moved(neck, P, kg, taut, 5) for kg in LOADS for P in motions]
+    return ChangeSettings().design(several(neck, taut), runs)
 
 
-def controller(neck: str) -> VaryingController:
+def controller(neck: str, taut: float, reference_time: float | None = None) -> VaryingController:
     """Return the controller of lines at each payload."""
-    lines = [Rls().fit(log) for log in logs(neck)]
-    return SwitchedSettings(payloads=LOADS, least_cocontraction=TAUT, observer=False).design(lines)
+    settings = SwitchedSettings(payloads=LOADS, least_cocontraction=taut, observer=False)
+    if reference_time is not None:
+        settings = replace(settings, reference_time=reference_time)
+    return settings.design(lines(neck, taut))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,10 +151,11 @@ def targets(seconds: float) -> Matrix:
     return np.array(found)
 
 
-def run(neck: str, case: str, judged: VaryingController, watch: ChangeDetector, *, told: bool) -> LoopResult:
+def run(
+    neck: str, case: str, judged: VaryingController, watch: ChangeDetector, *, taut: float, told: bool
+) -> LoopResult:
     """Return a closed loop."""
     seconds = CREPT if case == "creep" else 60.0
-    wanted = targets(seconds)
     block = specimen(neck).block(noise_seed=11)
     plant: Part = Creeping(BlockPart(block)) if case == "creep" else BlockPart(block)  # pyright: ignore[reportAssignmentType]
     faults = {
@@ -149,45 +166,101 @@ def run(neck: str, case: str, judged: VaryingController, watch: ChangeDetector, 
     unsaid = {} if told else {"controller": {"payload": 0.0}}
     return run_loop(Loop(
         plant=plant, controller=BlockPart(judged.block()), duration=seconds, faults=faults.get(case, ()),
-        reference=RecordingReference(time=np.arange(len(wanted)) * EVERY, pitch=wanted[:, 0], roll=wanted[:, 1],
-                                     cocontraction=np.full(len(wanted), TAUT)),
-        others={"watch": BlockPart(watch.block())}, other_inputs=unsaid,
+        reference=asked_for(seconds, taut), others={"watch": BlockPart(watch.block())}, other_inputs=unsaid,
     ))  # fmt: skip
+
+
+def undisturbed(neck: str, judged: VaryingController, taut: float, payload: float, told: float) -> LoopResult:
+    """Return a closed loop under one payload, with another told."""
+    return run_loop(Loop(
+        plant=BlockPart(specimen(neck).block(noise_seed=11)), controller=BlockPart(judged.block()), duration=60.0,
+        faults=(NeckFault(start=0.0, values={"payload": payload}),) if payload else (), reference=asked_for(60.0, taut),
+        other_inputs={"controller": {"payload": told, "changed": 0.0}},
+    ))  # fmt: skip
+
+
+def asked_for(seconds: float, taut: float) -> RecordingReference:
+    """Return the reference."""
+    wanted = targets(seconds)
+    return RecordingReference(time=np.arange(len(wanted)) * EVERY, pitch=wanted[:, 0], roll=wanted[:, 1],
+                              cocontraction=np.full(len(wanted), taut))  # fmt: skip
+
+
+def parts(found: LoopResult, seconds: float) -> list[tuple[Matrix, Vector]]:
+    """Return how far the neck went of each step (time,), and how far from its end it was in its last second [rad]."""
+    y = np.column_stack([found["pitch_measured"], found["roll_measured"]])
+    wanted, rows, each = targets(seconds), round(EVERY / TS), []
+    for k in range(2, len(wanted)):
+        way, part = wanted[k] - wanted[k - 1], y[k * rows : (k + 1) * rows]
+        each.append(((part - wanted[k - 1]) @ way / float(way @ way), part[-50:].mean(axis=0) - wanted[k]))
+    return each
+
+
+def overshoot_and_rise(found: LoopResult, seconds: float) -> tuple[float, float]:
+    """Return the largest overshoot [%], and the mean time until 90 % of a step are gone [s]."""
+    gone = [part for part, _ in parts(found, seconds)]
+    rises = [float(np.argmax(part >= 0.9)) * TS if part.max() >= 0.9 else EVERY for part in gone]
+    return 100.0 * (max(float(part.max()) for part in gone) - 1.0), float(np.mean(rises))
 
 
 def judge(found: LoopResult, seconds: float) -> str:
     """Return what a loop is worth."""
-    y = np.column_stack([found["pitch_measured"], found["roll_measured"]])
-    wanted, rows = targets(seconds), round(EVERY / TS)
-    over, off, rises = 0.0, 0.0, []
-    for k in range(2, len(wanted)):
-        way, part = wanted[k] - wanted[k - 1], y[k * rows : (k + 1) * rows]
-        gone = (part - wanted[k - 1]) @ way / float(way @ way)
-        over = max(over, 100.0 * (float(gone.max()) - 1.0))
-        rises.append(float(np.argmax(gone >= 0.9)) * TS if gone.max() >= 0.9 else EVERY)
-        if not found["changed"][(k - 1) * rows : (k + 1) * rows].any():
-            off = max(off, float(np.degrees(np.linalg.norm(part[-50:].mean(axis=0) - wanted[k]))))
+    (over, rise), rows = overshoot_and_rise(found, seconds), round(EVERY / TS)
+    slowed = found["changed"] > 0.5
+    off = [float(np.degrees(np.linalg.norm(away))) for k, (_, away) in enumerate(parts(found, seconds), start=2)
+           if not slowed[(k - 1) * rows : (k + 1) * rows].any()]  # fmt: skip
     P = np.column_stack([found[f"motor_setpoint_{j}"] for j in (1, 2, 3)])
     beyond = float((np.abs(P) > 6.0 + 1e-9).any(axis=1).sum()) * TS
-    return (f"{over:10.1f} %{np.mean(rises):8.2f} s{off:8.2f} deg{beyond:8.1f} s{found['payload'][-1]:9.2f} kg"
-            f"{float((found['changed'] > 0.5).sum()) * TS:9.1f} s")  # fmt: skip
+    return (f"{over:10.1f} %{rise:8.2f} s{max(off, default=0.0):8.2f} deg{beyond:8.1f} s"
+            f"{found['payload'][-1]:9.2f} kg{float(slowed.sum()) * TS:9.1f} s")  # fmt: skip
+
+
+def choose(necks: list[str], cocontraction: float | None) -> None:
+    """Print each candidate (of one co-contraction, if given), and what necks left out get from the others' choice."""
+    candidates = [each for each in CANDIDATES if cocontraction in (None, each[0])]
+    found: dict[str, Matrix] = {}
+    for neck in necks:
+        rows = []
+        for taut, time in candidates:
+            judged = controller(neck, taut, time)
+            loops = [undisturbed(neck, judged, taut, *case) for case in JUDGED]
+            over, rise = np.array([overshoot_and_rise(loop, 60.0) for loop in loops]).T
+            tension = np.column_stack([loops[2][f"tension_{j}"] for j in (1, 2, 3)])
+            rows.append([float(over.max()), float(rise.mean())])
+            print(f"{neck:8}{taut:5.1f} rad{time:6.2f} s: overshoot "
+                  + "".join(f"{x:6.1f}" for x in over) + " %, 90 % after " + "".join(f"{x:6.2f}" for x in rise)
+                  + f" s, slack {(tension < 1e-3).any(axis=1).mean():5.2f}", flush=True)  # fmt: skip
+        found[neck] = np.array(rows)
+    for neck, own in found.items() if cocontraction is None else ():
+        others = np.array([rows for name, rows in found.items() if name != neck])
+        kept = (others[:, :, 0] <= GOAL).all(axis=0)
+        best = int(np.argmin(np.where(kept, np.log(others[:, :, 1]).mean(axis=0), np.inf)))
+        taut, time = candidates[best]
+        print(f"left out {neck:8} others choose {taut:g} rad, {time:g} s: overshoot {own[best, 0]:.1f} %, 90 % after "
+              f"{own[best, 1]:.2f} s; 1.5 rad, 0.06 s: {own[0, 0]:.1f} %, {own[0, 1]:.2f} s")  # fmt: skip
 
 
 def main() -> None:
-    """Print the table."""
+    """Print the table, or how its co-contraction was chosen."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=["column", "spring", "foam"])
+    parser.add_argument("what", nargs="?", choices=["table", "choose"], default="table")
+    parser.add_argument("--necks", nargs="*", choices=NECKS, default=list(CHOOSING))
     parser.add_argument("--cases", nargs="*", choices=CASES, default=CASES)
+    parser.add_argument("--cocontraction", type=float, metavar="RAD", help=f"of the table {TAUT:g} unless said")
     asked = parser.parse_args()
+    if asked.what == "choose":
+        choose(asked.necks, asked.cocontraction)
+        return
+    taut = TAUT if asked.cocontraction is None else asked.cocontraction
     for neck in asked.necks:
-        judged, watch = controller(neck), detector(neck)
+        judged, watch = controller(neck, taut), detector(neck, taut)
         print(
             f"{neck:22}{'overshoot':>12}{'rise':>10}{'error':>12}{'beyond':>10}{'payload':>12}{'changed':>11}",
             flush=True,
         )
         for case in asked.cases:
             for told in (True, False) if case in ("put on", "taken off") else (True,):
-                found = run(neck, case, judged, watch, told=told)
+                found = run(neck, case, judged, watch, taut=taut, told=told)
                 name = f"{case}, {'switched' if told else 'first'}"
                 print(f"{name:22}{judge(found, CREPT if case == 'creep' else 60.0)}", flush=True)
 

@@ -97,7 +97,9 @@ class Adaptation:
         model.check(recording)
         window = _latest(recording, self.window)
         if window is None:
-            return _kept(model, Judged(adapted=False, why="the outputs were not measured", seconds=0.0))
+            least = (WARM_UP + 1) * recording.sample_time
+            why = f"no run of the window goes on for more than {least:.3g} s after all outputs were first measured"
+            return _kept(model, Judged(adapted=False, why=why, seconds=0.0))
         known, held = _split(window, self.block)
         seconds = len(window) * window.sample_time
         if min(int(known.sum()), int(held.sum())) < _LEAST_ROWS:

@@ -155,11 +155,15 @@ def test_missing_stretches_are_not_learnt_from(old: Trained, window: Recording) 
     assert sum(fits(new, loaded("rotation", 1.0, 8))) > sum(fits(old["play"], loaded("rotation", 1.0, 8)))
 
 
-def test_a_window_without_a_measurement_keeps_the_model(old: Trained, window: Recording) -> None:
+@pytest.mark.parametrize("seconds", [None, 0.5], ids=["never measured", "too short"])
+def test_a_window_without_a_run_measured_keeps_the_model_and_says_so(
+    old: Trained, window: Recording, seconds: float | None
+) -> None:
     nothing = np.full(len(window), np.nan)
-    new = old["oe"].adapted(window.with_channels(pitch=nothing, roll=nothing))
+    unseen = window if seconds else window.with_channels(pitch=nothing, roll=nothing)
+    new = old["oe"].adapted(unseen, window=seconds or 30.0)
     assert same_arrays(new, old["oe"])
-    assert new.findings["adaptation"]["why"] == "the outputs were not measured"
+    assert "no run of the window goes on for more than 0.52 s" in new.findings["adaptation"]["why"]
 
 
 def test_only_the_latest_seconds_count(old: Trained, window: Recording) -> None:
