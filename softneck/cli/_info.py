@@ -19,9 +19,9 @@ from softneck.core import (
     load,
     read_archive,
     refuse_existing,
-    require_file,
 )
 from softneck.core._budget import MOST_JSON, open_zip, settings_text
+from softneck.core._files import require_file
 from softneck.core._kinds import KINDS, fitting
 
 from .shared._console import print_json, progress

@@ -18,7 +18,6 @@ from ._errors import SoftneckError as SoftneckError
 from ._files import atomic_write as atomic_write
 from ._files import file_hash as file_hash
 from ._files import refuse_existing as refuse_existing
-from ._files import require_file as require_file
 from ._kinds import KINDS as KINDS
 from ._kinds import Kind as Kind
 from ._kinds import find_kind as find_kind

@@ -17,8 +17,8 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     find_kind,
-    require_file,
 )
+from softneck.core._files import require_file
 
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import json_option

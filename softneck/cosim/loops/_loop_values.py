@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, require_file
+from softneck.core import FileFormatError, SettingsError
 from softneck.core._budget import settings_text
+from softneck.core._files import require_file
 from softneck.loop._wiring import Link
 
 

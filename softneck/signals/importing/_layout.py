@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, require_file, to_si
+from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
 from softneck.core._budget import settings_text
+from softneck.core._files import require_file
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, require_file, to_si
+from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 from softneck.core._budget import MOST_TOML, require_numbers, require_size, require_table
+from softneck.core._files import require_file
 from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
 
