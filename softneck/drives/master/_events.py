@@ -77,7 +77,7 @@ RULES: dict[str, Rule] = {
     "sensor_noise": Rule(_R.RETREAT, 0, 0.5, "the inclinometer's noise is not what it was"),
     "sensor_rate": Rule(_R.RETREAT, 0, 0.5, "the inclinometer's samples come less often than they did"),
     "sensor_drift": Rule(_R.RETREAT, 0, 4.0, "the inclinometer drifts: its own gyro does not confirm its angles"),
-    "not_watched": Rule(_R.COUNT, 0, 5.0, "tilt and tracking are not compared with the experiments"),
+    "not_watched": Rule(_R.COUNT, 0, 5.0, "not all is compared with the experiments"),
     "stalled": Rule(_R.STOP, 1, 0.0, "the control loop stood still for 5 cycles or more"),
     "late_cycle": Rule(_R.COUNT, 1, 0.0, "a cycle came late"),
     "clock": Rule(_R.STOP, 1, 0.0, "the clock went backwards"),

@@ -12,6 +12,7 @@ from softneck.signals.detection._cusum import Charts
 from softneck.signals.detection._whitening import Filter, Whitening
 
 from ._baseline import Baseline
+from ._charts_runtime import SUPERVISED_NOT
 
 RUNTIME = "softneck.drives.supervision._charts_runtime"
 # Set-points that a step of a motor may still answer to [cycles]: the slowest drives' latency is 0.1 s.
@@ -187,6 +188,9 @@ class MotorCharts:
         self._functions.supervised_levels(
             self._levels, self._rules, f.past, f.x, self._rest, self._scales, self._load, self.scores[at:]
         )
+        if not self.known_load:
+            # As for the tilt: nobody saw how such a load is shared.
+            self.scores[2 * n :] = SUPERVISED_NOT
         found = self.charts.step(self.scores)
         if found < 0:
             return None

@@ -239,11 +239,11 @@ class TiltCharts:
         """Tendons that hang or carry more, motors beyond where they were seen: the tilt is not what the model says."""
         self.off = ""
         if not known_load:
-            self.off = "more is carried than in the experiments"
+            self.off = "more is carried than in the experiments: tilt, tracking and currents rest"
         elif (taut < self._slack).any():
-            self.off = "a tendon may hang"
+            self.off = "a tendon may hang: tilt and tracking rest"
         elif (positions < self._low).any() or (positions > self._high).any():
-            self.off = "a motor is beyond its range in the experiments"
+            self.off = "a motor is beyond its range in the experiments: tilt and tracking rest"
         out = bool(self.off)
         # And so long after as the model looks back, and again for the rest that it begins anew from.
         self._wait = _SETTLED * self._b.lags[-1] if out else max(0, self._wait - 1)

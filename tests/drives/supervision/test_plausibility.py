@@ -170,7 +170,9 @@ def test_where_tendons_hang_the_tilt_is_not_judged() -> None:
     bench.pass_time(1.5)
     # Said once, after 5 s, and no fault.
     assert bench.master.counts["not_watched"] == 1
-    assert [e.detail for e in bench.master.events if e.name == "not_watched"] == ["a tendon may hang"]
+    assert [e.detail for e in bench.master.events if e.name == "not_watched"] == [
+        "a tendon may hang: tilt and tracking rest"
+    ]
     assert bench.phase is Phase.RUNNING
     assert np.all(charts.tilt.scores[: charts.tilt._hypotheses] == 0.0)
 
