@@ -17,11 +17,14 @@ from ._possible import FILE, lacking, possible, require_known
 from ._step import Step, Unmet
 
 AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
+FAMILY = "models/family.npz"
 PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu", "fmus/Controller.fmu"
 _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
 # Of `tune`: without `scheduled`, which needs several models, and `adaptive`, which was the best on none of the foreign
 # necks `column`, `spring` and `chain`, and takes a fifth of a search with empty caches.
-_KINDS = "pi,pid,fopi,hinf,ncf,lqg,mpc"
+_KINDS = "pi,pid,fopi,hinf,ncf,lqg"
+# Beside a family nothing is certified of it: its loops pull no tendons as the recordings do.
+_UNCERTIFIED = ",mpc"
 _TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"
 
 
@@ -137,6 +140,10 @@ def _models(recordings: list[str], asked: Asked) -> Iterator[Step]:
     data = [word for recording in recordings for word in ("--data", recording)]
     command = ("softneck", "observer", linear, *data, "-o", OBSERVER, "--force")
     yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings))
+    # Linear checks are then about what the recordings show, and not about one line through them.
+    command = ("softneck", "family", *recordings, "-o", FAMILY, "--html", "build/family.html", "--force")
+    yield Step(stage="identification", command=command, makes=(FAMILY,), reads=tuple(recordings),
+               unmet=Unmet.DONE_WITHOUT)  # fmt: skip
 
 
 def linear_model() -> str:
@@ -152,13 +159,15 @@ def nonlinear_model() -> str | None:
 
 
 def _controller(asked: Asked) -> Iterator[Step]:
-    linear, nonlinear = linear_model(), nonlinear_model()
-    plants = (linear,) if nonlinear is None else (linear, nonlinear)
+    family = Path(FAMILY).is_file()
+    linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
+    plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
+    kinds = asked.kinds or (_KINDS if family else _KINDS + _UNCERTIFIED)
     # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
     finding = possible(plants) if asked.requirements is None else ""
     stated = FILE if finding else asked.requirements
     wanted = () if stated is None else (stated,)
-    words = [word for name, value in (("--requirements", stated), ("--kinds", asked.kinds or _KINDS),
+    words = [word for name, value in (("--requirements", stated), ("--kinds", kinds),
                                       ("--budget", asked.budget), ("--seed", asked.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
     # --force goes on with the judgements of the same search, and replaces another one. In this process: with empty

@@ -17,7 +17,16 @@ from typing import Any
 
 import click
 
-from softneck.core import CheckFailedError, FileFormatError, OutputFileError, SoftneckError, atomic_write, file_hash
+from softneck.core import (
+    CheckFailedError,
+    DataError,
+    FileFormatError,
+    OutputFileError,
+    SettingsError,
+    SoftneckError,
+    atomic_write,
+    file_hash,
+)
 from softneck.core._budget import MOST_JSON, settings_text
 
 from ..shared._console import note
@@ -94,6 +103,8 @@ class Sitting:
                 raise CheckFailedError(said["said"])
             if not self.as_json:
                 note(f"does not hold: {said['said']}")
+        elif said["said"]:
+            note(f"no {step.makes[0]}, and what comes after does without: {said['said']}")
 
     def _tell(self, step: Step, kept: bool) -> None:
         line = f"[{STAGES.index(step.stage) + 1}/{len(STAGES)}] {step.stage}{' (done before)' if kept else ''}"
@@ -108,6 +119,13 @@ class Sitting:
         except CheckFailedError as error:
             ended = False
             entry |= {"holds": False, "said": " ".join(filter(None, [step.finding, str(error)]))}
+        except (DataError, SettingsError) as error:
+            if step.unmet is not Unmet.DONE_WITHOUT:
+                raise
+            ended = False
+            entry["said"] = str(error)
+            for name in step.makes:  # what an earlier call made is of other recordings
+                Path(name).unlink(missing_ok=True)
         lacking = [name for name in step.makes if not Path(name).is_file()]
         if lacking and ended:
             raise OutputFileError(f"{lacking[0]}: was not made by `{step.shown}`.")

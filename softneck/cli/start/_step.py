@@ -16,6 +16,7 @@ class Unmet(Enum):
 
     FINDING = "a result, with which the sitting goes on"
     NO_MODEL = "nothing that comes after can be believed"
+    DONE_WITHOUT = "what comes after does without what it makes, whatever the reason"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

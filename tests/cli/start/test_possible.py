@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import tomllib
@@ -11,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from softneck.cli.start import _possible, _sitting, _start
+from softneck.cli.start import _plan, _possible, _sitting, _start
 from softneck.cli.start._plan import PI, Asked
 from softneck.cli.start._step import Step, Unmet
 from softneck.core import CheckFailedError, SettingsError
@@ -19,6 +20,7 @@ from softneck.robot import Robot
 from softneck.tuning import _beforehand
 
 from ..conftest import Call
+from .conftest import facts_of, short_plan
 
 # Of a linear model alone, whose steps are asked of it.
 WHY = {
@@ -119,6 +121,40 @@ def test_a_log_is_asked_for_only_where_the_model_is_at_fault(
     assert ("Record 60 s of `mixed`" in said.err.splitlines()[-1]) == records
     assert why in said.err.splitlines()[-1]
     assert said.code == (1 if records else 2)
+
+
+def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordings_is_left(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The sitting goes on, says why, and plans on the models alone; where it can be made it is the first plant."""
+
+    def plan(asked: Asked) -> Iterator[Step]:
+        Path("models").mkdir(exist_ok=True)
+        Path(_plan.FAMILY).write_bytes(b"of an earlier call")
+        yield Step(stage="identification", command=("softneck", "family", "log.csv"), makes=(_plan.FAMILY,),
+                   reads=asked.logs, unmet=Unmet.DONE_WITHOUT)  # fmt: skip
+        yield from itertools.islice(short_plan(asked), 1)
+        planned.append(next(_plan._controller(asked)).command)
+
+    def refuse_family(words: tuple[str, ...], *, as_json: bool) -> None:
+        if words[1] == "family":
+            raise SettingsError("log.csv: too short.")
+        inner(words, as_json=as_json)
+
+    inner, planned = _sitting._softneck, list[tuple[str, ...]]()
+    monkeypatch.setattr(_start, "steps", plan)
+    monkeypatch.setattr(_start, "_facts", facts_of)
+    monkeypatch.setattr(_sitting, "_softneck", refuse_family)
+    monkeypatch.setattr(_plan, "possible", lambda _: "")
+    said = call("start", short, "-o", "p", "--yes")
+    assert said.code == 0, said.err
+    assert "no models/family.npz, and what comes after does without: log.csv: too short." in " ".join(said.err.split())
+    assert not Path("p", _plan.FAMILY).exists()
+    assert planned[0][2:5] == ("models/auto.npz", "--kinds", "pi,pid,fopi,hinf,ncf,lqg,mpc")
+    Path("models").mkdir()
+    Path(_plan.FAMILY).touch()
+    beside = next(_plan._controller(Asked(logs=()))).command
+    assert beside[2:6] == (_plan.FAMILY, "models/auto.npz", "--kinds", "pi,pid,fopi,hinf,ncf,lqg")
 
 
 def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
