@@ -1,6 +1,6 @@
 """A closed loop on a neck that changes, with the controller that switches by the estimated payload.
 
-`python benchmarks/changing_neck.py [table|choose] [--necks NECK...] [--cases CASE...] [--cocontraction RAD]`
+`python benchmarks/changing_neck.py [table|payloads] [--necks NECK...] [--cases CASE...] [--cocontraction RAD]`
 
 Of each foreign neck: logs of 100 s of Eq. 22 around a co-contraction of 3 rad with 0, 0.5 and 1 kg; a line of each,
 a `greybox` of all three, a detector over it from 200 s of other motion with each, and `switched` at the three. Beside
@@ -11,10 +11,9 @@ slows the reference), the time with a set-point beyond its limit, the payload th
 `changed`. The angle is the measured one: nobody sees a sensor's bias. Creep: tendon 1 grows by 5 % of 0.11 m in 10
 minutes, the others by half of that.
 
-`choose` says where 3 rad come from: co-contractions and times of the reference filter, each neck left out in turn. The
-others choose the fastest with which none of them overshoots by more than 8 %, without detector: 0, 0.5 and 1 kg under
-their own gains, and 0 and 1 kg under those of the other. `slack` is the part of the time in which a tendon bears less
-than 1 mN with 1 kg.
+`payloads` prints loops without a detector instead: 0, 0.5 and 1 kg under their own gains, and 0 and 1 kg under those of
+the other, with each time of the reference filter. `slack` is the part of the time in which a tendon bears less than
+1 mN with 1 kg.
 """
 
 from __future__ import annotations
@@ -40,11 +39,11 @@ OUT, TS, LOADS, TAUT = Path("build/changing_neck"), 0.02, (0.0, 0.5, 1.0), 3.0
 EVERY, AT = 4.0, 20.0
 # 5 % of 0.11 m on a winch of 7.5 mm.
 CREEP, CREPT = 0.05 * 0.11 / 0.0075, 600.0
+# Loops without a detector: payload, told.
+JUDGED = ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (0.0, 1.0), (1.0, 0.0))
+TIMES = (0.06, 0.2, 0.4)
 CASES = ("nothing", "put on", "taken off", "creep", "bias 2 deg")
 MOTIONS = ("steps", "sine", "rotation", "aprbs", "multisine", "mixed")
-# What may be chosen: co-contraction [rad], time of the reference filter [s]; loops it is chosen on: payload, told.
-CANDIDATES = [(taut, time) for taut in (1.5, 2.0, 2.5, 3.0, 4.0) for time in (0.06, 0.2, 0.4)]
-JUDGED, GOAL = ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (0.0, 1.0), (1.0, 0.0)), 8.0
 
 
 def moved(neck: str, P: Matrix, payload: float, taut: float, seed: int) -> Recording:
@@ -179,6 +178,18 @@ def undisturbed(neck: str, judged: VaryingController, taut: float, payload: floa
     ))  # fmt: skip
 
 
+def payloads(neck: str, taut: float, time: float) -> Vector:
+    """Print what loops without a detector are worth, and return the largest overshoot [%] and the mean rise [s]."""
+    judged = controller(neck, taut, time)
+    loops = [undisturbed(neck, judged, taut, *case) for case in JUDGED]
+    over, rise = np.array([overshoot_and_rise(loop, 60.0) for loop in loops]).T
+    tension = np.column_stack([loops[2][f"tension_{j}"] for j in (1, 2, 3)])
+    print(f"{neck:8}{taut:5.1f} rad{time:6.2f} s: overshoot "
+          + "".join(f"{x:6.1f}" for x in over) + " %, 90 % after " + "".join(f"{x:6.2f}" for x in rise)
+          + f" s, slack {(tension < 1e-3).any(axis=1).mean():5.2f}", flush=True)  # fmt: skip
+    return np.array([over.max(), rise.mean()])
+
+
 def asked_for(seconds: float, taut: float) -> RecordingReference:
     """Return the reference."""
     wanted = targets(seconds)
@@ -215,43 +226,20 @@ def judge(found: LoopResult, seconds: float) -> str:
             f"{found['payload'][-1]:9.2f} kg{float(slowed.sum()) * TS:9.1f} s")  # fmt: skip
 
 
-def choose(necks: list[str], cocontraction: float | None) -> None:
-    """Print each candidate (of one co-contraction, if given), and what necks left out get from the others' choice."""
-    candidates = [each for each in CANDIDATES if cocontraction in (None, each[0])]
-    found: dict[str, Matrix] = {}
-    for neck in necks:
-        rows = []
-        for taut, time in candidates:
-            judged = controller(neck, taut, time)
-            loops = [undisturbed(neck, judged, taut, *case) for case in JUDGED]
-            over, rise = np.array([overshoot_and_rise(loop, 60.0) for loop in loops]).T
-            tension = np.column_stack([loops[2][f"tension_{j}"] for j in (1, 2, 3)])
-            rows.append([float(over.max()), float(rise.mean())])
-            print(f"{neck:8}{taut:5.1f} rad{time:6.2f} s: overshoot "
-                  + "".join(f"{x:6.1f}" for x in over) + " %, 90 % after " + "".join(f"{x:6.2f}" for x in rise)
-                  + f" s, slack {(tension < 1e-3).any(axis=1).mean():5.2f}", flush=True)  # fmt: skip
-        found[neck] = np.array(rows)
-    for neck, own in found.items() if cocontraction is None else ():
-        others = np.array([rows for name, rows in found.items() if name != neck])
-        kept = (others[:, :, 0] <= GOAL).all(axis=0)
-        best = int(np.argmin(np.where(kept, np.log(others[:, :, 1]).mean(axis=0), np.inf)))
-        taut, time = candidates[best]
-        print(f"left out {neck:8} others choose {taut:g} rad, {time:g} s: overshoot {own[best, 0]:.1f} %, 90 % after "
-              f"{own[best, 1]:.2f} s; 1.5 rad, 0.06 s: {own[0, 0]:.1f} %, {own[0, 1]:.2f} s")  # fmt: skip
-
-
 def main() -> None:
-    """Print the table, or how its co-contraction was chosen."""
+    """Print the table, or the loops without a detector."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("what", nargs="?", choices=["table", "choose"], default="table")
+    parser.add_argument("what", nargs="?", choices=["table", "payloads"], default="table")
     parser.add_argument("--necks", nargs="*", choices=NECKS, default=list(CHOOSING))
     parser.add_argument("--cases", nargs="*", choices=CASES, default=CASES)
-    parser.add_argument("--cocontraction", type=float, metavar="RAD", help=f"of the table {TAUT:g} unless said")
+    parser.add_argument("--cocontraction", type=float, default=TAUT, metavar="RAD", help="%(default)s unless said")
     asked = parser.parse_args()
-    if asked.what == "choose":
-        choose(asked.necks, asked.cocontraction)
+    taut = asked.cocontraction
+    if asked.what == "payloads":
+        for neck in asked.necks:
+            for time in TIMES:
+                payloads(neck, taut, time)
         return
-    taut = TAUT if asked.cocontraction is None else asked.cocontraction
     for neck in asked.necks:
         judged, watch = controller(neck, taut), detector(neck, taut)
         print(
