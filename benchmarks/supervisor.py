@@ -4,7 +4,8 @@
 `... faults [--seeds 1000] [--row NAME]` plays every row of the table, each from a fork of the run before its fault.
 `... undisturbed [--hours 30]` looks for false alarms at 0 to 1 kg: it keeps the motion (`... motion` plays that alone),
 which no supervisor changes that says nothing, and asks the charts again where the baseline or the code changed. Results
-are lines of JSON under build/supervisor; `... report` prints the tables, and which faults are told apart.
+are lines of JSON under build/supervisor; `... report` prints the tables, and which faults are told apart; `--first`
+SEED begins elsewhere, where nobody looked, and reports what was found from there on.
 """
 
 from __future__ import annotations
@@ -63,11 +64,11 @@ def add(path: Path, item: dict[str, Any]) -> None:
         file.write(json.dumps({**item, "judged_by": judged_by()}) + "\n")
 
 
-def faults(seeds: int, rows: list[str]) -> None:
+def faults(first: int, seeds: int, rows: list[str]) -> None:
     """Play the rows, seed by seed."""
     path = FOLDER / "faults.jsonl"
     known = {(item["row"], item["seed"]) for item in done(path)}
-    for seed in range(_FIRST_FAULT, _FIRST_FAULT + seeds):
+    for seed in range(first, first + seeds):
         # Payloads at which tendons are taut: at 1 kg they hang, and the tilt is not watched (see the docs).
         payload = float(np.random.default_rng([seed, 5]).uniform(0.0, 0.3))
         left = {name: ROWS[name] for name in rows if (name, seed) not in known}
@@ -76,11 +77,11 @@ def faults(seeds: int, rows: list[str]) -> None:
                        "beyond": found.beyond, "excited": found.excited, "showed": found.showed})  # fmt: skip
 
 
-def undisturbed(hours: float, *, judge: bool = True) -> None:
+def undisturbed(first: int, hours: float, *, judge: bool = True) -> None:
     """Ask the charts of motion without any fault, ten minutes each, and note what they say; or play it only."""
     path = FOLDER / "undisturbed.jsonl"
     known = {item["seed"] for item in done(path)}
-    for seed in range(_FIRST, _FIRST + math.ceil(hours * 60.0 / _MINUTES)):
+    for seed in range(first, first + math.ceil(hours * 60.0 / _MINUTES)):
         if seed in known:
             continue
         payload = float(np.random.default_rng([seed, 6]).uniform(0.0, 1.0))
@@ -136,9 +137,9 @@ def said(motion: Motion, references: Matrix) -> tuple[list[tuple[float, str, str
     return told, valid / len(motion.due)
 
 
-def report() -> None:
-    """Print both tables."""
-    items = list(done(FOLDER / "faults.jsonl"))
+def report(first: int) -> None:
+    """Print both tables, of the seeds from `first` on."""
+    items = [item for item in done(FOLDER / "faults.jsonl") if item["seed"] >= first]
     print(f"{'row':36}" + "".join(f"{title:>{width}}" for title, width in TITLES.items()))
     for name, row in ROWS.items():
         runs = [item for item in items if item["row"] == name]
@@ -155,15 +156,14 @@ def report() -> None:
               f"{len(named):7}{len(own):6}{len(near):9}{least(len(near), len(found)):>8}"
               f"{np.median(after):12.2f}{np.quantile(after, 0.95):10.2f}")  # fmt: skip
     for name, row in ROWS.items():
-        runs = [item for item in items if item["row"] == name and row.shows]
-        if runs and row.shows:
+        runs = [item for item in items if item["row"] == name]
+        if runs and row.shows < math.inf:
             shown = [item for item in runs if item["event"] or item["showed"] > row.limit]
             soon = sum(item["event"] != "" and item["showed"] <= row.limit + 1e-6 for item in shown)
-            what = {"own": "of its own part of the tilt", "apart": "off the path without it"}[row.shows[0]]
-            print(f"  {name}, {row.limit:g} s after {math.degrees(row.shows[1]):.1f} deg {what}: "
+            print(f"  {name}, {row.limit:g} s after {math.degrees(row.shows):.1f} deg off the path without it: "
                   f"{soon} of {len(shown)}, at least {least(soon, len(shown))}")  # fmt: skip
     told_apart(items)
-    calm = list(done(FOLDER / "undisturbed.jsonl"))
+    calm = [item for item in done(FOLDER / "undisturbed.jsonl") if item["seed"] >= first]
     known = max(PAYLOADS)
     for what, runs in (
         (f"0 to {known:g} kg, as the experiments", [item for item in calm if item["payload"] <= known]),
@@ -215,15 +215,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1000)
     parser.add_argument("--row", action="append", choices=list(ROWS))
     parser.add_argument("--hours", type=float, default=30.0)
+    parser.add_argument("--first", type=int)
     asked = parser.parse_args()
     if asked.part == "baseline":
         BASELINE.unlink(missing_ok=True)
         commissioned().save(BASELINE)
     elif asked.part == "faults":
-        faults(asked.seeds, asked.row or list(ROWS))
+        faults(_FIRST_FAULT if asked.first is None else asked.first, asked.seeds, asked.row or list(ROWS))
     elif asked.part in ("motion", "undisturbed"):
-        undisturbed(asked.hours, judge=asked.part == "undisturbed")
-    report()
+        undisturbed(_FIRST if asked.first is None else asked.first, asked.hours, judge=asked.part == "undisturbed")
+    report(asked.first or 0)
 
 
 if __name__ == "__main__":

@@ -102,14 +102,14 @@ class Row:
         breaks: it, at a random time; from the start where `early`.
         names: of the events that name it; the first is the right one, others where sensors cannot tell it apart.
         excited: what must have happened since in the run without the fault: "position" of motor 1 and "tilt" moved so
-            far [rad], or "way", both axes together; "pulls": in so many cycles its tension changed by 0.25 N within
-            three.
+            far [rad], or "way", both axes together; "own": the part of motor 1 in the axis it moves most did; "pulls":
+            in so many cycles its tension changed by 0.25 N within three.
         limit: time to the event after that [s].
         early: the fault is there before the run begins.
         gyro: whether the sensor has one.
         loop: whether it is a fault of loops only.
-        shows: where that excites less than the fault is, when it must show: "own" part of the tilt by motor 1, or how
-            far the neck is "apart" from its path without the fault, is so large [rad].
+        shows: where that excites less than the fault is, how far the neck is from its path without the fault when it
+            must show [rad].
     """
 
     breaks: Callable[[Bench], object]
@@ -119,15 +119,15 @@ class Row:
     early: bool = False
     gyro: bool = True
     loop: bool = False
-    shows: tuple[str, float] | None = None
+    shows: float = math.inf
 
 
 DEG = math.radians(1.0)
 AT_ONCE, BY_TILT, BY_PULLS = ("", 0.0), ("tilt", 2 * DEG), ("pulls", 25.0)
-BY_WAY = ("way", 2 * DEG)
-# Half of the 3 deg that a fault may lead the neck; and as much beside the 0.6 deg of slow error that the tracking of
-# the baseline takes for none.
-OWN, APART = ("own", 1.5 * DEG), ("apart", 2.1 * DEG)
+BY_WAY, BY_OWN = ("way", 2 * DEG), ("own", 2 * DEG)
+# Half of the 3 deg that a fault may lead the neck, beside the 0.6 deg of slow error that the tracking of the baseline
+# takes for none.
+APART = 2.1 * DEG
 
 
 def reversed_(bench: Bench) -> None:
@@ -148,8 +148,8 @@ ROWS: dict[str, Row] = {
     "ten bad TPDO frames": Row(misreads, ("position_bad",), AT_ONCE),
     "peak current x 2": Row(lambda b: peak_current(b, 2.0), ("current_scale",), BY_PULLS),
     "peak current x 1/2": Row(lambda b: peak_current(b, 0.5), ("current_scale", "following", "motor_jammed"), BY_PULLS),
-    "gear x 2": Row(lambda b: gear(b, 2.0), ("gear_wrong", "current_scale"), BY_TILT, early=True, shows=OWN),
-    "gear x 1/2": Row(lambda b: gear(b, 0.5), ("gear_wrong", "current_scale"), BY_TILT, early=True, shows=OWN),
+    "gear x 2": Row(lambda b: gear(b, 2.0), ("gear_wrong", "current_scale"), BY_OWN, early=True),
+    "gear x 1/2": Row(lambda b: gear(b, 0.5), ("gear_wrong", "current_scale"), BY_OWN, early=True),
     "sensor stuck, 0.005 deg of noise": Row(
         lambda b: stuck(b, 0.005 * DEG), ("sensor_noise", "sensor_stuck", "sensor_drift"), AT_ONCE
     ),
@@ -285,13 +285,12 @@ def _broken(row: Row, bench: Bench, calm: Calm, k: int, most: float) -> Outcome:
     first, last = k, k + round(most / T)
     excited = _excited(row, calm, first)
     beyond = 0.0
-    what, enough = row.shows or ("", math.inf)
-    own, shown = _own_part(calm, first) if what == "own" else np.zeros(last), last
+    shown = last
     while bench.phase is Phase.RUNNING and k < last:
         bench.step()
         apart = float(np.hypot(*(tilt_of(bench) - calm.tilt[k])))
         beyond = max(beyond, apart)
-        if (own[k] if what == "own" else apart) > enough:
+        if apart > row.shows:
             shown = min(shown, k)
         k += 1
     showed = (k - 1 - shown) * T if shown < last else -math.inf
@@ -323,6 +322,8 @@ def _excited(row: Row, calm: Calm, first: int) -> int:
         moved = np.abs(calm.tilt[:, 0] - calm.tilt[start, 0])
     elif what == "way":
         moved = np.hypot(*(calm.tilt - calm.tilt[start]).T)
+    elif what == "own":
+        moved = _own_part(calm, start)
     else:
         moved = np.abs(calm.positions[:, 0] - calm.positions[start, 0])
     at = np.flatnonzero(moved[first:] > by)

@@ -48,7 +48,7 @@ def _sentence(one: Finding) -> str:
 
 
 def _proposal(result: Commissioned) -> Section:
-    """List the keys that the proposed drives file changes."""
+    """List the keys that the proposed files change."""
     before, after = drives_table(result.believed), drives_table(result.file)
     rows = []
     for j, (old, new) in enumerate(zip(before["drive"], after["drive"], strict=True), start=1):
@@ -57,12 +57,18 @@ def _proposal(result: Commissioned) -> Section:
     axes = [", ".join(table["sensor"].get("axes", [])) or "as they come" for table in (before, after)]
     if axes[0] != axes[1]:
         rows.append(["[sensor] axes", *axes])
-    said = [
-        f"{robot.delay_s:g}" if robot.delay_s is not None else "-" for robot in (result.believed.moves, result.robot)
+    given, right = result.believed.moves, result.robot
+    rows += [
+        [f"robot: {key}", _cell(old), _cell(value)]
+        for key, old, value in (
+            ("[motors] sign", given.motors.sign, right.motors.sign),
+            ("[sensor] noise_std", given.noise_std, right.noise_std),
+            ("[sensor] delay_s", given.delay_s, right.delay_s),
+        )
+        if old != value
     ]
-    if said[0] != said[1]:
-        rows.append(["robot: [sensor] delay_s", *said])
-    text = [] if rows else ["The proposed files say the same of drives and sensor as those that were given."]
+    text = ["Slack and friction stand in no file: they are below, and in the JSON."]
+    text += [] if rows else ["The proposed files say the same of drives and sensor as those that were given."]
     table = Table("What the proposed files change", ["key", "given", "proposed"], rows)
     return Section("Proposal", text, [table] if rows else [])
 

@@ -68,6 +68,8 @@ def _with(planted: Planted, kind: str, *said: str) -> Planted:
     outputs = file.moves.outputs.names
     if kind == "exchanged":
         a, b = (_motor(text, len(drives)) for text in said)
+        if a == b:
+            raise ValueError(said)
         drives[a], drives[b] = drives[b], drives[a]
     elif kind in ("reversed", *_SCALES):
         (where, *factor) = said
@@ -89,7 +91,11 @@ def _with(planted: Planted, kind: str, *said: str) -> Planted:
         axes = tuple((before[n][0], sign * before[n][1]) for n, sign in turn)
         return replace(planted, file=replace(file, sensor_axes=said_of(axes, outputs)))
     elif kind == "late":
-        return replace(planted, late=float(said[0]))
+        late = float(said[0])
+        # Samples are kept for so long; a minute is more than any sensor needs.
+        if not 0.0 <= late <= 60.0:
+            raise ValueError(late)
+        return replace(planted, late=late)
     else:
         return replace(planted, twins=(*planted.twins, file.nodes[_motor(said[0], len(drives))]))
     return replace(planted, file=replace(file, drives=tuple(drives)))

@@ -194,7 +194,7 @@ def _features(**changes: Any) -> Features:
 
 @pytest.mark.parametrize(
     "mistake", ["", "reversed", "reversed:4", "gear:1", "gear:1:x", "gear:1:0", "sign:yaw", "late:soon", "axes:1",
-                "duplicate:0", "exchanged:1", "lazy"],
+                "duplicate:0", "exchanged:1", "exchanged:1:1", "late:-1", "late:inf", "lazy"],
 )  # fmt: skip
 def test_a_mistake_that_is_none_is_one_line(mistake: str) -> None:
     with pytest.raises(SettingsError, match=r"--plant takes reversed:N|gear"):
