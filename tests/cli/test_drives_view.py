@@ -139,6 +139,19 @@ def test_a_small_terminal_shows_all_of_it() -> None:
     assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 32
 
 
+@pytest.mark.parametrize("size", [(80, 24), (104, 32)])
+@pytest.mark.parametrize("change", [(math.nan,) * 3, (1.0, 12.5, 43.0)])
+def test_what_the_supervisor_says_fits_in_two_lines(size: tuple[int, int], change: tuple[float, ...]) -> None:
+    """It is the longest; a loop of two minutes has the longest head."""
+    fault = Event(103.4, "gear_wrong", 1, "motor 1: the tilt moves as if the winch turned 0.5 times as far")
+    full = replace(_snapshot(), fault=fault, events=(fault,) * 5, change=change, index=6000, phase=Phase.STOPPING)
+    lines = _drawn(render(full, CycleFigures(), begin=0.0, duration=120.0, size=size), size[0]).splitlines()
+    assert len(lines) <= size[1]
+    assert lines[-1].startswith("╰")
+    said = " ".join(line.strip("│ ") for line in lines)
+    assert str(fault) in said
+
+
 def test_a_picture_is_one_line_and_markup_in_it_is_text() -> None:
     fault = Event(103.4, "emergency", 2, "code 2310h")
     stopped = replace(_snapshot(), phase=Phase.STOPPED, fault=fault, estimates=(math.nan, math.nan))

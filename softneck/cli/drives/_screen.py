@@ -36,14 +36,16 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
     from rich.panel import Panel
 
     narrow, low = size[0] < _WIDE, size[1] < _HIGH
+    # A fault that needs two lines takes an event's place, and so does a change's line where there is no room for both.
+    events = 5 - (len(picture["fault"] or "") > min(size[0], _WIDE) - 4)
+    events -= low and math.isfinite(picture["change"][0])
     blocks: list[list[RenderableType]] = [
-        [_head(picture)],
+        [_head(picture, narrow=narrow)],
         [_angles(picture, narrow=narrow)],
         [_motors(picture, narrow=narrow, low=low)],
         [_drives(picture, narrow=narrow)],
         [_timing(picture, narrow=narrow)],
-        # A change's line takes an event's place where there is no room for both.
-        [*_events(picture, 4 if low and math.isfinite(picture["change"][0]) else 5)],
+        [*_events(picture, events)],
         [_counts(picture)],
     ]
     parts = [line for k, block in enumerate(blocks) for line in (block if low or not k else ["", *block])]
@@ -51,13 +53,15 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
     return Panel(Group(*parts), title=_title(picture["title"]), title_align="left", border_style=style)
 
 
-def _head(picture: dict[str, Any]) -> Text:
+def _head(picture: dict[str, Any], *, narrow: bool) -> Text:
     from rich.text import Text
 
     text = Text()
     text.append(picture["phase"], style=picture["phase_style"])
     of = "" if picture["duration"] is None else f" of {picture['duration']:.1f}"
-    text.append(f"   loop {picture['run_time']:.2f}{of} s   since start {picture['since']:.2f} s")
+    text.append(f"   loop {picture['run_time']:.2f}{of} s")
+    if not narrow:
+        text.append(f"   since start {picture['since']:.2f} s")
     text.append(f"   bus cycle {picture['cycle']}")
     text.append("   validity ")
     text.append(_number(picture["validity"], ".2f"), style="bold red" if picture["validity"] < 0.5 else "none")
