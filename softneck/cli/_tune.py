@@ -143,15 +143,26 @@ def _print(found: Tuned, folder: Path) -> None:
 
 def _why(found: Tuned, folder: Path) -> str:
     from softneck.report._tune_page import stands_in_the_way
+    from softneck.verification._own_plants import ALONE
 
-    binds = [item.note for item in found.verification.verdicts if item.requirement.metric == found.binding]
+    failed = found.verification.failed
+    binds = [item.note for item in failed if item.requirement.metric == found.binding]
+    blind = ALONE in binds or (found.binding is None and any(item.value is None for item in failed))
     unheard = any(note.startswith("not supported by the data") for note in binds)
-    way = way_on(found.binding, unheard=unheard)
+    way = way_on(found.binding, unheard=unheard, blind=blind)
     return f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} {way}."
 
 
-def way_on(binding: str | None, *, unheard: bool) -> str:
-    """Return what to do about the requirement that binds; `unheard` where the data do not support it."""
+def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:
+    """Return what to do about the requirement that binds.
+
+    Args:
+        binding: the requirement; None where none is known to.
+        unheard: whether the data do not support it.
+        blind: whether the kind has no linear form that could be held against the data.
+    """
+    if blind:
+        return "No setting mends it: name kinds with a linear form in --kinds, such as pi or lqg"
     if binding is None:
         return "Go on with a larger --budget"
     if unheard:

@@ -72,6 +72,10 @@ def stands_in_the_way(found: Tuned) -> str:
     """Return what binds, and what it costs, in a sentence or two."""
     if found.holds:
         return ""
+    unknown = [item for item in found.verification.failed if item.value is None]
+    if found.binding is None and unknown:
+        metrics = ", ".join(verdict.requirement.metric for verdict in unknown)
+        return f"Of {found.best.kind} nobody knows {metrics}: {unknown[0].note}."
     if found.binding is None:
         # Loops of tuning have noise, smaller steps and a circle, which `verify` has not.
         asked = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)

@@ -71,20 +71,20 @@ def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
 def binding(
     items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested: bool
 ) -> tuple[str | None, float | None]:
-    """Return the requirement that stands in the way, None where a candidate keeps all.
+    """Return the requirement that stands in the way, None where a candidate keeps all that were computed of it.
 
     And the value to which it alone would have to be loosened; None where that does not do.
 
     It is the one that must be loosened least, alone, for some candidate to keep the rest; where none does, the one
-    that the best candidate breaks most.
+    that the best candidate breaks most. What was not computed is broken all the same, but nothing is known to bind.
     """
     loosened: dict[str, float] = {}
     for item in items:
         broken = {name: value for name, value in item.ratios(bounds, tested=tested).items() if value > 1.0}
         if not broken:
             return None, None
-        if len(broken) == 1:
-            name, value = next(iter(broken.items()))
+        name, value = next(iter(broken.items()))
+        if len(broken) == 1 and name in item.metrics:
             loosened[name] = min(value, loosened.get(name, math.inf))
     if loosened:
         name = min(loosened, key=lambda name: loosened[name])
@@ -93,8 +93,8 @@ def binding(
     best = min(items, key=lambda item: item.cost(bounds, tested=tested), default=None)
     if best is None:
         return None, None
-    found = best.ratios(bounds, tested=tested)
-    return max(found, key=lambda name: found[name]), None
+    found = {name: value for name, value in best.ratios(bounds, tested=tested).items() if name in best.metrics}
+    return (max(found, key=lambda name: found[name]) if max(found.values(), default=0.0) > 1.0 else None), None
 
 
 def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:

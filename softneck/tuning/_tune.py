@@ -239,10 +239,11 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
     stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=task.tested)
     paid = [] if stuck is None else prices(compared, bounds, stuck, tested=task.tested)
-    if not holds and stuck is None and verification.failed:
+    known = [verdict for verdict in verification.failed if verdict.value is not None]
+    if not holds and stuck is None and known:
         # The search saw nothing broken, and knows no price; the certificate of the whole box does.
-        stuck = verification.failed[0].requirement.metric
-        nearest = verification.failed[0].value if len(verification.failed) == 1 else None
+        stuck = known[0].requirement.metric
+        nearest = known[0].value if len(verification.failed) == 1 else None
     return Tuned(
         best=best, controller=controller, observer=eyes,
         assumed=dict(getattr(controller, "design", {}).get("assumed", {})),

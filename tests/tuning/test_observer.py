@@ -107,4 +107,6 @@ def test_what_is_never_certified_beside_recordings_is_searched_to_the_end_where_
     found = tune({**families, "own": several}, kinds=(kind,), budget=4, workers=0)
     assert (found.best.kind, found.best.level) == (kind, "margins")
     assert not found.holds
+    # What has no linear form has no Ms: it is not what stands in the way.
+    assert found.binding in found.best.metrics
     assert found.observed == (kind == "switched")

@@ -229,6 +229,19 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
     assert binding([good, slow], BOUNDS, tested=False) == (None, None)
 
 
+@pytest.mark.parametrize("tested", [True, False])
+def test_what_was_not_computed_does_not_bind(tested: bool) -> None:
+    """`switched` has no linear form: beside recordings its Ms counts as broken, and nobody knows it."""
+    bounds = (Requirement("axes.sensitivity", "max", 2.5, True), *BOUNDS[:2])
+    blind = candidate(neck__rise_s=0.5, neck__overshoot_pct=3.0)
+    del blind.metrics["axes.sensitivity"]
+    assert blind.cost(bounds, tested=tested) > 1.0
+    assert binding([blind], bounds, tested=tested) == ("neck.rise_s", None)
+    blind.metrics["neck.rise_s"] = 0.3
+    assert blind.cost(bounds, tested=tested) > 1.0
+    assert binding([blind], bounds, tested=tested) == (None, None)
+
+
 def test_prices_paid_with_the_same_are_one_clause() -> None:
     def price(limit: float, other: str, least: float | None, held: bool = False) -> Price:
         return Price(metric="rise", limit=limit, other=other, least=least, held=held)
