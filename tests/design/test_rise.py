@@ -141,6 +141,8 @@ def test_what_is_taken_from_the_papers_neck_is_said() -> None:
     late_and_fast, quick = (settings().design(neck(*PLANTS[name])) for name in ("late", "slow"))
     assert "of the paper's neck" not in late_and_fast.summary()
     assert "of the paper's neck, not of this plant: small moves as fast as 5.293 1/s" in quick.summary()
+    # `tune` prints the line too, and has no --set.
+    assert "`softneck design --set small_move_pole=...`" in quick.summary()
 
 
 @pytest.mark.parametrize("kind", ["pi", "mpc"])

@@ -183,7 +183,8 @@ def assumed_lines(values: Mapping[str, float]) -> list[str]:
     told = [words[name].format(value) for name, value in values.items()]
     if not told:
         return []
-    return [f"  of the paper's neck, not of this plant: {' and '.join(told)} (--set {', '.join(values)})"]
+    way = f"`softneck design --set {'=... '.join(values)}=...` says otherwise"
+    return [f"  of the paper's neck, not of this plant: {' and '.join(told)}; {way}"]
 
 
 def _findings(item: Mapping[str, Any]) -> list[str]:
