@@ -21,10 +21,11 @@ _OBJECTIVES = (
     ("neck.steady_rms_", "step.steady_rms_"), ("track.circle_rms_deg",), ("track.variation_rad_s",),
     ("axes.sensitivity",), ("axes.gain_margin",),
 )  # fmt: skip
-# Limits at which the price of a requirement is told, in parts of its own.
-_LOOSER = (1.0, 1.25, 1.5, 2.0, 3.0, 5.0)
-# And that of the best candidate, up to so many.
-_LOOSEST = 100.0
+# Limits at which the price of a requirement is told, in parts of its own, and that of the best candidate.
+_LOOSER = (1.0, 1.25, 1.5, 2.0)
+# Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
+# loosened, and beyond it is another requirement ("disk_margin 0.0151 costs sensitivity 66.7").
+_NEAR = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +101,11 @@ def binding(
 def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:
     """Return the curve of what the requirement on `metric` costs: of the other that is broken most when it is held.
 
-    Where no candidate keeps all the others, they are to be no worse than in the best one.
+    Where no candidate keeps all the others, they are to be no worse than in the best one. Only candidates within a
+    factor of two of every limit are compared.
     """
     item = next((bound for bound in bounds if bound.metric == metric), None)
+    items = [one for one in items if max(one.ratios(bounds, tested=tested).values(), default=math.inf) <= _NEAR]
     best = min(items, key=lambda one: one.cost(bounds, tested=tested), default=None)
     if item is None or best is None:
         return []
@@ -112,7 +115,7 @@ def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: st
         if other is None:
             continue
         found = []
-        for part in sorted({*_LOOSER, max(1.0, min(now.get(metric, 1.0), _LOOSEST))}):
+        for part in sorted({*_LOOSER, max(1.0, now.get(metric, 1.0))}):
             least = _least(items, bounds, {metric: part, other.metric: math.inf}, rest, other, tested=tested)
             limit = item.limit / part if item.bound == "min" else item.limit * part
             found.append(Price(metric, limit, other.metric, least, held=not rest))

@@ -268,14 +268,24 @@ def test_what_a_requirement_costs() -> None:
 
 
 def test_where_nothing_keeps_all_the_rest_the_price_is_told_beside_what_the_best_does() -> None:
-    loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=30.0, axes__gain_margin=1.9)
-    slow = candidate(neck__rise_s=0.9, neck__overshoot_pct=6.0, axes__gain_margin=1.9)
-    worse = candidate(neck__rise_s=0.5, neck__overshoot_pct=6.0, axes__gain_margin=0.8)
+    loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=9.9, axes__gain_margin=1.9)
+    slow = candidate(neck__rise_s=0.6, neck__overshoot_pct=6.0, axes__gain_margin=1.9)
+    worse = candidate(neck__rise_s=0.5, neck__overshoot_pct=6.0, axes__gain_margin=1.1)
     found = prices([loud, slow, worse], BOUNDS, "neck.overshoot_pct", tested=False)
     assert {(price.other, price.held) for price in found} == {("neck.rise_s", False)}
-    # At 5 % nothing is known; from 6 % on it costs 0.9 s: what does it in 0.5 s has less margin than the best.
+    # At 5 % nothing is known; from 6 % on it costs 0.6 s: what does it in 0.5 s has less margin than the best.
     assert [price.least for price in found if price.limit < 6.0] == [None]
-    assert {price.least for price in found if price.limit >= 6.0} == {0.9}
+    assert {price.least for price in found if 6.0 <= price.limit < 9.9} == {0.6}
+
+
+def test_no_price_is_told_of_what_is_far_from_any_limit() -> None:
+    near = candidate(neck__rise_s=0.5, neck__overshoot_pct=6.0, axes__gain_margin=2.5)
+    slow = candidate(neck__rise_s=4.0, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
+    loose = candidate(neck__rise_s=0.3, neck__overshoot_pct=90.0, axes__gain_margin=2.5)
+    assert not prices([slow, loose], BOUNDS, "neck.overshoot_pct", tested=False)
+    found = prices([near, slow, loose], BOUNDS, "neck.overshoot_pct", tested=False)
+    assert {price.least for price in found} == {None, 0.5}
+    assert max(price.limit for price in found) <= 10.0
 
 
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
