@@ -63,9 +63,10 @@ class Log:
         content = _read(path)
         if content.get("digest") == digest:
             for row in content["evaluations"]:
+                if row["error"]:
+                    continue  # it is tried again: a later softneck may be able to
                 self._found[Job(row["kind"], row["settings"], row["level"])] = Judgement(
-                    {name: math.inf if value is None else float(value) for name, value in row["metrics"].items()},
-                    row["error"],
+                    {name: math.inf if value is None else float(value) for name, value in row["metrics"].items()}
                 )
         elif resume:
             raise SettingsError(
