@@ -97,8 +97,8 @@ def command(
     files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}
     with progress("tune", quiet=as_json) as report:
         found = tune(
-            things, asked, kinds=tuple(kinds.split(",")) if kinds else (), budget=budget, observer=eyes, seed=seed,
-            workers=workers, folder=output, resume=resume, force=force, progress=report,
+            things, asked, kinds=() if kinds is None else tuple(kinds.split(",")), budget=budget, observer=eyes,
+            seed=seed, workers=workers, folder=output, resume=resume, force=force, progress=report,
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
     steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)

@@ -29,12 +29,15 @@ def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
     """
     uncertain = uncertain_plant(plant)
     limits = LoopSettings().of_robot(uncertain)
+    _refuse_quiet(asked)
     for name in uncertain.names:
         nominal = uncertain.axis(name).nominal
         _refuse_rise(asked, uncertain, limits, name, nominal)
         _refuse_circle(asked, name, nominal)
+        _refuse_turn(asked, uncertain, limits, name, nominal)
         _refuse_sensitivity(asked, name)
         _refuse_load(asked, name, nominal)
+    _refuse_order(asked)
 
 
 def quickest(plant: Any) -> float:
@@ -46,6 +49,30 @@ def quickest(plant: Any) -> float:
         for axis in (uncertain.axis(name).nominal for name in uncertain.names)
     ]
     return max((least for least in found if math.isfinite(least)), default=0.0)
+
+
+def _refuse_order(asked: TuneRequirements) -> None:
+    """Refuse a step that may rise later than it has to have settled; of defaults of `verify` nobody asked both."""
+    said = {item.metric for item in asked.bounds if item.asked}
+    for group in ("neck", "step"):
+        names = f"{group}.settling_s", f"{group}.rise_s"
+        settling, rise = (asked.wanted(name) for name in names)
+        if settling is not None and rise is not None and settling < rise and said.issuperset(names):
+            raise SettingsError(
+                f"`{names[0]}` <= {settling:g} s and `{names[1]}` <= {rise:g} s contradict each other: what has "
+                f"settled has risen; ask for a rise of at most {settling:g} s as well, or for a later settling."
+            )
+
+
+def _refuse_quiet(asked: TuneRequirements) -> None:
+    """Refuse a steady state that is quieter than the sensor: white noise is in what it tells, whatever is done."""
+    metric = f"neck.{asked.certificate.name_of('steady_rms_deg')}"
+    limit, noise = asked.limit(metric), asked.track["noise_deg"]
+    if limit is not None and limit < noise:
+        raise SettingsError(
+            f"`{metric}` <= {limit:g} cannot be: the noise of the sensor alone is {noise:g} (`[track] noise_deg`); "
+            "allow more, or state the noise of yours."
+        )
 
 
 def _refuse_rise(
@@ -83,6 +110,31 @@ def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None
         f"dead time of {name}, {1e3 * dead:.0f} ms, allows, {1.0 / dead:.3g} rad/s; ask for a slower one, or for "
         "`track.ahead_rms_deg`, of a reference that is known ahead."
     )
+
+
+def _refuse_turn(
+    asked: TuneRequirements, uncertain: UncertainPlant, limits: LoopSettings, name: str, plant: AxisPlant
+) -> None:
+    """Refuse a circle whose first harmonic slew and range of the motors cannot give.
+
+    No input within them has more of it than the square wave of the range, or the triangle of the slew.
+    """
+    if not asked.certificate.robot.is_neck:
+        return
+    size, turn = asked.track["circle_deg"], asked.track["circle_rad_s"]
+    motors = limits.limits(uncertain.robot)
+    share = float(np.abs(limits.redefinition(uncertain)[1][:, uncertain.names.index(name)]).max())
+    most = 4.0 / math.pi * min(motors.position_limit, motors.slew_limit / turn) / share
+    reached = math.degrees(most * float(np.abs(plant.response(np.array([turn])))[0]))
+    # Of one output alone; a sine has its amplitude over the root of two.
+    least = (size - reached) / math.sqrt(2.0)
+    for metric in ("track.circle_rms_deg", "track.ahead_rms_deg"):
+        limit = asked.wanted(metric)
+        if limit is not None and limit < least:
+            raise SettingsError(
+                f"`{metric}` <= {limit:g} cannot be: within the motors' slew and range {name} swings by {reached:.2g} "
+                f"deg at {turn:g} rad/s, of {size:g} deg; ask for a slower circle, or a smaller one."
+            )
 
 
 def _refuse_sensitivity(asked: TuneRequirements, name: str) -> None:

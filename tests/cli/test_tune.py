@@ -165,6 +165,7 @@ def test_nobody_is_told_to_loosen_a_margin() -> None:
     ("change", "match"),
     [
         (["--requirements", "{folder}/fast.toml"], "within the motors' slew and range"),
+        (["--kinds", ""], "unknown kind of controller ``"),
         (["--kinds", "pie"], "unknown kind of controller `pie`"),
         (["--resume"], "no search to resume"),
         (["--requirements", "{folder}/none.toml"], "cannot be read"),

@@ -10,6 +10,7 @@ import control
 import numpy as np
 import pytest
 import tomli_w
+from scipy.signal import lfilter
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.estimation import LinearNeck
@@ -153,14 +154,67 @@ def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
 
 def test_a_circle_beyond_a_bandwidth_of_one_over_the_dead_time_is_refused() -> None:
     fastest = 1.0 / ((DELAY + 1) * TS)
-    for part, limit, refused in ((1.01, 11.9, True), (1.01, 12.0, False), (0.99, 0.1, False)):
-        table = {"require": {"track.circle_rms_deg": {"max": limit}}, "track": {"circle_rad_s": part * fastest}}
+    for part, limit, refused in ((1.01, 1.9, True), (1.01, 2.0, False), (0.99, 0.1, False)):
+        table = {"require": {"track.circle_rms_deg": {"max": limit}},
+                 "track": {"circle_deg": 2.0, "circle_rad_s": part * fastest}}  # fmt: skip
         asked = make_tune_requirements(table)
         if refused:
             with pytest.raises(SettingsError, match="dead time of pitch, 100 ms, allows, 10 rad/s"):
                 refuse_impossible(asked, neck())
         else:
             refuse_impossible(asked, neck())
+
+
+@pytest.mark.parametrize("turn", [2.0, 6.0])
+def test_a_circle_is_refused_exactly_where_slew_and_range_leave_too_little_of_it(turn: float) -> None:
+    # The input with most of the first harmonic, through the plant's own difference equation: a square wave of all the
+    # range where that ends first, else a triangle of all the slew; of roll, whose motors go 0.577 of phi_i (Eq. 10).
+    turn = 2.0 * math.pi / TS / round(2.0 * math.pi / TS / turn)  # whole samples a turn
+    rows, a = round(2.0 * math.pi / TS / turn), math.exp(-POLE * TS)
+    t = turn * TS * np.arange(20 * rows)
+    square, triangle = np.sign(np.sin(t)), np.arcsin(np.sin(t))
+    u = min(6.0 * square, 12.5 / turn * triangle, key=lambda wave: abs(np.exp(-1j * t) @ wave)) * math.sqrt(3.0)
+    y = np.asarray(lfilter([0.0, 0.5 * GAIN * (1 - a)], [1.0, -a], u))[-rows:]
+    harmonic = math.degrees(2.0 / rows * abs(np.exp(-1j * t[:rows]) @ y))
+    size = 40.0
+    # A triangle in samples has 2 % less at most.
+    for limit, refused in (((size - 0.97 * harmonic) / math.sqrt(2.0), False),
+                           ((size - 1.03 * harmonic) / math.sqrt(2.0), True)):  # fmt: skip
+        table = {"require": {"track.circle_rms_deg": {"max": limit}, "track.ahead_rms_deg": False},
+                 "track": {"circle_deg": size, "circle_rad_s": turn}}  # fmt: skip
+        plant, asked = LinearNeck(pitch=neck().pitch, roll=0.5 * neck().roll), make_tune_requirements(table)
+        if refused:
+            with pytest.raises(SettingsError, match="within the motors' slew and range roll swings by"):
+                refuse_impossible(asked, plant)
+        else:
+            refuse_impossible(asked, plant)
+
+
+@pytest.mark.parametrize("group", ["neck", "step"])
+@pytest.mark.parametrize(("rise", "settling", "refused"), [(0.5, 0.3, True), (0.3, 0.3, False), (0.5, 0.6, False)])
+def test_what_may_rise_later_than_it_settles_is_refused(
+    group: str, rise: float, settling: float, refused: bool
+) -> None:
+    table = {"require": {f"{group}.rise_s": {"max": rise}, f"{group}.settling_s": {"max": settling}}}
+    if refused:
+        with pytest.raises(SettingsError, match=r"what has settled has risen; ask for a rise of at most 0\.3 s"):
+            refuse_impossible(make_tune_requirements(table), neck())
+    else:
+        refuse_impossible(make_tune_requirements(table), neck())
+
+
+def test_a_slow_rise_beside_a_settling_that_nobody_asked_is_no_contradiction() -> None:
+    refuse_impossible(make_tune_requirements({"require": {"neck.rise_s": {"max": 3.0}}}), neck())
+
+
+@pytest.mark.parametrize(("limit", "noise", "refused"), [(0.05, 0.06, True), (0.05, 0.04, False), (0.0, 0.05, True)])
+def test_a_steady_state_quieter_than_the_sensor_is_refused(limit: float, noise: float, refused: bool) -> None:
+    table = {"require": {"neck.steady_rms_deg": {"max": limit}}, "track": {"noise_deg": noise}}
+    if refused:
+        with pytest.raises(SettingsError, match="noise of the sensor alone"):
+            refuse_impossible(make_tune_requirements(table), neck())
+    else:
+        refuse_impossible(make_tune_requirements(table), neck())
 
 
 def test_what_settles_before_it_can_rise_and_an_Ms_of_one_are_refused() -> None:
