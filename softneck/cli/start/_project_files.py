@@ -36,7 +36,7 @@ def project_of_loop(loop_file: Path, folder: Path) -> dict[str, str]:
         SettingsError: a loop with another reference than a step.
     """
     robot = find_robot(beside=folder / "loop.toml")
-    loop = _over_fmus(_read(loop_file), robot.noise_std)
+    loop = _over_fmus(_read(loop_file), robot)
     texts = {name: _text("softneck.cli", source) for name, source in _SHARED.items()}
     texts |= {name: _text("softneck.cli.start", source) for name, source in _OWN.items()}
     said = "# The loop that `softneck tune` judged, over FMUs that need no Python.\n"
@@ -59,12 +59,13 @@ def _read(path: Path) -> dict[str, Any]:
     return table
 
 
-def _over_fmus(table: dict[str, Any], noise: float | None) -> dict[str, Any]:
+def _over_fmus(table: dict[str, Any], robot: Robot) -> dict[str, Any]:
+    noise = robot.noise_std
     # Seeds of runs are drawn by the study.
     parameters = {} if noise is None else {"parameters": {"noise_std": noise, "noise_seed": 1}}
     eyes = {"observer": {"fmu": OBSERVER_FMU}} if "observer" in table else {}
-    reference, sizes = dict(table["reference"]), _sizes(table)
-    if sizes and "pitch_deg" in reference:
+    reference = dict(table["reference"])
+    if "pitch_deg" in reference and "roll" in robot.outputs.names and _sizes(table):
         reference.setdefault("roll_deg", 0.0)
     kept = {key: value for key, value in table.items() if key not in ("plant", "observer", "controller", "reference")}
     limits = {"limits": kept.pop("limits")} if kept.get("limits") else {}
@@ -87,7 +88,7 @@ def _study(loop: dict[str, Any], robot: Robot) -> dict[str, Any]:
         f"reference.{key}": {"grid": [round(part * size, 6) for part in _PARTS_OF_STEP]}
         for key, size in _sizes(loop).items()
     }
-    if "pitch_deg" in loop["reference"]:
+    if {"pitch_deg", "roll_deg"} <= loop["reference"].keys():
         half = 0.5 * float(loop["reference"]["pitch_deg"])
         vary["reference.roll_deg"] = {"uniform": [-half, half]}
     if "parameters" in loop["plant"]:

@@ -6,11 +6,13 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import tomli_w
 
 from softneck.cli.start._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
 from softneck.loop._result import metric_names
+from softneck.loop._robot_references import robot_reference
 from softneck.robot import Robot
 from softneck.signals import signal
 
@@ -46,6 +48,20 @@ def test_the_study_of_another_robot_asks_in_its_units(call: Call) -> None:
     study = table("study.toml")
     assert study["objectives"] == ["x.settling_s", "motors.total_variation_V"]
     assert set(study["objectives"]) <= set(metric_names(Robot.read("p/robot.toml")))
+
+
+def test_a_robot_of_one_output_is_asked_for_that_output_alone(call: Call) -> None:
+    tables = {"name": "one axis", "motors": {"names": ["a", "b"], "unit": "rad"},
+              "outputs": {"names": ["pitch"], "unit": "rad", "display_unit": "deg"},
+              "directions": {"kind": "identified"}}  # fmt: skip
+    Path("p").mkdir()
+    Path("p/robot.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+    assert made(call, TUNED, "--force") == 0
+    reference = {key: value for key, value in table("loop.toml")["reference"].items() if key != "kind"}
+    # It takes no key of an output that the robot does not have.
+    assert robot_reference("step", reference, Robot.read("p/robot.toml")).values == pytest.approx([np.radians(10.0)])
+    varied = {key.partition(".")[2] for key in table("study.toml")["vary"] if key.startswith("reference.")}
+    assert varied <= set(reference)
 
 
 def test_the_project_of_a_loop_keeps_what_was_judged_and_takes_fmus(call: Call) -> None:
