@@ -45,7 +45,7 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
             )
         entry = require[metric]
         limit = entry.get("max") if isinstance(entry, Mapping) else None
-        if isinstance(limit, bool) or not isinstance(limit, int | float) or limit <= 0.0 or value == 0.0:
+        if isinstance(limit, bool) or not isinstance(limit, int | float) or limit < 0.0 or value == 0.0:
             continue  # dropped, or refused by what reads the limit
         if limit - value <= 0.0:
             raise SettingsError(

@@ -100,6 +100,7 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"reserve": {"axes.gain_margin": 0.1}}, "is of loops over plants that step"),
         ({"reserve": {"neck.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
         ({"reserve": {"neck.rise_s": 0.4}}, "<= 0.4 leaves nothing beside its reserve of 0.4"),
+        ({"require": {"neck.overshoot_pct": {"max": 0.0}}}, "<= 0 leaves nothing beside its reserve of 1.6"),
         ({"reserve": {"neck.ris_s": 0.1}}, r"of which \[require\] asks nothing"),
         ({"reserve": 1.0}, "must be a table"),
         ({"require": 1.0}, "must be a table"),
