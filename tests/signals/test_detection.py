@@ -175,6 +175,11 @@ def test_blocks_never_run_into_the_next_stretch() -> None:
     assert set(np.unique(found)) <= {0.0, 99.0, 100.0, 200.0, 300.0}
 
 
+def test_a_window_of_one_block_follows_one_before_it() -> None:
+    budget = Budget(block=2.0, window=2.0, windows=100, step=0.02)
+    assert (window_maxima([np.ones((1200, 1))], budget, np.random.default_rng(0)) == 200.0).all()
+
+
 def test_too_little_motion_is_refused_and_so_are_bad_settings() -> None:
     with pytest.raises(DataError, match=r"need 22 s of undisturbed motion .* there are 3"):
         thresholds([np.zeros((250, 1))], Budget(), np.random.default_rng(0))

@@ -10,6 +10,7 @@ import pytest
 from softneck.drives.supervision._calibrate import _Samples, _tilt_noise, fit
 from softneck.drives.supervision._charts_runtime import (
     SUPERVISED_NOT,
+    supervised_faults,
     supervised_levels,
     supervised_load,
     supervised_motors,
@@ -17,7 +18,7 @@ from softneck.drives.supervision._charts_runtime import (
 from softneck.drives.supervision._motor_charts import SCALES, MotorCharts, MotorRules
 from softneck.drives.supervision._motor_models import Motion, features_of, level_rows
 from softneck.drives.supervision._plausibility import Finding, Plausibility
-from softneck.drives.supervision._tilt_charts import GyroLevel, TiltCharts
+from softneck.drives.supervision._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
 
 from ..plausible import baseline
 
@@ -27,12 +28,23 @@ GATES = (np.full(N, TOP), np.full(N, REACH), np.full(N, SLACK))
 
 
 def levels(
-    tensions: list[float], *, behind: float = 0.0, rest: int | None = None, seen: int = 50, share: float = 1.0
+    tensions: list[float],
+    *,
+    behind: float = 0.0,
+    rest: int | None = None,
+    seen: int = 50,
+    share: float = 1.0,
+    before: float = 0.0,
 ) -> np.ndarray:
-    """Return scores (scales, motors) where each tension should be `share` of the others' mean, in `seen` cycles."""
+    """Return scores (scales, motors) where each tension should be `share` of the others' mean, in `seen` cycles.
+
+    Motors are at 0, so far `behind` their set-points, and were at `before`.
+    """
     level = np.zeros((N, FEATURES + 2))
     level[:, FEATURES] = share
-    past = (np.full((12, N), behind), np.zeros((5, N)), np.tile(tensions, (4, 1)))
+    positions = np.full((5, N), before)
+    positions[0] = 0.0
+    past = (np.full((12, N), behind), positions, np.tile(tensions, (4, 1)))
     resting = np.full(N, -1.0)
     if rest is not None:
         resting[rest] = 1.0
@@ -56,6 +68,8 @@ def test_a_tension_twice_those_of_the_others_is_rather_a_scale_of_two_than_any_o
     assert (levels([3.0, 3.0, 3.0]) < 0.0).all()
     assert levels([1.5, 3.0, 3.0])[1, 0] == pytest.approx(4.5)
     assert levels([4.0, 4.0, 4.0], share=0.5)[0] == pytest.approx(4.5)
+    # Behind is a motor by where it is, not by where it was.
+    assert levels([6.0, 3.0, 3.0], before=2.0 * REACH)[0, 0] == pytest.approx(4.5)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +165,23 @@ def test_only_what_is_faster_than_ever_is_a_jump() -> None:
     assert changes(5.0, moved=0.4)[1, 0] == -MotorRules().usual
 
 
+def test_a_jam_is_judged_by_the_way_that_was_left_before_the_cycle() -> None:
+    """Motor 1 had 0.1 rad to go, of which it goes the tenth: it stands instead."""
+    positions = np.zeros((5, N))
+    positions[2:] = 5.0
+    drive = np.zeros((N, 12))
+    drive[:, 0] = 0.1
+    spread = np.tile([1.6e-5, 0.0], (N, 1))
+    model = (drive, spread, np.full(N, 0.5), np.zeros((N, FEATURES)), spread, *GATES)
+    past = (np.full((12, N), 0.1), positions, np.full((4, N), 3.0))
+    white = (np.zeros((0, N)), np.zeros((0, 3, N)), np.zeros((3, N)))
+    scores = np.full(4 * N, np.nan)
+    place = np.zeros((4, N, FEATURES))
+    supervised_motors(model, tuple(MotorRules()), past, place, white, np.full(N, -1.0), np.array(SCALES), 0.01, scores)
+    # 0.01 rad is 2.5 standard deviations: f^2 / 2.
+    assert scores[:N] == pytest.approx([3.125] * N)
+
+
 def test_a_motor_that_turns_is_not_jammed() -> None:
     assert changes(5.0, moved=0.001)[0, 0] == SUPERVISED_NOT
     assert changes(5.0)[0, 0] == 0.0
@@ -197,6 +228,106 @@ def test_a_drift_does_not_become_the_gyros_bias() -> None:
         assert known
         # 2 s of drift, of which a sixth of the time's part leaks away: 6 (1 - e^(-2/6)) = 1.70 s are left.
         assert np.degrees(level.level[0]) == pytest.approx(expected * 0.5 * 1.70, abs=0.02)
+
+
+def test_the_gyros_bias_is_the_mean_of_what_is_old_enough() -> None:
+    """Of the older half of what came, or of all but its last 4 s, as long as that is less than 15 s."""
+    changes = 1e-3 * np.random.default_rng(0).standard_normal(900)
+    level = GyroLevel(1, 0.02)
+    for count, value in enumerate(np.cumsum(changes)):
+        level.take(np.array([value]), np.zeros(1))
+        old = count - min(count // 2, 200)
+        if count > 1:
+            np.testing.assert_allclose(level._bias, changes[1 : 1 + old].mean(), atol=1e-15)
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 3])
+def test_each_fault_is_what_it_makes_of_the_tilt(outputs: int) -> None:
+    """What an inclinometer would say with the fault less what it should, for each name of the list."""
+    rng, gears = np.random.default_rng(outputs), np.array([2.0, 0.5])
+    parts, began = rng.standard_normal((2, N, outputs))
+    residual, late, stuck = rng.standard_normal((3, outputs))
+    angle, moved = parts.sum(axis=0), (parts - began).sum(axis=0)
+    names = tilt_names(N, outputs, gyro=False)[: -2 * outputs]
+    raw = np.full((1 + len(names), outputs), np.nan)
+    offset = next(size for name, _, size in names if name == "tilt_unexplained")
+    supervised_faults(gears, offset, (residual, parts, began, late, stuck), raw)
+    for row, (name, k, size) in zip(raw[1:], names, strict=True):
+        said = angle.copy()
+        if name == "gear_wrong":
+            said += (size - 1.0) * (moved if k < 0 else parts[k] - began[k])
+        elif name == "sensor_stuck":
+            said[k] = stuck[k]
+        elif name == "sensor_reversed":
+            said[k] -= 2.0 * moved[k]
+        elif name == "sensor_swapped":
+            said[[k, k + 1]] += moved[[k + 1, k]] - moved[[k, k + 1]]
+        elif name == "sensor_late":
+            said = late
+        else:
+            said[k] += size
+        np.testing.assert_allclose(row, said - angle, atol=1e-14, err_msg=name)
+    assert np.array_equal(raw[0], residual)
+
+
+def test_the_tilts_model_is_linear_from_nothing() -> None:
+    model = TiltModel(np.array(baseline().tilt), baseline().lags, N)
+    assert not model.step(np.zeros(N)).any()
+
+
+def test_a_late_sensor_says_what_was_a_fifth_of_a_second_before() -> None:
+    charts = TiltCharts(baseline())
+    assert not charts.valid
+    model, angles = TiltModel(np.array(baseline().tilt), baseline().lags, N), []
+    for k in range(40):
+        places = np.full(N, 0.01 * k)
+        places[0] = 0.0
+        angles.append(model.step(places).sum(axis=0))
+        charts.step(places, np.full(N, 3.0), np.zeros(2), np.zeros(2))
+    np.testing.assert_allclose(charts._angles[0], angles[-1 - round(0.2 / 0.02)], atol=1e-12)
+
+
+def test_without_a_gyro_that_knows_its_bias_a_push_is_not_called_a_drift() -> None:
+    charts = TiltCharts(baseline())
+    names = [name for name, _, _ in charts.names]
+    push = names.index("tilt_unexplained")
+    charts.charts.sums[push] = 1.1 * charts.charts.thresholds[push]
+    charts._explained[push] = charts._information[push] = 100.0
+    assert not charts.gyro.known
+    assert charts.likeliest() == (push, pytest.approx(50.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "size", "said"),
+    [
+        ("gear_wrong", 1, 2.0, "motor 2: the tilt moves as if the winch turned 2 times as far"),
+        ("gear_wrong", -1, 0.5, "all motors: the tilt moves as if the winch turned 0.5 times as far"),
+        ("sensor_late", -1, 0.2, "the tilt follows about 0.2 s later than it did"),
+        ("sensor_noise", 0, 0.04, "output 1: its noise is a fifth of what it was, or beyond"),
+        ("sensor_noise", 1, 25.0, "output 2: its noise is five times what it was, or beyond"),
+        ("sensor_drift", 1, 0.026, "output 2: tilt less model 1.0, -2.0 deg"),
+    ],
+)
+def test_what_is_found_is_said_in_words(name: str, number: int, size: float, said: str) -> None:
+    charts = Plausibility(baseline())
+    charts.tilt.residual = np.radians([1.0, -2.0])
+    assert charts._said(name, number, size) == said
+
+
+@pytest.mark.parametrize(("chart", "said"), [(0, "motor 1 at 0.25 rad, set-point 0.50 rad"),
+                                             (2 * N + 1, "motor 2: its current is about 2 times what its motion takes"),
+                                             (3 * N, "motor 1: its current is about 0.5 times")])  # fmt: skip
+def test_what_a_motor_shows_is_said_in_words(chart: int, said: str) -> None:
+    charts = MotorCharts(baseline())
+    setpoints, places, pulls = np.full(N, 0.5), np.full(N, 0.25), np.full(N, 2.0)
+    for _ in range(30):
+        charts.charts.sums[:] = 0.0
+        charts.step(setpoints, places, pulls)
+    charts.charts.sums[:] = 0.0
+    charts.charts.sums[chart] = 1e9
+    found = charts.step(setpoints, places, pulls)
+    assert found is not None
+    assert found[2].startswith(said)
 
 
 def test_the_likeliest_fault_leads_the_next_of_another_name() -> None:
@@ -268,6 +399,14 @@ def test_the_load_is_that_of_the_last_seconds() -> None:
     _, seen, _, _ = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0), MotorRules())
     # A mean over all would end where it began to fall, at nothing.
     np.testing.assert_allclose(seen, (-0.75, 0.75), atol=0.25)
+
+
+def test_tendons_that_hang_all_the_time_have_no_level() -> None:
+    known, limits = carrying(0.0, np.random.default_rng(4), rows=400), (np.full(N, 9.0), np.full(N, 99.0))
+    load, _, rows, spread = level_rows([(known, features_of(known, 0.01))], *limits, np.full(N, 9.0), MotorRules())
+    assert not np.any(load)
+    assert not np.any(rows)
+    assert spread == (1.0,) * N
 
 
 def test_known_ground_ends_a_fifth_beyond_the_loads_of_the_experiments() -> None:

@@ -65,7 +65,9 @@ def test_what_the_loop_is_off_by_itself_counts_for_no_fault() -> None:
         scores, _ = tracking_scores(model._replace(bias=(bias, bias)), run)
         assert bool(scores[len(scores) // 2 :].sum(axis=0).max() > 50.0) is astray
     # Each was off in its second half: so is what the other one did not know of.
-    known = _tracking([run_of(1, off=0.02), run_of(2, off=0.02)], Budget(charts=4, step=TS), np.random.default_rng(0))
+    runs = [run_of(seed, off=0.02) for seed in (1, 2, 4)]
+    known = _tracking(runs, Budget(charts=4, step=TS), np.random.default_rng(0))
+    assert len(known.bias) == 2
     # Half of it goes into the weights, which have no constant, or not: at least half remains.
     assert all(0.01 < bias < 0.03 for bias in known.bias)
     assert all(np.isfinite(known.thresholds))
