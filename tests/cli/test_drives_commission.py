@@ -67,6 +67,9 @@ def test_a_mistake_is_exit_code_1_one_line_and_still_four_files(
     assert load_drives(tmp_path / "drives.toml").drives[1].scale.reversed
     page = (tmp_path / "commission.html").read_text()
     assert "Motor 2: reversed: it pulls while the counts fall. Take the proposed `reversed`." in page
+    assert "[[drive]] 2 reversed" in page
+    # The paper's neck says 0.05 deg; so does its sensor, but for what 50 samples know of it.
+    assert "robot: [sensor] noise_std" in page
 
 
 def test_two_devices_with_one_number_write_the_page_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
 from softneck.drives import default_drives
 from softneck.drives.supervision import _calibrate
-from softneck.drives.supervision._baseline import Baseline
 from softneck.drives.supervision._calibrate import calibrate
 from softneck.drives.supervision._motor_models import Motion
 from softneck.signals.detection._threshold import Budget
@@ -31,13 +30,11 @@ def motions() -> tuple[Motion, ...]:
     return tuple(replace(motion, references=None) for motion in played)
 
 
-def calibrated(known_bias: float | None = None) -> Baseline:
-    chosen = {} if known_bias is None else {"known_bias": known_bias}
-    return calibrate(motions(), cycle=T, sample_cycles=2, slack=default_drives().limits.slack, **chosen)
+calibrated = partial(calibrate, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
 
 
 def test_a_quarter_of_the_slow_error_of_each_output_and_each_sample_that_is_missing_is_known() -> None:
-    part, whole = calibrated(), calibrated(1.0)
+    part, whole = calibrated(motions()), calibrated(motions(), known_bias=1.0)
     assert len(part.tilt_bias) == part.outputs
     assert whole.tilt_bias == pytest.approx([4.0 * bias for bias in part.tilt_bias])
     assert min(part.tilt_bias) > 0.0
@@ -54,7 +51,7 @@ def test_budgets_are_told_in_the_steps_of_their_charts(monkeypatch: pytest.Monke
         return real(scores, budget, rng)
 
     monkeypatch.setattr(_calibrate, "thresholds", kept)
-    made = calibrated()
+    made = calibrated(motions())
     assert [round(_SECONDS / budget.step) for _, budget in told] == [rows for rows, _ in told]
     assert [budget.step for _, budget in told] == [T, TS]
     # Shared by all of them, and the one that counts the samples.

@@ -73,16 +73,6 @@ def test_what_the_loop_is_off_by_itself_counts_for_no_fault() -> None:
     assert all(np.isfinite(known.thresholds))
 
 
-@pytest.mark.slow
-def test_a_quarter_of_the_tilts_slow_error_counts_for_no_fault() -> None:
-    motions = experiments(None, 0.0)[:2]
-    slack = default_drives().limits.slack
-    part = calibrate(motions, cycle=T, sample_cycles=2, slack=slack)
-    whole = calibrate(motions, cycle=T, sample_cycles=2, slack=slack, known_bias=1.0)
-    assert whole.tilt_bias == pytest.approx([4.0 * bias for bias in part.tilt_bias])
-    assert min(whole.tilt_bias) > 0.0
-
-
 def test_without_a_reference_and_where_tendons_hung_nothing_is_compared() -> None:
     model = fit_tracking([run_of(1), run_of(2)])._replace(thresholds=(10.0,) * 4)
     charts = TrackingCharts(model, 2, TS)
