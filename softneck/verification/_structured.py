@@ -24,6 +24,7 @@ from softneck.design.robust._mu import Structure, mu_lower, mu_upper
 from softneck.design.robust._robustness import worst_gains
 from softneck.identification.uncertainty._measured import response_of
 
+from ._axis_box import AxisBox
 from ._linear import LinearLaw, radii
 from ._plants import UncertainNeck, make_plants, measured_plant, mixing
 from ._search import axes_together, together
@@ -107,9 +108,8 @@ def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], 
         return bool(radii(measured.later(extra), law)[0] < 1.0)
     numbers = np.stack([box.nominal for box in neck.axes])
     for i in axes:
-        box, Ts = neck.axes[i], neck.sample_time
-        alpha = 1.0 - 0.5 * np.exp(-np.array([box.low[1], box.high[1]]) * Ts).sum()
-        numbers[i] = [box.middle[0], -math.log1p(-alpha) / Ts, box.middle[2]]
+        box = neck.axes[i]
+        numbers[i] = [box.middle[0], _middle_pole(box, neck.sample_time), box.middle[2]]
     return bool(radii(make_plants(neck, numbers[None], [""]).later(extra), law)[0] < 1.0)
 
 
@@ -173,7 +173,7 @@ def _axis(box: Any, w: Vector, Ts: float, extra: int) -> tuple[np.ndarray, ...]:
     rK = box.widths[0]
     ends = 1.0 - np.exp(-np.array([box.low[1], box.high[1]]) * Ts)
     alpha, r = 0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])
-    middle = -math.log1p(-alpha) / Ts
+    middle = _middle_pole(box, Ts)
     rest = np.polyval(box.rest[0], z) / np.polyval(box.rest[1], z) * z**-extra
     D = _delay_factor(middle, L, z, Ts) * rest
     W = _delay_weight(box, middle, z, Ts)
@@ -187,6 +187,12 @@ def _axis(box: Any, w: Vector, Ts: float, extra: int) -> tuple[np.ndarray, ...]:
     E[:, 1, 0], E[:, 1, 1] = rK * (1.0 - lag * alpha), -lag * r
     E[:, 2, 0], E[:, 2, 1] = D * lag * alpha * rK, D * lag * r
     return P, H, F, E
+
+
+def _middle_pole(box: AxisBox, Ts: float) -> float:
+    """Return the pole [1/s] that is sampled to the middle of its box's ends, also where neither shows in one."""
+    low, high = -Ts * box.low[1], -Ts * box.high[1]
+    return float(math.log(2.0) - np.logaddexp(low, high)) / Ts
 
 
 def _delay_factor(p: float, L: float, z: np.ndarray, Ts: float) -> np.ndarray:

@@ -11,6 +11,7 @@ import pytest
 
 from softneck.design import diskmargin, mu_bounds, nugap
 from softneck.design.robust._mu import two_scalars
+from softneck.estimation import LinearNeck
 from softneck.verification._linear import LinearLaw, gaps, judged, margins, radii
 from softneck.verification._plants import (
     AxisBox,
@@ -23,7 +24,7 @@ from softneck.verification._plants import (
     nominal_plants,
 )
 from softneck.verification._search import search
-from softneck.verification._structured import structured
+from softneck.verification._structured import _axis, structured
 
 from .necks import PAPER, TS, controller_of, family, linear_neck, pi
 
@@ -198,6 +199,15 @@ def test_mu_of_gain_alone_is_that_of_the_gain_margin() -> None:
     row = structured(neck, law, extra=0, drawn=np.ones((1, 2, 3)), performance=False)[0]
     # The 1 % of complex dead time that is always there widens the peak, and costs as much here.
     assert r / (margin - 1.0) <= row.mu <= 1.2 * r / (margin - 1.0)
+
+
+@pytest.mark.parametrize("poles", [[1.0, -0.9], [1.0, 0.43], [1.0, -1.6, 0.73]], ids=["lag", "alternating", "ringing"])
+def test_the_middle_of_a_model_s_box_is_the_model(poles: list[float]) -> None:
+    """Also where no pole is a lag's, as of a log in which motor positions are the input."""
+    tf = control.TransferFunction([0.01], [*poles, 0.0, 0.0, 0.0], TS)
+    neck = neck_of_model(LinearNeck(pitch=tf, roll=tf), "m", {"gain": 0.2, "pole": 0.0, "delay": 0.0})
+    # 1e-6: as of the nominal plant.
+    np.testing.assert_allclose(_axis(neck.axes[0], W, TS, 0)[0], np.asarray(tf(np.exp(1j * W * TS))), rtol=1e-6)
 
 
 def test_wrong_delay_is_seen() -> None:
