@@ -43,8 +43,8 @@ def atomic_write(path: str | Path, *, force: bool = False) -> Iterator[Path]:
         temporary.replace(target)
         _to_disk(target.parent)
     except OSError as error:
-        if isinstance(error, OutputFileError):
-            raise
+        if isinstance(error, OutputFileError):  # of a writer in a writer, which knows the temporary file alone
+            raise OutputFileError(str(error).replace(str(temporary), str(named))) from error
         reason = error.strerror or str(error)
         raise OutputFileError(f"{named}: cannot be written: {reason}. Nothing was left behind.") from error
     finally:

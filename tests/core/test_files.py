@@ -6,6 +6,7 @@ import errno
 import fcntl
 import hashlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -94,6 +95,16 @@ def _write(target: Path, recording: Recording) -> None:
         write_archive(target, {}, {"a": np.zeros(3)})
     else:
         write_recording(target, recording)
+
+
+def test_a_writer_within_a_writer_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OutputFileError, match=re.escape(f"{tmp_path / 'm.npz'}: cannot be written: No space left")),
+        atomic_write(tmp_path / "m.npz") as outer,
+        atomic_write(outer, force=True),
+    ):
+        raise OSError(errno.ENOSPC, "No space left")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_new_file_obeys_the_umask(tmp_path: Path) -> None:

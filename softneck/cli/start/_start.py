@@ -161,14 +161,16 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[s
     """Return the error with the step that it ended; what else to do is noted before it, so that it stays short."""
     if not sitting.ran:
         return error
-    stage = next(reversed(sitting.ran)).partition(":")[0]
+    last = next(reversed(sitting.ran))
+    stage, step = last.partition(":")[0], sitting.done[last]
     said = str(error)
     for log in logs:
         said = said.replace(log, Path(log).name)
-    if next(reversed(sitting.ran)).endswith(PI) and "to design on" not in said:
+    between = step["ended"] and step["holds"]  # no step is at fault: the robot's file lacks something
+    if last.endswith(PI) and "to design on" not in said:
         note("the models are kept: `softneck validate` and `softneck fmu` take them, and `softneck design` other kinds")
         return type(error)(_shortened(f"first controller: {said}"))
-    if stage == "identification":  # what the recordings lack was said before it
+    if stage == "identification" and not between:  # what the recordings lack was said before it
         note(_MIXED)
         first = _FIRST_SENTENCE.match(said)
         without = _WITHOUT.search(said)  # an output: that needs no other recording

@@ -153,6 +153,8 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
         1000
     """
     source = Path(path)
+    if source.is_dir():
+        require_file(source)
     suffix = recording_suffix(source)
     if source.is_file():
         require_size(source)

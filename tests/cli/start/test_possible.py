@@ -177,3 +177,27 @@ def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
     assert said.code == 1
     assert last.endswith(f"its fit in free run is -31.9 % in yaw. {leave}.")
     assert len(last) <= 160
+
+
+def test_a_robots_file_that_lacks_something_is_to_be_mended_and_no_log_to_be_recorded(
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare = Robot.from_dict({"name": "pump", "motors": {"names": ["pump"], "unit": "V"},
+                            "outputs": {"names": ["level"], "unit": "V"},
+                            "directions": {"kind": "identified"}})  # fmt: skip
+
+    def plan(asked: Asked) -> Iterator[Step]:
+        command = ("softneck", "robot", "new", "m.npz", "--preset", "neck", "--force")
+        yield Step(stage="identification", command=command, makes=("m.npz",), reads=asked.logs, unmet=Unmet.NO_MODEL)
+        _possible.require_known(bare)
+
+    monkeypatch.setattr(_start, "steps", plan)
+    monkeypatch.setattr(_sitting, "_softneck", lambda *_, **__: Path("m.npz").touch())
+    for _ in range(2):  # and so it is where the models are kept
+        said = call("start", short, "-o", "p", "--yes")
+        last = said.err.splitlines()[-1]
+        assert said.code == 2
+        assert all(f"{table}.{key}" in last for table, key in (("motors", "setpoint_min"), ("sensor", "rate_hz")))
+        assert "Record" not in said.err
+        assert "the same command goes on" in said.err
+        assert len(last) <= 160
