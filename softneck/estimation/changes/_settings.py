@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector, require_one_of, require_positive
+from softneck.core import DataError, Matrix, SettingsError, Vector, require_one_of, require_positive, require_whole
 from softneck.identification import Model
 from softneck.identification.models._fitting import known_rows, one_recording
 from softneck.identification.models._ports import payloads
@@ -61,6 +61,7 @@ class ChangeSettings:
         if self.ratio <= 1.0:
             raise SettingsError(f"`ratio` must be above 1, for a change makes a model worse; got {self.ratio:g}.")
         require_one_of("order", self.order, ("sequential", "jacobi"))
+        require_whole("seed", self.seed, 0, 2**62)
 
     def design(self, model: Model, recordings: Recording | list[Recording]) -> ChangeDetector:
         """Return the detector over a model.
@@ -70,7 +71,7 @@ class ChangeSettings:
             recordings: undisturbed motion like that which it will see, on which the model was not trained.
 
         Raises:
-            DataError: too little motion, or motion that the model was trained on.
+            DataError: too little motion or none, or motion that the model was trained on.
         """
         recording = one_recording(recordings)
         model.check(recording)
@@ -182,6 +183,9 @@ def _spread(runs: list[tuple[Matrix, dict[str, Matrix]]], still: float) -> Matri
             target.append((outputs[:, axis] - y) ** 2)
         A, b = np.concatenate(X), np.concatenate(target)
         there = np.isfinite(b) & (A[:, 1] > still**2)
+        if not there.any():
+            raise DataError("the neck stands still throughout, or nothing was measured; record motion like that which "
+                            "the detector will see.")  # fmt: skip
         A, b = A[there], b[there]
         size = np.maximum(A.mean(axis=0), 1e-12)
         weights = nnls(A / size, b)[0] / size

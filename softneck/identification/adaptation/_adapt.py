@@ -30,7 +30,7 @@ _STRENGTH = 0.1
 _EVERY, _BLOCK = 3, 2.0
 # Set-points that move less than this part of what they do along the reference teach nothing.
 _LEAST_MOTION = 0.1
-# Fewer entries than this on either side decide nothing.
+# Fewer entries of an output than this on either side decide nothing.
 _LEAST_ROWS = 50
 # Parts of the way that are tried until no output is worse.
 _PARTS = (1.0, 0.5, 0.25)
@@ -102,8 +102,9 @@ class Adaptation:
             return _kept(model, Judged(adapted=False, why=why, seconds=0.0))
         known, held = _split(window, self.block)
         seconds = len(window) * window.sample_time
-        if min(int(known.sum()), int(held.sum())) < _LEAST_ROWS:
-            return _kept(model, Judged(adapted=False, why="too few rows were measured", seconds=seconds))
+        if min(known.sum(axis=0).min(), held.sum(axis=0).min()) < _LEAST_ROWS:
+            why = "an output was measured in too few of its rows"
+            return _kept(model, Judged(adapted=False, why=why, seconds=seconds))
         motion = reference(model)
         if not _moved(window.set_points, motion.set_points):
             why = "the window hardly moves the neck, so that it teaches nothing"

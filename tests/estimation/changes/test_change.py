@@ -16,6 +16,7 @@ from softneck.signals import Recording, concatenate, signal
 from softneck.signals.detection._charts_runtime import chart_spread
 
 NECK = VirtualNeck(NeckParameters.paper())
+SET_POINTS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3")
 
 
 def moved(motion: str, payload: float, seed: int, seconds: float = 26.0) -> Recording:
@@ -152,7 +153,13 @@ def test_motion_that_the_model_knows_is_refused(model: Model) -> None:
         ChangeSettings().design(model, moved("rotation", 0.0, 3, 10.0))
 
 
-@pytest.mark.parametrize("wrong", [{"ratio": 1.0}, {"period": 0.0}, {"hours": -1.0}, {"order": "other"}])
+def test_a_hold_is_no_motion(model: Model) -> None:
+    run = moved("rotation", 0.0, 3)
+    with pytest.raises(DataError, match="stands still throughout"):
+        ChangeSettings().design(model, run.with_channels(**{name: np.full(len(run), 0.5) for name in SET_POINTS}))
+
+
+@pytest.mark.parametrize("wrong", [{"ratio": 1.0}, {"period": 0.0}, {"hours": -1.0}, {"order": "other"}, {"seed": "x"}])
 def test_bad_settings_are_refused(wrong: dict) -> None:
     with pytest.raises(SettingsError, match=next(iter(wrong))):
         ChangeSettings(**wrong)

@@ -166,6 +166,14 @@ def test_a_window_without_a_run_measured_keeps_the_model_and_says_so(
     assert "no run of the window goes on for more than 0.52 s" in new.findings["adaptation"]["why"]
 
 
+def test_an_output_that_is_not_measured_cannot_be_judged(old: Trained, window: Recording) -> None:
+    pitch = window.channels["pitch"].copy()
+    pitch[30:] = np.nan
+    new = old["oe"].adapted(window.with_channels(pitch=pitch))
+    assert same_arrays(new, old["oe"])
+    assert "an output was measured in too few" in new.findings["adaptation"]["why"]
+
+
 def test_only_the_latest_seconds_count(old: Trained, window: Recording) -> None:
     early = {name: window.channels[name].copy() for name in ("pitch", "roll")}
     for values in early.values():
