@@ -1,14 +1,15 @@
 """How soon a change detector over a `greybox` finds a payload, how often it cries wolf, and how it was chosen.
 
-`python benchmarks/changes.py choose|found|alarms|curve|oracle [--several] [--necks NECK...] [--hours H]`
+`python benchmarks/changes.py choose|found|alarms|curve|oracle [--several] [--minutes N] [--necks NECK...] [--hours H]`
 
 Models are of 140 s of Eq. 22; thresholds of some 200 s of other motion of the same neck. `choose` leaves each neck out
 in turn: seconds until a payload put on at 60 s is found during the paper's rotation (60 where it is not), and as many
 again for each false alarm over other motion. `found` prints these seconds, and those of the next motion after a hold
 at 14 deg. `alarms` counts false alarms over independent minutes of motion; it goes on where it was stopped
-(`build/changes`). `curve` prints both for several budgets of false alarms. With `--several` the model is one of 0, 0.5
-and 1 kg, so that the detector tells the payload: found is then `changed`, or a payload of more than 0.16 kg (half of
-the least that is put on) where there was less before. `choose` then adds the seconds until what is told stays within
+(`build/changes`). `found` and `alarms` take thresholds of `--minutes` of such motion as well. `curve` prints both for
+several budgets of false alarms. With `--several` the model is one of 0, 0.5 and 1 kg, so that the detector tells the
+payload: found is then `changed`, or a payload of more than 0.16 kg (half of the least that is put on) where there was
+less before. `choose` then adds the seconds until what is told stays within
 0.16 kg, and takes another 12 minutes of motion than `alarms`. `oracle` puts the true neck in the place of the model,
 with and without the payload, sensor noise alone between them: what anyone could find, the rms shift that the payload
 makes in the 10 s after it was put on, and the rms error there of the model of several payloads without one.
@@ -47,6 +48,7 @@ CANDIDATES_OF_SEVERAL = [
     for memory in (0.5, 1.0, 2.0)
 ]
 PUT_ON, NEXT = 60.0, 70.0
+MOTIONS = ("aprbs", "multisine", "mixed")
 # [kg] A payload told beyond it is one that was found.
 TOLD = 0.5 * LOADS[0]
 
@@ -111,10 +113,10 @@ def learnt(neck: str, *, several: bool) -> tuple[Model, list[Recording]]:
     return load(path, role="model"), [moved(neck, P, kg, 5) for kg in (0.0, 0.5, 1.0) for P in motions(3)]
 
 
-def detector_of(neck: str, settings: ChangeSettings, *, several: bool) -> ChangeDetector:
-    """Return a detector over a model without payload, or over one of several."""
+def detector_of(neck: str, settings: ChangeSettings, *, several: bool, minutes: int = 0) -> ChangeDetector:
+    """Return a detector over a model without payload, or over one of several, from so many further minutes."""
     model, undisturbed = learnt(neck, several=several)
-    return settings.design(model, undisturbed)
+    return settings.design(model, undisturbed + [minute(neck, 7000 + number) for number in range(minutes)])
 
 
 def loaded(neck: str, P: Matrix, payload: float, seed: int = 9) -> Recording:
@@ -124,7 +126,7 @@ def loaded(neck: str, P: Matrix, payload: float, seed: int = 9) -> Recording:
 
 def minute(neck: str, seed: int) -> Recording:
     """Return undisturbed motion that a seed makes anew."""
-    name, size = ("aprbs", "multisine", "mixed")[seed % 3], np.random.default_rng(seed).uniform(0.5, 1.0)
+    name, size = MOTIONS[seed % 3], np.random.default_rng(seed).uniform(0.5, 1.0)
     return moved(neck, size * signal(name, duration=60.0, seed=seed).set_points, 0.0, seed)
 
 
@@ -177,26 +179,33 @@ def curve(necks: list[str], hours: float, *, several: bool) -> None:
                             for i, d in enumerate(delays)), flush=True)  # fmt: skip
 
 
-def found(necks: list[str], *, several: bool) -> None:
+def found(necks: list[str], *, several: bool, minutes: int) -> None:
     """Print how soon a payload is found."""
     print(f"{'':22}" + "".join(f"{payload:>9g} kg" for payload in (0.0, *LOADS)))
     for neck in necks:
-        detector = detector_of(neck, ChangeSettings(), several=several)
+        detector = detector_of(neck, ChangeSettings(), several=several, minutes=minutes)
         for name, P, since in (("rotation", rotation(80.0), PUT_ON), ("hold", hold(80.0), NEXT)):
             delays = [first(detector, loaded(neck, P, payload), since) for payload in (0.0, *LOADS)]
             print(f"{neck:14}{name:8}" + "".join(f"{'none' if d == np.inf else f'{d:.2f} s':>12}" for d in delays),
                   flush=True)  # fmt: skip
 
 
-def alarms(necks: list[str], hours: float, *, several: bool) -> None:
+def alarms(necks: list[str], hours: float, *, several: bool, minutes: int) -> None:
     """Count false alarms, minute by minute of motion that each seed makes anew; kept where it stopped."""
     OUT.mkdir(parents=True, exist_ok=True)
     for neck in necks:
-        detector = detector_of(neck, ChangeSettings(), several=several)
-        path = OUT / f"{neck}{'.several' if several else ''}.alarms.json"
+        detector = detector_of(neck, ChangeSettings(), several=several, minutes=minutes)
+        path = OUT / f"{neck}{'.several' if several else ''}{f'.{minutes}' if minutes else ''}.alarms.json"
         done: list[bool] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
         while len(done) < 60.0 * hours:
-            done.append(bool(np.isfinite(first(detector, minute(neck, 1000 + len(done)), 0.0))))
+            run = minute(neck, 1000 + len(done))
+            at = first(detector, run, 0.0)
+            done.append(bool(np.isfinite(at)))
+            if done[-1]:
+                before = slice(round((at - 2.0) / TS), round(at / TS))
+                off = np.degrees(detector.model.simulate(run)[before, :2] - run.outputs[before]).mean(axis=0)
+                print(f"{neck:14}minute {len(done)} ({MOTIONS[(999 + len(done)) % 3]}), {at:.2f} s: "
+                      f"the model was {off[0]:.1f}/{off[1]:.1f} deg off in the 2 s before", flush=True)  # fmt: skip
             part = path.with_suffix(".part")
             part.write_text(json.dumps(done), encoding="utf-8")
             part.replace(path)
@@ -233,18 +242,19 @@ def main() -> None:
     parser.add_argument("what", choices=["choose", "found", "alarms", "curve", "oracle"])
     parser.add_argument("--necks", nargs="*", choices=CHOOSING, default=list(CHOOSING))
     parser.add_argument("--hours", type=float, default=30.0, help="of motion of each neck")
+    parser.add_argument("--minutes", type=int, default=0, help="of further undisturbed motion to `found` and `alarms`")
     parser.add_argument("--several", action="store_true", help="a model of several payloads, which is told as well")
     asked = parser.parse_args()
     if asked.what == "choose":
         choose(asked.necks, several=asked.several)
     elif asked.what == "found":
-        found(asked.necks, several=asked.several)
+        found(asked.necks, several=asked.several, minutes=asked.minutes)
     elif asked.what == "oracle":
         oracle(asked.necks)
     elif asked.what == "curve":
         curve(asked.necks, asked.hours, several=asked.several)
     else:
-        alarms(asked.necks, asked.hours, several=asked.several)
+        alarms(asked.necks, asked.hours, several=asked.several, minutes=asked.minutes)
 
 
 if __name__ == "__main__":
