@@ -18,6 +18,7 @@ from softneck.loop import SensorFault
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.tuning import tune
+from softneck.tuning._beforehand import refuse_impossible
 from softneck.tuning._cases import loop_of, quietly
 from softneck.tuning._judge import made_ready
 from softneck.tuning._tune import Tuned, task_of
@@ -47,6 +48,13 @@ def test_a_robots_own_plant_steps_as_the_linear_one_that_it_is(name: str) -> Non
     assert 0.0 < metrics["neck.rise_s"] <= metrics["step.rise_s"] + 0.02
     assert metrics["neck.overshoot_pct"] <= metrics["step.overshoot_pct"] + 0.5
     assert not [metric for metric in metrics if metric.startswith("track.circle")], "a circle is a neck's"
+
+
+def test_a_default_that_is_quieter_than_the_noise_of_a_neck_refuses_no_other_robot() -> None:
+    model = plant(Robot.preset("antagonist"))
+    asked = task_of({"model": model}, {"track": {"noise_deg": 5.0}}, 0).asked
+    assert 0.0 < (asked.limit("neck.steady_rms_deg") or 0.0) < 5.0
+    refuse_impossible(asked, model)
 
 
 def test_verify_judges_by_what_tune_stretched_and_not_by_more() -> None:
