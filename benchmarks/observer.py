@@ -1,6 +1,6 @@
 """Print what the observer is worth against the true angles on foreign necks with a poor sensor, beside a peer.
 
-`python benchmarks/observer.py [--seeds N] [--necks NECK...] [--grid | --unseen | --oracle]`
+`python benchmarks/observer.py [--seeds N] [--necks NECK...] [--grid | --unseen | --oracle | --causes]`
 
 Noise of 0.25 deg, 20 % of the samples lost, 2 % outliers, a blackout of a second in each of four motions; every filter
 sees the same. The model is an `oe` of 140 s of Eq. 22 with that noise. `default`, `look-ahead` (over 50 ms) and `data`
@@ -15,7 +15,8 @@ of a grid of noise levels and sensor delays *on the very motions it is judged on
 seen, as the poor sensor logs it: error on the rows that it held out itself, of the defaults and of what it kept, then
 against the truth. `--oracle`: the filter over the `greybox`; the same that knew at each sample, without noise, gaps or
 outliers, what its model misses at the sensor's time; and the error left in the blackouts under the best constant
-disturbance of each, in hindsight.
+disturbance of each, in hindsight. `--causes`: the filter over the `greybox` of the neck as it is, and of the same neck
+without one part of its physics, which says what the equations of `greybox` lack.
 """
 
 from __future__ import annotations
@@ -54,6 +55,23 @@ LEVELS = {
     },
 }
 UNSEEN_S, UNSEEN_SEED = 60.0, 77
+# What is taken out of a neck, and the numbers that do so.
+Changes = tuple[tuple[str, tuple[float, ...]], ...]
+CAUSES: dict[str, dict[str, Changes]] = {
+    "spring": {
+        "hysteresis": (("hysteresis", (0.0, 0.0)),),
+        "dead zone and play": (("dead_zone", (0.0, 0.5, 100.0)), ("backlash", (0.0, 0.4, 8.0))),
+        "axes and tendons aside": (
+            ("stiffness", (0.8, 0.8, 0.0)), ("angle", (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)),
+            ("radius", (0.05, 0.05, 0.05)),
+        ),
+    },
+    "foam": {
+        "sheaths' friction": (("sheath", (0.0, 0.0008)),),
+        "buckling": (("stiffness", (0.62, 0.25, 0.0, 12.0)),),
+        "lobes, buckling, stiffening": (("stiffness", (0.62, 0.0, 0.0, 0.0)),),
+    },
+}  # fmt: skip
 
 
 def peer(model: Model, run: Recording) -> Matrix:
@@ -85,9 +103,9 @@ def peer(model: Model, run: Recording) -> Matrix:
     return np.array(told).reshape(2, -1).T
 
 
-def known(neck: str, seed: int) -> tuple[Block, Recording, list[Spoiled]]:
+def known(neck: str, seed: int, changes: Changes = ()) -> tuple[Block, Recording, list[Spoiled]]:
     """Return a specimen, the recording that models are from, and the motions to judge by."""
-    block = ForeignNeck(name=neck, seed=seed, noise=False).block()
+    block = ForeignNeck(name=neck, seed=seed, noise=False, changes=changes).block()
     log = logged(moved(block, signal("eq22"), 1000 * seed + 1).rows(0, 7000))
     return block, log, [spoiled(block, motion, 1000 * seed + 10 + i) for i, motion in enumerate(motions())]
 
@@ -160,6 +178,16 @@ def oracle(neck: str, seed: int) -> str:
     )
 
 
+def causes(neck: str, seed: int) -> str:
+    """Return rms errors [deg] of the filter over the neck as it is, and without parts of its physics."""
+    lines = []
+    for what, changes in {"as it is": (), **CAUSES.get(neck, {})}.items():
+        _, log, runs = known(neck, seed, changes)
+        whole, dark = error(KalmanSettings().design(GreyBox().fit(log)), runs)
+        lines.append(f"{neck:8}{seed:3}  {what:28}{whole:.3f} ({dark:.2f})")
+    return "\n".join(lines)
+
+
 def unseen(neck: str, seed: int) -> str:
     """Return what `--data` of a recording that the model has not seen keeps, and what that is worth."""
     block, log, runs = known(neck, seed)
@@ -181,10 +209,12 @@ def main() -> None:
     other.add_argument("--grid", action="store_true", help="the defaults beside the best of a grid")
     other.add_argument("--unseen", action="store_true", help="what `--data` makes of rows that the model has not seen")
     other.add_argument("--oracle", action="store_true", help="what a filter that were told all would reach")
+    other.add_argument("--causes", action="store_true", help="without parts of the neck's physics")
     wanted = parser.parse_args()
     printed = {
         grid: "of the defaults, told the sensor's noise, of the best of the grid (its levels), and with its best delay",
         unseen: "kept; on rows held out, of the defaults and of what was kept; the same against the truth",
+        causes: "(in blackouts) of the defaults, without a part of the neck's physics",
         oracle: "(in blackouts) of the defaults, of the oracle, of hindsight in the blackouts",
     }
     for line, head in printed.items():
