@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -245,6 +246,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]><x>&b;</x>'
     [
         (BOMB, "DOCTYPE"),
         ("<x/>", "no SSP 1.0 or 2.0"),
+        (ssd(version="3.0"), "no SSP 1.0 or 2.0"),
         ("not xml", "no valid XML"),
         (ssd("<ssd:SignalDictionaryReference name='d'/>", ""), "SignalDictionaryReference `d`"),
         (ssd(COMPONENT.replace("F.fmu", "../../etc.fmu").format(""), ""), "outside the archive"),
@@ -398,6 +400,16 @@ def test_an_archive_that_reaches_out_of_itself(foreign: Path, tmp_path: Path) ->
     assert not (tmp_path.parent / "out.txt").exists()
     with pytest.raises(FileFormatError, match="is not an SSP archive"):
         load_ssp(foreign)
+
+
+def test_an_fmu_that_reaches_out_of_itself_is_named_by_its_archive(foreign: Path, tmp_path: Path) -> None:
+    fmu = tmp_path / "Out.fmu"
+    fmu.write_bytes(foreign.read_bytes())
+    with zipfile.ZipFile(fmu, "a") as file:
+        file.writestr("../../../out.txt", b"x")
+    path = archive(tmp_path, fmu, ssd())
+    with pytest.raises(FileFormatError, match=rf"^{re.escape(str(path))}:resources/F.fmu: .* reaches out of it"):
+        load_ssp(path)
 
 
 def test_only_loops_are_loops(foreign: Path, tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ class Reader:
             FileFormatError: no valid structure, or one with what a loop cannot carry; the line names it.
         """
         root = self._xml("SystemStructure.ssd")
-        if root.tag != f"{SSD}SystemStructureDescription":
+        if root.tag != f"{SSD}SystemStructureDescription" or root.get("version", "1.0") not in ("1.0", "2.0"):
             raise self._wrong("SystemStructure.ssd", "is no SSP 1.0 or 2.0 system structure description")
         system = root.find(f"{SSD}System")
         if system is None:

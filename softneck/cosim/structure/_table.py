@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softneck.core import SettingsError
+from softneck.core import FileFormatError, SettingsError
 from softneck.fmu import unpack, unpacked
 from softneck.loop._loop import USE_MOTOR_POSITIONS
 
@@ -68,8 +68,12 @@ def _components(system: SystemNode) -> list[Component]:
 
 
 def _description(source: Path, name: str, file: Path) -> Description:
-    with unpacked(file) as folder:
-        return read_description(Path(f"{source}:{name}"), folder, {})
+    inside = f"{source}:{name}"
+    try:
+        with unpacked(file) as folder:
+            return read_description(Path(inside), folder, {})
+    except FileFormatError as error:  # of a place that nobody knows
+        raise FileFormatError(str(error).replace(str(file), inside)) from error
 
 
 def _ports(description: Description) -> Ports:
