@@ -176,10 +176,10 @@ static int sn_worked(sn_instance *s, int what)
 
 static int sn_check_outputs(sn_instance *s)
 {
-    double sum = 0.0;
+    int finite = 1;
     for (int64_t i = 0; i < s->pending.n; i++)
-        sum += s->pending.p[i];
-    if (sn_finite(sum))
+        finite &= sn_finite(s->pending.p[i]);
+    if (finite)
         return 1;
     for (int64_t i = 0; i < s->pending.n; i++) {
         double x = s->pending.p[i];
@@ -252,7 +252,7 @@ static int sn_do_step(sn_instance *s, double time, double size)
         sn_say(s, SN_FAIL, "a step before the initialisation has ended.");
         return 0;
     }
-    if (!sn_finite(end) || size < 0.0 || (end - s->start) / period - (double)s->count > SN_MOST_SAMPLES) {
+    if (!sn_finite(end) || size < 0.0 || end - s->start > ((double)s->count + SN_MOST_SAMPLES) * period) {
         sn_say(s, SN_FAIL, "a step from %g s over %g s cannot be taken.", time, size);
         return 0;
     }
@@ -364,7 +364,8 @@ static void sn_warn_outside(sn_instance *s, uint32_t i, double value)
            angle ? " Is it in degrees?" : "");
 }
 
-static int sn_set(sn_instance *s, uint32_t i, double value)
+/* What is not a number within its limits for an input. */
+SN_APART static int sn_set_rarely(sn_instance *s, uint32_t i, double value)
 {
     const sn_port *port;
     double slack = 1e-9 * (1.0 + fabs(value)); /* a limit that a controller works out may miss by rounding */
@@ -375,11 +376,6 @@ static int sn_set(sn_instance *s, uint32_t i, double value)
         return 0;
     }
     port = &s->model.ports[i];
-    if (i < s->model.n_in && sn_finite(value) && value >= port->low && value <= port->high) {
-        s->values.p[i] = value; /* most of what is ever set */
-        s->looked = 0;
-        return 1;
-    }
     if (!sn_finite(value) && !((port->flags & SN_MISSING) && sn_nan(value))) {
         sn_say(s, SN_FAIL, "%.80s was set to %f; it must be finite.", port->name, value);
         return 0;
@@ -406,18 +402,25 @@ static int sn_set(sn_instance *s, uint32_t i, double value)
     return 1;
 }
 
+static SN_MERGED int sn_set(sn_instance *s, uint32_t i, double value)
+{
+    if (i < s->model.n_in && sn_finite(value) && value >= s->model.ports[i].low && value <= s->model.ports[i].high) {
+        s->values.p[i] = value; /* most of what is ever set */
+        s->looked = 0;
+        return 1;
+    }
+    return sn_set_rarely(s, i, value);
+}
+
 static int sn_is_ahead(const sn_instance *s, uint32_t i)
 {
     uint32_t end = s->model.n_in + s->model.n_out;
     return i < end && i >= end - s->model.ahead;
 }
 
-static int sn_get(sn_instance *s, uint32_t i, double *value)
+/* What is not an output of now. */
+SN_APART static int sn_get_rarely(sn_instance *s, uint32_t i, double *value)
 {
-    if (!s->stale && i >= s->model.n_in && i < s->model.n_in + (uint32_t)s->pending.n) {
-        *value = s->values.p[i]; /* an output of now: most of what is ever got */
-        return 1;
-    }
     if ((int64_t)i >= s->values.n) {
         sn_say(s, SN_FAIL, "there is no variable %u.", (unsigned)i);
         return 0;
@@ -429,6 +432,15 @@ static int sn_get(sn_instance *s, uint32_t i, double *value)
     if (i < s->model.n_in && sn_nan(*value))
         *value = s->model.ports[i].start;
     return 1;
+}
+
+static SN_MERGED int sn_get(sn_instance *s, uint32_t i, double *value)
+{
+    if (!s->stale && i >= s->model.n_in && i < s->model.n_in + (uint32_t)s->pending.n) {
+        *value = s->values.p[i]; /* most of what is ever got */
+        return 1;
+    }
+    return sn_get_rarely(s, i, value);
 }
 
 /* The whole state, to the bit: values, pending outputs and state vector stand behind each other. */

@@ -84,14 +84,14 @@ LIBRARIES = {
     "robot_control": _CONTROL & _SIZED | _DRIVES,
 }
 
-# Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other.
-# A network, a search among thousands of points and a quadratic program spend their time in every loop; the neck in
-# sine and tangent (2 % slower without its entry, and 3 kB less).
+# Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other, 0
+# for all. A search among thousands of points and a quadratic program spend their time in every loop.
 FAST = {
-    "softneck.identification.linear._rls_runtime": 1,
+    "softneck.identification.linear._rls_runtime": 0,
     "softneck.identification.set_membership._nlsm_runtime": 1,
     "softneck.identification.set_membership._online_nlsm_runtime": 1,
-    "softneck.identification.networks._nn_runtime": 1,
+    "softneck.identification.networks._nn_runtime": 0,
+    "softneck.plant._neck_runtime": 0,
     "softneck.estimation._kalman_runtime": 2,
     "softneck.design.predictive._mpc_runtime": 1,
 }

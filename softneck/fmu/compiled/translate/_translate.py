@@ -102,7 +102,7 @@ class Unit:
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
-        functions = [_whole_here(text) if defined(text) in fast else _small(text) for text in self.functions]
+        functions = [_fast(text) if defined(text) in fast else _small(text) for text in self.functions]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
 
     def _fast(self) -> set[str]:
@@ -252,9 +252,9 @@ def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
     return runtime.function("step_tangent", (arrays, VECTOR, VECTOR, VECTOR, VECTOR, *rows, INT)).name
 
 
-def _whole_here(text: str) -> str:
-    """Return a function that checks whole numbers where they stand."""
-    return text.replace("sn_int(", "sn_int_here(")
+def _fast(text: str) -> str:
+    """Return a function that may stand where it is called, and checks whole numbers where they stand."""
+    return text.replace("sn_int(", "sn_int_here(").replace("\nstatic ", "\nstatic inline ", 1)
 
 
 def _small(text: str) -> str:
