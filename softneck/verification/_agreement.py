@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from softneck.design.linear._margins import nearer_gain
+
 from ._evidence import Evidence, LinearEvidence
 from ._linear import LinearLaw
 from ._plants import Plants
@@ -153,7 +155,7 @@ def _by_control(plants: Plants, law: LinearLaw, axis: int, row: int) -> list[flo
         # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
         warnings.filterwarnings("ignore", "(stability_margins: Falling back|Badly conditioned)", UserWarning)
         gains, phases = (np.asarray(item) for item in control.stability_margins(loop, returnall=True)[:2])
-    gain = float(np.exp(np.abs(np.log(gains[gains > 0.0])).min(initial=math.inf)))
+    gain = nearer_gain(float(np.exp(np.abs(np.log(gains[gains > 0.0])).min(initial=math.inf))), complex(loop(-1.0)))
     # The nearest of all crossings, as `classical` takes it.
     phase = float(np.abs((phases + 180.0) % 360.0 - 180.0).min(initial=math.inf))
     closed: Any = control.feedback(1, loop)

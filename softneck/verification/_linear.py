@@ -24,6 +24,8 @@ SMALL = ("sensitivity", "complementary", "control_sensitivity")
 MIMO = "mimo_disk_margin"
 # Plants whose responses are held in memory at once.
 _CHUNK = 64
+# The cosine of pi, up to 1e-6 rad.
+_PI = -1.0 + 5e-13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,6 +232,9 @@ def classical(L: np.ndarray, w: Vector) -> dict[str, Vector]:
         border = 2.0 * math.pi * max(turns[i, k], turns[i, k + 1]) - math.pi
         part = (border - phase[i, k]) / (phase[i, k + 1] - phase[i, k])
         gain[i] = min(gain[i], abs(size[i, k] + part * (size[i, k + 1] - size[i, k])))
+    # At the Nyquist frequency a loop is real: where it is negative it has come to such a multiple, and passes none.
+    ends = np.cos(phase[:, -1]) < _PI
+    gain[ends] = np.minimum(gain[ends], np.abs(size[ends, -1]))
     least, delay = np.full(n, math.inf), np.full(n, math.inf)
     for i, k in np.argwhere((size[:, 1:] > 0.0) != (size[:, :-1] > 0.0)):
         part = size[i, k] / (size[i, k] - size[i, k + 1])

@@ -274,6 +274,11 @@ def test_an_unstable_loop_has_no_margins() -> None:
         loop_margins(control.TransferFunction([100.0 * B], [1.0, -POLE, 0.0, 0.0], TS))
 
 
+def test_a_gain_margin_at_the_nyquist_frequency_counts() -> None:
+    """The pole of 0.3 k/(z + 0.43) is at -0.43 - 0.3 k: at -1 with k = 1.9."""
+    assert loop_margins(control.TransferFunction([0.3], [1.0, 0.43], TS)).gain == pytest.approx(0.57 / 0.3, rel=1e-9)
+
+
 def test_a_controller_without_direct_gain_needs_its_own_conditioning() -> None:
     one = np.eye(1)
     with pytest.raises(SettingsError, match="needs `L`"):

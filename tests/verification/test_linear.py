@@ -190,15 +190,37 @@ def test_bounds_enclose_what_was_sampled() -> None:
     assert row.worst_sensitivity >= peak
 
 
-def test_mu_of_gain_alone_is_that_of_the_gain_margin() -> None:
+def one_pole(gain: float, pole: float, late: int) -> LinearNeck:
+    """Both axes `gain (1 - pole) / (z - pole)` of the paper's gain, `late` samples late; a pole below 0 alternates."""
+    axis = control.TransferFunction([gain * (1.0 - pole) * PAPER[0]], [1.0, -pole, *([0.0] * late)], TS)
+    return LinearNeck(pitch=axis, roll=axis)
+
+
+@pytest.mark.parametrize(
+    "model", [linear_neck(), *(one_pole(*x) for x in ((0.5, -0.1, 1), (0.3, -0.43, 3), (0.5, -0.43, 3)))]
+)
+def test_mu_of_gain_alone_is_that_of_the_gain_margin(model: LinearNeck) -> None:
     """With gain +-r alone the loop is unstable from 1 + k r = gain margin on: mu = r/(margin - 1)."""
     r = 0.3
-    neck = neck_of_model(linear_neck(), "m", {"gain": r, "pole": 0.0, "delay": 0.0})
+    neck = neck_of_model(model, "m", {"gain": r, "pole": 0.0, "delay": 0.0})
     law = LinearLaw.of(pi().ss())
     margin = float(margins(nominal_plants([neck])[0], law, W)["pitch.gain_margin"][0])
     row = structured(neck, law, extra=0, drawn=np.ones((1, 2, 3)), performance=False)[0]
     # The 1 % of complex dead time that is always there widens the peak, and costs as much here.
     assert r / (margin - 1.0) <= row.mu <= 1.2 * r / (margin - 1.0)
+
+
+@pytest.mark.parametrize("late", [0, 3, 6])
+def test_a_gain_margin_is_where_poles_leave_the_circle(late: int) -> None:
+    """Also where they leave it at -1, the Nyquist frequency, as those of a plant that alternates do."""
+    law, box = LinearLaw.of(pi().ss()), {"gain": 0.3, "pole": 0.0, "delay": 0.0}
+
+    def plant(k: float) -> Plants:
+        return nominal_plants([neck_of_model(one_pole(0.3 * k, -0.43, late), "m", box)])[0]
+
+    margin = float(margins(plant(1.0), law, W)["pitch.gain_margin"][0])
+    # 0.1 %: straight lines between frequencies.
+    assert radii(plant(0.999 * margin), law)[0] < 1.0 < radii(plant(1.001 * margin), law)[0]
 
 
 @pytest.mark.parametrize("poles", [[1.0, -0.9], [1.0, 0.43], [1.0, -1.6, 0.73]], ids=["lag", "alternating", "ringing"])

@@ -12,7 +12,7 @@ from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
 from ._assembly import AxisController
-from ._margins import LOWEST, Margins, frequencies
+from ._margins import LOWEST, Margins, frequencies, nearer_gain
 
 # Samples are judged on a coarser grid than margins: 4 % apart, a peak of |S| changes by less than 2e-3 between two.
 _COARSE = 4
@@ -140,6 +140,7 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
     gain, phase, _, _, crossover, _ = (float(value) for value in control.stability_margins(data))
     angle = math.radians(phase)
     delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
+    gain = nearer_gain(gain, loop[-1])
     return Margins(gain, angle, float(np.max(1.0 / np.abs(1.0 + loop))), crossover, delay)
 
 

@@ -71,4 +71,15 @@ def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> M
     sensitivity = float(np.abs(1.0 / (1.0 + response)).max())
     angle = math.radians(float(phase))
     delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
-    return Margins(float(gain), angle, sensitivity, float(crossover), delay)
+    return Margins(nearer_gain(float(gain), response[-1]), angle, sensitivity, float(crossover), delay)
+
+
+def nearer_gain(gain: float, last: complex) -> float:
+    """Return the nearer of a gain margin and of that at the Nyquist frequency, which python-control leaves out.
+
+    Args:
+        gain: a factor.
+        last: the open loop at the Nyquist frequency, where it is real.
+    """
+    there = -1.0 / last.real if last.real < 0.0 else math.inf
+    return min(gain, there, key=lambda factor: abs(math.log(max(factor, 1e-300))))
