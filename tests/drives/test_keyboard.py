@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +27,14 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminal
 # A machine that stalls ends a run by itself: such a try says nothing about keys.
 _STALLS = ("stalled", "tpdo", "position did not come", "no drive answered", "heartbeat", "emergency", "dropped out",
            "stood still", "follow")  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def signals_are_heard() -> Iterator[None]:
+    """Under nohup the tests ignore SIGHUP, and so would what they start."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 @dataclass(frozen=True)
