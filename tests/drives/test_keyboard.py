@@ -31,10 +31,11 @@ _STALLS = ("stalled", "tpdo", "position did not come", "no drive answered", "hea
 
 @pytest.fixture(autouse=True, scope="module")
 def signals_are_heard() -> Iterator[None]:
-    """Under nohup the tests ignore SIGHUP, and so would what they start."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    """Under nohup the tests ignore SIGHUP, and in a shell's background SIGINT; so would what they start."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGHUP, signal.SIGINT)}
     yield
-    signal.signal(signal.SIGHUP, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @dataclass(frozen=True)
