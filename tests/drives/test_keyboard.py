@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,15 +26,6 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminal
 # A machine that stalls ends a run by itself: such a try says nothing about keys.
 _STALLS = ("stalled", "tpdo", "position did not come", "no drive answered", "heartbeat", "emergency", "dropped out",
            "stood still", "follow")  # fmt: skip
-
-
-@pytest.fixture(autouse=True, scope="module")
-def signals_are_heard() -> Iterator[None]:
-    """Under nohup the tests ignore SIGHUP, and in a shell's background SIGINT; so would what they start."""
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGHUP, signal.SIGINT)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @dataclass(frozen=True)
