@@ -2,11 +2,19 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# What README installs and nothing else: the pages' commands run there.
+README_VENV := .venv-readme
 
-.PHONY: demo test slow check docs benchmark conformance mutate native wheel tag constraints nightly nightly-tests nightly-fuzz nightly-fmu nightly-can nightly-systemd clean
+.PHONY: demo test slow check docs documents benchmark conformance mutate native wheel tag constraints nightly nightly-tests nightly-documents nightly-fuzz nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
 	$(BIN)/softneck demo --out build/demo
+
+# Run the blocks of README and of the pages as a newcomer does: installed from the checkout without tests' packages.
+# `PAGES="--page docs/howto/loops.md"` runs one.
+documents: $(README_VENV)/.made
+	$(README_VENV)/bin/python -m pip install --quiet --disable-pip-version-check '.[drives]'
+	$(PYTHON) tests/docs/run_documents.py --python $(README_VENV)/bin/python --jobs 2 $(PAGES)
 
 # Neighbours stay with one worker: what a module makes once is made once.
 test: $(VENV)/.tested
@@ -43,11 +51,15 @@ mutate: $(VENV)/.mutated
 native: $(VENV)/.crossed
 	$(BIN)/python -m softneck.fmu.compiled
 
-nightly: nightly-tests nightly-fuzz nightly-fmu nightly-can nightly-systemd
+nightly: nightly-tests nightly-documents nightly-fuzz nightly-fmu nightly-can nightly-systemd
 
 # With `make test` and `make slow` that is all: every kind in every importer, predictive control over every kind.
 nightly-tests: $(VENV)/.tested
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m nightly
+
+# The pages that take minutes.
+nightly-documents:
+	$(MAKE) documents PAGES=--nightly
 
 # 100,000 damaged files, spread over the formats that we read; each is a file or one error of ours.
 nightly-fuzz: $(VENV)/.tested
@@ -84,7 +96,7 @@ constraints: $(VENV)/.documented $(VENV)/.linted $(VENV)/.mutated $(VENV)/.cross
 	$(BIN)/python -m pip freeze --quiet --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[A-Za-z0-9.]+$$' > .ci/constraints.txt
 
 clean:
-	rm -rf $(VENV) docs/_build .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(README_VENV) docs/_build .pytest_cache .ruff_cache
 
 # Each stamp is made anew when the dependencies change.
 $(VENV)/.installed: pyproject.toml
@@ -113,4 +125,9 @@ $(VENV)/.linted: $(VENV)/.tested
 
 $(VENV)/.documented: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' --group docs
+	@touch $@
+
+$(README_VENV)/.made: pyproject.toml
+	$(PYTHON) -m venv --clear $(README_VENV)
+	$(README_VENV)/bin/python -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
 	@touch $@
