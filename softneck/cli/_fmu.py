@@ -1,4 +1,4 @@
-"""softneck fmu: models, observers, controllers and the virtual neck as FMUs."""
+"""softneck fmu: models, observers, controllers and the virtual neck as FMUs, a loop as an SSP file."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import FileFormatError, SettingsError, load
+from softneck.core import FileFormatError, SettingsError, file_hash, load
 from softneck.core._budget import settings_text
 from softneck.fmu.compiled._platforms import PLATFORMS
 
-from .shared._console import print_json, progress
+from .shared._console import note, print_json, progress
 from .shared._neck import load_neck
 from .shared._options import force_option, json_option, output_option, read_together, target
 from .shared._robot import load_of, robot_option
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
 @click.argument("file", required=False)
-@output_option("FMU", "X.fmu")
+@output_option("FMU, or the SSP file", "X.fmu|X.ssp")
 @click.option("--all", "folder", type=click.Path(path_type=Path), help="Build an FMU from every softneck file in DIR.")
 @click.option(
     "--data",
@@ -36,9 +36,8 @@ if TYPE_CHECKING:
 @click.option(
     "--backend",
     type=click.Choice(["python", "compiled"]),
-    default="python",
-    show_default=True,
-    help="What runs inside: Python and numpy of the host, or a C library that needs neither.",
+    help="What runs inside: Python and numpy of the host, or a C library that needs neither.  "
+    "[default: python; compiled in an SSP file]",
 )
 @click.option(
     "--fmi",
@@ -65,18 +64,25 @@ if TYPE_CHECKING:
 @json_option
 def command(
     file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
-    backend: str, fmi: str, platforms: tuple[str, ...], sensitivities: bool, robot: str | None, force: bool,
+    backend: str | None, fmi: str, platforms: tuple[str, ...], sensitivities: bool, robot: str | None, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
     """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough,
     trunk), a robot file or preset, whose virtual plant it becomes, or a loop file, from whose [reference] a reference
-    FMU is built.
+    FMU is built. With -o X.ssp the whole loop of a loop file (or of another archive) becomes an SSP 1.0 archive: plant,
+    observer, controller and reference. Masters that read it set all inputs and then step all: they compute what
+    `order = "jacobi"` does.
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
-    if backend == "python" and (fmi != "2" or platforms or sensitivities):
+    if output is not None and output.suffix.lower() == ".ssp":
+        if file is None or folder is not None or data or fmi != "2" or platforms or sensitivities:
+            raise SettingsError(f"{output}: an SSP file is made of one loop file, and takes --backend only.")
+        _ssp(Path(file), output, robot, compiled=backend != "python", force=force, as_json=as_json)
+        return
+    if backend != "compiled" and (fmi != "2" or platforms or sensitivities):
         raise SettingsError(
             "--fmi 3, --platform and --sensitivities are for compiled FMUs only; add `--backend compiled`."
         )
@@ -109,6 +115,27 @@ def command(
         click.echo(f"libraries: {origin}")
     for source in left_out:
         click.echo(f"left out: {source}, which is not a model, observer or controller")
+
+
+def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bool, as_json: bool) -> None:
+    """Write a loop as an SSP archive."""
+    from softneck.cosim import load_loop, load_ssp, write_ssp
+    from softneck.loop._system import System
+
+    if file.suffix.lower() not in (".toml", ".ssp"):
+        raise SettingsError(f"{file}: an SSP file is made of a loop file (.toml) or of another archive (.ssp).")
+    with progress("build SSP", quiet=as_json):
+        plain = file.suffix.lower() == ".ssp" and robot is None
+        setup = load_ssp(file) if plain else load_loop(file, robot=robot)
+        write_ssp(setup, path, force=force, compiled=compiled)
+    loop = setup if isinstance(setup, System) else setup.loop
+    parts = [*loop.parts, *(["reference"] if loop is not setup and "reference" not in loop.parts else [])]
+    if as_json:
+        print_json({"ssp": str(path), "sha256": file_hash(path), "parts": parts})
+        return
+    click.echo(str(path))
+    if loop.order == "sequential":
+        note('the loop file is sequential; an SSP master computes what it gives with order = "jacobi".')
 
 
 def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:

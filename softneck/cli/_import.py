@@ -118,6 +118,9 @@ def command(
 ) -> None:
     """Turn any logger's table LOG into a recording, by a layout file or by a guess at one.
 
+    With --resample alone LOG is a recording. Where the new sample time is slower, measured channels are low-passed
+    first, without a delay; set-points and flags hold their last value. At its own sample time it stays, to the bit.
+
     Reads text in any encoding, spreadsheets, Parquet, MATLAB and Octave files, and ROS 2 bags (.mcap). The .mcap log of
     `softneck drives run --log` needs neither layout nor guess.
     """
@@ -138,6 +141,9 @@ def command(
     if ours:
         _run_log(job, layout=asked)
         return
+    if not asked and sample_time is not None:
+        _resample(job, robot)
+        return
     if robot_out is not None:
         if guess or layout_file is not None or robot is not None:
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
@@ -148,7 +154,7 @@ def command(
         guess = True
     if guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given"
-        raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
+        raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess (a recording: --resample); {what}.")
     recording_suffix(path)
     refuse_existing(path, force=replace)
     if html is not None:
@@ -165,6 +171,22 @@ def command(
         layout, proposed = read_layout(layout_file, robot=whose), None
         imported = import_log(log, layout)
     _finish(job, imported, layout, proposed, facts)
+
+
+def _resample(job: _Job, robot: str | None) -> None:
+    """Bring a recording to another sample time."""
+    from softneck.signals import read_recording, write_recording
+    from softneck.signals.importing._log import ImportResult
+    from softneck.signals.recording._files import recording_suffix
+
+    if job.html is not None:
+        raise SettingsError("--html shows what a layout or a guess made of a log; a recording needs neither.")
+    recording_suffix(job.path)
+    refuse_existing(job.path, force=job.replace)
+    before = read_recording(job.log, robot=robot)
+    imported = _at_sample_time(job, ImportResult(before, ()))
+    write_recording(job.path, imported.recording, force=job.replace)
+    _tell(job.path, imported, {"sample_time_before_s": before.sample_time}, job.as_json)
 
 
 def _finish(job: _Job, imported: ImportResult, layout: Layout, proposed: Guess | None, facts: dict[str, Any]) -> None:

@@ -17,6 +17,7 @@ from softneck.core import SoftneckError
 from softneck.core._errors import missing_extra
 
 from .shared._groups import NearGroup
+from .shared._moved import now
 
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.
@@ -25,11 +26,10 @@ _COMMANDS = {
     "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
-    "robot": ("_robot", "Say what the robot is: show, start or check a robot.toml."),
+    "robot": ("_robot", "Show and check a robot.toml, or start one."),
     "record": ("experiments._record", "Record a signal on the virtual neck."),
     "excite": ("experiments._excite", "Design what to record next: motions on which the members of a model disagree."),
-    "import": ("_import", "Turn any logger's table into a recording, by a layout file."),
-    "resample": ("experiments._resample", "Bring a recording to another sample time."),
+    "import": ("_import", "Turn any logger's table into a recording, or bring one to another sample time."),
     "identify": ("_identify", "Identify a model from recordings."),
     "adapt": ("experiments._adapt", "Refit a model to the latest data of a neck that changed."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),
@@ -37,7 +37,7 @@ _COMMANDS = {
     "calibrate": ("_calibrate", "Fit the virtual neck to recordings or to a grey box."),
     "frf": ("_frf", "Estimate a frequency response with confidence, coherence and the band that the data support."),
     "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
-    "fmu": ("_fmu", "Package models, observers, controllers or the virtual neck as FMUs."),
+    "fmu": ("_fmu", "Package models, observers, controllers, necks as FMUs, a loop as an SSP file."),
     "linearize": ("experiments._linearize", "Write A, B, C, D that a model or any tool's FMU has near a moment."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
     "design": ("_design", "Design a controller on a linear model."),
@@ -45,10 +45,8 @@ _COMMANDS = {
     "verify": ("_verify", "Verify a controller against requirements, or fail loudly."),
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
     "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
-    "ssp": ("_ssp", "Write a loop as an SSP file for other simulators."),
     "drives": ("drives._commands", "Run controllers on CANopen drives, or on simulated ones."),
     "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),
-    "completion": ("shared._completion", "Print the script by which a shell completes these commands."),
     "new": ("_new", "Start a project whose closed-loop test passes at once."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3
@@ -105,6 +103,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
         return _BAD_INPUT
+    except click.NoSuchOption as error:
+        new = None if error.ctx is None else now(error.ctx, error.option_name)
+        told = error.format_message() if new is None else f"there is no option {error.option_name} any more: {new}"
+        return _fail(told, _BAD_INPUT)
     except click.ClickException as error:
         return _fail(error.format_message(), _BAD_INPUT)
     except (KeyboardInterrupt, click.Abort):

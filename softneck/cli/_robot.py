@@ -14,33 +14,56 @@ from softneck.core._budget import settings_text
 
 from .shared._console import print_json
 from .shared._groups import NearGroup
+from .shared._moved import now
 from .shared._options import force_option, json_option
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
 
 
+class _RobotGroup(NearGroup):
+    """A group whose argument is a file, unless it is a command."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Take what names no command for the argument of `FILE`."""
+        asked = args[0] if args else ""
+        # A shell that completes asks without a word.
+        if (
+            not ctx.resilient_parsing
+            and asked not in {*self.commands, *ctx.help_option_names}
+            and now(ctx, asked) is None
+        ):
+            args = ["FILE", *args]
+        return super().parse_args(ctx, args)
+
+
 @click.group(
-    "robot", cls=NearGroup, epilog="Example: softneck robot new --preset antagonist, then softneck robot check"
+    "robot", cls=_RobotGroup, epilog="Example: softneck robot new --preset antagonist, then softneck robot robot.toml"
 )
 def command() -> None:
-    """Say what the robot is: its motors, outputs, directions and limits (`robot.toml`).
+    """Show and check what the robot is, `softneck robot FILE`, or start a file, `softneck robot new`.
 
     Presets: neck (the paper's), arm, antagonist, finger, trunk4. Without FILE: `robot.toml` in this folder or
     one above it, else the preset neck. Each takes `--json`.
     """
 
 
-@command.command("show")
+@command.command("FILE")
 @click.argument("file", required=False, metavar="[FILE|PRESET]")
 @json_option
 def show(file: str | None, as_json: bool) -> None:
-    """Show what is given and what is not."""
-    robot = _robot(file)
+    """Show motors, outputs, directions, limits, and what is not given; check the files that it names.
+
+    Exit code 2 where something is wrong.
+    """
+    from softneck.robot import find_robot
+
+    robot = find_robot(file, beside=Path("here"))
+    if not as_json:
+        click.echo(f"{robot.summary()}\nhash: {robot.hash}")
+    _check_files(robot)
     if as_json:
-        print_json({**robot.as_dict(), "hash": robot.hash})
-        return
-    click.echo(f"{robot.summary()}\nhash: {robot.hash}")
+        print_json({**robot.as_dict(), "hash": robot.hash, "holds": True})
 
 
 @command.command("new")
@@ -62,7 +85,7 @@ def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
         print_json({"file": str(file), "preset": preset})
         return
     what = f"as {preset}" if taken else f"the preset {preset}"
-    click.echo(f"{file}: {what}; edit it, then softneck robot check {file}")
+    click.echo(f"{file}: {what}; edit it, then softneck robot {file}")
 
 
 def _moved(source: Path, folder: Path) -> str:
@@ -82,25 +105,6 @@ def _moved(source: Path, folder: Path) -> str:
         if name not in PRESETS and not Path(name).is_absolute():
             table[part][key] = Path(os.path.relpath((source.parent / name).resolve(), folder.resolve())).as_posix()
     return text if table == tomllib.loads(text) else tomli_w.dumps(table)
-
-
-@command.command("check")
-@click.argument("file", required=False, metavar="[FILE]")
-@json_option
-def check(file: str | None, as_json: bool) -> None:
-    """Check FILE and the files that it names, and that they fit; exit code 2 where something is wrong."""
-    robot = _robot(file)
-    _check_files(robot)
-    if as_json:
-        print_json({"robot": robot.name, "hash": robot.hash, "holds": True})
-        return
-    click.echo(f"{robot.label()}: nothing is wrong\n{robot.summary().splitlines()[-1]}")
-
-
-def _robot(file: str | None) -> Robot:
-    from softneck.robot import find_robot
-
-    return find_robot(file, beside=Path("here"))
 
 
 def _check_files(robot: Robot) -> None:

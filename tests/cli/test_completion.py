@@ -19,7 +19,6 @@ from .conftest import Call
     ("words", "line"),
     [
         (("desing",), "softneck: no such command `desing`; did you mean `design`?"),
-        (("robot", "chek"), "softneck: no such command `chek`; did you mean `check`?"),
         (("drives", "recrod"), "softneck: no such command `recrod`; did you mean `record`?"),
         (("xyzzy",), "softneck: no such command `xyzzy`; the commands are start, demo, "),
         (("identify", "nnn", "a.csv"), "softneck: unknown kind of model `nnn`; did you mean `nn`? use one of rls, "),
@@ -56,28 +55,34 @@ def test_commands_options_and_kinds_are_completed(
 ) -> None:
     assert completed(capsys, monkeypatch, "softneck de") == ["demo", "design"]
     assert completed(capsys, monkeypatch, "softneck ") == list(_main._COMMANDS)
-    assert completed(capsys, monkeypatch, "softneck robot ch") == ["check"]
+    assert completed(capsys, monkeypatch, "softneck robot n") == ["new"]
     assert completed(capsys, monkeypatch, "softneck design --any") == ["--any-fit"]
     assert completed(capsys, monkeypatch, "softneck design ") == list(kinds_of("controller"))
     assert completed(capsys, monkeypatch, "softneck identify au") == ["auto"]
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_script_asks_by_the_variable_that_the_command_answers_to(call: Call, shell: str) -> None:
-    said = call("completion", shell)
-    assert said.code == 0
-    assert f"_SOFTNECK_COMPLETE={shell}_complete" in said.out
+@pytest.mark.parametrize(
+    ("words", "new"),
+    [
+        (("resample", "a.csv", "--sample-time", "0.05", "-o", "b.csv"), "softneck import REC --resample S -o REC2"),
+        (("robot", "show", "arm"), "softneck robot FILE"),
+    ],
+)
+def test_an_old_name_ends_with_the_new_one(call: Call, words: tuple[str, ...], new: str) -> None:
+    said = call(*words)
+    assert (said.code, said.out) == (2, "")
+    assert said.error.endswith(f" any more: {new}")
 
 
-def test_the_script_completes_when_bash_sources_it(tmp_path: Path, call: Call) -> None:
+def test_the_script_completes_when_bash_sources_it(tmp_path: Path) -> None:
     bash = shutil.which("bash")
     if bash is None:
         pytest.skip("there is no bash")
     command = tmp_path / "softneck"
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -c "from softneck.cli._main import main; main()" "$@"\n')
     command.chmod(0o755)
-    (tmp_path / "script").write_text(call("completion", "bash").out)
-    ask = f'. ./script && COMP_WORDS=("{command}" val) COMP_CWORD=1 && _softneck_completion "{command}"'
+    ask = f'eval "$(_SOFTNECK_COMPLETE=bash_source {command})" && '
+    ask += f'COMP_WORDS=("{command}" val) COMP_CWORD=1 && _softneck_completion "{command}"'
     done = subprocess.run(
         [bash, "-c", ask + ' && echo "${COMPREPLY[@]}"'], cwd=tmp_path, capture_output=True, text=True, check=False
     )

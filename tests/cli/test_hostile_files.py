@@ -148,7 +148,7 @@ CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
         ["study", "grid.toml", "-o", "out"],
     ),
     "holes.toml": (holes(b"a = 1\n"), ["simulate", "holes.toml"]),
-    "key.toml": (text("a." * 200_000 + "a = 1\n"), ["robot", "check", "key.toml"]),
+    "key.toml": (text("a." * 200_000 + "a = 1\n"), ["robot", "key.toml"]),
     "brackets.toml": (text("a = " + "[" * 100_000), ["drives", "check", "--drives", "brackets.toml", "--simulated"]),
     "needs.toml": (holes(b"version = 1\n"), ["verify", "pi.npz", "pi.npz", "--requirements", "needs.toml"]),
     "a.certificate.json": (holes(b"{\n"), ["info", "a.certificate.json"]),

@@ -260,15 +260,16 @@ def test_import_resamples_where_asked(call: Call, tmp_path: Path) -> None:
 
 def test_resample_brings_a_recording_to_another_sample_time(call: Call, tmp_path: Path) -> None:
     write_recording("a.csv", neck_recording(400))
-    said = call("resample", "a.csv", "--sample-time", "0.05", "-o", "b.csv", "--json")
+    said = json.loads(call("import", "a.csv", "--resample", "0.05", "-o", "b.csv", "--json").out)
     facts = {"recording": "b.csv", "rows": 160, "runs": 1, "sample_time_s": 0.05, "sample_time_before_s": 0.02}
-    assert json.loads(said.out) == facts
-    assert call("resample", "a.csv", "--sample-time", "0.02", "-o", "same.csv").code == 0
+    assert {name: said[name] for name in facts} == facts
+    assert call("import", "a.csv", "--resample", "0.02", "-o", "same.csv").code == 0
     assert (tmp_path / "same.csv").read_bytes() == (tmp_path / "a.csv").read_bytes()
-    assert call("resample", "b.csv", "--sample-time", "robot", "-o", "c.csv").code == 0
+    assert call("import", "b.csv", "--resample", "robot", "-o", "c.csv").code == 0
     assert read_recording("c.csv").sample_time == 0.02
-    assert "b.csv: exists already" in call("resample", "a.csv", "--sample-time", "0.1", "-o", "b.csv").error
-    assert "--sample-time takes a sample time in seconds" in call(
-        "resample", "a.csv", "--sample-time", "0", "-o", "d.csv").error  # fmt: skip
-    assert "none.csv: no such file" in call("resample", "none.csv", "--sample-time", "1", "-o", "d.csv").error
+    assert "b.csv: exists already" in call("import", "a.csv", "--resample", "0.1", "-o", "b.csv").error
+    assert (
+        "--resample takes a sample time in seconds" in call("import", "a.csv", "--resample", "0", "-o", "d.csv").error
+    )
+    assert "none.csv: no such file" in call("import", "none.csv", "--resample", "1", "-o", "d.csv").error
     assert not (tmp_path / "d.csv").exists()

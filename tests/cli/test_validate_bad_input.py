@@ -41,7 +41,7 @@ CASES: dict[str, tuple[Recording, tuple[str, ...], str]] = {
         slower(WHOLE),
         (),
         "on bad.csv: the model was identified at 0.02 s and the recording is at 0.04 s; resample it "
-        "(`softneck resample`) or identify again",
+        "(`softneck import --resample`) or identify again",
     ),
     "a horizon longer than the run": (
         WHOLE,

@@ -176,7 +176,7 @@ def test_the_commands(loop_file: Path, foreign: Path, tmp_path: Path, capsys: py
     assert run(["simulate", str(path), "-o", str(tmp_path / "out.csv")]) == 0
     head = (tmp_path / "out.csv").read_text().splitlines()[0]
     assert head == "time [s],first.alpha [deg],first.beta [deg],inner_se_cond.alpha [deg],inner_se_cond.beta [deg]"
-    assert run(["ssp", str(path), "-o", str(tmp_path / "b.ssp")]) == 0
+    assert run(["fmu", str(path), "-o", str(tmp_path / "b.ssp")]) == 0
     # The loop's own order is sequential, in which its overshoot holds the limit; an archive has neither.
     loop = write_ssp(load_loop(loop_file), tmp_path / "Loop.ssp", compiled=False)
     assert run(["simulate", str(loop), "-o", str(tmp_path / "loop.csv"), "--json"]) == 0

@@ -94,6 +94,8 @@ def wrong(line: str) -> str | None:
     command: click.Command = group
     context = click.Context(group)
     while isinstance(command, click.Group) and words and not words[0].startswith("-"):
+        if command.name == "robot" and words[0] != "new":
+            words.insert(0, "FILE")
         names = words.pop(0).split("|")
         found = {name: command.get_command(context, name) for name in names}
         if missing := [name for name, value in found.items() if value is None]:

@@ -181,5 +181,5 @@ def test_connected_positions_say_where_the_modelled_motors_begin() -> None:
 def test_what_is_no_controller_or_has_drives_stays_as_it_is(toys: Any) -> None:
     for block in (block_of("rls"), toys.controller(), toys.pi()):
         assert with_modelled_drives(block) is block
-    whole = with_modelled_drives(block_of("pi"))  # as `softneck ssp` reads it out of a Python FMU
+    whole = with_modelled_drives(block_of("pi"))  # as an SSP file of ours has it, read out of a Python FMU
     assert with_modelled_drives(whole) is whole

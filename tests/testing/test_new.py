@@ -26,7 +26,7 @@ def test_the_new_project_s_test_passes_at_once(
     assert done.returncode == 0, done.stdout + done.stderr
     assert "2 passed" in done.stdout
     assert run(["simulate", str(folder / "loop.toml"), "-o", str(tmp_path / "run.csv")]) == 0
-    assert run(["ssp", str(folder / "loop.toml"), "-o", str(tmp_path / "loop.ssp")]) == 0
+    assert run(["fmu", str(folder / "loop.toml"), "-o", str(tmp_path / "loop.ssp")]) == 0
     if shutil.which("cc"):
         for name in ("Pi", "Kalman", "VirtualNeck"):
             assert _runs_python(folder / "fmus" / f"{name}.fmu")

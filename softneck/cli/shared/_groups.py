@@ -9,9 +9,11 @@ import click
 from softneck.core._checks import did_you_mean
 from softneck.core._kinds import kinds_of
 
+from ._moved import now
+
 
 class NearGroup(click.Group):
-    """A group whose error on an unknown command names the nearest one."""
+    """A group whose error on an unknown command names the new one of an old name, else the nearest one."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -19,6 +21,8 @@ class NearGroup(click.Group):
         """Return the command that `args` begin with, as click does."""
         name, known = args[0], self.list_commands(ctx)
         if not ctx.resilient_parsing and not name.startswith("-") and name not in known:
+            if new := now(ctx, name):
+                raise click.UsageError(f"there is no command `{name}` any more: {new}", ctx)
             hint = did_you_mean(name, known) or f"the commands are {', '.join(known)}."
             raise click.UsageError(f"no such command `{name}`; {hint.rstrip()}", ctx)
         return super().resolve_command(ctx, args)

@@ -33,7 +33,7 @@ def read_together(paths: Sequence[Path], robot: str | None = None) -> Recording:
             raise DataError(
                 f"{path}: is at {1e3 * recording.sample_time:g} ms and {paths[0]} at "
                 f"{1e3 * recordings[0].sample_time:g} ms; recordings are used together at one sample time only. Take "
-                f"each by itself, or bring one to the other's: `softneck resample {path} --sample-time "
+                f"each by itself, or bring one to the other's: `softneck import {path} --resample "
                 f"{recordings[0].sample_time:g} -o OTHER.csv`."
             )
         require_same_robot(recording.robot, recordings[0].robot, f"{paths[0]} and {path}: recordings")

@@ -120,7 +120,7 @@ def _of_one_sample_time(recordings: list[str]) -> Iterator[Step]:
         if isclose(read_recording(recording).sample_time, first, rel_tol=1e-6):  # as `identify` has it
             continue
         recordings[number] = resampled = f"{recording.removesuffix('.csv')}_resampled.csv"
-        command = ("softneck", "resample", recording, "--sample-time", repr(first), "-o", resampled, "--force")
+        command = ("softneck", "import", recording, "--resample", repr(first), "-o", resampled, "--force")
         yield Step(stage="quality", command=command, makes=(resampled,), reads=(recording, recordings[0]))
 
 

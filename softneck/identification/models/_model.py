@@ -341,7 +341,7 @@ class Model(Shown):
         if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
             raise DataError(
                 f"the model was identified at {self.sample_time:g} s and the recording is at "
-                f"{recording.sample_time:g} s; resample it (`softneck resample`) or identify again."
+                f"{recording.sample_time:g} s; resample it (`softneck import --resample`) or identify again."
             )
         if len(recording) < 2:
             raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")

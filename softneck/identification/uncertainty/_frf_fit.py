@@ -110,7 +110,8 @@ def _one(parts: Sequence[Recording]) -> tuple[Robot, float]:
             raise DataError(f"recordings of two robots, {first.robot.label()} and {part.robot.label()}; take one's.")
         if abs(part.sample_time - first.sample_time) > 1e-9 * first.sample_time:
             raise DataError(
-                f"recordings at {first.sample_time:g} s and {part.sample_time:g} s; resample one (softneck resample)."
+                f"recordings at {first.sample_time:g} s and {part.sample_time:g} s; resample one "
+                "(softneck import --resample)."
             )
     return first.robot, first.sample_time
 
