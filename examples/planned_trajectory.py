@@ -1,7 +1,7 @@
 """A trajectory of the motors, planned before anything moves, over a grey box of the virtual neck.
 
 The neck is to nod and turn; motors have 6 rad/s, and no tendon may hang. Run it with
-`python examples/planned_trajectory.py` (CasADi is needed: `pip install 'softneck[mpc]'`).
+`python examples/planned_trajectory.py`.
 """
 
 import math

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from importlib import metadata
 from importlib.util import find_spec
 
 # A message quotes what stands in files. Control characters there would end its line, or write to the terminal what they
@@ -41,11 +43,9 @@ class CheckFailedError(SoftneckError):
     exit_code = 1
 
 
-# Package as it is imported -> (extra of `pip install`, what needs it). 500 of 1,300 MB that the main job never loads.
+# Package as it is imported -> (extra of `pip install`, what needs it). No path of the README needs one but the drives'.
 EXTRAS = {
-    "casadi": ("mpc", "predictive control, plans and `model.casadi()`"),
-    "daqp": ("mpc", "predictive control solved by daqp"),
-    "pyarrow": ("files", "Parquet files and studies"),
+    "pyarrow": ("files", "Parquet files"),
     "h5py": ("files", "MATLAB files of version 7.3"),
     "python_calamine": ("files", "spreadsheets"),
     "mcap_ros2": ("ros", "bags of ROS 2"),
@@ -66,7 +66,17 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
     if found is None:
         return None
     extra, purpose = found
-    return f"{error.name} is not installed, and it is needed for {purpose}; run: pip install 'softneck[{extra}]'"
+    return f"{error.name} is not installed, and it is needed for {purpose}; run: pip install {_requirements(extra)}"
+
+
+def _requirements(extra: str) -> str:
+    """Return the packages of an extra for a shell: softneck itself is on no index that pip asks."""
+    try:
+        lines = metadata.requires("softneck") or []
+    except metadata.PackageNotFoundError:  # run from its folder alone
+        return f"'.[{extra}]'"
+    asked = (line.replace('"', "'").partition(";") for line in lines)
+    return shlex.join(name.strip() for name, _, condition in asked if condition.strip() == f"extra == '{extra}'")
 
 
 def require_package(package: str) -> None:

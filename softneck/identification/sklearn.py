@@ -1,4 +1,4 @@
-"""Set membership as a scikit-learn regressor, over the same core; needs the extra `softneck[sklearn]`."""
+"""Set membership as a scikit-learn regressor, over the same core; needs scikit-learn."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector
-from softneck.core._errors import require_package
 
 from ._block import Block
 from ._bundle import bundle
@@ -24,10 +23,8 @@ def step_function(block: Block, parameters: Vector, inputs: int) -> Any:
         inputs: that many are symbols u, the others are not given (NaN).
 
     Raises:
-        SettingsError: CasADi is not installed, or the text does what a function of symbols cannot; the message names
-            function and line.
+        SettingsError: the text does what a function of symbols cannot; the message names function and line.
     """
-    require_package("casadi")
     import casadi as ca
 
     size = block.initial_state().values.size

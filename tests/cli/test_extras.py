@@ -6,12 +6,13 @@ import sys
 import tomllib
 from pathlib import Path
 
+import control
 import pytest
 
-from softneck import load
 from softneck.cli._main import run
 from softneck.core import SettingsError, _errors
 from softneck.core._errors import EXTRAS, missing_extra
+from softneck.design import mixsyn
 from softneck.signals import write_recording
 
 from ..data import ROOT, neck_recording
@@ -34,14 +35,21 @@ def test_a_command_names_the_extra_that_it_lacks(
     assert run(["info", str(tmp_path / "a.parquet")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "pip install 'softneck[files]'" in said
+    assert "run: pip install 'h5py" in said
+    assert "'pyarrow>=" in said
+    assert "softneck[" not in said
 
 
-def test_a_model_without_casadi_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = load(Path(__file__).parents[1] / "golden" / "rls.npz")
+def test_a_function_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_errors, "find_spec", lambda _: None)
-    with pytest.raises(SettingsError, match=r"casadi is not installed.*pip install 'softneck\[mpc\]'"):
-        model.casadi()
+    with pytest.raises(SettingsError, match=r"slycot is not installed.*pip install 'slycot>="):
+        mixsyn(control.tf([1.0], [1.0, 1.0]), 1.0, 0.1, None, method="slycot")
+
+
+def test_what_the_design_card_names_is_installed_with_softneck() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    core = {line.partition(">")[0] for line in project["dependencies"]}
+    assert core >= {"numpy", "scipy", "control", "filterpy", "fmpy", "pythonfmu", "numba", "pandas", "bokeh", "casadi"}
 
 
 def test_any_other_missing_module_is_an_error_of_ours() -> None:

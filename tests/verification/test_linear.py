@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 import control
 import numpy as np
 import pytest
 
-from softneck.design import diskmargin, mu_bounds, nugap
+from softneck.design import FopiSettings, PiSettings, diskmargin, mu_bounds, nugap
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
+from softneck.verification import _agreement
 from softneck.verification._linear import LinearLaw, gaps, judged, margins, radii
 from softneck.verification._plants import (
     AxisBox,
@@ -99,6 +101,27 @@ def test_margins_are_those_of_python_control() -> None:
         assert found["pitch.sensitivity"][row] == pytest.approx(norm, rel=2e-3)
         assert found["pitch.disk_margin"][row] == pytest.approx(diskmargin(L).margin, rel=2e-3)
     assert np.isfinite(np.asarray(Ky(z))).all()
+
+
+@pytest.mark.parametrize("kind", [PiSettings, FopiSettings], ids=["pi", "fopi"])
+@pytest.mark.parametrize("slycot", [True, False])
+def test_python_control_says_the_same_margins_with_and_without_slycot(
+    monkeypatch: pytest.MonkeyPatch, kind: Any, slycot: bool
+) -> None:
+    if slycot:
+        pytest.importorskip("slycot")
+    else:
+        monkeypatch.setitem(sys.modules, "slycot", None)
+        monkeypatch.setattr(control.exception, "slycot_installed", False)
+        monkeypatch.setattr(_agreement, "find_spec", lambda _: None)
+    plants = nominal_plants([neck_of_model(linear_neck(), "m", SPREAD)])[0]
+    law = LinearLaw.of(kind().design(linear_neck()).ss())
+    own = margins(plants, law, W)
+    gain, phase, Ms = _agreement._by_control(plants, law, 0, 0)
+    # The grid of `W` is 3 % wide; straight lines on it.
+    assert gain == pytest.approx(own["pitch.gain_margin"][0], rel=5e-3)
+    assert phase == pytest.approx(own["pitch.phase_margin_deg"][0], rel=5e-3)
+    assert Ms == (pytest.approx(own["pitch.sensitivity"][0], rel=5e-3) if slycot else None)
 
 
 def test_two_complex_scalars_have_a_closed_form() -> None:

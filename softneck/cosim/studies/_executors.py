@@ -12,6 +12,7 @@ from concurrent.futures import Executor, Future
 from typing import Any, Protocol
 
 from softneck.core import SettingsError, SoftneckError
+from softneck.core._errors import require_package
 
 # One thread each: the processes share the cores already.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
@@ -91,10 +92,9 @@ class Cluster:
         Raises:
             SettingsError: no such scheduler, or Dask is not installed.
         """
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise SettingsError("--dask needs Dask: pip install 'softneck[dask]'.") from error
+        require_package("distributed")
+        from distributed import Client
+
         try:
             self._client: Any = Client(address, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError, TypeError) as error:

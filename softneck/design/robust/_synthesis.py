@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of
+from softneck.core._errors import require_package
 
 from ._bilinear import to_continuous, to_discrete
 from ._riccati import least_gamma, partition, solve_at
@@ -301,13 +302,10 @@ def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
 def _by_slycot(P: Any, nmeas: int, ncon: int, above: float) -> tuple[float, control.StateSpace]:
     import control
 
-    try:
-        from slycot import sb10ad
-        from slycot.exceptions import SlycotError
-    except ImportError as error:
-        raise SettingsError(
-            "`method` slycot needs the extra: pip install softneck[slycot]; `riccati` does without."
-        ) from error
+    require_package("slycot")
+    from slycot import sb10ad
+    from slycot.exceptions import SlycotError
+
     sizes = (P.nstates, P.ninputs, P.noutputs, ncon, nmeas)
     try:
         gamma = float(sb10ad(*sizes, 1e6, P.A, P.B, P.C, P.D, job=1, gtol=1e-5)[0])

@@ -11,7 +11,7 @@ import pytest
 
 from softneck.identification import Cones
 
-sklearn = pytest.importorskip("sklearn", reason="scikit-learn is the extra `softneck[sklearn]`")
+sklearn = pytest.importorskip("sklearn", reason="scikit-learn is not installed")
 
 from sklearn.model_selection import GridSearchCV  # noqa: E402
 from sklearn.pipeline import make_pipeline  # noqa: E402
