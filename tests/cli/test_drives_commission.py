@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from softneck.cli._main import run
+from softneck.cli.drives import _commission as cli_commission
+from softneck.cli.drives._target import Target
 from softneck.drives import load_drives
+from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning import _commission
-from softneck.drives.commissioning._moves import Guards, Moves, write_moves
+from softneck.drives.commissioning._moves import Guards, Moves
 from softneck.drives.running._bus_loop import Session
 from softneck.robot import Robot
 
+from ..drives.commissioning.planted import plant, planted_link
 from ..drives.commissioning.toy import Toy, mover_of
 
 SIMULATED = ["drives", "commission", "--simulated"]
@@ -36,7 +42,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
     return made
 
 
-def test_nothing_to_find_is_exit_code_0_and_four_files(
+def test_nothing_to_find_is_exit_code_0_and_three_files(
     toy: Toy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run([*SIMULATED, "-o", str(tmp_path / "c"), "--json"]) == 0
@@ -46,7 +52,7 @@ def test_nothing_to_find_is_exit_code_0_and_four_files(
     assert [motor["tendon"] for motor in said["motors"]] == [1, 2, 3]
     assert said["motors"][0]["slack_rad"] == pytest.approx(toy.slack[0], abs=0.06)
     assert sorted(path.name for path in (tmp_path / "c").iterdir()) == [
-        "commission.html", "drives.toml", "moves.json", "robot.toml",
+        "commission.html", "drives.toml", "robot.toml",
     ]  # fmt: skip
     # What was proposed is read by every other command, with each other.
     robot = Robot.read(tmp_path / "c" / "robot.toml")
@@ -54,7 +60,7 @@ def test_nothing_to_find_is_exit_code_0_and_four_files(
     assert load_drives(tmp_path / "c" / "drives.toml").moves == robot
 
 
-def test_a_mistake_is_exit_code_1_one_line_and_still_four_files(
+def test_a_mistake_is_exit_code_1_one_line_and_still_three_files(
     toy: Toy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     toy.pull = (1, -1, 1)
@@ -72,8 +78,16 @@ def test_a_mistake_is_exit_code_1_one_line_and_still_four_files(
     assert "robot: [sensor] noise_std" in page
 
 
-def test_two_devices_with_one_number_write_the_page_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run([*SIMULATED, "--plant", "duplicate:2", "-o", str(tmp_path), "--json"]) == 1
+def test_two_devices_with_one_number_write_the_page_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextlib.contextmanager
+    def planted(chosen: Target, *, moves: bool) -> Iterator[VirtualLink]:
+        assert moves
+        yield planted_link(chosen.file, plant(chosen.file, ["duplicate:2"]), None, sample_time=0.02)
+
+    monkeypatch.setattr(cli_commission, "open_link", planted)
+    assert run([*SIMULATED, "-o", str(tmp_path), "--json"]) == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["findings"][0]["name"] == "duplicate node"
     assert "node 2: 2 devices answer (serial numbers 1002, 2002)" in said.err
@@ -81,23 +95,12 @@ def test_two_devices_with_one_number_write_the_page_only(tmp_path: Path, capsys:
     assert "Nothing was moved" in (tmp_path / "commission.html").read_text()
 
 
-def test_resume_takes_what_was_measured(toy: Toy, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from dataclasses import replace
-
-    before = replace(toy.run(mover_of(motors=(1, 3))), identities={1: {"serial": 1001}, 3: {"serial": 1003}})
-    write_moves(tmp_path / "moves.json", before)
-    assert run([*SIMULATED, "--resume", "-o", str(tmp_path), "--json"]) == 0
-    assert [motor["outcome"] for motor in json.loads(capsys.readouterr().out)["motors"]] == ["pulled"] * 3
-
-
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--plant", "lazy"], "--plant takes reversed:N, exchanged:N:M"),
         (["--travel", "100"], "`--travel` must be between 1 and 30 [rad]"),
         (["--pace", "0"], "`--pace` must be between"),
         (["--log", "x.mcap"], "commission has no cycles to replay; its --log ends in .blf or .log."),
-        (["--resume"], "moves.json: cannot be read"),
         (["--motor", "5"], "`--motor` must be a whole number between 1 and 3"),
         (["--override", "all"], "--override takes one of"),
     ],
@@ -112,7 +115,7 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert not list((tmp_path / "c").glob("*")) if (tmp_path / "c").exists() else True
 
 
-@pytest.mark.parametrize("name", ["drives.toml", "robot.toml", "commission.html", "moves.json"])
+@pytest.mark.parametrize("name", ["drives.toml", "robot.toml", "commission.html"])
 def test_a_file_that_is_there_is_not_replaced(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / name).write_text("mine")
     assert run([*SIMULATED, "-o", str(tmp_path)]) == 2
@@ -148,7 +151,6 @@ def test_a_bus_needs_arming_and_a_drives_file(tmp_path: Path, capsys: pytest.Cap
     assert run([*command, "--arm"]) == 1
     assert "virtual:nobody: no node answers. Are the drives on, is the bit rate right" in capsys.readouterr().err
     assert not list((tmp_path / "c").glob("*"))
-    assert run([*command, "--plant", "axes"]) == 2
     assert run([*command, "--pace", "1"]) == 2
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import resource
 import struct
@@ -28,7 +27,6 @@ from softneck.cosim.studies._store import read_description, read_runs
 from softneck.drives.bus._objects import require_eds
 from softneck.drives.bus._read import load_drives
 from softneck.drives.bus._sdo import load_eds
-from softneck.drives.commissioning._moves import read_moves
 from softneck.drives.logs._cycle import Cycle
 from softneck.drives.logs._frame_log import BlfSink, CandumpSink, FrameLog
 from softneck.drives.logs._log_file import read_run_log
@@ -239,8 +237,6 @@ def runs_beside(path: Path) -> Any:
 
 
 GOLDEN = ("tests", "golden")
-MOVED = {"motor": 0, "node": 1, "outcome": "pulled", "way": 1, "phase": [0], "time": [0.0], "counts": [0],
-         "current": [0.0], "outputs": [[0.0, None]], "captures": []}  # fmt: skip
 TARGETS: dict[str, Target] = {
     "npz": Target(".npz", load, [copy(*GOLDEN, f"{name}.npz") for name in ("pi", "rls", "frf", "kalman")], zipped=True),
     "csv": Target(".csv", read_recording, [lambda path: write_recording(path, neck_recording(30))]),
@@ -299,10 +295,6 @@ TARGETS: dict[str, Target] = {
     "tune": Target(".toml", read_tune_requirements, [copy("softneck", "tuning", "requirements.toml")]),
     "certificate": Target(".json", read_certificate, [certificate]),
     "baseline": Target(".json", load_baseline, [copy("tests", "drives", "paper.supervision.json")]),
-    "moves": Target(".json", read_moves, [text(json.dumps({
-        "softneck_moves": 1, "sample_time_s": 0.01, "stopped": "", "axes": [], "identities": {"1": {}},
-        "motors": [MOVED],
-    }))]),
     "study_json": Target("", lambda path: read_description(path.parent), [text('{"study": {"loop": {}, "runs": 3}}')]),
 }  # fmt: skip
 

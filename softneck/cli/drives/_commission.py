@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,6 @@ from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option
 from ._log import log_options, opened_log, require_logs
 from ._target import (
-    SAMPLE_TIME,
-    Target,
     checked_names,
     drives_options,
     leave_if_asked,
@@ -28,10 +25,6 @@ from ._target import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from softneck.drives import CanLink
-    from softneck.drives.bus._link import VirtualLink
     from softneck.drives.commissioning._commission import Commissioned
 
 
@@ -44,11 +37,6 @@ if TYPE_CHECKING:
               help="Move these only; may be given several times.  [default: all]")  # fmt: skip
 @click.option("--travel", type=float, default=10.0, show_default=True, metavar="RAD",
               help="How far a winch may turn to either side in search of its tendon.")  # fmt: skip
-@click.option("--resume", is_flag=True, help="Do not move again what moves.json in DIR has of the same drives.")
-@click.option("--plant", "mistakes", multiple=True, metavar="MISTAKE",
-              help="With --simulated: set the drives up otherwise than the file says: reversed:N, exchanged:N:M, "
-              "gear:N:FACTOR, lines:N:FACTOR, current:N:FACTOR, axes, sign:OUTPUT, late:SECONDS, duplicate:N; may be "
-              "given several times.")  # fmt: skip
 @click.option("--pace", type=float, help="With --simulated: run at this multiple of real time.")
 @override_option
 @neck_option
@@ -59,8 +47,8 @@ if TYPE_CHECKING:
 @json_option
 def commission_command(
     drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, motors: tuple[int, ...],
-    travel: float, resume: bool, mistakes: tuple[str, ...], pace: float | None, overrides: tuple[str, ...],
-    neck: str | None, logs: tuple[Path, ...], no_log: bool, output: Path | None, force: bool, as_json: bool,
+    travel: float, pace: float | None, overrides: tuple[str, ...], neck: str | None, logs: tuple[Path, ...],
+    no_log: bool, output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Find out what drives, tendons and sensor really are, before anything else moves.
 
@@ -71,21 +59,20 @@ def commission_command(
     Exit code 1 if anything is not as the files say; Ctrl-C leads the motor back, switches off, and exits with 130.
     """
     from softneck.drives.commissioning._commission import commission
-    from softneck.drives.commissioning._moves import Guards, read_moves, write_moves
-    from softneck.drives.commissioning._proposal import MOVES, require_folder, write_files
+    from softneck.drives.commissioning._moves import Guards
+    from softneck.drives.commissioning._proposal import require_folder, write_files
     from softneck.drives.running._bus_loop import Session
     from softneck.drives.running._keyboard import Keyboard
 
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)
-    _require(simulated, mistakes, pace, logs)
+    _require(simulated, pace, logs)
     require_logs(logs, no_log=no_log, force=force)
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     guards = Guards.of(chosen.file.watch.gain, travel=travel)
-    require_folder(folder, force=replace, resume=resume)
-    before = read_moves(folder / MOVES) if resume else None
+    require_folder(folder, force=replace)
     with (
-        _linked(chosen, mistakes) as link,
+        open_link(chosen, moves=True) as link,
         opened_log(chosen, "commission", logs, no_log=no_log, force=force, ending=".blf") as log,
     ):
         link.tap = None if log is None else log.frame
@@ -96,36 +83,21 @@ def commission_command(
                 operator=keyboard,
             )  # fmt: skip
             result = commission(
-                session, guards=guards, neck=virtual, motors=motors, before=before, report=tell,
-                where=bus or "the bus", keep=lambda moves: write_moves(folder / MOVES, moves, force=replace or resume),
-            )  # fmt: skip
+                session, guards=guards, neck=virtual, motors=motors, report=tell, where=bus or "the bus"
+            )
         written = write_files(folder, result, force=replace)
         _print(result, written, as_json=as_json)
         leave_if_asked(keyboard, terminated=result.ended is not None and result.ended.terminated)
         result.require()
 
 
-def _require(simulated: bool, mistakes: tuple[str, ...], pace: float | None, logs: tuple[Path, ...]) -> None:
-    if mistakes and not simulated:
-        raise SettingsError("--plant is for --simulated: it changes how simulated drives are set up.")
+def _require(simulated: bool, pace: float | None, logs: tuple[Path, ...]) -> None:
     if pace is not None:
         require_between("--pace", pace, 0.01, 1000.0)
         if not simulated:
             raise SettingsError("--pace is for --simulated; a bus runs in real time.")
     if any(path.suffix.lower() == ".mcap" for path in logs):
         raise SettingsError("commission has no cycles to replay; its --log ends in .blf or .log.")
-
-
-@contextlib.contextmanager
-def _linked(chosen: Target, mistakes: tuple[str, ...]) -> Iterator[CanLink | VirtualLink]:
-    """Yield the bus, or simulated drives with what was planted; their tendons hang as before `zero`."""
-    from softneck.drives.commissioning._planted import plant, planted_link
-
-    if chosen.simulated:
-        yield planted_link(chosen.file, plant(chosen.file, mistakes), chosen.neck, sample_time=SAMPLE_TIME)
-        return
-    with open_link(chosen, moves=True) as link:
-        yield link
 
 
 def _print(result: Commissioned, written: dict[str, str], *, as_json: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,15 @@ from softneck.plant import NeckParameters
 from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
+from ..bus._link import VirtualLink
 from ..bus._objects import ampere
 from ..running._bus_loop import RunEnd, Session
 from ..running._scan import scan
+from ..simulated._springs import SimulatedSprings
 from ._findings import Finding
 from ._identify import LATE, Expected, Identified, identify, proposed
 from ._known import fatal, known_before, require_answers, typed
-from ._measure import SAMPLE_TIME, expected_of, measure
+from ._measure import expected_of, measure
 from ._moves import PULLED, Guards, Moves
 
 
@@ -114,8 +116,6 @@ def commission(
     guards: Guards | None = None,
     neck: NeckParameters | None = None,
     motors: Sequence[int] = (),
-    before: Moves | None = None,
-    keep: Callable[[Moves], None] | None = None,
     report: Callable[[float, str], None] | None = None,
     where: str = "the bus",
 ) -> Commissioned:
@@ -129,17 +129,20 @@ def commission(
         guards: limits of the moves; None: as slow as the gain in [watch] asks for.
         neck: the virtual plant to compare with; None: the one that the robot names.
         motors: those that move, from 1 on; () for all.
-        before: moves of an earlier commissioning; its motors are not moved again.
-        keep: called with what was measured, as soon as the drives are off.
         report: called now and then with the done fraction and a word.
         where: the bus, for messages.
 
     Raises:
         CheckFailedError: nobody answers, or the pre-flight failed; nothing moved.
         BusError: the bus takes no frames.
-        SettingsError: no such motor, or moves of other drives.
+        SettingsError: no such motor, or springs in the place of the robot.
     """
     file, count = session.file, len(session.file.drives)
+    if isinstance(session.link, VirtualLink) and isinstance(session.link.neck, SimulatedSprings):
+        raise SettingsError(
+            f"robot {file.moves.label()} has no virtual plant, and the springs that stand in for it pull both "
+            "ways: moves say nothing of them. Give it one: --neck, or [plant] neck in the robot file."
+        )
     for motor in motors:
         require_whole("--motor", motor, 1, count)
     guards = Guards.of(file.watch.gain) if guards is None else guards
@@ -150,17 +153,7 @@ def commission(
         return Commissioned(file, tuple(told), None, None, None, file, file.moves)
     # Whose type says what its current is relative to is led by that from the first move on.
     believed, peaks = typed(file, found)
-    identities = {item["node"]: item for item in found}
-    old = () if before is None else tuple(moved for moved in before.motors if moved.outcome == PULLED)
-    _require_same(before, identities, count, file.sensor_axes)
-    ways = [j for j in (motors or range(1, count + 1)) if j not in {moved.motor for moved in old}]
-    ended = None
-    moves = Moves(old, SAMPLE_TIME, identities, axes=file.sensor_axes)
-    if ways:
-        moved, ended = measure(replace(session, file=believed), guards, motors=ways, report=report)
-        moves = replace(moved, motors=(*old, *moved.motors), identities=identities, axes=file.sensor_axes)
-        if keep is not None and moves.motors:
-            keep(moves)
+    moves, ended = measure(replace(session, file=believed), guards, motors=motors or range(1, count + 1), report=report)
     pulled = any(moved.outcome == PULLED for moved in moves.motors)
     expected = expected_of(believed, guards, neck) if pulled else None
     seen = identify(moves, believed, expected, types=peaks)
@@ -168,23 +161,6 @@ def commission(
     return Commissioned(
         file, (*told, *seen.findings), moves, seen, expected, right, _robot(right, seen, expected), ended
     )
-
-
-def _require_same(before: Moves | None, identities: Mapping[int, Mapping[str, Any]], count: int,
-                  axes: tuple[str, ...]) -> None:  # fmt: skip
-    """Raise SettingsError where earlier moves are of other drives."""
-    if before is None:
-        return
-    if before.axes != axes:
-        said = [", ".join(one) or "as they come" for one in (before.axes, axes)]
-        raise SettingsError(f"--resume: [sensor] axes was {said[0]} then and is {said[1]} now. Leave --resume out.")
-    for moved in before.motors:
-        then, now = before.identities.get(moved.node, {}), identities.get(moved.node, {})
-        if moved.motor > count or then.get("serial") != now.get("serial"):
-            raise SettingsError(
-                f"--resume: motor {moved.motor} was moved by a drive with serial number {then.get('serial')}, and node "
-                f"{moved.node} has {now.get('serial')}. Leave --resume out."
-            )
 
 
 def _robot(file: DrivesFile, found: Identified, expected: Expected | None) -> Robot:

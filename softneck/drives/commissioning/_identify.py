@@ -257,7 +257,7 @@ def _unmoved(moves: Moves, count: int) -> list[Finding]:
         moved = moves.of(j)
         if moved is None:
             why = moves.stopped or "it was left out"
-            found.append(Finding("not moved", why, "Look at the cause, then go on with --resume.", (j,)))
+            found.append(Finding("not moved", why, f"Look at the cause, then go on with --motor {j}.", (j,)))
         elif moved.outcome == HANGS:
             found.append(Finding("hangs", "no tendon got taut within the travel", "Tighten it by hand, or raise "
                                  "--travel; is the motor's coupling tight?", (j,)))  # fmt: skip

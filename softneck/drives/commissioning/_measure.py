@@ -77,7 +77,7 @@ def measure(
     ended = run_session(session, mover, sample_time=SAMPLE_TIME, most=most, begin=mover.watch)
     fault = ended.master.supervisor.fault
     stopped = mover.stopped or ("somebody asked for the end" if ended.left else "" if fault is None else str(fault))
-    return Moves(tuple(mover.done), SAMPLE_TIME, stopped=stopped), ended
+    return Moves(tuple(mover.done), stopped), ended
 
 
 def expected_of(file: DrivesFile, guards: Guards, neck: NeckParameters | None = None) -> Expected | None:

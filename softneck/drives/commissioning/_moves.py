@@ -1,20 +1,16 @@
-"""What the small moves of a commissioning measured, and what they may not exceed; a file of it for going on later."""
+"""What the small moves of a commissioning measured, and what they may not exceed."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from softneck.core import FileFormatError, Matrix, Vector, atomic_write, require_between
-from softneck.core._budget import MOST_JSON, settings_text
+from softneck.core import Matrix, Vector, require_between
 
 # What a row was measured in: standing before the moves, on the way through the slack, on the slow way up and down under
 # tension, in the quick wiggle, on the way back.
@@ -26,7 +22,6 @@ WIGGLES, PERIOD = 8, 1.0
 # How fast the neck tilts in what is measured, and in the search [rad/s]: within the 0.3 s in which a tilt stops a
 # motor, of a sensor that is 0.2 s late too, it is less than a degree also where a gear is half of what was believed.
 _SLOW_TILT, _FREE_TILT = math.radians(0.8), math.radians(1.3)
-_VERSION = 1
 # Of one index pulse [counts]: a quarter of a line to either side, and some for the drive's own delay.
 _EDGES = 16
 
@@ -111,17 +106,11 @@ class Moves:
 
     Attributes:
         motors: each motor's.
-        sample_time: of the rows [s].
-        identities: what each drive said of itself before, by node; see `softneck drives scan`.
         stopped: what ended them early, "" if nothing did.
-        axes: of the sensor, as the drives file had them.
     """
 
     motors: tuple[MotorMoves, ...]
-    sample_time: float
-    identities: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
     stopped: str = ""
-    axes: tuple[str, ...] = ()
 
     def of(self, motor: int) -> MotorMoves | None:
         """Return those of motor `motor`, from 1 on, if it was moved."""
@@ -135,60 +124,3 @@ def counts_per_turn(captures: Sequence[int]) -> int:
     """
     steps = [abs(b - a) for a, b in itertools.pairwise(captures)]
     return min((step for step in steps if step > _EDGES), default=0)
-
-
-def write_moves(path: Path, moves: Moves, *, force: bool = False) -> None:
-    """Write what was measured, for going on later."""
-    table = {
-        "softneck_moves": _VERSION,
-        "sample_time_s": moves.sample_time,
-        "stopped": moves.stopped,
-        "axes": list(moves.axes),
-        "identities": {str(node): dict(found) for node, found in moves.identities.items()},
-        "motors": [_table(moved) for moved in moves.motors],
-    }
-    with atomic_write(path, force=force) as temporary:
-        temporary.write_text(json.dumps(table, allow_nan=False), encoding="utf-8")
-
-
-def _table(moved: MotorMoves) -> dict[str, Any]:
-    outputs = [[None if value != value else value for value in row] for row in moved.outputs.tolist()]
-    columns = {name: getattr(moved, name).tolist() for name in ("phase", "time", "counts", "current")}
-    named = {name: getattr(moved, name) for name in ("motor", "node", "outcome", "way")}
-    return {**named, **columns, "outputs": outputs, "captures": list(moved.captures)}
-
-
-def read_moves(path: Path) -> Moves:
-    """Read what `write_moves` wrote.
-
-    Raises:
-        FileFormatError: no such file, or another one.
-    """
-    try:
-        table = json.loads(settings_text(path, MOST_JSON))
-        if table["softneck_moves"] != _VERSION:
-            raise ValueError("another version")
-        identities = {int(node): dict(found) for node, found in table["identities"].items()}
-        motors = tuple(_moved(entry) for entry in table["motors"])
-        return Moves(motors, float(table["sample_time_s"]), identities, str(table["stopped"]),
-                     tuple(map(str, table["axes"])))  # fmt: skip
-    except OSError as error:
-        raise FileFormatError(f"{path}: cannot be read ({error.strerror}).") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise FileFormatError(
-            f"{path}: does not hold the moves of a commissioning ({type(error).__name__}: {error}). Leave --resume out."
-        ) from error
-
-
-def _moved(entry: Mapping[str, Any]) -> MotorMoves:
-    phase, time, counts, current = columns = [
-        np.asarray(entry[name], dtype=np.float64) for name in ("phase", "time", "counts", "current")
-    ]
-    outputs = np.array([[math.nan if value is None else float(value) for value in row] for row in entry["outputs"]])
-    if outputs.ndim != 2 or any(column.shape != outputs.shape[:1] for column in columns):
-        raise ValueError("columns of different length")
-    if entry["outcome"] not in (PULLED, HANGS, BLIND) or entry["way"] not in (-1, 0, 1):
-        raise ValueError("an outcome that is none")
-    captures: Sequence[int] = [int(count) for count in entry["captures"]]
-    return MotorMoves(int(entry["motor"]), int(entry["node"]), entry["outcome"], entry["way"], phase, time, counts,
-                      current, outputs, tuple(captures))  # fmt: skip

@@ -1,4 +1,4 @@
-"""The files of a commissioning: proposed drives and robot file, the page, and the moves for going on later."""
+"""The files of a commissioning: proposed drives and robot file, and the page."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from ..bus._write import drives_table
 from ._commission import Commissioned
 from ._commission_page import commission_page
 
-DRIVES, ROBOT, PAGE, MOVES = "drives.toml", "robot.toml", "commission.html", "moves.json"
+DRIVES, ROBOT, PAGE = "drives.toml", "robot.toml", "commission.html"
 _REMARK = "# Proposed by `softneck drives commission`; look at commission.html before it is used.\n"
 
 
-def require_folder(folder: Path, *, force: bool, resume: bool = False) -> None:
+def require_folder(folder: Path, *, force: bool) -> None:
     """Raise where the files of a commissioning could not be written; before anything moves.
 
     Raises:
         OutputFileError: a file exists and not `force`, or the folder cannot be written.
     """
-    for name in (DRIVES, ROBOT, PAGE, MOVES):
-        refuse_existing(folder / name, force=force or (resume and name == MOVES))
+    for name in (DRIVES, ROBOT, PAGE):
+        refuse_existing(folder / name, force=force)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -49,6 +49,6 @@ def write_files(folder: Path, result: Commissioned, *, force: bool) -> dict[str,
         for name, text in texts.items():
             with atomic_write(folder / name, force=force) as temporary:
                 temporary.write_text(_REMARK + text, encoding="utf-8")
-        written = {"drives": folder / DRIVES, "robot": folder / ROBOT, "moves": folder / MOVES, **written}
+        written = {"drives": folder / DRIVES, "robot": folder / ROBOT, **written}
     write_page(folder / PAGE, commission_page(result), force=force)
     return {what: str(path) for what, path in written.items()}

@@ -14,9 +14,10 @@ from softneck.drives.bus._link import VirtualLink
 from softneck.drives.commissioning._identify import Expected, Identified, identify, proposed
 from softneck.drives.commissioning._measure import expected_of, measure
 from softneck.drives.commissioning._moves import Guards, Moves
-from softneck.drives.commissioning._planted import Planted, plant, planted_link
 from softneck.drives.running._bus_loop import Session
 from softneck.plant import NeckParameters
+
+from .planted import Planted, plant, planted_link
 
 
 class Truth:

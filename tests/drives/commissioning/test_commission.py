@@ -6,7 +6,6 @@ The tilt is that of the simulated plant, absolute: a neck that leans by 1.5 deg 
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import pytest
 
@@ -16,14 +15,15 @@ from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._units import current_to_internal
 from softneck.drives.commissioning._commission import commission
 from softneck.drives.commissioning._moves import PULLED
-from softneck.drives.commissioning._planted import plant, planted_link
 from softneck.drives.commissioning._proposal import write_files
 from softneck.drives.running._bus_loop import Session
 from softneck.drives.running._timing import Ask
+from softneck.drives.running._virtual import simulated_plant
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
 
 from .commissioned import Run, Truth, agrees, believed, commissioned
+from .planted import plant, planted_link
 
 MISTAKES = {
     "reversed:1": {"reversed"},
@@ -170,7 +170,7 @@ def test_springs_that_stand_in_for_a_robot_are_not_commissioned() -> None:
     """They pull both ways, so that the sign of each motor came out as the noise had it."""
     file = default_drives(robot=Robot.preset("arm"))
     with pytest.raises(SettingsError, match=r"has no virtual plant.*Give it one: --neck"):
-        planted_link(file, plant(file, []), None, sample_time=0.02)
+        commission(Session(file=file, link=VirtualLink(simulated_plant(file, None, sample_time=0.02, homed=False))))
 
 
 @pytest.mark.slow
@@ -259,29 +259,3 @@ def test_a_push_is_stopped_by_the_guard() -> None:
     assert result.moves is not None
     assert result.moves.stopped.startswith("tilt: ")
     assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
-
-
-def test_an_earlier_commissioning_is_gone_on_with(monkeypatch: pytest.MonkeyPatch) -> None:
-    file = default_drives()
-    from .toy import Toy, mover_of
-
-    toy = Toy().run(mover_of(motors=(1, 2)))
-    before = replace(toy, identities={1: {"serial": 1001}, 2: {"serial": 1002}})
-    asked: list[tuple[int, ...]] = []
-
-    def stands_in(_session: Session, _guards: object, *, motors: list[int], report: object) -> tuple[object, None]:
-        del report
-        asked.append(tuple(motors))
-        return Toy().run(mover_of(motors=tuple(motors))), None
-
-    monkeypatch.setattr("softneck.drives.commissioning._commission.measure", stands_in)
-    monkeypatch.setattr("softneck.drives.commissioning._commission.expected_of", lambda *_: None)
-    kept = []
-    link: VirtualLink = planted_link(file, plant(file, []), None, sample_time=0.02)
-    result = commission(Session(file=file, link=link), before=before, keep=kept.append)
-    assert asked == [(3,)]
-    assert [moved.motor for moved in kept[0].motors] == [1, 2, 3]
-    assert result.holds, [str(one) for one in result.findings]
-    others = replace(before, identities={1: {"serial": 7}, 2: {"serial": 1002}})
-    with pytest.raises(Exception, match=r"--resume: motor 1 was moved by a drive with serial number 7, and node 1 has"):
-        commission(Session(file=file, link=link), before=others)

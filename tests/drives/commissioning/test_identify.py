@@ -24,11 +24,11 @@ from softneck.drives.commissioning._identify import Identified, Scale, factors, 
 from softneck.drives.commissioning._known import fatal, known_before, peak_of, require_answers, typed
 from softneck.drives.commissioning._mounting import Mounting, exchanges, explain, seen
 from softneck.drives.commissioning._moves import WIGGLE
-from softneck.drives.commissioning._planted import plant
 from softneck.drives.master import Tilt
 from softneck.robot import Robot
 
 from ...data import ROOT
+from .planted import plant
 from .toy import Toy, mover_of
 
 TENDONS = np.array([[1.0, -0.5, -0.5], [0.0, math.sqrt(0.75), -math.sqrt(0.75)]])
@@ -196,8 +196,8 @@ def _features(**changes: Any) -> Features:
     "mistake", ["", "reversed", "reversed:4", "gear:1", "gear:1:x", "gear:1:0", "sign:yaw", "late:soon", "axes:1",
                 "duplicate:0", "exchanged:1", "exchanged:1:1", "late:-1", "late:inf", "lazy"],
 )  # fmt: skip
-def test_a_mistake_that_is_none_is_one_line(mistake: str) -> None:
-    with pytest.raises(SettingsError, match=r"--plant takes reversed:N|gear"):
+def test_a_mistake_that_is_none_is_refused(mistake: str) -> None:
+    with pytest.raises((ValueError, SettingsError), match=r"a mistake is one of reversed:N|gear"):
         plant(default_drives(), [mistake])
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from softneck.core import FileFormatError, SettingsError
+from softneck.core import SettingsError
 from softneck.drives.commissioning._features import features, hinge, line, staircase
 from softneck.drives.commissioning._moves import (
     BLIND,
@@ -19,8 +18,6 @@ from softneck.drives.commissioning._moves import (
     Guards,
     Moves,
     counts_per_turn,
-    read_moves,
-    write_moves,
 )
 
 from .toy import COUNTS, TURN, Toy, mover_of
@@ -149,35 +146,6 @@ def test_a_turn_is_the_way_between_two_pulses_whatever_edges_do(captures: tuple[
     assert counts_per_turn(captures) == turn
 
 
-def test_moves_come_back_from_their_file(tmp_path: Path) -> None:
-    moves = replace(Toy().run(mover_of(motors=(1,))), identities={1: {"serial": 7}}, stopped="why")
-    moves.motors[0].outputs[3] = np.nan
-    write_moves(tmp_path / "moves.json", moves)
-    back = read_moves(tmp_path / "moves.json")
-    assert (back.stopped, back.identities, back.sample_time) == ("why", {1: {"serial": 7}}, moves.sample_time)
-    for name in ("phase", "time", "counts", "current", "outputs"):
-        np.testing.assert_array_equal(getattr(back.motors[0], name), getattr(moves.motors[0], name))
-    assert features(back.motors[0]) is not None
-    assert back.of(2) is None
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["", "[]", "{}", '{"softneck_moves": 2}', "[" * 5000, '{"softneck_moves": 1, "sample_time_s": 0.02, "stopped": "", '
-     '"identities": {}, "motors": [{"motor": 1}]}', "\x00"],
-)  # fmt: skip
-def test_another_file_is_one_line(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "moves.json"
-    path.write_text(text)
-    with pytest.raises(FileFormatError, match=r"does not hold the moves of a commissioning.*Leave --resume out"):
-        read_moves(path)
-
-
-def test_no_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="cannot be read"):
-        read_moves(tmp_path / "moves.json")
-
-
 def test_moves_without_a_wiggle_say_nothing() -> None:
     moved = Toy().run(mover_of(motors=(1,))).motors[0]
     keep = ~moved.rows(WIGGLE)
@@ -185,4 +153,4 @@ def test_moves_without_a_wiggle_say_nothing() -> None:
         moved, **{name: getattr(moved, name)[keep] for name in ("phase", "time", "counts", "current", "outputs")}
     )
     assert features(cut) is None
-    assert Moves((cut,), 0.02).of(1) is cut
+    assert Moves((cut,)).of(1) is cut

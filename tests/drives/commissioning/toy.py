@@ -55,7 +55,7 @@ class Toy:
                 if j not in self.stuck:
                     self._move(j, view, believed[j], before[j], mover)
             self.rows = index
-        return Moves(tuple(mover.done), STEP, stopped=mover.stopped)
+        return Moves(tuple(mover.done), mover.stopped)
 
     def _move(self, j: int, view: Any, wanted: float, before: float, mover: Mover) -> None:
         view.counts = round(wanted * COUNTS)

@@ -1,4 +1,4 @@
-"""Simulated drives that are not set up as the drives file says, to practise on: what a commissioning has to find."""
+"""Simulated drives that are not set up as the drives file says: what a commissioning has to find."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from softneck.core import SettingsError
+from softneck.drives.bus._axes import Axes, axes_of, inverse, said_of
+from softneck.drives.bus._file import DrivesFile
+from softneck.drives.bus._link import VirtualLink
+from softneck.drives.running._virtual import simulated_plant
+from softneck.drives.simulated import SimulatedNeck
+from softneck.drives.simulated._drives import OutputSample, TiltSample, sample_at, twin
+from softneck.drives.simulated._springs import SimulatedSprings
 from softneck.plant import NeckParameters
-
-from ..bus._axes import Axes, axes_of, inverse, said_of
-from ..bus._file import DrivesFile
-from ..bus._link import VirtualLink
-from ..running._virtual import physics_of, simulated_plant
-from ..simulated import SimulatedNeck
-from ..simulated._drives import OutputSample, TiltSample, sample_at, twin
-from ..simulated._springs import SimulatedSprings
 
 # How a mistake is written, for people.
 KINDS = ("reversed:N", "exchanged:N:M", "gear:N:FACTOR", "lines:N:FACTOR", "current:N:FACTOR", "axes", "sign:OUTPUT",
@@ -45,7 +43,7 @@ def plant(file: DrivesFile, mistakes: Sequence[str]) -> Planted:
     Motors are those of `file`; what is exchanged goes with its drive.
 
     Raises:
-        SettingsError: a mistake that is none.
+        ValueError: a mistake that is none.
     """
     planted = Planted(file)
     # What is exchanged comes last: until then motors stand where the file has them.
@@ -56,7 +54,7 @@ def plant(file: DrivesFile, mistakes: Sequence[str]) -> Planted:
                 raise ValueError(mistake)
             planted = _with(planted, kind, *said)
         except (ValueError, KeyError) as error:
-            raise SettingsError(f"--plant takes {', '.join(KINDS)}; got `{mistake}`.") from error
+            raise ValueError(f"a mistake is one of {', '.join(KINDS)}; got `{mistake}`.") from error
     return planted
 
 
@@ -111,16 +109,7 @@ def _motor(text: str, count: int) -> int:
 def planted_link(
     believed: DrivesFile, planted: Planted, neck: NeckParameters | None, *, sample_time: float, seed: int = 0
 ) -> VirtualLink:
-    """Return simulated drives that are set up as `planted` says, on a bus that is read as `believed` says.
-
-    Raises:
-        SettingsError: nothing that has tendons stands for the robot.
-    """
-    if physics_of(believed.moves, neck) is None:
-        raise SettingsError(
-            f"robot {believed.moves.label()} has no virtual plant, and the springs that stand in for it pull both "
-            "ways: moves say nothing of them. Give it one: --neck, or [plant] neck in the robot file."
-        )
+    """Return simulated drives that are set up as `planted` says, on a bus that is read as `believed` says."""
     turns = simulated_plant(planted.file, neck, sample_time=sample_time, homed=False, seed=seed)
     outputs = believed.moves.outputs.names
     mounted = MountedOtherwise(turns, inverse(axes_of(planted.file.sensor_axes, outputs)), late=planted.late)
@@ -142,7 +131,7 @@ class MountedOtherwise:
         """Let output k of the sensor be `sign` times the true output `number`: (number, sign) is `axes[k]`."""
         count = len(neck.newest.values)
         if sorted(number for number, _ in axes) != list(range(count)):
-            raise SettingsError(f"`axes` must name each of the {count} outputs once.")
+            raise ValueError(f"`axes` must name each of the {count} outputs once.")
         self._neck, self._axes = neck, tuple(axes)
         samples = round(late / neck.settings.sample_time)
         self._past: deque[TiltSample | OutputSample] = deque([neck.newest] * (samples + 1), samples + 1)
