@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ._errors import DataError, SettingsError
 from ._types import Vector
-
-
-def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """Return "did you mean `PREFIXx`? " for the known word nearest to `word`; "" where none is near."""
-    near = difflib.get_close_matches(word, list(known), n=1)
-    return f"did you mean `{prefix}{near[0]}`? " if near else ""
 
 
 def require_finite(name: str, value: float, unit: str = "") -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import shlex
+from collections.abc import Iterable
 from importlib import metadata
 from importlib.util import find_spec
 
@@ -41,6 +43,12 @@ class CheckFailedError(SoftneckError):
     """A check that the user asked for did not hold; exit code 1."""
 
     exit_code = 1
+
+
+def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
+    """Return "did you mean `PREFIXx`? " for the known word nearest to `word`; "" where none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1)
+    return f"did you mean `{prefix}{near[0]}`? " if near else ""
 
 
 # Package as it is imported -> (extra of `pip install`, what needs it). No path of the README needs one but the drives'.

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ._archive import read_archive
-from ._checks import did_you_mean
-from ._errors import FileFormatError, SettingsError
+from ._errors import FileFormatError, SettingsError, did_you_mean
 
 
 @dataclass(frozen=True, slots=True)

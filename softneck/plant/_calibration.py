@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.signals import Recording
 
@@ -68,6 +69,7 @@ class Calibration(Shown):
         return "\n".join(lines) + "\n"
 
 
+@one_blas_thread
 def calibrate(
     recordings: Sequence[Recording],
     payloads: Sequence[float],

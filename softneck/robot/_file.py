@@ -12,7 +12,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, require_one_of
 from softneck.core._budget import settings_text
-from softneck.core._checks import did_you_mean
+from softneck.core._errors import did_you_mean
 
 from ._channels import Motors, Outputs
 from ._directions import Directions

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import CheckFailedError, Progress, SettingsError, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import robot_of
@@ -86,6 +87,7 @@ class Tuned:
     own: Sequence[OwnPlant] = ()
 
 
+@one_blas_thread
 def tune(
     plants: Mapping[str, Any],
     requirements: TuneRequirements | Mapping[str, Any] | str | Path | None = None,

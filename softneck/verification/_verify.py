@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._certificate import certificate_contents
 from softneck.core._kinds import opened
 from softneck.core._progress import shown_progress
@@ -225,6 +226,7 @@ def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[Un
     return necks
 
 
+@one_blas_thread
 def verify(
     controller: Any,
     plants: Mapping[str, Any] | Sequence[Any] | Any,
@@ -269,8 +271,7 @@ def verify(
             require_same_robot(robot_of(thing), robot, f"the controller and {what}")
     own_words = isinstance(requirements, Requirements)
     asked = requirements.of_robot(robot) if own_words else read_requirements(requirements, robot=robot)
-    own = {name: thing for name, thing in named.items() if is_own_plant(thing)}
-    own = {name: standing_for(thing, robot) for name, thing in own.items()}
+    own = {name: standing_for(thing, robot) for name, thing in named.items() if is_own_plant(thing)}
     linear = {name: thing for name, thing in named.items() if name not in own}
     if not robot.is_neck:
         asked = scaled(asked, sources_of(linear, asked))
@@ -312,8 +313,7 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
         group = item.metric.partition(".")[0]
         group = "axes" if group in evidence.plants.axes else group
         why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
-        note = f"not computed: {why}"
-        return Verdict(item, None, False if item.asked else None, {}, note)
+        return Verdict(item, None, False if item.asked else None, {}, f"not computed: {why}")
     row = worst_row(evidence.metrics, item.metric, item.bound)
     value = float(values.values[row])
     worst = plain(values.describe(row))

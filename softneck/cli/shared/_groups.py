@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import click
 
-from softneck.core._checks import did_you_mean
-from softneck.core._kinds import kinds_of
+from softneck.core._errors import did_you_mean
 
 from ._moved import now
 
@@ -30,4 +29,11 @@ class NearGroup(click.Group):
 
 def kinds_complete(role: str, *more: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
     """Return what completes the kinds of `role` and `more` in a shell."""
-    return lambda _ctx, _param, begun: [name for name in (*kinds_of(role), *more) if name.startswith(begun)]
+
+    def complete(_ctx: click.Context, _param: click.Parameter, begun: str) -> list[str]:
+        # Here, for it imports NumPy: the command line sets the number of its threads first.
+        from softneck.core._kinds import kinds_of
+
+        return [name for name in (*kinds_of(role), *more) if name.startswith(begun)]
+
+    return complete

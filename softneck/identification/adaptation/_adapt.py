@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector, require_positive
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate
 
 from ..models._arrays import members
@@ -86,6 +87,7 @@ class Adaptation:
         require_positive("strength", self.strength)
         require_positive("block", self.block, "s")
 
+    @one_blas_thread
     def of(self, model: Model, recording: Recording) -> Model:
         """Return the adapted model, or the old one where that is no worse; findings say which, under `adaptation`.
 

@@ -18,6 +18,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
 
 from ..models._directions import Directions, directions_of
@@ -62,6 +63,7 @@ class OutputError:
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify both axes; runs are never joined and each has its own start, missed samples are not judged.
 

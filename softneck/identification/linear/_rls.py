@@ -18,6 +18,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
 
@@ -102,6 +103,7 @@ class Rls:
             start_covariance=EXACT_START,
         )
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify pitch from theta_i and roll from phi_i, or both from the motors.
 

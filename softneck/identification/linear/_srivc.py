@@ -19,6 +19,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._fitting import delay_samples, fitted_model, training_recording
@@ -183,6 +184,7 @@ class Srivc:
         require_between("level", self.level, 0.5, 0.9999)
         require_whole("seed", self.seed, 0, 2**31 - 1)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify both axes; runs are never joined and each has its own start, missed samples are not judged.
 

@@ -19,6 +19,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._directions import directions_of
@@ -225,6 +226,7 @@ class Subspace:
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify both angles at once; runs are never joined, missed samples are left out.
 

@@ -19,6 +19,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.runtime import load_functions
 from softneck.signals import Recording, concatenate
 
@@ -128,6 +129,7 @@ class Network:
         if self.decay is not None:
             require_positive("decay", self.decay)
 
+    @one_blas_thread
     def fit(
         self,
         recordings: Recording | list[Recording],
@@ -199,15 +201,12 @@ class Network:
 
     def _train(self, problem: _Problem, progress: Progress) -> tuple[list[dict], bool]:
         """Return the arrays of all axes, and whether Ctrl-C ended it."""
-        from threadpoolctl import threadpool_limits
-
         told = [(0.0, name) for name in problem.train.robot.outputs.names]
         stop = threading.Event()
         interrupted = False
         # Before the threads start: Python 3.11 cannot parse two texts at once.
         load_functions(FUNCTIONS)
-        # One thread each: matrices this small gain nothing from more.
-        with threadpool_limits(limits=1), ThreadPoolExecutor(2) as pool:
+        with ThreadPoolExecutor(2) as pool:
             jobs = [pool.submit(self._axis, problem, axis, told, stop) for axis in range(len(told))]
             while not all(job.done() for job in jobs):
                 try:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
@@ -76,6 +77,7 @@ class NeuralStateSpace:
         require_whole("echo", self.echo, 1, 100)
         require_whole("seed", self.seed, 0, 2**63)
 
+    @one_blas_thread
     def fit(
         self,
         recordings: Recording | list[Recording],
@@ -93,33 +95,28 @@ class NeuralStateSpace:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        from threadpoolctl import threadpool_limits
-
         recording = training_recording(recordings, any_robot=True, all_motors=True)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)
-        with threadpool_limits(limits=1):
-            directions = directions_of(
-                recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()]
-            )
-            fits, delay = linear_start(recording, drive, directions, self.order)
-            loads = [payload_of(run) for run in recording.runs()] if recording.robot.is_neck else [0.0]
-            made = Inputs(
-                drive, directions, directions.inputs(recording), np.array(self.widths), delay, len(set(loads)) > 1
-            )
-            records = Records.of(recording, made)
-            shape, linear, gain = whitened(fits, records, made, self.neurons)
-            contraction = Contraction(shape.states, self.neurons, largest_rate(records.sample_time))
-            self._check_rows(records, shape)
-            rows, judge = records.apart()
-            if hold_out is not None:
-                rows, judge = records, Records.of(hold_out, made, scales=records.scales)
-            job = _Job(self, shape, contraction, gain, shape.arrays(linear), records, rows, judge)
-            theta, found = job.run(progress)
-            weights = shape.arrays(job.weights(theta))
-            arrays = _arrays(recording, made, records, weights, (self.echo, gain))
-            if made.loaded:
-                arrays["payload"] = np.array([min(loads), max(loads)])
+        directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
+        fits, delay = linear_start(recording, drive, directions, self.order)
+        loads = [payload_of(run) for run in recording.runs()] if recording.robot.is_neck else [0.0]
+        made = Inputs(
+            drive, directions, directions.inputs(recording), np.array(self.widths), delay, len(set(loads)) > 1
+        )
+        records = Records.of(recording, made)
+        shape, linear, gain = whitened(fits, records, made, self.neurons)
+        contraction = Contraction(shape.states, self.neurons, largest_rate(records.sample_time))
+        self._check_rows(records, shape)
+        rows, judge = records.apart()
+        if hold_out is not None:
+            rows, judge = records, Records.of(hold_out, made, scales=records.scales)
+        job = _Job(self, shape, contraction, gain, shape.arrays(linear), records, rows, judge)
+        theta, found = job.run(progress)
+        weights = shape.arrays(job.weights(theta))
+        arrays = _arrays(recording, made, records, weights, (self.echo, gain))
+        if made.loaded:
+            arrays["payload"] = np.array([min(loads), max(loads)])
         findings: dict[str, Any] = {"delay": delay, "parameters": theta.size, **found}
         if not recording.robot.is_neck:
             findings |= directions.findings()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, SoftneckError, resolve, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.quality._poor_excitation import poor_excitation
@@ -79,6 +80,7 @@ def kinds_to_try() -> tuple[str, ...]:
     return tuple(kind for kind in _SIMPLE_FIRST if kind in KINDS)
 
 
+@one_blas_thread
 def choose(
     train: Recording,
     hold_out: Recording,
@@ -112,22 +114,18 @@ def choose(
     Raises:
         DataError: no kind could be identified.
     """
-    from threadpoolctl import threadpool_limits
-
     wanted = _wanted(train, kinds)
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
-    # The matrices are small: a second thread of BLAS would only wait.
-    with threadpool_limits(limits=1):
-        for number, kind in enumerate(wanted):
-            progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
-            if kind in _MADE_OF_OTHERS:
-                race.examine()
-            race.screen(kind)
-        race.examine()
-        race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
-        best = race.trained(lambda done, what: progress(0.8 + 0.1 * done, what))
-        chosen = race.guarded(best, lambda done, what: progress(0.9 + 0.1 * done, what))
-        race.train_other(chosen)
+    for number, kind in enumerate(wanted):
+        progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
+        if kind in _MADE_OF_OTHERS:
+            race.examine()
+        race.screen(kind)
+    race.examine()
+    race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
+    best = race.trained(lambda done, what: progress(0.8 + 0.1 * done, what))
+    chosen = race.guarded(best, lambda done, what: progress(0.9 + 0.1 * done, what))
+    race.train_other(chosen)
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
@@ -135,6 +133,7 @@ def choose(
     return Choice(ranking, chosen, why(best, alike) + guarded_why(best, chosen), wary, seed)
 
 
+@one_blas_thread
 def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
     """Identify the chosen kind again, with what it is made of, from all recordings there are.
 

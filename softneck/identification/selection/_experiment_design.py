@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_between, silent, to_si
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -181,6 +182,7 @@ class NextExperiment(Shown):
         }
 
 
+@one_blas_thread
 def next_experiment(
     known: Known, *, duration: float, seed: int = 0, bounds: Bounds | None = None, progress: Progress = silent
 ) -> NextExperiment:

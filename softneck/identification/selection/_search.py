@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, require_one_of, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
@@ -131,6 +132,7 @@ class Search(Shown):
         }
 
 
+@one_blas_thread
 def search(
     estimator: Estimator,
     vary: Mapping[str, Sequence[Any]],

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, SettingsError, Vector, require_between, require_one_of, require_whole
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._budget import available_bytes
 
 from ._cone_set import ConeSet, as_matrix, as_outputs
@@ -74,6 +75,7 @@ class Cones:
         require_numbers("epsilon", self.epsilon, zero=True)
         require_numbers("scale", self.scale, zero=False)
 
+    @one_blas_thread
     def fit(self, X: ArrayLike, Y: ArrayLike, *, workers: int | None = None) -> ConeSet:
         """Return the set over regressors X (N, n) and outputs Y (N,) or (N, m).
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from softneck.core import FileFormatError, Matrix, Progress, require_one_of, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._arrays import within
@@ -47,6 +48,7 @@ class OnlineSetMembership:
         require_whole("capacity", self.capacity, 1, _MOST)
         self._set()
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify the set that it starts from; see `SetMembership.fit`."""
         found = self._set().fit(recordings, progress=progress)

@@ -21,6 +21,7 @@ from softneck.core import (
     resolve,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.robot import Robot
 from softneck.signals import Recording
 
@@ -164,6 +165,7 @@ class SetMembership:
             require_one_of("motors", self.motors, _MOTORS)
         require_one_of("base", self.base, _BASES)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Store the data set and find gamma and epsilon that are consistent with all of it.
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, Vector, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.plant._neck import require_tendons
 from softneck.robot import Robot
 from softneck.runtime import load_functions
@@ -72,6 +73,7 @@ class GreyBox:
         if self.sensor_delay is not None:
             require_whole("sensor_delay", self.sensor_delay, 0, 100)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify the numbers; Ctrl-C keeps the best so far.
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._arrays import memory_array
@@ -73,6 +74,7 @@ class Play:
         if self.ridge is not None:
             require_positive("ridge", self.ridge)
 
+    @one_blas_thread
     def fit(
         self,
         recordings: Recording | list[Recording],

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from softneck.core import KINDS, Progress, SettingsError, find_kind, require_whole, resolve, silent
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
 
@@ -41,6 +42,7 @@ class Ensemble:
             if kind in COMPOSED:
                 raise SettingsError(f"a model of kind `{kind}` holds others itself and cannot be a member.")
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify every member on the same recordings.
 

@@ -19,6 +19,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate
 from softneck.signals.recording._conditions import conditions
 
@@ -144,6 +145,7 @@ class FamilySettings:
         require_whole("lpv_knots", self.lpv_knots, 0, 12)
         require_between("confidence", self.confidence, 0.5, 0.9999)
 
+    @one_blas_thread
     def fit(
         self,
         recordings: Recording | list[Recording],
@@ -186,9 +188,8 @@ class FamilySettings:
         axes, dropped = {}, {}
         for axis, name in enumerate(directions.names):
             progress(0.8 * axis / len(directions.names), f"local models of {name}")
-            found, lost = self._local_models(search, cut, axis, len(parts), slow)
-            dropped[name] = lost
-            axes[name] = self._axis(name, found, frequency, sample_time, lost)
+            found, dropped[name] = self._local_models(search, cut, axis, len(parts), slow)
+            axes[name] = self._axis(name, found, frequency, sample_time, dropped[name])
         progress(0.8, "cross gains")
         nominal = [one_pole(axes[name].nominal) for name in directions.names]
         cross, cross_std = cross_gains(parts, nominal, directions, self.source)

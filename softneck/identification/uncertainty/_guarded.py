@@ -19,6 +19,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
@@ -86,6 +87,7 @@ class Guarded:
         if self.workers is not None:
             require_whole("workers", self.workers, 1, 1000)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify base and members; Ctrl-C ends it without a model.
 

@@ -17,6 +17,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
+from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
@@ -70,6 +71,7 @@ class Residual:
         require_positive("angle_weight", self.angle_weight)
         require_whole("seed", self.seed, 0, 2**62)
 
+    @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
         """Identify the base, then the set on the residual of its free run over the same rows.
 

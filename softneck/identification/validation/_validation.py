@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_one_of
+from softneck.core._blas_threads import one_blas_thread
 from softneck.core._kinds import opened
 from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot
@@ -207,6 +208,7 @@ class Rules:
                 raise DataError(f"a horizon is a number of samples from 1, or `inf`; got {horizon!r}.")
 
 
+@one_blas_thread
 def validate(
     model: Model | str | Path,
     recording: Recording | str | Path,

@@ -1,0 +1,103 @@
+"""One BLAS thread inside every fit, `tune` and `verify`, and as many as before outside."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+import scipy.linalg  # noqa: F401  (its BLAS is one of those that are counted)
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from softneck.core._blas_threads import one_blas_thread
+from softneck.core._kinds import KINDS, kinds_of, make_settings, resolve
+from softneck.identification import FamilySettings
+from softneck.identification.selection._auto import choose
+from softneck.plant._calibration import calibrate
+from softneck.signals import Recording
+from softneck.tuning import tune
+from softneck.verification import verify
+
+from ..verification.necks import linear_neck, pi
+
+_OUTSIDE = 2
+
+
+class _AskedError(Exception):
+    """Ends a fit once its threads are counted."""
+
+
+def _threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def _count_and_stop(done: float, what: str) -> None:
+    raise _AskedError(_threads())
+
+
+@pytest.fixture(autouse=True)
+def two_threads() -> Iterator[None]:
+    """Two threads before, also where the environment of the tests says one."""
+    with threadpool_limits(_OUTSIDE):
+        yield
+
+
+@pytest.mark.parametrize("kind", kinds_of("model"))
+def test_a_fit_has_one_blas_thread(kind: str, neck: Recording) -> None:
+    settings = make_settings(resolve(KINDS[kind].settings), {})
+    with pytest.raises(_AskedError) as told:
+        settings.fit(neck, progress=_count_and_stop)
+    assert told.value.args == ({1},)
+    assert _threads() == {_OUTSIDE}
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda neck: FamilySettings().fit(neck, progress=_count_and_stop),
+        lambda neck: choose(*neck.split(0.7), kinds=["rls"], progress=_count_and_stop),
+        lambda neck: calibrate([neck], [0.0], progress=_count_and_stop),
+        lambda _: verify(pi(), linear_neck(), progress=_count_and_stop),
+        lambda _: tune({"neck": linear_neck()}, kinds=["pi"], budget=1, workers=0, progress=_count_and_stop),
+    ],
+    ids=["family", "auto", "calibrate", "verify", "tune"],
+)
+def test_what_searches_or_verifies_has_one_too(call: Callable[[Recording], object], neck: Recording) -> None:
+    with pytest.raises(_AskedError) as told:
+        call(neck)
+    assert told.value.args == ({1},)
+    assert _threads() == {_OUTSIDE}
+
+
+def test_a_fit_that_ends_leaves_others_limited() -> None:
+    begun, ended = threading.Event(), threading.Event()
+
+    @one_blas_thread
+    def short() -> None:
+        begun.wait(10.0)
+
+    @one_blas_thread
+    def long() -> set[int]:
+        begun.set()
+        assert ended.wait(10.0)
+        return _threads()
+
+    first = threading.Thread(target=lambda: (short(), ended.set()))
+    first.start()
+    assert long() == {1}
+    first.join()
+    assert _threads() == {_OUTSIDE}
+
+
+def test_the_command_line_limits_numpy_before_it_is_imported() -> None:
+    code = (
+        "import sys, softneck.cli._main as m; print('numpy' in sys.modules); "
+        "sys.argv = ['softneck', 'info', 'absent']\n"
+        "try: m.main()\nexcept SystemExit: pass\n"
+        "import numpy, threadpoolctl; print(*{l['num_threads'] for l in threadpoolctl.threadpool_info()})"
+    )
+    environment = {"PATH": "/usr/bin:/bin"}  # without a number of threads
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split() == ["False", "1"]
