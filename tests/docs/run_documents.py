@@ -48,7 +48,6 @@ NOT_YET: dict[str, str] = {
     "docs/howto/drives.md": "`drives scan`, `jog` and `zero` become steps of `commission`, `replay` one of `simulate`",
     "docs/howto/mpc.md": "its blocks follow what is left of the kinds of controllers",
     "docs/howto/payloads.md": "its blocks follow what is left of the kinds of controllers",
-    "docs/howto/robot.md": "`robot show` and `check` become `robot FILE`",
 }
 
 _BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>[\w-]+)\n(?P<text>.*?)^ *```$", flags=re.MULTILINE | re.DOTALL)
