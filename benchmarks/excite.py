@@ -1,10 +1,10 @@
-"""Print what a second recording is worth: that of `softneck excite` beside more of the same, and `mixed`.
+"""Print what a second recording is worth: that which `next_experiment` designs beside more of the same, and `mixed`.
 
 `python benchmarks/excite.py [--necks NECK...] [--kinds KIND...] [--seconds S] [--seed N] [--fresh]`
 
-Each neck is recorded for so many seconds of Eq. 22, then again as long: more of Eq. 22, `mixed`, or what `excite` asks
-for after the first. Models of both together run free over steps, sine and rotation, which none of them has seen: mean
-and worst axis [%]. The first alone stands beside. What is computed is kept in `build/excite`.
+Each neck is recorded for so many seconds of Eq. 22, then again as long: more of Eq. 22, `mixed`, or what four quick
+`nss` ask for after the first. Models of both together run free over steps, sine and rotation, which none of them has
+seen: mean and worst axis [%]. The first alone stands beside. What is computed is kept in `build/excite`.
 """
 
 from __future__ import annotations

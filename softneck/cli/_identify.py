@@ -11,6 +11,7 @@ import click
 from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, require_positive, resolve
 from softneck.core._kinds import kinds_of
 
+from ._adapt import adapt
 from ._auto import identify_auto
 from ._search import (
     SearchOptions,
@@ -52,7 +53,10 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
     "identify",
     cls=kind_command("model"),
     help=f"Identify a model of KIND from one or more recordings.\n\n\b\nKinds:\n{_KINDS}",
-    epilog="Example: softneck identify rls neck.csv -o rls.npz --set na=1 --set delay=0.08",
+    epilog="With --from a model follows a robot that changed: it is refitted to the last 30 s of the recordings (--set "
+    "window=30), starting from what it is. What these do not excite stays. Every third block of 2 s is held out: where "
+    "an output would be worse there, or where nothing moves, the old model is kept, and that is said.\n\n"
+    "Example: softneck identify rls neck.csv -o rls.npz --set na=1 --set delay=0.08",
 )
 @click.argument("kind", shell_complete=kinds_complete("model", "auto"))
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -61,6 +65,13 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
 @click.option("--refit", is_flag=True, help="With KIND auto: train the chosen kind again, on all rows; judged before.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
+@click.option(
+    "--from",
+    "old",
+    type=click.Path(path_type=Path),
+    metavar="MODEL",
+    help="Refit this model of KIND, or auto: its own.",
+)
 @tolerance_option
 @robot_option
 @set_option
@@ -78,6 +89,7 @@ def command(
     html: Path | None,
     refit: bool,
     seed: int | None,
+    old: Path | None,
     tolerance: float | None,
     robot: str | None,
     settings: tuple[str, ...],
@@ -94,6 +106,13 @@ def command(
 
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
+    if old is not None:
+        if html is not None or refit or tolerance is not None or searches:
+            raise SettingsError(
+                "--from takes no --html, --refit, --tolerance and --search: the model stays what it is."
+            )
+        adapt(kind, old, recordings, output, settings=settings, robot=robot, force=force, as_json=as_json)
+        return
     if kind == "auto":
         if settings:
             raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")

@@ -124,7 +124,7 @@ def _print(path: Path, result: Result) -> None:
     if "changed" in signals and "since_s" in signals and signals["changed"][-1] > 0.5:
         click.echo(
             f"changed for {signals['since_s'][-1]:.1f} s: the neck is not the one of the detector's model. Bring it to "
-            "rest, record it anew, then `softneck adapt` and `softneck tune`."
+            "rest, record it anew, then `softneck identify --from` and `softneck tune`."
         )
 
 

@@ -1,4 +1,4 @@
-"""`softneck adapt` and `softneck observer --change`: files, JSON, one line for what cannot be; replay of a loop."""
+"""`softneck identify --from` and `softneck observer --change`: files, JSON, what cannot be; replay of a loop."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_model_that_is_written_is_that_of_python(call: Call, folder: Path) -> None:
-    said = call("adapt", folder / "oe.npz", folder / "today.csv", "-o", "new.npz", "--json")
+    said = call("identify", "oe", folder / "today.csv", "--from", folder / "oe.npz", "-o", "new.npz", "--json")
     assert said.code == 0, said.err
     told = json.loads(said.out)
     assert told["adapted"]
@@ -48,7 +48,7 @@ def test_the_model_that_is_written_is_that_of_python(call: Call, folder: Path) -
 
 
 def test_a_model_that_is_kept_is_said_to_be(call: Call, folder: Path) -> None:
-    said = call("adapt", folder / "oe.npz", folder / "still.csv", "-o", "new.npz")
+    said = call("identify", "oe", folder / "still.csv", "--from", folder / "oe.npz", "-o", "new.npz")
     assert said.code == 0, said.err
     assert "the old model, kept: the window hardly moves the neck" in said.out
     for name, array in load_model("new.npz").arrays.items():
@@ -56,11 +56,18 @@ def test_a_model_that_is_kept_is_said_to_be(call: Call, folder: Path) -> None:
 
 
 def test_what_cannot_be_adapted_is_one_line_and_no_file(call: Call, folder: Path) -> None:
-    said = call("adapt", folder / "rls.npz", folder / "today.csv", "-o", "new.npz")
+    said = call("identify", "rls", folder / "today.csv", "--from", folder / "rls.npz", "-o", "new.npz")
     assert said.code == 2
     assert "`rls` cannot adapt" in said.error
-    assert call("adapt", folder / "oe.npz", folder / "today.csv", "-o", "new.npz", "--window", "0").code == 2
-    assert call("adapt", folder / "pi.npz", folder / "today.csv", "-o", "new.npz").code == 2
+    assert (
+        call(
+            "identify", "oe", folder / "today.csv", "--from", folder / "oe.npz", "-o", "new.npz", "--set", "window=0"
+        ).code
+        == 2
+    )
+    of_another_kind = call("identify", "rls", folder / "today.csv", "--from", folder / "oe.npz", "-o", "new.npz")
+    assert (of_another_kind.code, "is of kind oe, not rls" in of_another_kind.error) == (2, True)
+    assert call("identify", "pi", folder / "today.csv", "--from", folder / "pi.npz", "-o", "new.npz").code == 2
     assert not Path("new.npz").exists()
 
 

@@ -43,7 +43,6 @@ SHOWN_LINES = 40
 NOT_YET: dict[str, str] = {
     "README.md": "`start` and `verify` lack packages of an extra, and are being repaired",
     "docs/tutorials/design_study.md": "studies write Parquet alone, and are being repaired",
-    "docs/howto/adapt.md": "`adapt` becomes `identify --from`",
     "docs/howto/bring_up.md": "for real drives; `drives scan`, `jog` and `zero` become steps of `commission`",
     "docs/howto/drives.md": "`drives scan`, `jog` and `zero` become steps of `commission`, `replay` one of `simulate`",
     "docs/howto/mpc.md": "its blocks follow what is left of the kinds of controllers",

@@ -25,17 +25,19 @@ from softneck.signals.recording._recording import require_same_robot
 from ..shared._console import print_json, progress
 from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option, output_option
+from ._next import record_next
 
 
 @click.command(
     "record",
     help="Record SIGNAL on the virtual neck, or on that of a robot.\n\nSignals: "
     + ", ".join(signal_names())
-    + ", or a "
-    "recording whose set-points are played, such as that of `softneck excite`.",
+    + ", or a recording whose set-points are played. A MODEL (guarded, ensemble): the next experiment, motions on "
+    "which its members disagree, or lead where nothing was seen; REC holds its set-points, and as outputs what they "
+    "expect. Play it with `softneck drives record REC`.",
     epilog="Example: softneck record eq22 -o eq22.csv --neck paper --seed 1",
 )
-@click.argument("signal_name", metavar="SIGNAL")
+@click.argument("signal_name", metavar="SIGNAL|MODEL")
 @output_option("recording", "REC", required=True)
 @click.option(
     "--robot",
@@ -47,7 +49,9 @@ from ..shared._options import force_option, json_option, output_option
     metavar="paper|lab|rough|NECK.toml",
     help="Which neck, or whose physics the robot has.  [default: what the robot says; paper]",
 )
-@click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
+@click.option(
+    "--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own; 60 of a MODEL]"
+)
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
 )
@@ -99,10 +103,17 @@ def command(
 
     recording_suffix(output)
     refuse_existing(output, force=force)
+    bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
+    if Path(signal_name).suffix.lower() == ".npz":
+        duration = 60.0 if duration is None else duration
+        record_next(
+            Path(signal_name), output, duration=duration, seed=seed, limits=bounds, robot=robot, force=force,
+            as_json=as_json,
+        )  # fmt: skip
+        return
     require_between("--payload", payload, 0.0, 1.0, "kg")
     whose = find_robot(robot, beside=output)
     virtual = VirtualNeck.of(whose, None if neck is None else load_neck(neck))
-    bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
     limits = SetPointLimits(**_allowed(whose) | {name: value for name, value in bounds.items() if value is not None})
     experiment = {"amplitude": amplitude, "band": _band(band), "realisations": realisations}
     asked = {name: value for name, value in experiment.items() if value is not None}

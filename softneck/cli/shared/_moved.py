@@ -7,6 +7,8 @@ import click
 # Command, or command and option, as they were -> what to call instead.
 _NOW = {
     "resample": "softneck import REC --resample S -o REC2",
+    "adapt": "softneck identify KIND REC --from MODEL -o MODEL2",
+    "excite": "softneck record MODEL -o NEXT.csv (of a recording: identify guarded first)",
     "ssp": "softneck fmu LOOP.toml -o X.ssp",
     "completion": 'eval "$(_SOFTNECK_COMPLETE=bash_source softneck)" (or zsh_source, fish_source)',
     "robot show": "softneck robot FILE",

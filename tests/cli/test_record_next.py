@@ -1,4 +1,4 @@
-"""softneck excite: the file that says what to record next, and what plays it."""
+"""softneck record MODEL: the file that says what to record next, and what plays it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_writes_what_to_record_and_says_why(call: Call, two: Path) -> None:
-    said = call("excite", two, "-o", "next.csv", "--duration", 20, "--max-slack", 1, "--max-speed", 4, "--json")
+    said = call("record", two, "-o", "next.csv", "--duration", 20, "--max-slack", 1, "--max-speed", 4, "--json")
     assert said.code == 0, said.err
     facts = json.loads(said.out)
     assert facts["rows"] == 1000
@@ -40,13 +40,13 @@ def test_it_writes_what_to_record_and_says_why(call: Call, two: Path) -> None:
 
 
 def test_record_plays_it_and_nothing_is_replaced_unasked(call: Call, two: Path) -> None:
-    assert call("excite", two, "-o", "next.csv", "--duration", 10).code == 0
+    assert call("record", two, "-o", "next.csv", "--duration", 10).code == 0
     before = Path("next.csv").read_bytes()
-    again = call("excite", two, "-o", "next.csv", "--duration", 10, "--seed", 3)
+    again = call("record", two, "-o", "next.csv", "--duration", 10, "--seed", 3)
     assert again.code == 2
     assert "next.csv" in again.error
     assert Path("next.csv").read_bytes() == before
-    assert call("excite", two, "-o", "next.csv", "--duration", 10, "--seed", 3, "--force").code == 0
+    assert call("record", two, "-o", "next.csv", "--duration", 10, "--seed", 3, "--force").code == 0
     played = call("record", "next.csv", "-o", "rec.csv")
     assert played.code == 0, played.err
     np.testing.assert_array_equal(read_recording("rec.csv").set_points, read_recording("next.csv").set_points)
@@ -60,14 +60,14 @@ def test_record_plays_it_and_nothing_is_replaced_unasked(call: Call, two: Path) 
     ],
 )
 def test_bad_settings_are_one_line(call: Call, two: Path, arguments: tuple[str, ...], what: str) -> None:
-    said = call("excite", two, "-o", "next.csv", *arguments)
+    said = call("record", two, "-o", "next.csv", *arguments)
     assert said.code == 2
     assert what in said.error
     assert not Path("next.csv").exists()
 
 
 def test_a_model_of_one_piece_is_one_line(call: Call, rls_file: Path) -> None:
-    said = call("excite", rls_file, "-o", "next.csv")
+    said = call("record", rls_file, "-o", "next.csv")
     assert said.code == 2
     assert "`rls` has no members that could part" in said.error
 
@@ -78,12 +78,12 @@ def test_a_robot_that_names_its_drives_has_their_slack_and_speed(call: Call, two
         f'profile = "ipos2015"\n[limits]\nslack_unwind_rad = 0.7\nspeed_rad_s = 8.0\n{drives}'
     )
     Path("robot.toml").write_text('name = "lab"\nextends = "neck"\n[drives]\nfile = "drives.toml"\n')
-    said = call("excite", two, "-o", "next.csv", "--duration", 10, "--robot", "robot.toml")
+    said = call("record", two, "-o", "next.csv", "--duration", 10, "--robot", "robot.toml")
     assert said.code == 0, said.err
     P = read_recording("next.csv").set_points
     assert -0.7 <= P.min() < -0.6
     # A quarter of what the drives take, as `drives record` has it; rounding of sums of steps.
     assert np.abs(np.diff(P, axis=0)).max() <= 2.0 * 0.02 + 1e-9
-    said = call("excite", two, "-o", "b.csv", "--duration", 10, "--robot", "robot.toml", "--max-speed", 9)
+    said = call("record", two, "-o", "b.csv", "--duration", 10, "--robot", "robot.toml", "--max-speed", 9)
     assert said.code == 2
     assert "--max-speed 9 is beyond the 8 rad/s" in said.error
