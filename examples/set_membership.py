@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
-from softneck.identification import Cones, OnlineCones, gamma_curve
+from softneck.identification import Cones, gamma_curve
 
 # The same file from the same numbers, so that a change of a picture shows a change of the method.
 mpl.rcParams["svg.hashsalt"] = "softneck"
@@ -94,28 +94,6 @@ def gamma_figure(path: Path) -> None:
     save(figure, path)
 
 
-def drift_figure(path: Path) -> None:
-    """One step ahead of a plant whose gain falls: a frozen set, and one that learns and forgets."""
-    rng = np.random.default_rng(2)
-    u = np.repeat(rng.uniform(-1, 1, 300), 10)
-    gain = np.interp(np.arange(u.size), [500, 2500], [1.0, 0.5])
-    y = np.zeros(u.size + 1)
-    for k in range(u.size):
-        y[k + 1] = 0.6 * y[k] + gain[k] * u[k] + 1e-3 * rng.uniform(-1, 1)
-    X, target = np.column_stack([y[:-1], u]), y[1:]
-    online = OnlineCones(epsilon=0.01, capacity=400)
-    online.add(X[:500], target[:500])
-    frozen = Cones(epsilon=0.01).fit(X[:500], target[:500]).predict(X[500:])
-    followed = online.track(X[500:], target[500:]).estimate
-    figure, ax = plt.subplots(layout="constrained", figsize=(7, 3.2))
-    for name, estimate in (("frozen after 500 rows", frozen), ("online, the last 400 rows", followed)):
-        error = np.sqrt(np.convolve((estimate - target[500:]) ** 2, np.full(100, 0.01), mode="valid"))
-        ax.plot(np.arange(error.size) + 600, error, label=name)
-    ax.set(xlabel="row", ylabel="rms error of 100 rows")
-    ax.legend()
-    save(figure, path)
-
-
 def main(folder: Path) -> None:
     """Draw all of them."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -123,10 +101,9 @@ def main(folder: Path) -> None:
         ("cones", cones_figure),
         ("bounds", bounds_figure),
         ("gamma", gamma_figure),
-        ("drift", drift_figure),
     ):
         draw(folder / f"set_membership_{name}.svg")
-    print(f"set_membership_cones.svg, _bounds, _gamma and _drift are in {folder}")
+    print(f"set_membership_cones.svg, _bounds and _gamma are in {folder}")
 
 
 if __name__ == "__main__":

@@ -58,10 +58,6 @@ KINDS: dict[str, Kind] = {
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, f"{_IDENT}.set_membership._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)",
              f"{_IDENT}.set_membership._arrays:check_nlsm"),
-        Kind("online_nlsm", "model", f"{_IDENT}.set_membership._online_nlsm:OnlineSetMembership", _MODEL,
-             f"{_IDENT}.set_membership._online_nlsm_runtime",
-             "set membership that learns measured outputs while it runs, its bounds widening where they break",
-             f"{_IDENT}.set_membership._online_nlsm:check_online"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, f"{_IDENT}.networks._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)",
              f"{_IDENT}.networks._arrays:check_nn"),
@@ -145,6 +141,22 @@ KINDS: dict[str, Kind] = {
 }  # fmt: skip
 
 
+#: Kinds that went, and what takes their place; docs/theory/tried.md says why each went.
+REMOVED: dict[str, str] = {
+    "online_nlsm": "nlsm",
+}
+_LAST_VERSION = "0.2.0"  # reads files of the kinds above
+
+
+def removed_kind(name: str) -> str:
+    """Return a sentence on a kind that went; empty if `name` is none."""
+    if name not in REMOVED:
+        return ""
+    return (
+        f"kind `{name}` was removed after softneck {_LAST_VERSION}, which still reads its files; use `{REMOVED[name]}`."
+    )
+
+
 def kinds_of(role: str) -> tuple[str, ...]:
     """Return the names of all kinds of one role."""
     return tuple(kind.name for kind in KINDS.values() if kind.role == role)
@@ -154,6 +166,8 @@ def find_kind(name: str, role: str) -> Kind:
     """Return the kind of that name; raise SettingsError with the known ones if there is none."""
     kind = KINDS.get(name)
     if kind is None or kind.role != role:
+        if gone := removed_kind(name):
+            raise SettingsError(gone)
         known = kinds_of(role)
         raise SettingsError(
             f"unknown kind of {role} `{name}`; {did_you_mean(name, known)}use one of {', '.join(known)}."
@@ -206,6 +220,8 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
     """
     header, arrays = read_archive(path)
     kind = KINDS.get(str(header.get("kind")))
+    if kind is None and (gone := removed_kind(str(header.get("kind")))):
+        raise FileFormatError(f"{path}: {gone}")
     if kind is None:
         raise FileFormatError(
             f"{path}: holds the unknown kind `{header.get('kind')}`; was it written by a newer softneck?"

@@ -22,7 +22,6 @@ from .set_membership._cone_set import ConeSet as ConeSet
 from .set_membership._cones import Cones as Cones
 from .set_membership._gamma import gamma_curve as gamma_curve
 from .set_membership._gamma import offending_pair as offending_pair
-from .set_membership._online import OnlineCones as OnlineCones
 from .set_membership._set_membership import SetMembership as SetMembership
 from .set_membership._set_membership import outside_seen as outside_seen
 from .structured._greybox import GreyBox as GreyBox

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.identification import PAPER_EQ21, Cones, ConeSet, OnlineCones, gamma_curve
+from softneck.identification import PAPER_EQ21, Cones, ConeSet, gamma_curve
 from softneck.identification.linear._arrays import no_base
 from softneck.identification.set_membership._regressor import set_arrays
 from softneck.runtime import load_functions, load_runtime
@@ -189,23 +189,6 @@ def test_batch(benchmark: BenchmarkFixture, workers: int) -> None:
     X = np.tile(arrays[4][0].T, (3, 1))[:20_000] + 0.01
     low, _ = benchmark.pedantic(cones.bounds, (X,), {"workers": workers}, rounds=5)
     np.testing.assert_array_equal(low, cones.bounds(X, workers=1)[0])
-
-
-@pytest.mark.benchmark(group="adding 1,000 rows one by one")
-@pytest.mark.parametrize("rows", [2_000, 20_000])
-def test_online(benchmark: BenchmarkFixture, rows: int) -> None:
-    arrays = arrays_of(20_000 + 1_000)
-    X, y = arrays[4][0].T, arrays[5][0]
-    online = OnlineCones(epsilon=EPSILON)
-    online.add(X[:rows], y[:rows])
-    online.add(X[rows : rows + 1], y[rows : rows + 1])
-
-    def add() -> None:
-        for k in range(rows + 1, rows + 1_000):
-            online.add(X[k : k + 1], y[k : k + 1])
-
-    benchmark.pedantic(add, rounds=1)
-    assert len(online) == rows + 1_000
 
 
 @pytest.mark.benchmark(group="building")

@@ -19,6 +19,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 
 from softneck.core import FileFormatError, load, read_archive, write_archive
 from softneck.core._archive import FORMAT_VERSION
+from softneck.core._kinds import KINDS, REMOVED
 
 NAMES = st.text("abcdefgh_", min_size=1, max_size=8).filter(lambda name: name != "header")
 JSON = st.recursive(
@@ -164,6 +165,10 @@ def test_a_file_of_another_role_or_kind_is_refused(tmp_path: Path, models: dict)
         load(tmp_path / "m.npz", role="controller")
     with pytest.raises(FileFormatError, match="holds the unknown kind `magic`"):
         load(archive(tmp_path, {"kind": "magic"}))
+    for name, instead in REMOVED.items():
+        assert name not in KINDS
+        with pytest.raises(FileFormatError, match=rf"`{name}` was removed after softneck 0\.2\.0.*use `{instead}`"):
+            load(archive(tmp_path, {"kind": name}))
 
 
 def with_member(folder: Path, name: str, change: Callable[[bytes], bytes]) -> Path:

@@ -40,7 +40,6 @@ from softneck.identification import (
     Subspace,
     combine,
 )
-from softneck.identification.set_membership._online_nlsm import OnlineSetMembership
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.identification.uncertainty._guarded_base import Base
 from softneck.plant import NeckParameters, VirtualNeck
@@ -95,11 +94,6 @@ def _subspace() -> Block:
 
 def _nlsm() -> Block:
     return SetMembership().fit(recording()).block()
-
-
-def _online_nlsm() -> Block:
-    # So few that the ring of what is learnt goes round.
-    return OnlineSetMembership(epsilon=0.01, output_weight=10.0, capacity=7).fit(recording()).block()
 
 
 def _residual() -> Block:
@@ -250,12 +244,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
     "nlsm": (
         _nlsm,
-        MOTORS,
-        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
-        _MODEL,
-    ),
-    "online_nlsm": (
-        _online_nlsm,
         MOTORS,
         ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
         _MODEL,

@@ -26,7 +26,6 @@ PLANTS = (
     "srivc",
     "subspace",
     "nlsm",
-    "online_nlsm",
     "play",
     "greybox",
     "nss",

@@ -148,8 +148,6 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
         values[parts["motors"]], values[parts["angles"]] = m, y
     if "slow" in parts:
         values[parts["slow"]] = m
-    if kind == "online_nlsm":  # what held still for a start was never measured: nothing of it is learnt
-        values[parts["seen"].start :] = 0.0
     at = parts[list(parts)[-1]].start
     for member, part in members(arrays):
         size = load_runtime(runtime_of(member, part)).state_size(tuple(part.values()))

@@ -46,7 +46,7 @@ _MOTORS = ("simulated", "measured")
 # Kinds that can be far off beyond their training and have a guarded form.
 _GUARDED = ("nn", "nss")
 # Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
-_SEARCHING = ("nlsm", "online_nlsm", "residual")
+_SEARCHING = ("nlsm", "residual")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)

@@ -136,7 +136,7 @@ def _range(findings: Mapping[str, Any], motors: int) -> tuple[list[float], list[
 
 
 #: Kinds with bounds of their outputs, which follow outputs and motors.
-BOUNDED = ("nlsm", "online_nlsm", "residual", "ensemble")
+BOUNDED = ("nlsm", "residual", "ensemble")
 
 
 def outputs(kind: str, robot: Robot) -> tuple[Port, ...]:

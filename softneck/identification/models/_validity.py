@@ -56,7 +56,7 @@ class Trust:
 _EQUATIONS, _LEARNED = Trust(0.7, 1.0, 0.002), Trust(2.0, 0.0, 0.02)
 TRUST = {
     **dict.fromkeys(("rls", "oe", "srivc", "subspace", "greybox"), _EQUATIONS),
-    **dict.fromkeys(("play", "nlsm", "online_nlsm", "nn", "nss"), _LEARNED),
+    **dict.fromkeys(("play", "nlsm", "nn", "nss"), _LEARNED),
     "ensemble": Trust(1.0, 0.0, 0.02, 1.0),
     "guarded": Trust(1.0, 0.0, 0.02, 1.0),
     "residual": Trust(1.0, 0.0, 0.07, 0.1),

@@ -32,8 +32,7 @@ from ._kind_trial import EXAM, HOLD_OUT, KindTrial
 from ._left_out import Fold, everything, folds
 
 # From what can be read to what cannot: of kinds that hold as many numbers the first is taken. `_MADE_OF_OTHERS` come
-# last, as they need the others. `srivc` is tried where it is named: it has the model of `oe`. `online_nlsm` is not
-# there: in free run it measures nothing, learns nothing, and is `nlsm`.
+# last, as they need the others. `srivc` is tried where it is named: it has the model of `oe`.
 _SIMPLE_FIRST = ("rls", "oe", "srivc", "subspace", "greybox", "play", "nlsm", "nn", "nss", "residual", "ensemble")
 _MADE_OF_OTHERS = ("residual", "ensemble")
 _NAMED_ONLY = ("srivc",)

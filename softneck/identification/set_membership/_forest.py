@@ -143,16 +143,6 @@ def tighten(
     return bounds
 
 
-def needed_gamma(
-    trees: list[PointTree], output: int, slack: float, new: tuple[Matrix, Vector], *, windows: Matrix, gamma: float
-) -> float:
-    """Return the slope, at least `gamma`, that new points (rows, n) and values (rows,) need beside the trees'."""
-    needs = load_functions(_RUNTIME).set_needs if have_numba() else plain_needs
-    for tree in trees:
-        gamma = needs(tree.tree(output), tree.column(output), slack, *new, windows, gamma)
-    return float(gamma)
-
-
 def region_gammas(tree: PointTree, output: int, slack: float, regions: int) -> Vector:
     """Return the slope (regions,) that the points of each region need beside all points."""
     gammas = np.zeros(regions)

@@ -109,24 +109,6 @@ def set_need(
     return gamma, worst
 
 
-def set_needs(
-    tree: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    column: int,
-    slack: float,
-    queries: np.ndarray,
-    targets: np.ndarray,
-    windows: np.ndarray,
-    gamma: float,
-) -> float:
-    """Return the gamma that the points (queries (m, n), targets (m,)) need beside the tree's, at least `gamma`."""
-    points, values, nodes, ages = tree
-    for k in range(queries.shape[0]):
-        w = min(k, windows.shape[0] - 1)
-        hidden = (ages, windows[w, 0], windows[w, 1])
-        gamma, _ = set_need((points, values, nodes), column, gamma, slack, queries[k], targets[k], hidden)
-    return gamma
-
-
 def set_regions(
     tree: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], column: int, slack: float, gammas: np.ndarray
 ) -> None:

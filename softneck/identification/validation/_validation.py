@@ -40,7 +40,7 @@ from ._validity import judged_validity
 
 _HORIZONS = (1, 5, 25, INFINITE)
 # Kinds whose bounds are guaranteed under an assumption; an ensemble's are its members' least and largest.
-_PROMISING = ("nlsm", "online_nlsm", "residual")
+_PROMISING = ("nlsm", "residual")
 
 Scores = dict[str, dict[str, float | None]]
 

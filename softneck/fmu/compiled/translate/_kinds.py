@@ -17,7 +17,6 @@ _NECKS = (
     "softneck.identification.linear._oe_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.set_membership._nlsm_runtime",
-    "softneck.identification.set_membership._online_nlsm_runtime",
     "softneck.identification.networks._nn_runtime",
     "softneck.identification.structured._play_runtime",
     "softneck.identification.networks._nss_runtime",
@@ -45,7 +44,6 @@ _NECKS = (
 # Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
 _ROBOTS = (
     "softneck.identification.set_membership._nlsm_runtime",
-    "softneck.identification.set_membership._online_nlsm_runtime",
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.structured._loaded_greybox_runtime",
     "softneck.identification.uncertainty._residual_runtime",
@@ -89,7 +87,6 @@ LIBRARIES = {
 FAST = {
     "softneck.identification.linear._rls_runtime": 0,
     "softneck.identification.set_membership._nlsm_runtime": 1,
-    "softneck.identification.set_membership._online_nlsm_runtime": 1,
     "softneck.identification.networks._nn_runtime": 0,
     "softneck.plant._neck_runtime": 0,
     "softneck.estimation._kalman_runtime": 2,
