@@ -49,7 +49,7 @@ def command(
     """Run the loop of STUDY.toml over all that its [vary] names; exit code 1 if every run failed.
 
     \b
-    DIR gets  runs.parquet   a row for each run: what varied, seed, metrics, limits, error
+    DIR gets  runs.csv       a row for each run: what varied, seed, metrics, limits, error
               report.html    ranking, Pareto front, distributions, influences
               worst/         the worst runs as loop files for softneck simulate
     Ctrl-C or a crash loses no finished run: --resume continues.

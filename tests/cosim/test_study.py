@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import shutil
 import tempfile
 import threading
@@ -13,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import FileFormatError, OutputFileError, SettingsError, load
+from softneck.core import FileFormatError, OutputFileError, SettingsError, _errors, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -200,8 +201,44 @@ def test_resume_goes_on_where_it_stood(place: Path) -> None:
     runs: Any = study(made, workers=0, output=place / "out", resume=True)
     pd.testing.assert_frame_equal(numbers(whole), numbers(runs), check_exact=True)
     assert runs["seconds"][3:9].tolist() == whole["seconds"][3:9].tolist()  # not run again
-    assert sorted(path.name for path in (place / "out").iterdir()) == ["runs.parquet", "study.json"]
+    assert sorted(path.name for path in (place / "out").iterdir()) == ["runs.csv", "study.json"]
     assert study(made, workers=0, output=place / "out", resume=True)["seconds"].tolist() == runs["seconds"].tolist()
+
+
+def test_runs_read_back_to_the_bit(place: Path) -> None:
+    names = {"1": 0.85, "NA": 0.86, 'a,"b"': 0.87, " two  words\r": 0.88}
+    made = make_study(
+        place / "loop.toml", vary={"plant.parameters.pole": {"grid": names}, "reference.pitch_deg": [1, 2]}
+    )
+    store = Store(made, place / "out")
+    values = [0.1 + 0.2, 5e-324, -0.0, math.inf, -math.inf, None, 1.7976931348623157e308, 1e22 / 3]
+    for run, value in enumerate(values):
+        row = failed_row(made.points[run], 'a "fault", in\ntwo \udcff lines\0' + "x" * 200_000, METRICS)
+        store.add([row | {METRICS[0]: value, "holds": (True, False, None)[run % 3]}])
+    for table in (read_runs(place / "out"), store.finish(), read_runs(place / "out")):
+        assert [repr(cell) for cell in table[METRICS[0]]] == [repr(math.nan if v is None else v) for v in values]
+        assert table["plant.parameters.pole"].tolist() == [
+            name for name in ("1", "NA", 'a,"b"', "two words") for _ in "12"
+        ]
+        assert table["reference.pitch_deg"].tolist() == [1, 2] * 4
+        assert [None if pd.isna(cell) else cell for cell in table["holds"]] == [
+            (True, False, None)[k % 3] for k in range(8)
+        ]
+        assert table["error"].str.startswith('a "fault", in two ').all()
+
+
+def test_parquet_is_written_where_it_is_asked_for(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vary = {"plant.parameters.pole": [0.8, 0.9]}
+    study(place / "loop.toml", vary=vary, workers=0, output=place / "out")
+    assert not (place / "out" / "runs.parquet").exists()
+    runs = study(place / "loop.toml", vary=vary, workers=0, output=place / "out", force=True, parquet=True)
+    pd.testing.assert_frame_equal(
+        pd.read_parquet(place / "out" / "runs.parquet"), runs, check_dtype=False, check_exact=True
+    )
+    monkeypatch.setattr(_errors, "find_spec", lambda _: None)
+    with pytest.raises(SettingsError, match=r"pyarrow is not installed.*pip install .*pyarrow"):
+        study(place / "loop.toml", vary=vary, workers=0, output=place / "new", parquet=True)
+    assert not (place / "new").exists()
 
 
 @pytest.mark.slow
@@ -210,7 +247,7 @@ def test_many_small_files_are_joined(place: Path) -> None:
     store = Store(made, place / "out")
     for run in range(250):
         store.add([failed_row(made.points[run], "not run", METRICS)])
-    assert len(list((place / "out" / "runs.parts").glob("*.parquet"))) < 110
+    assert len(list((place / "out" / "runs.parts").glob("*.csv"))) < 110
     assert read_runs(place / "out")["run"].tolist() == list(range(250))
     assert store.finish()["run"].tolist() == list(range(250))
 

@@ -113,7 +113,7 @@ def test_kill_9_and_resume(place: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["runs"] == 40
-    after = pd.read_parquet(place / "out" / "runs.parquet")
+    after = pd.read_csv(place / "out" / "runs.csv")
     assert after["run"].tolist() == list(range(40))
     kept = after[after["run"].isin(before["run"])]
     assert kept["seconds"].tolist() == before["seconds"].tolist()  # those were not run again

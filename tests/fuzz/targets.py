@@ -15,8 +15,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
+import pandas as pd
 
 from softneck.core import FileFormatError, load, read_certificate, write_certificate
 from softneck.core._certificate import certificate_contents
@@ -226,13 +225,13 @@ def runs(path: Path) -> None:
     made = {"run": [0, 1, 2], "sample": [0, 1, 2], "seed": [5, 6, 7], "plant.payload": [0.0, 0.1, 0.2],
             "rise_s": [0.4, None, 0.5], "holds": [True, None, False], "error": ["", "a", ""],
             "seconds": [0.1] * 3}  # fmt: skip
-    pq.write_table(pa.table(made), path)
+    pd.DataFrame(made).to_csv(path, index=False)
 
 
 def runs_beside(path: Path) -> Any:
     """A study's runs lie beside its description."""
     (path.parent / "study.json").write_text('{"study": {"loop": {}, "runs": 3}}', encoding="utf-8")
-    path.replace(path.with_name("runs.parquet"))
+    path.replace(path.with_name("runs.csv"))
     return read_runs(path.parent)
 
 
@@ -284,7 +283,7 @@ TARGETS: dict[str, Target] = {
     "robot": Target(".toml", Robot.read, [text(preset_text(name)) for name in ("arm", "trunk4")]),
     "drives": Target(".toml", load_drives, [copy("examples", "drives", "drives.toml")]),
     "eds": Target(".eds", eds, [copy("softneck", "drives", "bus", "eds", "ipos2015.eds"), text(SMALL_EDS)]),
-    "runs": Target(".parquet", runs_beside, [runs]),
+    "runs": Target(".csv", runs_beside, [runs]),
     "layout": Target(
         ".toml",
         read_layout,

@@ -205,12 +205,12 @@ def _loops() -> Iterator[Step]:
         command += ("--certificate", certificate)
     yield Step(stage="loop", command=command, makes=("results/loop.csv", page), reads=("loop.toml", *_FMUS))
     yield Step(stage="study", command=("softneck", "study", "study.toml", "-o", "build/study", "--force"),
-               makes=("build/study/runs.parquet", "build/study/report.html"),
+               makes=("build/study/runs.csv", "build/study/report.html"),
                reads=("study.toml", "loop.toml", *_FMUS), resumes="build/study/study.json")  # fmt: skip
     command = ("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml", "build/test.xml")
     yield Step(stage="test", command=command, makes=("build/test.xml",),
                reads=("test_closed_loop.py", "loop.toml", *_FMUS))  # fmt: skip
     command = ("softneck", "report", ".", "-o", "build/report.html", "--force")
     yield Step(stage="report", command=command, makes=("build/report.html",),
-               reads=(AUTO, BEST, "certificates/best.certificate.json", "results/loop.csv", "build/study/runs.parquet",
+               reads=(AUTO, BEST, "certificates/best.certificate.json", "results/loop.csv", "build/study/runs.csv",
                       "build/test.xml"))  # fmt: skip

@@ -41,6 +41,7 @@ def study(
     output: str | Path | None = None,
     resume: bool = False,
     force: bool = False,
+    parquet: bool = False,
     report: Progress | None = None,
 ) -> pd.DataFrame:
     """Run a loop many times and return a row for each run: what varied, metrics, whether limits hold, error.
@@ -57,9 +58,10 @@ def study(
         objectives: metrics to be small.
         workers: local processes, as many as cores if not given; 0 for this process.
         dask: address of a Dask scheduler instead.
-        output: folder that keeps the runs as they end; nothing is kept without one.
+        output: folder that keeps the runs as they end, in `runs.csv`; nothing is kept without one.
         resume: go on with the study that `output` holds.
         force: replace the study that `output` holds.
+        parquet: whether `output` gets them as `runs.parquet` besides; needs pyarrow.
         report: called with the part done and a word; a bar in a terminal if not given.
 
     Raises:
@@ -81,7 +83,7 @@ def study(
         [5.0, 10.0]
     """
     made = loop if isinstance(loop, Study) else make_study(
-        loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives
+        loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives, parquet=parquet
     )  # fmt: skip
     if isinstance(loop, Study) and (vary, runs, objectives) != (None, None, None):
         raise SettingsError("a Study has its own vary, runs and objectives; make another one with `make_study`.")

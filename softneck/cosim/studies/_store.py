@@ -1,33 +1,36 @@
-"""The runs of a study on disk: small Parquet files as runs end, one table when all have."""
+"""The runs of a study on disk: small files as runs end, one table when all have."""
 
 from __future__ import annotations
 
 import json
 import shutil
 import uuid
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from softneck import __version__
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
-from softneck.core._budget import MOST_JSON, require_numbers, settings_text
+from softneck.core._budget import MOST_JSON, require_table, settings_text
+from softneck.core._errors import require_package
 
 from ._study import Study
 from ._vary import Vary
 
 if TYPE_CHECKING:
     import pandas as pd
-    import pyarrow as pa
 
 
-RUNS, DESCRIPTION, _PARTS = "runs.parquet", "study.json", "runs.parts"
+RUNS, PARQUET, DESCRIPTION, _PARTS = "runs.csv", "runs.parquet", "study.json", "runs.parts"
 # Small files are joined whenever there are so many of them: a folder stays readable, a merge stays rare.
 _MERGE_AT = 100
+# [characters] What a run's error may fill of its line.
+_LONGEST = 2000
 
 
 class Store:
-    """The folder of a study: `study.json` says what it is, Parquet files hold the runs that ended.
+    """The folder of a study: `study.json` says what it is, tables (`.csv`) hold the runs that ended.
 
     A run counts from the moment its file has its final name; a file that was being written does not count.
 
@@ -43,8 +46,9 @@ class Store:
             OutputFileError: the folder holds a study and neither `resume` nor `force` is given.
             SettingsError: `resume` in a folder of another study, or of none.
         """
-        self.folder, self._schema = folder, schema(study.vary, study.metrics)
-        self._parts = folder / _PARTS
+        if study.parquet:
+            require_package("pyarrow")
+        self.folder, self._study, self._parts = folder, study, folder / _PARTS
         if (folder / DESCRIPTION).exists() and not (resume or force):
             raise OutputFileError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
         if resume:
@@ -58,52 +62,57 @@ class Store:
             self._parts.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputFileError(f"{self._parts}: cannot be written: {error.strerror}.") from error
-        self.done = set(self._table(["run"]).column("run").to_pylist())
-        self._files = len(list(self._parts.glob("*.parquet")))
+        self.done = set(self.frame()["run"].tolist())
+        self._files = len(list(self._parts.glob("*.csv")))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write rows of runs that ended; they are there to stay when this returns."""
-        import pyarrow as pa
-
-        table = pa.Table.from_pylist([dict(row) for row in rows], schema=self._schema)
-        self._write(table, self._parts / f"{rows[0]['run']:08d}-{uuid.uuid4().hex[:8]}.parquet")
+        table = self._frame([{name: _cell(value) for name, value in row.items()} for row in rows])
+        self._write(table, self._parts / f"{rows[0]['run']:08d}-{uuid.uuid4().hex[:8]}.csv")
         self.done.update(row["run"] for row in rows)
         self._files += 1
         if self._files >= _MERGE_AT:
-            self._merge(self._parts / f"merged-{uuid.uuid4().hex[:8]}.parquet")
+            self._merge(self._parts / f"merged-{uuid.uuid4().hex[:8]}.csv")
             self._files = 1
 
     def frame(self) -> pd.DataFrame:
         """Return all runs that ended, in the order of their numbers."""
-        return _frame(self._table())
+        files = _files(self.folder)
+        return read_tables(files, self._study.vary) if files else self._frame([])
 
     def finish(self) -> pd.DataFrame:
         """Write all runs into one file, remove the small ones, return the table."""
         self._merge(self.folder / RUNS)
         shutil.rmtree(self._parts, ignore_errors=True)
-        return self.frame()
+        table = self.frame()
+        if self._study.parquet:
+            with atomic_write(self.folder / PARQUET, force=True) as temporary:
+                table.to_parquet(temporary, index=False)
+        return table
 
-    def _table(self, columns: list[str] | None = None) -> pa.Table:
-        return read_tables(_files(self.folder), self._schema, columns)
+    def _frame(self, rows: list[dict[str, Any]]) -> pd.DataFrame:
+        import pandas as pd
+
+        names = ["run", "sample", "seed", *self._study.vary, *self._study.metrics, "holds", "error", "seconds"]
+        return pd.DataFrame(rows, columns=names).astype(column_types(names, self._study.vary))
 
     def _merge(self, target: Path) -> None:
-        files = list(self._parts.glob("*.parquet"))
+        files = list(self._parts.glob("*.csv"))
         whole = target.parent == self.folder
-        table = self._table() if whole else read_tables(files, self._schema)
-        self._write(table, target)
+        self._write(self.frame() if whole else read_tables(files, self._study.vary), target)
         # Killed here, the runs are there twice; `read_tables` takes each once.
         for file in files:
             file.unlink(missing_ok=True)
 
-    def _write(self, table: pa.Table, path: Path) -> None:
-        import pyarrow.parquet as pq
-
+    def _write(self, table: pd.DataFrame, path: Path) -> None:
+        # The shortest digits that read back the same.
         with atomic_write(path, force=True) as temporary:
-            pq.write_table(table, temporary)
+            table.to_csv(temporary, index=False, encoding="utf-8", lineterminator="\n")
 
     def _clear(self) -> None:
         shutil.rmtree(self._parts, ignore_errors=True)
-        (self.folder / RUNS).unlink(missing_ok=True)
+        for name in (RUNS, PARQUET):
+            (self.folder / name).unlink(missing_ok=True)
 
     def _check_same(self, study: Study) -> None:
         path = self.folder / DESCRIPTION
@@ -118,16 +127,6 @@ class Store:
             f"{self.folder}: holds another study (other {', '.join(differs) or 'content'}); "
             "give the study that began it, or another folder. Nothing was changed."
         )
-
-
-def schema(vary: Mapping[str, Vary], metrics: Sequence[str]) -> pa.Schema:
-    """Return the columns of a study's runs with their types."""
-    import pyarrow as pa
-
-    fields = [("run", pa.int64()), ("sample", pa.int64()), ("seed", pa.int64())]
-    fields += [(key, _type_of(item)) for key, item in vary.items()]
-    fields += [(metric, pa.float64()) for metric in metrics]
-    return pa.schema([*fields, ("holds", pa.bool_()), ("error", pa.string()), ("seconds", pa.float64())])
 
 
 def read_description(folder: Path) -> dict[str, Any]:
@@ -149,74 +148,80 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
         FileFormatError: the folder holds no study.
     """
     import pandas as pd
-    import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    read_description(Path(folder))
+    said = read_description(Path(folder))["study"]
+    varied = said.get("vary") if isinstance(said, dict) else None
+    kinds = {}
+    for key, item in varied.items() if isinstance(varied, dict) else ():
+        labels = item.get("labels") if isinstance(item, dict) else None
+        kinds[key] = Vary(item.get("kind", ""), labels=tuple(labels)) if isinstance(labels, list) else Vary("")
     files = _files(Path(folder))
-    if not files:
-        return pd.DataFrame({"run": pd.Series(dtype="int64")})
+    return read_tables(files, kinds) if files else pd.DataFrame({"run": pd.Series(dtype="int64")})
+
+
+def read_tables(files: Sequence[Path], vary: Mapping[str, Vary]) -> pd.DataFrame:
+    """Return the rows of all files, each run once, in the order of their numbers."""
+    import pandas as pd
+
+    parts = [_read(path, vary) for path in files]
+    for path, part in zip(files, parts, strict=True):
+        if not part.columns.equals(parts[0].columns):
+            raise FileFormatError(f"{path}: has other columns than {files[0]}.")
+    table = pd.concat(parts, ignore_index=True).drop_duplicates("run")
+    return table.sort_values("run", kind="stable", ignore_index=True)
+
+
+def _read(path: Path, vary: Mapping[str, Vary]) -> pd.DataFrame:
+    import pandas as pd
+
+    require_table(path)
     try:
-        columns = pq.read_schema(files[0])
-    except (pa.ArrowException, ValueError, OSError) as error:
-        raise FileFormatError(f"{files[0]}: cannot be read ({_first_line(error)}).") from error
-    if "run" not in columns.names or not pa.types.is_integer(columns.field("run").type):
-        raise FileFormatError(f"{files[0]}: does not hold the runs of a study.")
-    return _frame(read_tables(files, columns))
+        names = [str(name) for name in pd.read_csv(path, nrows=0).columns]
+        for name in ("run", "holds", "error"):
+            if name not in names:
+                raise ValueError(f"no column `{name}`")
+        types: Any = column_types(names, vary)
+        with warnings.catch_warnings():
+            # pandas only warns of rows that are longer than the header.
+            warnings.simplefilter("error", pd.errors.ParserWarning)
+            return pd.read_csv(
+                path, dtype=types, index_col=False, keep_default_na=False,
+                na_values={name: [""] for name, kind in types.items() if kind in ("float64", "boolean")},
+            )  # fmt: skip
+    except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
+        said = (str(error).splitlines() or [type(error).__name__])[0][:120]
+        raise FileFormatError(f"{path}: holds runs that cannot be read ({said}).") from error
 
 
-def read_tables(files: Sequence[Path], columns: pa.Schema, chosen: list[str] | None = None) -> pa.Table:
-    """Return the rows of all files, each run once, by its number."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    try:
-        empty, parts = columns.empty_table().select(chosen or columns.names), []
-        for path in files:
-            with pq.ParquetFile(path) as file:
-                require_numbers(path, file.metadata.num_rows, file.metadata.num_columns)
-                read = file.read(columns=chosen)
-                parts.append(read.select(chosen) if chosen else read)  # in the file's order until here
-        table = pa.concat_tables([empty, *parts])
-        table.validate(full=True)
-        if table.column("run").null_count:
-            raise ValueError("a run without a number")
-    except (pa.ArrowException, KeyError, ValueError, OSError, ArithmeticError, MemoryError) as error:
-        said = _first_line(error)
-        raise FileFormatError(f"{files[0].parent}: holds runs that cannot be read ({said}).") from error
-    first = {}
-    for place, run in enumerate(table.column("run").to_pylist()):
-        first.setdefault(run, place)
-    return table.take(pa.array([first[run] for run in sorted(first)], type=pa.int64()))
+def column_types(names: Iterable[str], vary: Mapping[str, Vary]) -> dict[str, Any]:
+    """Return the type of each column of a study's runs: of what is neither named here nor varies, numbers."""
+    known = {"run": "int64", "sample": "int64", "seed": "int64", "holds": "boolean", "error": "str"}
+    known |= {key: _type_of(item) for key, item in vary.items()}
+    return {name: known.get(name, "float64") for name in names}
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+def _type_of(vary: Vary) -> str:
+    if vary.kind == "seed":
+        return "int64"
+    labels = vary.labels
+    if labels and not all(isinstance(label, int | float) and not isinstance(label, bool) for label in labels):
+        return "str"
+    return "int64" if labels and all(isinstance(label, int) for label in labels) else "float64"
 
 
 def _files(folder: Path) -> list[Path]:
     whole = folder / RUNS
     # Temporary names begin with a dot; they are files that nobody finished.
-    small = [path for path in (folder / _PARTS).glob("*.parquet") if not path.name.startswith(".")]
+    small = [path for path in (folder / _PARTS).glob("*.csv") if not path.name.startswith(".")]
     return ([whole] if whole.is_file() else []) + sorted(small)
 
 
-def _frame(table: pa.Table) -> pd.DataFrame:
-    frame = table.to_pandas()
-    frame["holds"] = frame["holds"].astype("boolean")
-    frame["error"] = frame["error"].fillna("")
-    return frame
-
-
-def _type_of(vary: Vary) -> pa.DataType:
-    import pyarrow as pa
-
-    if vary.kind == "seed":
-        return pa.int64()
-    labels = vary.labels
-    if labels and not all(isinstance(label, int | float) and not isinstance(label, bool) for label in labels):
-        return pa.string()
-    return pa.int64() if labels and all(isinstance(label, int) for label in labels) else pa.float64()
+def _cell(value: Any) -> Any:
+    """Return a text as one line that a reader of tables takes."""
+    if not isinstance(value, str):
+        return value
+    line = " ".join(value.split()).replace("\0", "?")[:_LONGEST]
+    return line.encode("utf-8", "backslashreplace").decode()
 
 
 def _description(study: Study) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from ..loops._loop_table import check_key, loop_table, set_sources, settable, wi
 from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
-_TOP = ("loop", "runs", "seed", "sampling", "objectives", "vary")
+_TOP = ("loop", "runs", "seed", "sampling", "objectives", "parquet", "vary")
 # Runs in the picture of a study.
 _MOST_SHOWN = 200
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
@@ -45,6 +45,7 @@ class Study(Shown):
         objectives: metrics to be small; the first one ranks, all of them span the Pareto front.
         folder: where relative paths of the loop start.
         name: for titles.
+        parquet: whether the folder gets the runs as Parquet besides.
     """
 
     loop: Mapping[str, Any]
@@ -55,6 +56,7 @@ class Study(Shown):
     objectives: tuple[str, ...] = ("pitch.rms_error_deg", "motors.total_variation_rad")
     folder: Path = field(default_factory=Path.cwd)
     name: str = "study"
+    parquet: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
@@ -64,6 +66,8 @@ class Study(Shown):
                 raise SettingsError(
                     f"`{metric}` is not a metric that can be an objective; use some of {', '.join(self.metrics)}."
                 )
+        if not isinstance(self.parquet, bool):
+            raise SettingsError(f"`parquet` must be true or false; got {self.parquet!r}.")
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
 
@@ -154,6 +158,7 @@ def make_study(
     objectives: Sequence[str] | None = None,
     name: str = "study",
     folder: str | Path | None = None,
+    parquet: bool = False,
 ) -> Study:
     """Return a study of `loop`: a loop file, its table, or a loop; `vary` is as [vary] in a study file.
 
@@ -167,7 +172,7 @@ def make_study(
     chosen = {key: make_vary(key, given) for key, given in flattened(vary)}
     start = Path(folder) if folder else start
     return Study(
-        loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=start, name=name,
+        loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=start, name=name, parquet=parquet,
         objectives=tuple(objectives) if objectives else _objectives(table, _robot_of(table, chosen, start)),
     )  # fmt: skip
 
@@ -197,7 +202,7 @@ def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
         raise SettingsError("`loop` is missing: name the loop file.")
     if not isinstance(table.get("vary", {}), dict):
         raise SettingsError("`vary` must be a table: [vary].")
-    rest = {key: table[key] for key in ("runs", "seed", "sampling", "objectives") if key in table}
+    rest = {key: table[key] for key in ("runs", "seed", "sampling", "objectives", "parquet") if key in table}
     loop = table["loop"]
     if isinstance(loop, str):
         loop = source.parent / loop
