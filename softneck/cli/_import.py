@@ -131,8 +131,6 @@ def command(
 
     asked = guess or layout_file is not None or robot_out is not None
     ours = log.suffix.lower() == ".mcap" and (not asked or is_run_log(log))
-    if log.suffix.lower() == ".blf":
-        raise SettingsError(f"{log}: holds CAN frames only; import the `.mcap` log of the same run.")
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     known = None if clock is None else sample_time_of(clock, "--sample-time")
     if known is not None and not guess:

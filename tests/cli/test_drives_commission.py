@@ -100,7 +100,7 @@ def test_two_devices_with_one_number_write_the_page_only(
     [
         (["--travel", "100"], "`--travel` must be between 1 and 30 [rad]"),
         (["--pace", "0"], "`--pace` must be between"),
-        (["--log", "x.mcap"], "commission has no cycles to replay; its --log ends in .blf or .log."),
+        (["--log", "x.blf"], "x.blf: a log ends in .mcap."),
         (["--motor", "5"], "`--motor` must be a whole number between 1 and 3"),
         (["--override", "all"], "--override takes one of"),
     ],

@@ -103,15 +103,6 @@ def two_corners(path: Path) -> None:
         archive.writestr("xl/worksheets/a.xml", f'<worksheet xmlns="{main}"><sheetData>{cells}</sheetData></worksheet>')
 
 
-def blf(path: Path) -> None:
-    """A container of 1 GB of zeros, packed to a thousandth of it."""
-    pack = zlib.compressobj(9)
-    packed = b"".join(pack.compress(bytes(2**24)) for _ in range(64)) + pack.flush()
-    head = b"LOGG" + struct.pack("<I", 144) + bytes(136)
-    whole = struct.pack("<HxxxxxxLxxxx", 2, 2**30) + packed
-    path.write_bytes(head + b"LOBJ" + struct.pack("<HHII", 16, 1, 16 + len(whole), 10) + whole)
-
-
 EDS = "[1018]\nParameterName=a\nObjectType=8\nCompactSubObj=1\nDataType=7\nAccessType=ro\n"
 DRIVES = ["drives", "check", "--simulated", "--drives", "drives.toml"]
 LOOP = '[plant]\nneck = "paper"\n[controller]\nfile = "pi.npz"\n[reference]\nkind = "step"\npitch_deg = 10\n'
@@ -152,7 +143,6 @@ CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "brackets.toml": (text("a = " + "[" * 100_000), ["drives", "check", "--drives", "brackets.toml", "--simulated"]),
     "needs.toml": (holes(b"version = 1\n"), ["verify", "pi.npz", "pi.npz", "--requirements", "needs.toml"]),
     "a.certificate.json": (holes(b"{\n"), ["info", "a.certificate.json"]),
-    "bomb.blf": (blf, ["info", "bomb.blf"]),
     "line.log": (text("(1.000000) can0 181#00\n" + "0" * 300_000_000), ["info", "line.log"]),
     "names.eds": (text(EDS + "[1018Name]\nNrOfEntries=2000000000\n"), DRIVES),
     "holes.eds": (holes(EDS.encode()), DRIVES),

@@ -257,7 +257,7 @@ def test_an_experiment_is_recorded_logged_and_replayed(tmp_path: Path, count: in
     played = Experiment(
         signal=str(tmp_path / "signal.csv"), limits=drive_limits(file), ramp=0.2, robot=moved, ranges=file.ranges
     )
-    with RunLogger([tmp_path / "run.mcap"], wait=True) as log:
+    with RunLogger(tmp_path / "run.mcap", wait=True) as log:
         session = Session(file=file, link=link_to(file), log=log, facts={"record": played.facts()})
         result = record_signal([one for one, _ in played.prepared()], session)
     assert result.completed
@@ -391,7 +391,7 @@ def test_a_controller_runs_on_four_drives_by_the_names_of_its_ports(tmp_path: Pa
         # Static: what brings the outputs to their references, and half of what is missing.
         return weights.T @ ((u[:2] + 0.5 * (u[:2] - u[2:])) / (2.0 * file.watch.gain))
 
-    with RunLogger([tmp_path / "run.mcap"], wait=True) as log:
+    with RunLogger(tmp_path / "run.mcap", wait=True) as log:
         result = run_simulated(Deployment(loop_of(moved, act), None), file, log=log)
     assert result.completed
     recording = result.recording()

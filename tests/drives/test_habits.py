@@ -329,7 +329,7 @@ def test_a_late_mode_that_is_not_taken_stops_the_run_before_anything_moves(what:
 @pytest.mark.slow
 def test_a_run_with_late_modes_replays(tmp_path: Path) -> None:
     path, file = tmp_path / "j.mcap", replace(default_drives(), ramps=FAST)
-    with RunLogger([path], wait=True) as log:
+    with RunLogger(path, wait=True) as log:
         jog(2, Session(file=file, link=linked(mode_when="enabled"), log=log), amplitude=0.4)
     logged = read_run_log(path)
     assert logged.settings().bus.late_modes == (1, 2, 3)

@@ -15,7 +15,6 @@ from pathlib import Path
 import pytest
 
 from softneck.drives import read_run_log, replay
-from softneck.drives.logs._frame_log import FrameLog
 from softneck.drives.master._cia402 import state_of
 from softneck.drives.master._events import RULES, Reaction
 from softneck.signals import read_recording
@@ -73,7 +72,7 @@ def played(
     drives.write_text(head + "[ramp]\nspeed_rad_s = 3.0\nsettle_s = 0.1\ntolerance_rad = 0.2" + rest, encoding="utf-8")
     served = str(Path(__file__).with_name("served.py"))
     words = [sys.executable, served, str(report), "drives", *command, "--drives", str(drives)]
-    words += ["--log", "l.blf" if command[0] == "zero" else "l.mcap"]
+    words += ["--log", "l.mcap"]
     words += ["--simulated", "--pace", pace] if simulated else ["--bus", "virtual:served", "--arm"]
     ours, theirs = pty.openpty()
     before = termios.tcgetattr(theirs)
@@ -251,4 +250,4 @@ def test_every_end_of_zero_switches_off(tmp_path: Path, key: bytes | signal.Sign
     assert ended.code == code, ended.said
     assert all(state in (0x40, 0x08) for state in ended.states)
     assert ended.restored
-    assert len(list(FrameLog(tmp_path / "l.blf"))) > 100
+    assert len(read_run_log(tmp_path / "l.mcap").frames()) > 100

@@ -6,7 +6,6 @@ import contextlib
 import io
 import os
 import resource
-import struct
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,7 +26,6 @@ from softneck.drives.bus._objects import require_eds
 from softneck.drives.bus._read import load_drives
 from softneck.drives.bus._sdo import load_eds
 from softneck.drives.logs._cycle import Cycle
-from softneck.drives.logs._frame_log import BlfSink, CandumpSink, FrameLog
 from softneck.drives.logs._log_file import read_run_log
 from softneck.drives.logs._run_log import _Entry, _McapSink
 from softneck.drives.master import Frame
@@ -101,18 +99,6 @@ def copy(*parts: str) -> Callable[[Path], Any]:
 
 def text(content: str) -> Callable[[Path], Any]:
     return lambda path: path.write_text(content, encoding="utf-8")
-
-
-def frames(kind: type[CandumpSink | BlfSink]) -> Callable[[Path], None]:
-    def write(path: Path) -> None:
-        with path.open("wb") as stream:
-            sink = kind(stream)
-            for k in range(20):
-                sink.add(0.01 * k, k % 2 == 0, Frame(0x181 + k % 3, struct.pack("<Hi", 0x1637, k)))
-            sink.add(0.3, False, Frame(0, b"", error=True))
-            sink.close()
-
-    return write
 
 
 def run_log(path: Path) -> None:
@@ -269,8 +255,6 @@ TARGETS: dict[str, Target] = {
     ),
     "mcap": Target(".mcap", sniff, [lambda path: log_writers.write_mcap(path, columns())]),
     "run_log": Target(".mcap", read_run_log, [run_log]),
-    "candump": Target(".log", lambda path: list(FrameLog(path)), [frames(CandumpSink)]),
-    "blf": Target(".blf", lambda path: list(FrameLog(path)), [frames(BlfSink)]),
     "fmu": Target(".fmu", lambda path: FmuPart(path, role="plant"), [fmu], zipped=True),
     "our_fmu": Target(".fmu", block_of, [our_fmu], zipped=True),
     "ssp": Target(".ssp", load_ssp, [ssp], zipped=True),

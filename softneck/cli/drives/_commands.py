@@ -15,10 +15,11 @@ from ..shared._groups import NearGroup
 from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option, output_option, target, trust_option
 from ._commission import commission_command
-from ._log import acting_files, log_options, opened_log, require_logs
+from ._log import acting_files, drives_of, log_options, opened_log, require_log
 from ._move import jog_command, record_command
 from ._replay import replay_command
 from ._target import (
+    SAMPLE_TIME,
     Target,
     checked_names,
     drives_options,
@@ -139,28 +140,28 @@ def _show(report: Report, *, as_json: bool) -> None:
 def zero_command(
     drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
     overrides: tuple[str, ...],
-    neck: str | None, logs: tuple[Path, ...], no_log: bool, force: bool, as_json: bool,
+    neck: str | None, log_file: Path | None, no_log: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer.
-
-    Its log holds frames: .blf or .log.
-    """
+    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
     from softneck.drives import preflight, zero
+    from softneck.drives.logs._run_log import run_facts
     from softneck.drives.running._keyboard import Keyboard
 
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
-    if any(path.suffix.lower() == ".mcap" for path in logs):
-        raise SettingsError("zero has no cycles to replay; its --log ends in .blf or .log.")
-    require_logs(logs, no_log=no_log, force=force)
+    require_log(log_file, no_log=no_log, force=force)
     with (
         open_link(chosen, moves=True) as link,
-        opened_log(chosen, "zero", logs, no_log=no_log, force=force, ending=".blf") as log,
+        opened_log(chosen, "zero", log_file, no_log=no_log, force=force) as log,
     ):
         link.tap = None if log is None else log.frame
         look = look_of(link, chosen.file)
         report = preflight(link, chosen.file, override=checked_names(overrides))
         report.require()
+        if log is not None:
+            # It has no cycles: what was set up, and the frames.
+            settings = chosen.file.master_settings(SAMPLE_TIME, guarding=report.guarding)
+            log.describe(run_facts(settings, drives_of(chosen.path), simulated=chosen.simulated))
         with Keyboard() as keyboard:
             try:
                 zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
@@ -201,7 +202,7 @@ def run_command(
     controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
     simulated: bool, robot: str | None, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None,
     realtime: bool,
-    logs: tuple[Path, ...], no_log: bool, output: Path | None, trust: bool, force: bool, as_json: bool,
+    log_file: Path | None, no_log: bool, output: Path | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
@@ -223,7 +224,7 @@ def run_command(
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
-    require_logs(logs, no_log=no_log, force=force)
+    require_log(log_file, no_log=no_log, force=force)
     names = checked_names(overrides)
     require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file)
@@ -247,7 +248,7 @@ def run_command(
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
     with contextlib.ExitStack() as stack:
         link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
-        log = stack.enter_context(opened_log(chosen, "run", logs, no_log=no_log, force=force))
+        log = stack.enter_context(opened_log(chosen, "run", log_file, no_log=no_log, force=force))
         with (
             live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
             # Two things that draw in place would draw over each other; the view tells the time as well.

@@ -12,7 +12,7 @@ from softneck.core import SettingsError, require_between
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option
-from ._log import log_options, opened_log, require_logs
+from ._log import drives_of, log_options, opened_log, require_log
 from ._target import (
     checked_names,
     drives_options,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 @json_option
 def commission_command(
     drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, motors: tuple[int, ...],
-    travel: float, pace: float | None, overrides: tuple[str, ...], neck: str | None, logs: tuple[Path, ...],
+    travel: float, pace: float | None, overrides: tuple[str, ...], neck: str | None, log_file: Path | None,
     no_log: bool, output: Path | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Find out what drives, tendons and sensor really are, before anything else moves.
@@ -65,22 +65,22 @@ def commission_command(
     from softneck.drives.running._keyboard import Keyboard
 
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)
-    _require(simulated, pace, logs)
-    require_logs(logs, no_log=no_log, force=force)
+    _require(simulated, pace)
+    require_log(log_file, no_log=no_log, force=force)
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     guards = Guards.of(chosen.file.watch.gain, travel=travel)
     require_folder(folder, force=replace)
     with (
         open_link(chosen, moves=True) as link,
-        opened_log(chosen, "commission", logs, no_log=no_log, force=force, ending=".blf") as log,
+        opened_log(chosen, "commission", log_file, no_log=no_log, force=force) as log,
     ):
         link.tap = None if log is None else log.frame
         sensor = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
         with progress("commission", quiet=as_json) as tell, Keyboard() as keyboard:
             session = Session(
                 file=chosen.file, link=link, sensor=sensor, override=checked_names(overrides), pace=pace,
-                operator=keyboard,
+                operator=keyboard, log=log, files=drives_of(chosen.path),
             )  # fmt: skip
             result = commission(
                 session, guards=guards, neck=virtual, motors=motors, report=tell, where=bus or "the bus"
@@ -91,13 +91,11 @@ def commission_command(
         result.require()
 
 
-def _require(simulated: bool, pace: float | None, logs: tuple[Path, ...]) -> None:
+def _require(simulated: bool, pace: float | None) -> None:
     if pace is not None:
         require_between("--pace", pace, 0.01, 1000.0)
         if not simulated:
             raise SettingsError("--pace is for --simulated; a bus runs in real time.")
-    if any(path.suffix.lower() == ".mcap" for path in logs):
-        raise SettingsError("commission has no cycles to replay; its --log ends in .blf or .log.")
 
 
 def _print(result: Commissioned, written: dict[str, str], *, as_json: bool) -> None:

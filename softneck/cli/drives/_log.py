@@ -1,11 +1,11 @@
-"""The logs of commands that move drives: those asked for, and on drives that may be real one in any case."""
+"""The log of a command that moves drives: the one asked for, and on drives that may be real one in any case."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,10 +26,9 @@ def log_options(function: Callable) -> Callable:
     """Add the options that say what is logged."""
     options = (
         click.option(
-            "--log", "logs", multiple=True, type=click.Path(path_type=Path), metavar="FILE",
-            help="Log of what happened: .mcap holds all (`softneck drives replay`, `import`, Foxglove), .blf and .log "
-            "(candump) the frames. May be given several times. [default: on a bus that may move something a file under "
-            "~/.local/state/softneck/log, or in $LOGS_DIRECTORY]",
+            "--log", "log_file", type=click.Path(path_type=Path), metavar="FILE.mcap",
+            help="Log of all that happened (`softneck drives replay`, `import`, Foxglove). [default: on a bus that may "
+            "move something a file under ~/.local/state/softneck/log, or in $LOGS_DIRECTORY]",
         ),
         click.option("--no-log", is_flag=True, help="Write no log, not even on such a bus."),
     )  # fmt: skip
@@ -38,28 +37,29 @@ def log_options(function: Callable) -> Callable:
     return function
 
 
-def require_logs(logs: Sequence[Path], *, no_log: bool, force: bool) -> None:
+def require_log(log_file: Path | None, *, no_log: bool, force: bool) -> None:
     """Raise where the options cannot be followed, before anybody is asked to arm anything."""
-    from softneck.drives.logs._run_log import require_log_paths
+    from softneck.drives.logs._run_log import require_log_path
 
-    if logs and no_log:
+    if log_file is None:
+        return
+    if no_log:
         raise SettingsError("--log and --no-log contradict each other; give one of them.")
-    require_log_paths(logs, force=force)
+    require_log_path(log_file, force=force)
 
 
 @contextlib.contextmanager
 def opened_log(
-    chosen: Target, command: str, logs: Sequence[Path], *, no_log: bool, force: bool, ending: str = ".mcap"
+    chosen: Target, command: str, log_file: Path | None, *, no_log: bool, force: bool
 ) -> Iterator[RunLogger | None]:
     """Yield a logger, None where nothing is logged; what it wrote has its names at the end.
 
     Args:
         chosen: the drives; where they may be real and no log is asked for, one is written to `log_folder`.
         command: what runs, for its name.
-        logs: those asked for.
+        log_file: the one asked for.
         no_log: write none that was not asked for.
-        force: replace existing files.
-        ending: of the one that was not asked for.
+        force: replace an existing file.
 
     Raises:
         OutputFileError: it cannot be written (before anything moves), or is not complete.
@@ -67,19 +67,19 @@ def opened_log(
     from softneck.drives.bus._link import HARMLESS
     from softneck.drives.logs._run_log import RunLogger
 
-    own = not logs and not no_log and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
-    paths = [_new_path(command, ending)] if own else list(logs)
-    if not paths:
+    own = log_file is None and not no_log and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
+    path = _new_path(command) if own else log_file
+    if path is None:
         yield None
         return
     # In virtual time the clock begins at 0, and the same run gives the same log.
     epoch = 0.0 if chosen.simulated else time.time() - time.monotonic()
     try:
-        log = RunLogger(paths, force=force, wait=chosen.simulated, epoch=epoch)
+        log = RunLogger(path, force=force, wait=chosen.simulated, epoch=epoch)
     except OutputFileError as error:
         raise OutputFileError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
     if own:
-        note(f"log: {paths[0]}")
+        note(f"log: {path}")
     try:
         yield log
     except BaseException:
@@ -96,10 +96,9 @@ def opened_log(
 
 def _drop_empty(log: RunLogger, *, own: bool) -> None:
     """Remove a log that nobody asked for of a run that did not begin."""
-    for path in log.paths:
-        if own and path.suffix == ".mcap" and not log.described and path.is_file():
-            path.unlink()
-            note(f"log: {path} is removed: nothing moved")
+    if own and not log.described and log.path.is_file():
+        log.path.unlink()
+        note(f"log: {log.path} is removed: nothing moved")
 
 
 def log_folder() -> Path:
@@ -108,14 +107,16 @@ def log_folder() -> Path:
     return Path(given) if given else platformdirs.user_log_path("softneck", appauthor=False)
 
 
-def _new_path(command: str, ending: str) -> Path:
+def _new_path(command: str) -> Path:
     """Return a path that is free; names sort by time."""
+    from softneck.drives.logs._run_log import partial
+
     stem = f"{command}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
     folder, number = log_folder(), 1
-    path = folder / f"{stem}{ending}"
-    while path.exists() or path.with_name(f"{path.stem}.part{ending}").exists():
+    path = folder / f"{stem}.mcap"
+    while path.exists() or partial(path).exists():
         number += 1
-        path = folder / f"{stem}_{number}{ending}"
+        path = folder / f"{stem}_{number}.mcap"
     return path
 
 

@@ -15,7 +15,7 @@ from softneck.signals import signal_names, write_recording
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option, output_option
-from ._log import drives_of, log_options, opened_log, require_logs
+from ._log import drives_of, log_options, opened_log, require_log
 from ._target import (
     Target,
     checked_names,
@@ -76,7 +76,7 @@ def _checked(chosen: Target, pace: float | None) -> None:
 @json_option
 def jog_command(
     motor: int, amplitude: float, drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None,
-    arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool,
+    arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None, log_file: Path | None, no_log: bool,
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Pull the tendon of motor N a little, let it out as much, and look where the neck goes.
@@ -88,7 +88,7 @@ def jog_command(
     from softneck.drives.running._keyboard import Keyboard
     from softneck.drives.running._virtual import physics_of
 
-    require_logs(logs, no_log=no_log, force=force)
+    require_log(log_file, no_log=no_log, force=force)
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
     _checked(chosen, pace)
@@ -99,7 +99,7 @@ def jog_command(
     angles = physics and (physics.tendon_angle_1, physics.tendon_angle_2, physics.tendon_angle_3)
     with (
         open_link(chosen, moves=True, homed=True) as link,
-        opened_log(chosen, "jog", logs, no_log=no_log, force=force) as log,
+        opened_log(chosen, "jog", log_file, no_log=no_log, force=force) as log,
     ):
         with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
             found = jog(
@@ -183,7 +183,7 @@ def record_command(
     supervision: Path | None, beside: tuple[Path, ...],
     drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
     overrides: tuple[str, ...],
-    neck: str | None, pace: float | None, logs: tuple[Path, ...], no_log: bool, force: bool,
+    neck: str | None, pace: float | None, log_file: Path | None, no_log: bool, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
@@ -202,7 +202,7 @@ def record_command(
         refuse_existing(supervision, force=force)
     elif beside:
         raise SettingsError("--beside needs --supervision: it is what the supervisor compares with that it adds to.")
-    require_logs(logs, no_log=no_log, force=force)
+    require_log(log_file, no_log=no_log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     virtual = load_neck(neck) if neck else None
     chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
@@ -224,7 +224,7 @@ def record_command(
         require_loops(sum(loops))
     with (
         open_link(chosen, moves=True, homed=True, seed=seed) as link,
-        opened_log(chosen, "record", logs, no_log=no_log, force=force) as log,
+        opened_log(chosen, "record", log_file, no_log=no_log, force=force) as log,
     ):
         if isinstance(link, VirtualLink):
             link.neck.set(payload=payload)

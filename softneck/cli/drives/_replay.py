@@ -37,8 +37,6 @@ def replay_command(log: Path, loop_file: Path | None, controller: Path | None, c
     from softneck.drives import read_run_log, replay
     from softneck.drives.logs._log_file import changed_files
 
-    if log.suffix.lower() in (".log", ".blf"):
-        raise SettingsError(f"{log}: holds frames only; replay needs the `.mcap` of the run.")
     run = read_run_log(log)
     notes = changed_files(run)
     pilot = None if core_only else _pilot(run, loop_file, controller)

@@ -20,11 +20,11 @@ from softneck.signals import Recording
 from softneck.signals.importing.formats._mcap import LARGEST_RECORD, require_chunks
 from softneck.signals.recording._channels import NECK
 
-from ..master import MasterSettings
+from ..master import Frame, MasterSettings
 from ..master._fieldbus import BusSettings
 from ..master._settings import ChannelSettings, LimitSettings, RampSettings, SensorSettings, WatchSettings
 from ..supervision._baseline import Baseline
-from ._cycle import Cycle, decode_cycle
+from ._cycle import Cycle, decode_cycle, frame_of
 from ._result import recording_of, signal_units
 from ._rows import experiment_channels, experiment_recording, experiment_table, motion_at
 from ._run_log import LOG_VERSION, METADATA
@@ -52,6 +52,7 @@ class LoggedRun:
         row_cycles: in which step of `cycles` each row was logged.
         events: (time [s], name, text).
         cut: why reading ended early, "" if the log is complete.
+        outside: frames that no cycle holds, of the pre-flight and the end: (time [s], whether we sent it, frame).
     """
 
     path: Path
@@ -61,6 +62,17 @@ class LoggedRun:
     events: tuple[tuple[float, str, str], ...]
     cut: str = ""
     row_cycles: tuple[int, ...] = ()
+    outside: tuple[tuple[float, bool, Frame], ...] = ()
+
+    def frames(self) -> list[tuple[float, bool, Frame]]:
+        """Return all frames on the wire: (time [s], whether we sent it, frame)."""
+        cycles = [
+            (cycle.time, sent, frame)
+            for cycle in self.cycles
+            for sent, frames in ((False, cycle.received), (True, cycle.sent))
+            for frame in frames
+        ]
+        return sorted([*cycles, *self.outside], key=lambda item: item[0])
 
     def settings(self) -> MasterSettings:
         """Return the settings of the run's master.
@@ -148,6 +160,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
     rows: list[Mapping[str, float]] = []
     at: list[int] = []
     events: list[tuple[float, str, str]] = []
+    outside: list[tuple[float, bool, Frame]] = []
     cut = ""
     try:
         require_size(source)
@@ -162,6 +175,9 @@ def read_run_log(path: str | Path) -> LoggedRun:
                     topic = topics.get(record.channel_id)
                     if topic == "/cycle":
                         cycles.append(decode_cycle(_table(record.data)))
+                    elif topic == "/frames":
+                        table = _table(record.data)
+                        outside.append((float(table["time"]), bool(table["sent"]), frame_of(table["frame"])))
                     elif topic == "/signals":
                         rows.append({name: float(value) for name, value in _table(record.data).items()})
                         at.append(len(cycles) - 1)
@@ -178,7 +194,7 @@ def read_run_log(path: str | Path) -> LoggedRun:
         cut = f"ends in the middle ({_word(error)})"
     if facts is None:
         raise FileFormatError(f"{source}: is MCAP, but not a log of `softneck drives`: it has no `{METADATA}`.")
-    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut, tuple(at))
+    return LoggedRun(source, facts, tuple(cycles), tuple(rows), tuple(events), cut, tuple(at), tuple(outside))
 
 
 def _facts(source: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

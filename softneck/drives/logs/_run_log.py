@@ -18,8 +18,7 @@ from softneck.core import OutputFileError, SettingsError, file_hash, refuse_exis
 
 from ..master import Event, Frame, Master, MasterSettings, Tilt
 from ..master._gate import Reading
-from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle
-from ._frame_log import FRAME_LOGS, BlfSink, CandumpSink
+from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle, frame_text
 
 RUN_LOG = ".mcap"
 LOG_VERSION = 1
@@ -43,6 +42,11 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
             "tensions": {"type": "array", "items": {"type": "number"}},
         },
     },
+    # What no cycle holds: frames of the pre-flight, of `zero`, of the end.
+    "softneck.Frame": {
+        "type": "object",
+        "properties": {"time": {"type": "number"}, "sent": {"type": "boolean"}, "frame": {"type": "string"}},
+    },
     "softneck.Signals": {"type": "object", "additionalProperties": {"type": "number"}},
     # A well-known schema: Foxglove shows it in its log panel.
     "foxglove.Log": {
@@ -58,7 +62,8 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
         },
     },
 }
-_TOPICS = {"/cycle": "softneck.Cycle", "/signals": "softneck.Signals", "/events": "foxglove.Log"}
+_TOPICS = {"/cycle": "softneck.Cycle", "/frames": "softneck.Frame", "/signals": "softneck.Signals",
+           "/events": "foxglove.Log"}  # fmt: skip
 
 
 class _Entry(NamedTuple):
@@ -69,28 +74,22 @@ class _Entry(NamedTuple):
     time: float = 0.0
 
 
-def log_endings() -> str:
-    """Return the endings that `RunLogger` takes, as a text."""
-    return ", ".join((RUN_LOG, *FRAME_LOGS))
-
-
 def partial(path: Path) -> Path:
     """Return the name of a log that is not finished."""
     return path.with_name(f"{path.stem}.part{path.suffix}")
 
 
-def require_log_paths(paths: Sequence[Path], *, force: bool = False) -> None:
-    """Raise where `RunLogger` would not write to `paths`.
+def require_log_path(path: Path, *, force: bool = False) -> None:
+    """Raise where `RunLogger` would not write to `path`.
 
     Raises:
         SettingsError: an ending that no log has.
-        OutputFileError: a file exists.
+        OutputFileError: the file exists.
     """
-    for path in paths:
-        if path.suffix.lower() not in (RUN_LOG, *FRAME_LOGS):
-            raise SettingsError(f"{path}: a log ends in {log_endings()}; `.mcap` holds all, the others frames.")
-        for taken in (path, partial(path)):
-            refuse_existing(taken, force=force)
+    if path.suffix.lower() != RUN_LOG:
+        raise SettingsError(f"{path}: a log ends in {RUN_LOG}.")
+    for taken in (path, partial(path)):
+        refuse_existing(taken, force=force)
 
 
 def run_facts(
@@ -109,60 +108,57 @@ def run_facts(
 
 
 class RunLogger:
-    """Writes logs of one run. The loop puts a few references into a queue; a thread makes text of them.
+    """Writes the log of one run. The loop puts a few references into a queue; a thread makes text of them.
 
-    Logs have `.part` before their ending until the run is over; one that a killed process leaves behind can be read.
+    A log has `.part` before its ending until the run is over; one that a killed process leaves behind can be read.
 
     Attributes:
+        path: of the log.
         lost: cycles that were dropped because the disk did not keep up.
         problem: why writing ended, "" if it did not.
         described: whether a run began: before that a log holds nothing to replay.
     """
 
-    def __init__(self, paths: Sequence[Path], *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
-        """Open the files.
+    def __init__(self, path: Path, *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
+        """Open the file.
 
         Args:
-            paths: the ending says what is written.
-            force: replace existing files.
+            path: of the log.
+            force: replace an existing one.
             wait: the loop may wait for the disk, as in virtual time.
             epoch: wall-clock time [s] of t = 0 of the loop's clock; taken once, so that a jump of the wall clock
                 does not matter.
 
         Raises:
-            SettingsError: an ending that no log has, or two alike.
-            OutputFileError: a file exists or cannot be written.
+            SettingsError: an ending that no log has.
+            OutputFileError: the file exists or cannot be written.
         """
-        self.paths = tuple(paths)
-        require_log_paths(self.paths, force=force)
+        self.path = path
+        require_log_path(path, force=force)
         self.lost, self.problem, self.described = 0, "", False
         self._wait, self._epoch = wait, epoch
+        self._older: list[tuple[float, bool, Frame]] = []
         self._frames: list[tuple[float, bool, Frame]] = []
         self._row: Mapping[str, float] | None = None
         self._seen: Event | None = None
         self._queue: queue.Queue[_Entry | Mapping[str, Any] | None] = queue.Queue(_WAITING)
-        self._streams: list[BinaryIO] = []
-        self._sinks: list[Any] = []
-        for path in self.paths:
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                stream = partial(path).open("wb")
-            except OSError as error:
-                self._close_streams()
-                raise OutputFileError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
-            self._streams.append(stream)
-            kind = {RUN_LOG: _McapSink, ".log": CandumpSink, ".blf": BlfSink}[path.suffix.lower()]
-            self._sinks.append(kind(stream))
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream: BinaryIO = partial(path).open("wb")
+        except OSError as error:
+            raise OutputFileError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
+        self._sink = _McapSink(self._stream)
         self._thread = threading.Thread(target=self._write, name="softneck-log", daemon=True)
         self._thread.start()
 
     def describe(self, facts: Mapping[str, Any]) -> None:
         """Say what the run is; before the first cycle."""
         self.described = True
+        self._put(_Entry(self._swap()))
         self._put(dict(facts))
 
     def frame(self, now: float, from_master: bool, frame: Frame) -> None:
-        """Take one frame on the wire; it is written with the cycle."""
+        """Take one frame on the wire; it is written where no cycle holds it."""
         self._frames.append((now, from_master, frame))
         if len(self._frames) >= 256:
             self._put(_Entry(self._swap()))
@@ -179,7 +175,12 @@ class RunLogger:
         ) -> None:
             row, self._row = self._row, None
             cycle = cycle_of(master, pilot, now, received, tilt, sent)
-            self._put(_Entry(self._swap(), cycle, row, self._news(master), now))
+            # A frame that this cycle does not hold may be one that the next one receives.
+            held = {id(frame) for frame in (*received, *sent)}
+            more = [item for item in self._older if id(item[2]) not in held]
+            self._older = [item for item in self._frames if id(item[2]) not in held]
+            self._frames = []
+            self._put(_Entry(more, cycle, row, self._news(master), now))
 
         return watch
 
@@ -202,27 +203,28 @@ class RunLogger:
         self.close()
 
     def close(self) -> None:
-        """Write what is left and give the files their names.
+        """Write what is left and give the file its name.
 
         Raises:
-            OutputFileError: a log is not complete; the line says why.
+            OutputFileError: the log is not complete; the line says why.
         """
-        if not self._thread.is_alive() and not self._streams:
+        if not self._thread.is_alive() and self._stream.closed:
             return
         self._queue.put(_Entry(self._swap()))
         self._queue.put(None)
         self._thread.join()
-        self._close_streams()
+        self._close_stream()
         if self.problem:
-            names = ", ".join(str(partial(path)) for path in self.paths)
-            raise OutputFileError(f"{names}: the log is not complete: {self.problem}. The run went on without it.")
-        for path in self.paths:
-            partial(path).replace(path)
+            raise OutputFileError(
+                f"{partial(self.path)}: the log is not complete: {self.problem}. The run went on without it."
+            )
+        partial(self.path).replace(self.path)
         if self.lost:
-            raise OutputFileError(f"{self.paths[0]}: {self.lost} cycle(s) were dropped: the disk did not keep up.")
+            raise OutputFileError(f"{self.path}: {self.lost} cycle(s) were dropped: the disk did not keep up.")
 
     def _swap(self) -> list[tuple[float, bool, Frame]]:
-        frames, self._frames = self._frames, []
+        frames = [*self._older, *self._frames]
+        self._older, self._frames = [], []
         return frames
 
     def _put(self, entry: _Entry | Mapping[str, Any]) -> None:
@@ -234,16 +236,14 @@ class RunLogger:
         except queue.Full:
             self.lost += 1
 
-    def _close_streams(self) -> None:
-        for stream in self._streams:
-            try:
-                stream.close()
-            except OSError as error:
-                # What was kept back for a full disk does not fit now either; closing it again gives it up.
-                self.problem = self.problem or error.strerror or str(error)
-                with contextlib.suppress(OSError):
-                    stream.close()
-        self._streams.clear()
+    def _close_stream(self) -> None:
+        try:
+            self._stream.close()
+        except OSError as error:
+            # What was kept back for a full disk does not fit now either; closing it again gives it up.
+            self.problem = self.problem or error.strerror or str(error)
+            with contextlib.suppress(OSError):
+                self._stream.close()
 
     def _write(self) -> None:
         flushed = time.monotonic()
@@ -258,27 +258,22 @@ class RunLogger:
                 continue
             try:
                 if entry is None:
-                    for sink in self._sinks:
-                        sink.close()
+                    self._sink.close()
                     return
                 self._take(entry)
                 if time.monotonic() - flushed >= _FLUSH:
-                    for stream in self._streams:
-                        stream.flush()
+                    self._stream.flush()
                     flushed = time.monotonic()
             except OSError as error:
                 self.problem = error.strerror or str(error)
+                if entry is None:
+                    return
 
     def _take(self, entry: _Entry | Mapping[str, Any]) -> None:
-        for sink in self._sinks:
-            if isinstance(sink, _McapSink):
-                if isinstance(entry, _Entry):
-                    sink.entry(self._epoch, entry)
-                else:
-                    sink.describe(entry)
-            elif isinstance(entry, _Entry):
-                for now, from_master, frame in entry.frames:
-                    sink.add(self._epoch + now, from_master, frame)
+        if isinstance(entry, _Entry):
+            self._sink.entry(self._epoch, entry)
+        else:
+            self._sink.describe(entry)
 
 
 class _McapSink:
@@ -301,9 +296,11 @@ class _McapSink:
         self._writer.add_metadata(METADATA, {"version": str(LOG_VERSION), "facts": json.dumps(facts)})
 
     def entry(self, epoch: float, entry: _Entry) -> None:
+        for now, sent, frame in entry.frames:
+            self._add("/frames", _stamp(epoch, now), {"time": now, "sent": sent, "frame": frame_text(frame)})
         if entry.cycle is None:
             return
-        stamp = max(0, round((epoch + entry.time) * 1e9))
+        stamp = _stamp(epoch, entry.time)
         self._add("/cycle", stamp, encode_cycle(entry.cycle))
         if entry.signals is not None:
             # A number that is missing is left out: JSON has none for it.
@@ -322,3 +319,7 @@ class _McapSink:
     def _add(self, topic: str, stamp: int, table: Mapping[str, Any]) -> None:
         data = json.dumps(table, separators=(",", ":"), allow_nan=False).encode()
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
+
+
+def _stamp(epoch: float, now: float) -> int:
+    return max(0, round((epoch + now) * 1e9))

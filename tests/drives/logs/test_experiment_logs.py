@@ -43,7 +43,7 @@ def virtual() -> VirtualLink:
 
 
 def recorded(path: Path, *, link: VirtualLink | None = None, operator: Operator | None = None) -> Recording:
-    with RunLogger([path, path.with_suffix(".blf")], wait=True) as log:
+    with RunLogger(path, wait=True) as log:
         session = Session(file=FILE, link=link or virtual(), log=log, facts={"record": EXPERIMENT.facts()})
         done = record_signal([part for part, _ in EXPERIMENT.prepared()], replace(session, operator=operator))
     assert done.recording is not None
@@ -89,7 +89,7 @@ def test_an_interrupted_experiment_keeps_its_log(tmp_path: Path, ask: Ask) -> No
 
 def test_leaving_before_anything_moved_replays(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
-    with RunLogger([path], wait=True) as log:
+    with RunLogger(path, wait=True) as log:
         session = Session(file=FILE, link=virtual(), log=log, operator=lambda: Ask.LEAVE)
         jog(2, session, tendon_angles=PSI)
     replay(read_run_log(path)).require()
@@ -98,7 +98,7 @@ def test_leaving_before_anything_moved_replays(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_jog_replays(tmp_path: Path) -> None:
     path = tmp_path / "j.mcap"
-    with RunLogger([path], wait=True) as log:
+    with RunLogger(path, wait=True) as log:
         jog(2, Session(file=FILE, link=virtual(), log=log), tendon_angles=PSI, amplitude=0.4)
     logged = read_run_log(path)
     assert logged.facts["jog"] == {"motor": 2, "amplitude": 0.4}
@@ -123,7 +123,7 @@ def test_a_jog_over_a_bus_of_python_can_replays(tmp_path: Path) -> None:
         server = threading.Thread(target=serve, args=(theirs, neck), kwargs={"stopped": ended.is_set})
         server.start()
         try:
-            with RunLogger([path, tmp_path / "j.log"]) as log:
+            with RunLogger(path) as log:
                 session = Session(
                     file=file, link=CanLink(ours, "virtual:jogged"), sensor=CanInclinometer(10), log=log,
                     operator=lambda: asked.append(1) or (Ask.STOP if len(asked) == 300 else None),

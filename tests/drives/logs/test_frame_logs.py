@@ -1,15 +1,14 @@
-"""Logs of frames: BLF and candump read back, and every frame has words."""
+"""Frames in logs: they read back, and every frame has words."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from softneck.drives import read_run_log
 from softneck.drives.bus._meaning import meaning
 from softneck.drives.logs._cycle import frame_of, frame_text
-from softneck.drives.logs._frame_log import FrameLog
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master import Frame
 from softneck.drives.master._cia301 import BUS_OFF
@@ -23,36 +22,18 @@ def test_a_frame_reads_back_from_its_text(frame: Frame) -> None:
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    frames=st.lists(
-        st.tuples(
-            st.integers(0, 60_000),
-            st.booleans(),
-            st.one_of(
-                st.builds(lambda number, data: Frame(number, data), st.integers(0, 0x7FF), st.binary(max_size=8)),
-                st.builds(lambda node: Frame(0x700 + node, b"\0", remote=True), st.integers(1, 127)),
-            ),
-        ),
-        min_size=1,
-        max_size=40,
-    )
-)
-def test_frame_logs_read_back(tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[int, bool, Frame]]) -> None:
-    folder = tmp_path_factory.mktemp("frames")
+@given(frames=st.lists(st.tuples(st.floats(0.0, 60.0), st.booleans(), FRAMES), min_size=1, max_size=40))
+def test_frames_outside_cycles_read_back(
+    tmp_path_factory: pytest.TempPathFactory, frames: list[tuple[float, bool, Frame]]
+) -> None:
+    path = tmp_path_factory.mktemp("frames") / "run.mcap"
     frames.sort(key=lambda item: item[0])
-    paths = [folder / "run.blf", folder / "run.log"]
-    epoch = 1_700_000_000.0
-    with RunLogger(paths, wait=True, epoch=epoch) as log:
-        for milliseconds, from_master, frame in frames:
-            log.frame(milliseconds / 1000.0, from_master, frame)
-    for path in paths:
-        read = list(FrameLog(path))
-        assert [item[2] for item in read] == [item[2] for item in frames]
-        # Microseconds in candump; a float of today's epoch has 0.24 us.
-        times = [item[0] - epoch for item in read]
-        np.testing.assert_allclose(times, [item[0] / 1000.0 for item in frames], atol=2e-6)
-    # Only BLF has a place for the direction.
-    assert [item[1] for item in FrameLog(paths[0])] == [item[1] for item in frames]
+    with RunLogger(path, wait=True, epoch=1_700_000_000.0) as log:
+        log.describe({"files": {}})
+        for item in frames:
+            log.frame(*item)
+    read = read_run_log(path)
+    assert read.frames() == list(read.outside) == frames
 
 
 @pytest.mark.parametrize(

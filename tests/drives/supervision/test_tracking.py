@@ -99,7 +99,7 @@ def test_a_run_out_is_not_compared_with_the_reference_before() -> None:
 
 def test_logs_keep_references_and_give_them_back(tmp_path: Path) -> None:
     path, bench = tmp_path / "run.mcap", Bench()
-    with RunLogger([path], wait=True) as log:
+    with RunLogger(path, wait=True) as log:
         log.describe(run_facts(bench.master.settings, {}, simulated=True))
         bench.pilot.act = Tracker(1, "ramp")
         pilot = LoggedPilot(bench.pilot)
