@@ -16,7 +16,6 @@ from .shared._options import (
     force_option,
     json_option,
     output_option,
-    read_together,
     set_option,
     target,
 )
@@ -44,12 +43,6 @@ if TYPE_CHECKING:
     help="Estimate the noise levels from this recording (maximum likelihood); with --sensor all but that of the "
     "measurement. May be given several times.",
 )
-@click.option(
-    "--change",
-    is_flag=True,
-    help="A change detector instead of a filter: whether the neck is still the one of MODEL. --data are recordings of "
-    "undisturbed motion, on which MODEL was not trained.",
-)
 @click.option("--gyro", is_flag=True, help="Driven by the gyro's rates, with their bias as a state (form=gyro).")
 @robot_option
 @set_option
@@ -60,7 +53,6 @@ def command(
     output: Path | None,
     sensor: str | None,
     data: tuple[Path, ...],
-    change: bool,
     gyro: bool,
     robot: str | None,
     settings: tuple[str, ...],
@@ -74,13 +66,8 @@ def command(
     """
 
     kind = find_kind("kalman", "observer")
-    path, replace = target(output, f"observers/{'change' if change else 'kalman'}.npz", force=force, ending=".npz")
+    path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    if change:
-        if gyro or sensor is not None:
-            raise SettingsError("--change takes no --sensor and no --gyro: it looks at what MODEL misses.")
-        _change_detector(model, path, data, robot, settings, force=replace, as_json=as_json)
-        return
     if gyro and any(setting.replace(" ", "").startswith("form=") for setting in settings):
         raise SettingsError("--gyro is the same as --set form=gyro; give only one of them.")
     chosen = apply_settings(resolve(kind.settings), settings, sensor=sensor, form="gyro" if gyro else None)
@@ -102,22 +89,6 @@ def command(
         print_json({**summary, **told, "summary": observer.summary()})
         return
     click.echo("\n".join([str(path), observer.summary(), *lines]))
-
-
-def _change_detector(
-    model: Path, path: Path, data: tuple[Path, ...], robot: str | None, settings: tuple[str, ...], *, force: bool,
-    as_json: bool,
-) -> None:  # fmt: skip
-    """Design a change detector, write it, and say so."""
-    if not data:
-        raise SettingsError("--change needs --data REC: undisturbed motion, from which its thresholds come.")
-    chosen = apply_settings(resolve(find_kind("change", "observer").settings), settings)
-    detector = chosen.design(load_of(model, robot, role="model"), read_together(data, robot))
-    detector.save(path, force=force)
-    if as_json:
-        print_json({"observer": str(path), "kind": "change", "summary": detector.summary(), **detector.findings})
-        return
-    click.echo(f"{path}\n{detector.summary()}")
 
 
 def _fitted(

@@ -120,12 +120,6 @@ def _print(path: Path, result: Result) -> None:
     if result.limits:
         print_table("Limits", *_limits(result))
     click.echo(f"{result.real_time_factor:.0f} times real time")
-    signals = result.signals.signals
-    if "changed" in signals and "since_s" in signals and signals["changed"][-1] > 0.5:
-        click.echo(
-            f"changed for {signals['since_s'][-1]:.1f} s: the neck is not the one of the detector's model. Bring it to "
-            "rest, record it anew, then `softneck identify --from` and `softneck tune`."
-        )
 
 
 def _metrics(result: Result) -> tuple[list[str], list[list[str]]]:

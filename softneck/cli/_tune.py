@@ -118,18 +118,11 @@ def _robot_of(things: dict[str, Any]) -> Any:
     return robot_of(next((thing for thing in things.values() if hasattr(thing, "robot")), None))
 
 
-def setting_text(value: Any) -> str:
-    """Return a setting in words: numbers to four digits, those of `switched`'s payloads in a list."""
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(setting_text(each) for each in value)}]"
-    return f"{value:.4g}"
-
-
 def _print(found: Tuned, folder: Path) -> None:
     from softneck.report._tune_page import notes, requirement_rows
 
     best = found.best
-    settings = ", ".join(f"{name} {setting_text(value)}" for name, value in best.settings.items())
+    settings = ", ".join(f"{name} {value:.4g}" for name, value in best.settings.items())
     print_table(f"{folder / 'best.npz'}: {best.kind} ({settings})", ["metric", "bound", "limit", "value", ""],
                 [row[:5] for row in requirement_rows(found)])  # fmt: skip
     for line in notes(found):

@@ -98,18 +98,12 @@ KINDS: dict[str, Kind] = {
         Kind("nonlinear", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:NonlinearObserver",
              "softneck.estimation._nonlinear_runtime",
              "filter over an identified nonlinear model with a disturbance that walks as far as the model moves"),
-        Kind("change", "observer", "softneck.estimation.changes._settings:ChangeSettings",
-             "softneck.estimation.changes._change:ChangeDetector", "softneck.estimation.changes._change_runtime",
-             "whether the neck is still the one of a model: its free run, and cumulative sums over what it misses"),
         Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
              f"{_DESIGN}.linear._linear_controller_runtime",
              "PI with reference filter, anti-windup and tendon allocation"),
         Kind("scheduled", "controller", "softneck.design:ScheduledSettings", "softneck.design:VaryingController",
              f"{_DESIGN}.varying._scheduled_runtime",
              "robust PI at every inclination of a family, gains interpolated without bumps"),
-        Kind("switched", "controller", f"{_DESIGN}.varying._switched:SwitchedSettings",
-             "softneck.design:VaryingController", f"{_DESIGN}.varying._switched_runtime",
-             "robust PI at each of several payloads, the estimated one chooses: dwell time, no bumps"),
         Kind("adaptive", "controller", "softneck.design:AdaptiveSettings", "softneck.design:VaryingController",
              f"{_DESIGN}.varying._adaptive_runtime",
              "recursive least squares as the neck moves, gains redesigned in every sample, with safeguards"),
@@ -144,6 +138,8 @@ KINDS: dict[str, Kind] = {
 #: Kinds that went, and what takes their place; docs/theory/tried.md says why each went.
 REMOVED: dict[str, str] = {
     "online_nlsm": "nlsm",
+    "change": "nonlinear",
+    "switched": "pi",
 }
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 

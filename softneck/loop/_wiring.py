@@ -28,8 +28,8 @@ REFERENCE_PORTS = (
 _HEALTHY = (("observer", "healthy"), ("plant", "measurement_valid"))
 _NECK = Robot.preset("neck")
 _USUAL = ("plant", "observer", "controller", "reference")
-# What holds where nobody says otherwise: measurements are valid, controllers enabled, the neck is the known one.
-_DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0, "changed": 0.0}
+# What holds where nobody says otherwise: measurements are valid, controllers enabled.
+_DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
 
 
 def reference_ports(robot: Robot = _NECK) -> tuple[Port, ...]:

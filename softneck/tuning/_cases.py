@@ -16,7 +16,6 @@ from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.verification._neck_loops import direction, judge_loop, step_at
 from softneck.verification._own_plants import OwnPlant
-from softneck.verification._steps import eyes_of
 
 from ._requirements import TuneRequirements
 from ._task import Task
@@ -115,9 +114,8 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, o
         reference = StepReference(pitch=ends[0], roll=ends[1], at=at)
     else:
         reference = RobotReference(kind="step", values=ends, at=at)
-    eyes, beside = eyes_of(observer)
     return Loop(
-        plant=plant.quiet(Ts), controller=BlockPart(block), observer=eyes, others=beside,
+        plant=plant.quiet(Ts), controller=BlockPart(block), observer=None if observer is None else BlockPart(observer),
         reference=_Together(reference, together),
         duration=duration, order=order,
         robot=robot, **plant.carrying(case.payload), faults=tuple(faults),

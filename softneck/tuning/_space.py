@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,8 +17,6 @@ from softneck.core._kinds import kinds_of
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptive", "mpc")
 #: Of these nothing is certified beside recordings, since they have no linear form: named, they are searched there too.
 UNCERTIFIED = ("scheduled", "adaptive")
-#: It wants families of one payload each, and is searched only where it is named.
-SWITCHED = "switched"
 #: A design of these takes ten times as long as one of the others.
 COSTLY = ("mpc", "nmpc")
 
@@ -60,7 +58,6 @@ _OWN: dict[str, tuple[Dimension, ...]] = {
             Dimension("input_noise", 1.0, 100.0, 5.0)),
     "scheduled": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
     "adaptive": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
-    SWITCHED: (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
     "mpc": (Dimension("max_sensitivity", 1.2, 2.5, 1.5),),
     "nmpc": (),
 }  # fmt: skip
@@ -116,7 +113,6 @@ def spaces(
     cocontraction: float | None,
     neck: bool,
     least: float = 0.0,
-    payloads: Sequence[float] = (),
 ) -> list[Space]:
     """Return the space of every kind.
 
@@ -126,7 +122,6 @@ def spaces(
         cocontraction: at which the robot was recorded [rad]; None: no rule is set.
         neck: whether it is a neck: of another robot limits are those of its file.
         least: the rise that the motors can give at best [s].
-        payloads: of the linear plants [kg], where each has one of its own.
 
     Raises:
         SettingsError: an unknown kind, or one with nothing to search.
@@ -138,11 +133,6 @@ def spaces(
                 f"`{kind}` cannot be tuned; use some of {', '.join(_OWN)}."
                 if kind in kinds_of("controller")
                 else f"unknown kind of controller `{kind}`; use some of {', '.join(_OWN)}."
-            )
-        if kind == SWITCHED and len(set(payloads)) < 2:
-            raise SettingsError(
-                f"`{kind}` has a controller for each payload: give families of one payload each, at least two "
-                "(`softneck family` of recordings with a column `payload [kg]`)."
             )
         names = {item.name for item in dataclasses.fields(resolve(KINDS[kind].settings))}
         speed: tuple[Dimension, ...] = (
@@ -158,7 +148,5 @@ def spaces(
         if cocontraction is not None and kind == "nmpc":
             # Its plan begins where the recordings were: elsewhere the tendons hang, and it is refused.
             fixed["minimum_tautness"] = cocontraction
-        if kind == SWITCHED:
-            fixed["payloads"] = list(payloads)
         found.append(Space(kind, tuple(item for item in wanted if item.name in names), fixed))
     return found

@@ -14,9 +14,8 @@ from ._requirements import TuneRequirements
 
 
 def has_observer(kind: str) -> bool:
-    """Return whether loops of a kind have an observer: designed for it, or acting by the payload that it tells."""
-    made = resolve(KINDS[kind].settings)
-    return hasattr(made, "over") or hasattr(made, "payloads")
+    """Return whether loops of a kind have an observer: designed for it."""
+    return hasattr(resolve(KINDS[kind].settings), "over")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -31,7 +30,7 @@ class Task:
         robot: whose controller is tuned.
         cocontraction: at which the loops are held [rad]; None: by the controller's own rule.
         seed: of the noise.
-        observer: of the loops of kinds that have one (`mpc`, `nmpc`, `switched`); None: these have none either.
+        observer: of the loops of kinds that have one (`mpc`, `nmpc`); None: these have none either.
     """
 
     digest: str

@@ -138,7 +138,7 @@ def tune(
     refuse_impossible(task.asked, task.plant)
     each = spaces(
         chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck,
-        least=quickest(task.plant), payloads=_payloads(task.linear),
+        least=quickest(task.plant),
     )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)
     task = replace(task, digest=digest_of(task, chosen, files))
@@ -196,18 +196,6 @@ def _held(linear: Mapping[str, Any]) -> float | None:
     middles = [sum(part["cocontraction"]) / 2.0 for part in made if max(part["payload_kg"]) >= heaviest]
     common = round(sorted(middles)[len(middles) // 2], 3)
     return common if common > _TAUT else None
-
-
-def _payloads(linear: Mapping[str, Any]) -> list[float]:
-    """Return the payload [kg] of each linear plant; none where one was recorded with several, or does not say."""
-    found = []
-    for thing in linear.values():
-        made = getattr(thing, "findings", {}).get("tested", {}).get("conditions", [])
-        seen = {kg for part in made for kg in part["payload_kg"]}
-        if len(seen) != 1:
-            return []
-        found.append(float(seen.pop()))
-    return found
 
 
 def _aimed(task: Task) -> float:

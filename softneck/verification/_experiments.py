@@ -26,7 +26,7 @@ from softneck.loop._result import shown_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
-from ._steps import eyes_of, middle_motors, middle_of
+from ._steps import middle_motors, middle_of
 
 _RUNTIME = "softneck.verification._louder_runtime"
 _NECK = Robot.preset()
@@ -283,19 +283,19 @@ class _Case:
         chosen = [self.axes in (axis, _TOGETHER) for axis in loop.outputs]
         parameters = {f"gain_{axis}": gain if on else 1.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
         parameters |= {f"delay_{axis}": delay if on else 0.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
-        eyes, beside = eyes_of(loop.observer)
-        block, connections = louder(loop.controller, eyes and eyes.block, loop.outputs, loop.samples)
+        block, connections = louder(loop.controller, loop.observer, loop.outputs, loop.samples)
         # Towards upright: no neck is led further than its posture.
         kick = np.array([-self.amplitude if p > 0.0 else self.amplitude for p in self.posture]) * chosen
         posture = tuple(float(a + b) for a, b in zip(loop.middle, self.posture, strict=True))
         middle = float(middle_motors(loop.robot, loop.controller).mean())
         return run_loop(
             Loop(
-                plant=loop.plant(), controller=BlockPart(loop.controller), observer=eyes,
+                plant=loop.plant(), controller=BlockPart(loop.controller),
+                observer=None if loop.observer is None else BlockPart(loop.observer),
                 reference=_Kicked(posture, tuple(float(v) for v in kick), loop.time, middle), robot=loop.robot,
                 duration=loop.time * (_REST + _FORGOTTEN + 2.0 * _WINDOW), order=loop.order,
                 **loop.constants, other_parameters={"louder": parameters},
-                others={"louder": BlockPart(block), **beside}, connections=connections,
+                others={"louder": BlockPart(block)}, connections=connections,
                 # A rate has no reference: it is wanted to be zero.
                 other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},
             ),

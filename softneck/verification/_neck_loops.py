@@ -20,7 +20,6 @@ from softneck.runtime import Block
 from ._experiments import LoopUnderTest
 from ._own_plants import OwnPlant, own_plant
 from ._requirements import Requirements, metric_ends
-from ._steps import eyes_of
 
 # When the step comes [s]: after the controller took over the motors, or has pulled tendons taut.
 _STEP_AT, _TAUT_AT = 0.5, 3.0
@@ -168,12 +167,10 @@ def _loop(
         StepReference(pitch=ends[0], roll=ends[1], at=at) if robot.is_neck
         else RobotReference(kind="step", values=ends, at=at)
     )  # fmt: skip
-    eyes, beside = eyes_of(observer)
     return Loop(
         plant=plant.make(seed, controller.sample_time),
         controller=BlockPart(controller),
-        observer=eyes,
-        others=beside,
+        observer=None if observer is None else BlockPart(observer),
         reference=reference,
         duration=at + float(asked.neck["duration_s"]),
         order=order,
@@ -255,13 +252,7 @@ def neck_changes(parameters: NeckParameters, robot: Robot) -> dict[str, float]:
 
 
 def check_blocks(controller: Block, observer: Block | None) -> None:
-    """Raise SettingsError where an observer has another sample time than the controller, or says not what it needs."""
-    told = set() if observer is None else {port.name for port in observer.outputs}
-    if {"payload", "changed"} <= {port.name for port in controller.inputs} and "payload" not in told:
-        raise SettingsError(
-            f"the controller {controller.kind} acts by the payload that it is told; give --observer, one over a model "
-            "of several payloads or its change detector (`softneck observer MODEL --change --data REC`)."
-        )
+    """Raise SettingsError where an observer has another sample time than the controller."""
     if observer is not None and not math.isclose(observer.sample_time, controller.sample_time, rel_tol=1e-9):
         raise SettingsError(
             f"the observer has a sample time of {observer.sample_time:g} s, the controller one of "

@@ -13,7 +13,6 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.design.linear._ports import motor_ranges
-from softneck.loop import BlockPart, Part
 from softneck.loop._result import SETTLING_BAND, shown_unit
 from softneck.robot import Robot
 from softneck.robot._redefined import redefinition_of
@@ -70,14 +69,6 @@ class Steps:
     motors: np.ndarray
     metrics: dict[str, Vector]
     worse: dict[str, np.ndarray]
-
-
-def eyes_of(observer: Block | None) -> tuple[BlockPart | None, dict[str, Part]]:
-    """Return the observer of a `Loop` and its further parts: a change detector tells no angles and stands beside it."""
-    if observer is None:
-        return None, {}
-    beside = any(port.name == "changed" for port in observer.outputs)
-    return (None, {"detector": BlockPart(observer)}) if beside else (BlockPart(observer), {})
 
 
 def check_ports(block: Block, robot: Robot) -> None:

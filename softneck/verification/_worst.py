@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, SettingsError, Vector, atomic_write, load, to_si
+from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
 from softneck.loop._result import shown_unit
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
@@ -21,7 +21,7 @@ from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix, writ
 
 from ._plants import mixing
 from ._requirements import Requirements
-from ._steps import eyes_of, middle_motors, middle_of
+from ._steps import middle_motors, middle_of
 
 _RUNTIME = "softneck.verification._linear_plant_runtime"
 
@@ -226,15 +226,10 @@ def _write_reference(path: Path, robot: Robot, levels: Matrix, sample_time: floa
 def _loop(
     folder: Path, name: str, *, title: str, controller: Path, observer: Path | None, **values: Any
 ) -> str:  # fmt: skip
-    seen = "" if observer is None else f"\n{_table(observer)}\nfile = {_quoted(observer, folder)}\n"
+    seen = "" if observer is None else f"\n[observer]\nfile = {_quoted(observer, folder)}\n"
     return _LOOP.format(
         name=name, title=title.replace("\n", " "), controller=_quoted(controller, folder), observer=seen, **values
     )  # fmt: skip
-
-
-def _table(observer: Path) -> str:
-    """Return the table of a loop file that an observer's file stands in."""
-    return "[observer]" if eyes_of(load(observer, role="observer").block())[0] else '[[part]]\nname = "detector"'
 
 
 def _quoted(path: Path, folder: Path) -> str:

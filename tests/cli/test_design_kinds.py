@@ -44,15 +44,6 @@ def test_it_designs_every_kind(kind: str, models: list[str], call: Call) -> None
     assert float(loadmat("c.mat")["Ts"][0, 0]) == controller.sample_time
 
 
-def test_it_designs_a_switched_one_from_a_list_of_payloads(models: list[str], call: Call) -> None:
-    result = call("design", "switched", *models, "-o", "c.npz", "--set", "payloads=[0,0.5]", "--json")
-    assert result.code == 0, result.err
-    assert "between switches at the least" in json.loads(result.out)["summary"]
-    block = load("c.npz", role="controller").block()
-    assert [port.name for port in block.inputs][-2:] == ["payload", "changed"]
-    assert "payloads=[]" in call("design", "switched", "--help").out
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -62,8 +53,7 @@ def test_it_designs_a_switched_one_from_a_list_of_payloads(models: list[str], ca
         (("lqg", "m0.npz", "--set", "sample_time=0.01"), "`sample_time` is for continuous plants"),
         (("ncf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),
         (("custom", "m0.npz"), "`controller` must be a control.StateSpace"),
-        (("switched", "m0.npz", "m1.npz", "--set", "payloads=[0,0.5,1]"), "got 2 and 3 payload(s)"),
-        (("switched", "m0.npz", "m1.npz", "--set", "payloads=[0,-1]"), "`payloads` must be between 0 and"),
+        (("switched", "m0.npz"), "kind `switched` was removed after softneck 0.2.0"),
         (("hinf", "m0.npz", "--mat", "c.txt"), "must end in `.mat`"),
         (("pid", "m0.npz", "--set", "tuning=placement", "--set", "frequency=3"), "take another `frequency`"),
     ],

@@ -9,7 +9,7 @@ import pytest
 
 import softneck
 from softneck.cli._main import run
-from softneck.cli._tune import setting_text, way_on
+from softneck.cli._tune import way_on
 from softneck.estimation import KalmanSettings
 
 from ..data import ROOT
@@ -186,9 +186,3 @@ def test_bad_input_is_said_before_anything_is_searched(
 def test_the_default_requirements_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["tune", "--print-requirements"]) == 0
     assert '"neck.rise_s" = { max = 0.4 }' in capsys.readouterr().out
-
-
-def test_a_setting_of_several_numbers_is_printed_as_a_list() -> None:
-    """`switched` has `payloads`, which had the result of a finished search end in an internal error."""
-    assert setting_text([0.0, 0.5]) == "[0, 0.5]"
-    assert setting_text(0.123456) == "0.1235"

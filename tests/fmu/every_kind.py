@@ -22,9 +22,7 @@ from softneck.design import (
     PiSettings,
     ScheduledSettings,
 )
-from softneck.design.varying._switched import SwitchedSettings
 from softneck.estimation import KalmanSettings, LinearNeck
-from softneck.estimation.changes._settings import ChangeSettings
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.identification import (
     GreyBox,
@@ -45,8 +43,6 @@ from softneck.identification.uncertainty._guarded_base import Base
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
-
-from ..data import neck_recording
 
 TS = 0.02
 ROWS = 400
@@ -171,28 +167,12 @@ def _payload_observer() -> Block:
     return KalmanSettings().design(_loaded_greybox_model()).block()
 
 
-def _change() -> Block:
-    return ChangeSettings().design(Rls().fit(recording()), neck_recording(4000, seed=9)).block()
-
-
-def _payload_change() -> Block:
-    run = neck_recording(4000, seed=9)
-    half = run.with_channels(payload=np.full(len(run), 0.5))
-    return ChangeSettings().design(_loaded_greybox_model(), [run, half]).block()
-
-
 def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
 
 def _scheduled() -> Block:
     return ScheduledSettings(inclinations=(0.05, 0.3)).design([_linear(), _linear()]).block()
-
-
-def _switched() -> Block:
-    # Random payloads pass the middle now and then.
-    settings = SwitchedSettings(payloads=(0.0, 0.2), dwell_time=0.1)
-    return settings.design([_linear(), _linear(1.3)]).block()
 
 
 def _adaptive() -> Block:
@@ -309,18 +289,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy", "payload"],
         ("measurement_noise_std", "rest_noise_std", "motion_noise_ratio"),
     ),
-    "change": (
-        _change,
-        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
-        ["changed", "since_s", "fit"],
-        (),
-    ),
-    "change_payload": (
-        _payload_change,
-        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
-        ["changed", "since_s", "fit", "payload"],
-        ("payload_start",),
-    ),
     "mpc": (
         _mpc,
         ["pitch_reference", "roll_reference", "cocontraction_reference", "pitch", "roll", "healthy", "enabled"],
@@ -335,7 +303,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         (),
     ),
     "scheduled": (_scheduled, _REFERENCES, MOTORS, ("lead_limit", "least_position", "least_cocontraction")),
-    "switched": (_switched, [*_REFERENCES, "payload", "changed"], MOTORS, ("lead_limit", "least_cocontraction")),
     "adaptive": (_adaptive, _REFERENCES, MOTORS, ("lead_limit", "least_cocontraction", "adapt")),
     "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
     "ncf": (_ncf, _REFERENCES, MOTORS, ("slew_limit",)),

@@ -15,7 +15,7 @@ from .necks import CHOOSING, NECKS
 # What only shows: it prints what each neck is like, and chooses nothing.
 SHOWS = {
     "benchmarks/foreign_necks.py", "benchmarks/baseline.py", "benchmarks/observer.py", "benchmarks/promises.py",
-    "benchmarks/tune.py", "benchmarks/payload.py", "benchmarks/changing_neck.py",
+    "benchmarks/tune.py", "benchmarks/payload.py",
 }  # fmt: skip
 SCRIPTS = [
     path

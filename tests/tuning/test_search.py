@@ -233,7 +233,7 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
 
 @pytest.mark.parametrize("tested", [True, False])
 def test_what_was_not_computed_does_not_bind(tested: bool) -> None:
-    """`switched` has no linear form: beside recordings its Ms counts as broken, and nobody knows it."""
+    """`adaptive` has no linear form: beside recordings its Ms counts as broken, and nobody knows it."""
     bounds = (Requirement("axes.sensitivity", "max", 2.5, True), *BOUNDS[:2])
     blind = candidate(neck__rise_s=0.5, neck__overshoot_pct=3.0)
     del blind.metrics["axes.sensitivity"]

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 _BAR = 20
-# What all of it needs [columns], [lines]: with a change's line, a fault's and five events.
-_WIDE, _HIGH = 104, 32
+# What all of it needs [columns], [lines]: with a fault's line and five events.
+_WIDE, _HIGH = 104, 31
 _NICE = 10
 
 
@@ -36,9 +36,8 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
     from rich.panel import Panel
 
     narrow, low = size[0] < _WIDE, size[1] < _HIGH
-    # A fault that needs two lines takes an event's place, and so does a change's line where there is no room for both.
+    # A fault that needs two lines takes an event's place.
     events = 5 - (len(picture["fault"] or "") > min(size[0], _WIDE) - 4)
-    events -= low and math.isfinite(picture["change"][0])
     blocks: list[list[RenderableType]] = [
         [_head(picture, narrow=narrow)],
         [_angles(picture, narrow=narrow)],
@@ -65,11 +64,6 @@ def _head(picture: dict[str, Any], *, narrow: bool) -> Text:
     text.append(f"   bus cycle {picture['cycle']}")
     text.append("   validity ")
     text.append(_number(picture["validity"], ".2f"), style="bold red" if picture["validity"] < 0.5 else "none")
-    changed, since, fit = picture["change"]
-    if math.isfinite(changed):
-        told = f"changed since {since:.1f} s: at rest, adapt and tune" if changed > 0.5 else "as the model knows it"
-        text.append("\nneck ").append(told, style="bold yellow" if changed > 0.5 else "none")
-        text.append(f"   fit {_number(fit, '.0f')} %")
     if picture["fault"] is not None:
         text.append(f"\n{picture['fault']}", style="bold red")
     return text

@@ -63,7 +63,6 @@ def to_line(
         "fault": None if snapshot.fault is None else str(snapshot.fault),
         "outputs": list(snapshot.outputs),
         "validity": snapshot.validity,
-        "change": snapshot.change,
         "angles": list(zip(snapshot.references[:-1], snapshot.angles, snapshot.estimates, strict=True)),
         "motors": list(zip(snapshot.setpoints, snapshot.positions, snapshot.tensions, strict=True)),
         "tension_limit": snapshot.tension_limit,

@@ -1,4 +1,4 @@
-"""Controllers whose gains vary as they run - scheduled, switched or adaptive - in loops, FMUs and files."""
+"""Controllers whose gains vary as they run - scheduled or adaptive - in loops, FMUs and files."""
 
 from __future__ import annotations
 
@@ -23,17 +23,16 @@ from ..linear._ports import ControllerLimits, controller_inputs, controller_outp
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class VaryingController(Shown):
-    """A designed controller of pitch and roll whose gains follow the inclination, the payload or what it learns.
+    """A designed controller of pitch and roll whose gains follow the inclination or what it learns.
 
     Attributes:
-        kind: "scheduled", "switched" or "adaptive".
+        kind: "scheduled" or "adaptive".
         runtime: dotted name of the runtime module, which declares `arrays`.
         sample_time: [s].
         arrays: by name, in the runtime's order.
         limits: of the set-points.
         order: of the loop it is for.
         parameters: more parameters of the block, after the limits.
-        inputs: more inputs of it, after those of every controller.
         lines: for `summary`.
         design: JSON values: settings and what was found.
     """
@@ -45,7 +44,6 @@ class VaryingController(Shown):
     limits: ControllerLimits
     order: str
     parameters: tuple[Port, ...] = ()
-    inputs: tuple[Port, ...] = ()
     lines: tuple[str, ...] = ()
     design: Mapping[str, Any] = field(default_factory=dict)
 
@@ -62,7 +60,7 @@ class VaryingController(Shown):
             runtime=sized(self.runtime, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
-            inputs=(*controller_inputs(self.robot), *self.inputs),
+            inputs=controller_inputs(self.robot),
             outputs=controller_outputs(self.robot),
             parameters=(*self.limits.ports(), *self.parameters),
         )
@@ -94,7 +92,6 @@ class VaryingController(Shown):
             "names": list(self.arrays),
             # None of them is an integer, and files of format 1 do not say so.
             "parameters": _ports(self.parameters),
-            **({"more_inputs": _ports(self.inputs)} if self.inputs else {}),
             "lines": list(self.lines),
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
@@ -116,7 +113,6 @@ class VaryingController(Shown):
             limits=ControllerLimits.from_header(header["limits"], robot_in(header)),
             order=str(header["order"]),
             parameters=tuple(Port(**port) for port in header["parameters"]),
-            inputs=tuple(Port(**port) for port in header.get("more_inputs", ())),
             lines=tuple(str(line) for line in header["lines"]),
             design=dict(header["design"]),
         )
@@ -128,6 +124,5 @@ def _ports(ports: tuple[Port, ...]) -> list[dict[str, Any]]:
 
 RUNTIMES = {
     "scheduled": "softneck.design.varying._scheduled_runtime",
-    "switched": "softneck.design.varying._switched_runtime",
     "adaptive": "softneck.design.varying._adaptive_runtime",
 }

@@ -18,8 +18,6 @@ from ._pilot import LoopPilot
 
 # So many of the last events are copied.
 _EVENTS = 5
-#: What a change detector gives, as far as it is shown.
-CHANGE = ("changed", "since_s", "fit")
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +65,6 @@ class Snapshot:
         tension_limit: beyond which a run stops [N].
         validity: of the model that stands for the plant in the loop file, told what is measured; NaN without one, for
             an FMU, which nothing runs beside the hardware, and for a model that does not know.
-        change: what a change detector among the loop's parts says: `changed`, `since_s`, `fit`; NaN without one.
     """
 
     time: float
@@ -89,7 +86,6 @@ class Snapshot:
     tension_limit: float
     outputs: tuple[str, ...] = ("pitch", "roll")
     validity: float = math.nan
-    change: tuple[float, ...] = (math.nan,) * len(CHANGE)
 
     @property
     def run_time(self) -> float:
@@ -120,7 +116,6 @@ class Snapshots:
             references=signals[: len(outputs) + 1],
             angles=(math.nan,) * len(outputs) if tilt is None else tilt.values,
             estimates=signals[len(outputs) + 1 : 2 * len(outputs) + 1],
-            change=signals[-1 - len(CHANGE) : -1],
             validity=signals[-1],
             setpoints=master.setpoints,
             positions=master.positions,
@@ -144,17 +139,15 @@ class Snapshots:
         )  # fmt: skip
 
     def _signals(self, master: Master, outputs: tuple[str, ...]) -> Motors:
-        """Return references of the outputs and of co-contraction, estimates of the outputs, a change, and validity."""
+        """Return references of the outputs and of co-contraction, estimates of the outputs, and validity."""
         pilot = master.pilot
         # Beyond the run they would be the last ones, and say something that nobody asks for any more.
         if not isinstance(pilot, LoopPilot) or master.index < 0 or master.supervisor.phase is not Phase.RUNNING:
-            return (math.nan,) * (2 * len(outputs) + 2 + len(CHANGE))
+            return (math.nan,) * (2 * len(outputs) + 2)
         if pilot is not self._pilot:
             self._pilot = pilot
             wanted = [("reference", f"{name}_reference") for name in (*outputs, "cocontraction")]
             wanted += [("observer", name) for name in outputs]
-            detectors = [name.removesuffix(".since_s") for name in pilot.columns if name.endswith(".since_s")]
-            wanted += [((*detectors, "")[0], name) for name in CHANGE]
             self._slots = tuple(pilot.slot(part, port) for part, port in wanted)
         signals = pilot.signals
         seen = [math.nan if slot is None else float(signals[slot]) for slot in self._slots]

@@ -131,10 +131,7 @@ def _size(stepped: Port, role: str) -> float:
 
 
 def _shown(block: Block) -> list[int]:
-    """Return which outputs answer: set-points of a controller, references, else what is measured and its rate.
-
-    All numbers of an observer that tells none of these, as a change detector.
-    """
+    """Return which outputs answer: set-points of a controller, references, else what is measured and its rate."""
     measured = {port.name.removesuffix("_measured") for port in (*block.inputs, *block.outputs)
                 if port.name.endswith("_measured")}  # fmt: skip
     found = {
@@ -144,7 +141,7 @@ def _shown(block: Block) -> list[int]:
         "plant": lambda name: name in measured,
     }[block.role]
     numbers = [i for i, port in enumerate(block.outputs) if not port.boolean]
-    return [i for i in numbers if found(block.outputs[i].name)] or (numbers if block.role == "observer" else [])
+    return [i for i in numbers if found(block.outputs[i].name)]
 
 
 def _answers(block: Block, u: Matrix) -> Matrix:

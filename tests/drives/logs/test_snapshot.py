@@ -13,13 +13,8 @@ from softneck.drives.bus._link import VirtualLink
 from softneck.drives.master import Frame, Master, Phase
 from softneck.drives.master._cia301 import NodeState
 from softneck.drives.master._cia402 import DriveState
-from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.running._snapshot import Snapshot
 from softneck.drives.running._virtual import recorded
-from softneck.estimation.changes._settings import ChangeSettings
-from softneck.identification import Rls
-from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import signal
 
 from ..bench import Bench
 from ..conftest import STEP, Project
@@ -88,28 +83,3 @@ def test_a_snapshot_does_not_change_with_the_run_and_tells_a_fault() -> None:
     assert after.counts["operator"] == 1
     assert after.events[-1].detail == "enough"
     assert all(drive.state is not DriveState.ENABLED for drive in after.drives)
-
-
-def test_a_change_detector_in_the_loop_is_shown_as_it_says(project: Project) -> None:
-    paper = VirtualNeck(NeckParameters.paper())
-    quiet = record(signal("mixed", duration=80.0), paper, seed=2)
-    model = Rls(delay=0.08).fit([record(signal("eq22", duration=40.0), paper, seed=1)])
-    ChangeSettings().design(model, quiet).save(project.folder / "change.npz")
-    path = project.write_loop("watched.toml", STEP, 2.0)
-    path.write_text(
-        path.read_text(encoding="utf-8") + '[[part]]\nname = "watch"\nfile = "change.npz"\n', encoding="utf-8"
-    )
-    deployed = prepare(load_loop(path), project.controller)
-    taker, seen, said = Snapshots(), [], []
-
-    def watch(now: float, _in: object, _out: object, _tilt: object, master: Master) -> None:
-        seen.append(taker.take(master, now))
-        pilot = master.pilot
-        assert isinstance(pilot, LoopPilot)
-        said.append(tuple(pilot.value(f"watch.{name}") for name in ("changed", "since_s", "fit")))
-
-    run_simulated(deployed, default_drives(), watches=(watch,))
-    ran = [item.phase is Phase.RUNNING and item.index >= 0 for item in seen]
-    np.testing.assert_array_equal([item.change for item, now in zip(seen, ran, strict=True) if now],
-                                  [value for value, now in zip(said, ran, strict=True) if now])  # fmt: skip
-    assert all(math.isfinite(item.change[0]) == now for item, now in zip(seen, ran, strict=True))
