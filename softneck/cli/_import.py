@@ -151,8 +151,8 @@ def command(
             raise SettingsError(f"{log}: is a recording of robot {said.label()} already, which commands take as it is.")
         guess = True
     if guess == (layout_file is not None):
-        what = "both were given" if guess else "neither was given"
-        raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess (a recording: --resample); {what}.")
+        what = "both were given" if guess else "neither was given (a recording needs --resample)"
+        raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
     recording_suffix(path)
     refuse_existing(path, force=replace)
     if html is not None:

@@ -129,7 +129,7 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
                 found["neck"] = (
                     f"not supported by the data: {name} was recorded with {kg:g} kg, and no plant that steps carries "
                     f"that at a co-contraction of {held:.2g} rad; `softneck identify greybox` a recording that does, "
-                    "or `softneck calibrate` with its --payload"
+                    "or calibrate a neck to it (`softneck.calibrate` in Python)"
                 )
             at = [end for part in made if _within(kg, part["payload_kg"]) for end in part["cocontraction"]]
             if not _within(held, at, _SAME):

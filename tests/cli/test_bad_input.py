@@ -175,7 +175,6 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "unknown setting `luck`"),
         (("observer", "MODEL", "-o", "o.npz", "--sensor", "nose"), "nose"),
         (("simulate", "none.toml"), "none.toml: no such file"),
-        (("linearize", "none.ssp"), "none.ssp: is several FMUs; unzip it"),
         (("fmu", "none.npz", "-o", "M.fmu"), "none.npz: no such file"),
         (("fmu",), ""),
         (("dance",), "no such command `dance`; the commands are start, "),
@@ -195,7 +194,7 @@ def test_wrong_arguments(
     "arguments",
     [
         ("identify", "rls", "D.csv", "-o", "m.npz"), ("validate", "MODEL", "--data", "D.csv"), ("simulate", "D.toml"),
-        ("simulate", "D.ssp"), ("linearize", "D.fmu"), ("linearize", "D.npz"), ("info", "D.csv"),
+        ("simulate", "D.ssp"), ("info", "D.csv"),
         ("import", "REC", "--layout", "D.toml"), ("start", "D.csv"), ("start", "REC", "--requirements", "D.toml"),
     ],
     ids=" ".join,

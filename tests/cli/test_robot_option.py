@@ -30,7 +30,6 @@ def neck_files(tmp_path: Path, recording: Path) -> Path:
         ("identify", "rls", "rec.csv", "-o", "a.npz"),
         ("identify", "auto", "rec.csv", "-o", "a.npz"),
         ("family", "rec.csv", "-o", "a.npz"),
-        ("frf", "rec.csv", "-o", "a.npz"),
         ("validate", "rls.npz", "--data", "rec.csv"),
         ("design", "pi", "rls.npz", "-o", "a.npz"),
         ("observer", "rls.npz", "-o", "a.npz"),

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
+import math
 import os
 import shutil
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import control
 import numpy as np
@@ -15,8 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.io import loadmat
 
-from softneck.cli._main import run
-from softneck.core import Matrix, SettingsError, Vector, load
+from softneck.core import Matrix, OutputFileError, SettingsError, SoftneckError, Vector, load
 from softneck.cosim.linear import _linearize
 from softneck.cosim.linear._linearize import linearize
 from softneck.cosim.linear._pulses import BlockSteps, realised
@@ -198,49 +198,40 @@ def test_what_moves_nothing_is_said() -> None:
         realised(quiet, np.zeros(1), [], [], [0], "toy")
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out, source = tmp_path / "ss.mat", str(GOLDEN / "rls.npz")
-    assert run(["linearize", source, "--at", "t=1.0", "--set", "motor_setpoint_1=0.5", "-o", str(out), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
-    system = linearize(block_of("rls"), at=1.0, values={"motor_setpoint_1": 0.5})
-    assert facts["states"] == len(system.A)
-    assert facts["method"] == "exact"
+def test_a_file_is_what_its_block_is(tmp_path: Path) -> None:
+    out, values = tmp_path / "ss.mat", {"motor_setpoint_1": 0.5}
+    system = linearize(GOLDEN / "rls.npz", at=1.0, values=values)
+    assert system.method == "exact"
+    expected = linearize(block_of("rls"), at=1.0, values=values)
+    system.to_mat(out)
     found = loadmat(out)
     for name in "ABCD":
-        np.testing.assert_array_equal(found[name], getattr(system, name))
+        np.testing.assert_array_equal(found[name], getattr(expected, name))
     assert found["Ts"].item() == TS
-    assert [str(name[0]) for name in found["InputName"].ravel()] == list(system.inputs)
-    assert run(["linearize", source, "-o", str(out)]) == 2
-    assert "exists" in capsys.readouterr().err
-    assert run(["linearize", source, "-o", str(out), "--force"]) == 0
-    assert "19 states at t = 0 s, 0.02 s a sample, exact" in capsys.readouterr().out
+    assert [str(name[0]) for name in found["InputName"].ravel()] == list(expected.inputs)
+    with pytest.raises(OutputFileError, match="exists"):
+        system.to_mat(out)
+    assert "19 states at t = 1 s, 0.02 s a sample, exact" in system.summary()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("more", "words"),
     [
-        (["--at", "soon"], "must be t=SECONDS"),
-        (["--at", "t=-1"], "must be t=SECONDS"),
-        (["--at", "t=nan"], "must be t=SECONDS"),
-        (["--at", "t=1e9"], "10000000 samples"),
-        (["--at", "t=0.031"], "take 0.04 s"),
-        (["--set", "motor_setpoint_1"], "must be NAME=VALUE"),
-        (["--set", "motor_setpoint_1=inf"], "a finite number"),
-        (["--set", "thrust=1"], "has no input or parameter `thrust`"),
+        ({"at": -1.0}, "`at` must be"),
+        ({"at": math.nan}, "`at` must be"),
+        ({"at": 1e9}, "10000000 samples"),
+        ({"at": 0.031}, "take 0.04 s"),
+        ({"values": {"motor_setpoint_1": math.inf}}, "must be finite"),
+        ({"values": {"thrust": 1.0}}, "has no input or parameter `thrust`"),
+        ({"sample_time": 0.1}, "`sample_time` is for FMUs"),
     ],
 )
-def test_bad_input_is_one_line(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "ss.mat"
-    assert run(["linearize", str(GOLDEN / "rls.npz"), "-o", str(out), *arguments]) == 2
-    error = capsys.readouterr().err.strip()
-    assert words in error
-    assert "\n" not in error
-    assert not out.exists()
+def test_bad_input_is_one_line(more: dict[str, Any], words: str) -> None:
+    with pytest.raises(SettingsError, match=words):
+        linearize(GOLDEN / "rls.npz", **more)
 
 
-def test_files_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_that_cannot_be(tmp_path: Path) -> None:
     fmu = build_foreign(tmp_path, 2)
     blind = tmp_path / "Blind.fmu"
     with zipfile.ZipFile(fmu) as source, zipfile.ZipFile(blind, "w") as target:
@@ -248,19 +239,20 @@ def test_files_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]
             data = source.read(name).replace(b'canGetAndSetFMUstate="true"', b'canGetAndSetFMUstate="false"')
             target.writestr(name, data)
     (tmp_path / "no.fmu").write_text("no zip")
+    (tmp_path / "D.fmu").mkdir()
+    (tmp_path / "D.npz").mkdir()
     for file, words in (
         (fmu, "states no step size"),
-        (tmp_path / "no.fmu", "no.fmu"),
-        (tmp_path / "absent.fmu", "absent.fmu"),
+        (tmp_path / "no.fmu", r"no\.fmu"),
+        (tmp_path / "absent.fmu", r"absent\.fmu"),
+        (tmp_path / "D.fmu", "is a folder; name a file"),
+        (tmp_path / "D.npz", "is a folder; name a file"),
+        (tmp_path / "none.ssp", "is several FMUs; unzip it"),
         (GOLDEN / "family.npz", "is not a model, observer or controller"),
     ):
-        assert run(["linearize", str(file), "-o", str(tmp_path / "x.mat")]) == 2
-        error = capsys.readouterr().err.strip()
-        assert words in error
-        assert "\n" not in error
-    assert run(["linearize", str(blind), "--sample-time", "0.1", "-o", str(tmp_path / "x.mat")]) == 2
-    assert "canGetAndSetFMUstate is false" in capsys.readouterr().err
-    assert run(["linearize", str(fmu), "--sample-time", "-1", "-o", str(tmp_path / "x.mat")]) == 2
-    assert "sample_time" in capsys.readouterr().err
-    assert run(["linearize", str(fmu), "-o", str(tmp_path / "x.txt")]) == 2
-    assert "must end in `.mat`" in capsys.readouterr().err
+        with pytest.raises(SoftneckError, match=words):
+            linearize(file)
+    with pytest.raises(SoftneckError, match="canGetAndSetFMUstate is false"):
+        linearize(blind, sample_time=0.1)
+    with pytest.raises(SettingsError, match="sample_time"):
+        linearize(fmu, sample_time=-1.0)

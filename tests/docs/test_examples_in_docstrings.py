@@ -9,8 +9,8 @@ import pytest
 
 import softneck
 
-NAMES = ("VirtualNeck", "build_fmu", "design_controller", "identify", "load", "read_recording", "record", "simulate",
-         "study", "validate", "verify")  # fmt: skip
+NAMES = ("VirtualNeck", "build_fmu", "calibrate", "design_controller", "frequency_response", "identify", "linearize",
+         "load", "read_recording", "record", "simulate", "study", "validate", "verify")  # fmt: skip
 
 
 @pytest.mark.slow

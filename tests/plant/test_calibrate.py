@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from softneck.cli._main import run
-from softneck.core import DataError
+import softneck
+from softneck.core import CheckFailedError, DataError, OutputFileError
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plant._calibration import _Run, calibrate
 from softneck.signals import Recording, read_recording, signal, write_recording
@@ -46,37 +45,37 @@ def test_payloads_must_be_one_for_each() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_writes_a_neck_that_loads_and_refuses_one_that_does_not_follow(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_neck_is_written_that_loads_and_none_that_does_not_follow(tmp_path: Path) -> None:
     good = recorded()
     write_recording(tmp_path / "good.csv", good)
     neck = tmp_path / "neck.toml"
-    assert run(["calibrate", str(tmp_path / "good.csv"), "-o", str(neck), "--evaluations", "5"]) == 0
+    found = softneck.calibrate(tmp_path / "good.csv", evaluations=5)
+    found.save(neck)
     again = NeckParameters.preset(str(neck))
     assert (_Run.of(good, 0.0).fits(again) > 85.0).all()
-    assert run(["calibrate", str(tmp_path / "good.csv"), "-o", str(neck)]) == 2
+    with pytest.raises(OutputFileError, match="exists already"):
+        found.save(neck)
     # A recording that no neck answers so: its roll is noise.
     noise = 0.1 * np.random.default_rng(0).standard_normal(len(good))
-    write_recording(tmp_path / "bad.csv", good.with_channels(roll=noise))
-    capsys.readouterr()
-    assert run(["calibrate", str(tmp_path / "bad.csv"), "-o", str(tmp_path / "bad.toml"), "--evaluations", "1"]) == 1
-    assert "less than 85: not written" in capsys.readouterr().err
+    bad = softneck.calibrate(good.with_channels(roll=noise), evaluations=1)
+    with pytest.raises(CheckFailedError, match="less than 85: not written"):
+        bad.save(tmp_path / "bad.toml")
     assert not (tmp_path / "bad.toml").exists()
 
 
 @pytest.mark.slow
-def test_the_command_takes_a_grey_box_and_the_payload_that_a_recording_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_grey_box_is_taken_and_the_payload_that_a_recording_says(tmp_path: Path) -> None:
     golden, neck = Path(__file__).parents[1] / "golden" / "greybox.npz", tmp_path / "neck.toml"
-    assert run(["calibrate", str(golden), "-o", str(neck), "--evaluations", "3", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["worst"] == min(fit for pair in told["fits"] for fit in pair) >= 85.0
-    assert NeckParameters.preset(str(neck)) != NeckParameters.preset(told["start"])
-    assert run(["calibrate", str(golden.with_name("oe.npz")), "-o", str(tmp_path / "no.toml")]) == 2
-    assert "is of kind oe; a neck is calibrated to recordings or to a `greybox`" in capsys.readouterr().err
+    found = softneck.calibrate(golden, evaluations=3)
+    assert found.worst == found.fits.min() >= 85.0
+    found.save(neck)
+    assert NeckParameters.preset(str(neck)) != NeckParameters.preset(found.start)
     assert conditions(recorded(0.5))["payload_kg"] == [0.5, 0.5]
     write_recording(tmp_path / "half.csv", recorded(0.5))
     assert conditions(read_recording(tmp_path / "half.csv"))["payload_kg"] == [0.5, 0.5]
     assert conditions(recorded())["payload_kg"] == [0.0, 0.0]
+
+
+def test_a_model_of_another_kind_is_refused() -> None:
+    with pytest.raises(DataError, match="is of kind oe; a neck is calibrated to recordings or to a `greybox`"):
+        softneck.calibrate(Path(__file__).parents[1] / "golden" / "oe.npz")

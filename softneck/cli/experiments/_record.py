@@ -55,15 +55,13 @@ from ._next import record_next
 @click.option(
     "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
 )
-@click.option("--amplitude", type=float, metavar="A", help="`multisine` for `frf`: largest input. [default: 1]")
-@click.option(
-    "--band", metavar="LOW,HIGH", help="`multisine` for `frf`: from where to where [rad/s]; one value: a sine."
-)
+@click.option("--amplitude", type=float, metavar="A", help="`multisine`: largest input. [default: 1]")
+@click.option("--band", metavar="LOW,HIGH", help="`multisine`: from where to where [rad/s]; one value: a sine.")
 @click.option(
     "--realisations",
     type=int,
     metavar="N",
-    help="`multisine` for `frf`: draws of the phases. [default: 4; 1 of a sine]",
+    help="`multisine`: draws of the phases. [default: 4; 1 of a sine]",
 )
 @click.option(
     "--cocontraction", type=float, default=0.0, show_default=True, metavar="RAD",
@@ -119,8 +117,8 @@ def command(
     asked = {name: value for name, value in experiment.items() if value is not None}
     if asked and (signal_name != "multisine" or duration is not None or ramp > 0.0):
         raise SettingsError(
-            f"`--{next(iter(asked))}` asks for the experiments of `softneck frf`: the signal is `multisine` then, and "
-            "takes no `--duration` and no `--ramp`, which would end its periods."
+            f"`--{next(iter(asked))}` asks for experiments of a frequency response: the signal is `multisine` "
+            "then, and takes no `--duration` and no `--ramp`, which would end its periods."
         )
     if asked:
         played = multisine_experiments(seed=seed, robot=whose, **asked)

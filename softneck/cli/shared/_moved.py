@@ -6,6 +6,9 @@ import click
 
 # Command, or command and option, as they were -> what to call instead.
 _NOW = {
+    "calibrate": "softneck.calibrate(recordings).save(NECK.toml) in Python",
+    "frf": "softneck.frequency_response(recordings) in Python",
+    "linearize": "softneck.linearize(MODEL, at=S).to_mat(SS.mat) in Python",
     "resample": "softneck import REC --resample S -o REC2",
     "adapt": "softneck identify KIND REC --from MODEL -o MODEL2",
     "excite": "softneck record MODEL -o NEXT.csv (of a recording: identify guarded first)",

@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, atomic_write
+from softneck.core import FileFormatError, Matrix, SettingsError, Vector, atomic_write, load, require_between
 from softneck.identification.models._linearisation import moved_through
+from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, Port, State
 from softneck.runtime._compile import load_tangent
 from softneck.runtime._tangent_activity import TangentError
@@ -29,8 +30,12 @@ from ._pulses import BlockSteps, FmuSteps, realised
 if TYPE_CHECKING:
     import control
 
+    from softneck.fmu.describe._describe import Buildable
+
 # What an FMU of ours and its block may differ by: the library adds in another order (1e-12 of a signal's size).
 _SAME = 1e-9
+# What pulses may differ by before a linear system is worth little.
+_POOR = 1e-3
 # Of a sample time: where `at` is meant to be one.
 _ON_GRID = 1e-6
 _MOST_SAMPLES = 10_000_000
@@ -62,6 +67,18 @@ class LinearPoint:
     method: str
     error: float = 0.0
 
+    def summary(self) -> str:
+        """Return a line on its order, moment and method, one on its signals, and one if it is worth little."""
+        pulses = f"by pulses, which it answers to {self.error:.1e} of the largest"
+        lines = [
+            f"{self.name}: {len(self.A)} states at t = {self.time:g} s, {self.sample_time:g} s a sample, "
+            f"{'exact' if self.method == 'exact' else pulses}",
+            f"from {', '.join(self.inputs)} to {', '.join(self.outputs)}",
+        ]
+        if self.error > _POOR:
+            lines.append("caution: it is not linear there, or moves while its inputs are held")
+        return "\n".join(lines)
+
     def ss(self) -> control.StateSpace:
         """Return it for python-control, with `dt` and the signals' names."""
         import control
@@ -83,16 +100,18 @@ class LinearPoint:
 
 
 def linearize(
-    source: str | Path | Block, *, at: float = 0.0, values: Mapping[str, float] | None = None,
+    source: str | Path | Block | Buildable, *, at: float = 0.0, values: Mapping[str, float] | None = None,
     sample_time: float | None = None,
 ) -> LinearPoint:  # fmt: skip
-    """Return the linear system near t = `at` of a block or an FMU whose inputs were held until then.
+    """Return the linear system near t = `at` of a model, neck, controller or FMU whose inputs were held until then.
 
+    Exact for what is ours and has derivatives; else from pulses on a saved state, whose `error` is told.
     Booleans and inputs that mean "not measured" are held, and `validity` is no output of a linear system. States
     that no input moves or no output shows are left out.
 
     Args:
-        source: an FMU's path, or a block.
+        source: file of a model, observer, controller, neck or of any tool's FMU (FMI 2.0 or 3.0, Co-Simulation); a
+            preset of a neck; a model, observer or controller; or its block.
         at: [s], on the grid of samples.
         values: inputs and parameters that differ from their start values, in SI units.
         sample_time: [s], of an FMU of others; its default step where none is given.
@@ -101,10 +120,21 @@ def linearize(
         SettingsError: a moment between samples, a name that is not there, an FMU that cannot save its state, or one
             whose outputs no input moves.
         FmuError: the FMU refused a call.
+
+    Example:
+        >>> import softneck
+        >>> system = softneck.linearize("paper", at=0.02, values={"motor_setpoint_1": 0.5})
+        >>> system.inputs[0], system.outputs[0], system.A.shape == (len(system.A), len(system.A))
+        ('motor_setpoint_1', 'pitch', True)
+        >>> system.ss().dt
+        0.02
     """
     given = dict(values or {})
-    if isinstance(source, Block):
-        return _of_block(source, at, given)
+    require_between("at", at, 0.0, 1e12, "s")
+    if not isinstance(source, str | Path) or Path(source).suffix != ".fmu":
+        if sample_time is not None:
+            raise SettingsError("`sample_time` is for FMUs; what is softneck's has its own.")
+        return _of_block(_opened(source), at, given)
     with FmuPart(source, role=None if _says_role(source) else "plant", sample_time=sample_time) as part:
         block = block_of(Path(source))
         ours = block is not None and sample_time in (None, block.sample_time)
@@ -113,6 +143,19 @@ def linearize(
         ports, parameters = _split(part.inputs, part.parameters, given, str(source))
         steps = FmuSteps(part, parameters, ports)
         return _by_pulses(steps, part.inputs, part.outputs, ports, at, Path(source).stem)
+
+
+def _opened(source: str | Path | Block | Buildable) -> Block:
+    """Return the block of what is ours."""
+    if isinstance(source, str | Path):
+        path = Path(source)
+        if path.suffix == ".ssp":
+            raise SettingsError(f"{path}: is several FMUs; unzip it and linearize one of those in `resources`.")
+        thing: Any = load(path) if path.suffix == ".npz" else VirtualNeck(NeckParameters.preset(str(path)))
+        if not hasattr(thing, "block"):
+            raise FileFormatError(f"{path}: is not a model, observer or controller, so it has no states.")
+        return thing.block()
+    return source if isinstance(source, Block) else source.block()
 
 
 def _says_role(path: str | Path) -> bool:

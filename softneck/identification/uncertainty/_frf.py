@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, SettingsError, Vector, require_between, to_si, write_archive
+from softneck.core import DataError, FileFormatError, SettingsError, Vector, require_between, to_si, write_archive
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 
@@ -17,6 +18,7 @@ from ._spectra import ComplexArray
 
 if TYPE_CHECKING:
     import control
+    from matplotlib.figure import Figure
 
 # By definition: a response is supported where its 95 % circle is within this part of it.
 SUPPORTED = 0.3
@@ -153,8 +155,43 @@ class FrequencyResponse(Shown):
         ]
         return "\n".join(lines)
 
+    def plot(self, output: str | None = None, *, models: Mapping[str, Any] | None = None) -> Figure:
+        """Return a Bode plot of one output's answer to its own input, and the coherence.
+
+        Args:
+            output: name; the first if not given.
+            models: name -> linear model or family, drawn beside.
+
+        Raises:
+            DataError: a model that is not linear, or of another sample time.
+        """
+        from softneck.plots import frequency_response_figure
+
+        output = self.outputs[0] if output is None else output
+        source = self.own_input(output)
+        i, a = self._entry(output, source)
+        scale, per_input, unit = self.shown()
+        sines = [
+            (item.frequency, scale * item.response[i], f"sine of {per_input * item.amplitude[a]:.2g}")
+            for item in self.sines
+            if int(np.argmax(item.amplitude)) == a
+        ]
+        return frequency_response_figure(
+            self.frequency, scale * self.response[:, i, a], scale * np.nan_to_num(self.radius()[:, i, a]),
+            self.coherence[:, i], f"{source} to {output}", unit=unit, sines=sines,
+            models={name: scale * self._curve(model, name, output) for name, model in (models or {}).items()},
+        )  # fmt: skip
+
+    def _curve(self, model: Any, name: str, output: str) -> np.ndarray:
+        """Return a model's response of `output` to the input that is meant for it [SI]."""
+        if not hasattr(model, "tf"):
+            raise DataError(f"{name}: only a linear model or a family has a response to draw.")
+        if abs(model.sample_time - self.sample_time) > 1e-9 * self.sample_time:
+            raise DataError(f"{name}: is at {model.sample_time:g} s and the recordings at {self.sample_time:g} s.")
+        return np.squeeze(model.tf(output)(np.exp(1j * self.frequency * self.sample_time)))
+
     def as_dict(self) -> dict[str, Any]:
-        """Return what `softneck frf --json` prints."""
+        """Return method, inputs, bands and sines as plain values."""
         bands = {output: self.band(output, self.own_input(output)) for output in self.outputs}
         return {
             "method": self.method,

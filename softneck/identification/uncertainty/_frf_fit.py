@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector, require_one_of
 from softneck.robot import Robot
 from softneck.signals import Recording, redefine
+from softneck.signals.recording._files import opened_recording
 
 from ..linear._oe import SOURCES
 from ._frf import FrequencyResponse
@@ -40,7 +42,9 @@ class _Run:
     missed: int
 
 
-def frequency_response(recordings: Recording | Sequence[Recording], *, source: str = "set_points") -> FrequencyResponse:
+def frequency_response(
+    recordings: Recording | str | Path | Sequence[Recording | str | Path], *, source: str = "set_points"
+) -> FrequencyResponse:
     """Return the nonparametric response from inputs to outputs, with covariance and coherence.
 
     Runs of periodic multisines (at least two realisations, each of as many orthogonal experiments as inputs move) are
@@ -49,7 +53,7 @@ def frequency_response(recordings: Recording | Sequence[Recording], *, source: s
     `S_yr S_ur^-1`. Every result is of inputs of this size: a nonlinear robot has another one for others.
 
     Args:
-        recordings: of one robot and one sample time; runs are never joined.
+        recordings: or their files; of one robot and one sample time; runs are never joined.
         source: "set_points", or "positions" of the motors.
 
     Returns:
@@ -58,8 +62,18 @@ def frequency_response(recordings: Recording | Sequence[Recording], *, source: s
     Raises:
         DataError: too short, nothing moves, too many samples missed, sizes of realisations that differ, a closed
             loop whose reference rests or was not logged.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> found = softneck.frequency_response(softneck.record(signal("eq22", duration=30.0), neck, seed=1))
+        >>> found.outputs, found.own_input("pitch")
+        (('pitch', 'roll'), 'theta_i')
     """
-    parts = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    listed = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
+    parts = [opened_recording(item) for item in listed]
     require_one_of("source", source, SOURCES)
     robot, sample_time = _one(parts)
     names, transform = input_names(robot)

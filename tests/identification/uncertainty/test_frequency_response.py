@@ -11,10 +11,19 @@ from scipy import signal as scipy_signal
 
 from softneck import load
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.identification import FrequencyResponse, frequency_response
+from softneck.identification import FrequencyResponse, OutputError, frequency_response
 from softneck.identification.uncertainty._local_polynomial import local_polynomial, spectrum
+from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
-from softneck.signals import Recording, concatenate, motors_from, multisine_experiments, redefine, signal
+from softneck.signals import (
+    Recording,
+    concatenate,
+    motors_from,
+    multisine_experiments,
+    redefine,
+    signal,
+    write_recording,
+)
 
 TS = 0.02
 S = control.TransferFunction([1.0, 0.0], [1.0])
@@ -300,3 +309,24 @@ def test_motors_that_were_not_always_logged_are_filled_and_not_zero() -> None:
     found = frequency_response(whole.with_channels(**motors), source="positions")
     np.testing.assert_allclose(found.response, frequency_response(whole).response, atol=1e-12)
     assert found.findings["missing"].startswith("12 rows")
+
+
+def test_a_response_of_files_is_saved_drawn_and_described(tmp_path: Path) -> None:
+    neck = VirtualNeck(NeckParameters.paper())
+    parts = [
+        record(item, neck, seed=i)
+        for i, item in enumerate(multisine_experiments(amplitude=0.4, band=(1.0, 12.0), realisations=2))
+    ]
+    write_recording(tmp_path / "m.csv", concatenate(parts))
+    found = frequency_response(tmp_path / "m.csv")
+    facts = found.as_dict()
+    assert (facts["method"], facts["own_inputs"]) == ("robust", {"pitch": "theta_i", "roll": "phi_i"})
+    low, high = facts["band_rad_s"]["pitch"]
+    assert 1.0 <= low < high <= 12.1
+    figure = found.plot(models={"oe": OutputError().fit(concatenate(parts))})
+    assert figure.get_suptitle() == "theta_i to pitch"
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["data, 95 %", "oe"]
+    found.save(tmp_path / "f.npz")
+    assert "supported from" in load(tmp_path / "f.npz").summary()
+    with pytest.raises(DataError, match="f: only a linear model or a family has a response to draw"):
+        found.plot(models={"f": found})
