@@ -80,7 +80,7 @@ def memory(runs: int = 10_000) -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         study(loop(0.02, 0.2), vary=VARY, runs=runs, workers=1, output=Path(folder) / "study", report=look)
-        print("runs.parquet", file_hash(Path(folder) / "study" / "runs.parquet")[:8])
+        print("runs.csv", file_hash(Path(folder) / "study" / "runs.csv")[:8])
 
 
 def rows() -> None:

@@ -1,9 +1,10 @@
-"""softneck new: a project to begin with, whose closed-loop test passes at once."""
+"""softneck new: a project to begin with, whose loop holds its limits at once."""
 
 from __future__ import annotations
 
 import re
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -17,7 +18,7 @@ from .shared._options import force_option, json_option
 _MOST_NAMES = 3
 
 
-@click.command("new", epilog="Example: softneck new my_neck && cd my_neck && pytest")
+@click.command("new", epilog="Example: softneck new my_neck && cd my_neck && python identify.py")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option(
     "--loop", "loop_file", type=click.Path(path_type=Path), metavar="LOOP.toml",
@@ -47,7 +48,9 @@ def command(folder: Path, loop_file: Path | None, force: bool, as_json: bool) ->
         return
     click.echo(f"{folder}: {', '.join(texts)}")
     if loop_file is None:
-        click.echo(f"next: cd {folder} && pytest")
+        click.echo(f"next: cd {folder} && python identify.py && python design.py && softneck simulate loop.toml")
+        install = "" if find_spec("pytest") else "pip install pytest, then "
+        click.echo(f"its test of the closed loop: {install}pytest")
 
 
 def _of_loop(loop_file: Path, folder: Path, project: str) -> dict[str, str]:

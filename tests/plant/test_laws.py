@@ -52,6 +52,19 @@ def test_energy_never_rises_when_the_neck_is_let_go() -> None:
     assert energies[0] - energies[-1] > 1e-3
 
 
+def test_the_gain_goes_with_the_winch_and_hardly_with_the_bending_stiffness() -> None:
+    """Tendons prescribe lengths: stiffness counts by how far they stretch; docs/tutorials/design_study.md says so."""
+    block = VirtualNeck(NeckParameters.paper().without_noise()).block()
+
+    def gain(**changes: float) -> float:
+        _, Y = block.run(block.initial_state(**changes), inputs(400, (4.0 / 3.0, -2.0 / 3.0, -2.0 / 3.0)))
+        return (Y[-1, 0] - Y[0, 0]) / 2.0
+
+    # The sine of a tilt of 12 deg, and friction of the tendons.
+    assert gain(winch_radius=0.009) / gain(winch_radius=0.006) == pytest.approx(1.5, rel=0.02)
+    assert gain(bending_stiffness=0.8) / gain(bending_stiffness=0.45) == pytest.approx(1.0 - 0.047, abs=0.005)
+
+
 @pytest.mark.parametrize("payload", [0.0, 1.0])
 def test_energy_never_rises_with_locked_winches(payload: float) -> None:
     block = VirtualNeck(quiet()).block()
