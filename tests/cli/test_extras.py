@@ -14,6 +14,7 @@ from softneck.core import SettingsError, _errors
 from softneck.core._errors import EXTRAS, missing_extra
 from softneck.design import mixsyn
 from softneck.signals import write_recording
+from softneck.signals.importing.formats._mat import mat_arrays
 
 from ..data import ROOT, neck_recording
 
@@ -38,6 +39,15 @@ def test_a_command_names_the_extra_that_it_lacks(
     assert "run: pip install 'h5py" in said
     assert "'pyarrow>=" in said
     assert "softneck[" not in said
+
+
+def test_a_file_without_its_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_errors, "find_spec", lambda _: None)
+    with pytest.raises(SettingsError, match=r"pyarrow is not installed.*pip install .*pyarrow"):
+        write_recording(tmp_path / "a.parquet", neck_recording(50))
+    (tmp_path / "a.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n")
+    with pytest.raises(SettingsError, match=r"h5py is not installed.*pip install .*h5py"):
+        mat_arrays(tmp_path / "a.mat")
 
 
 def test_a_function_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:

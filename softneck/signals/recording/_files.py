@@ -16,6 +16,7 @@ import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 from softneck.core._budget import MOST_TOML, require_numbers, require_size, require_table
+from softneck.core._errors import require_package
 from softneck.core._files import require_file
 from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
@@ -74,9 +75,12 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
     Raises:
         OutputFileError: the file exists (and not `force`) or cannot be written.
         DataError: another ending than `.csv` or `.parquet`, or a channel without a sample.
+        SettingsError: `.parquet`, and pyarrow is not installed.
     """
     suffix = recording_suffix(path)
     require_samples(recording)
+    if suffix == ".parquet":
+        require_package("pyarrow")
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
             _write_csv(_titled(recording), temporary, _robot_line(recording.robot))

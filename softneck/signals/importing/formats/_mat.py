@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError
+from softneck.core import DataError, FileFormatError, SoftneckError
 from softneck.core._budget import room
+from softneck.core._errors import require_package
 
 # Table 1-1: types of data.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -22,6 +23,8 @@ _MATRIX, _COMPRESSED = 14, 15
 _CELL, _STRUCT, _NUMBERS = 1, 2, range(6, 16)
 _COMPLEX = 0x0800
 _HEADER = 128
+# HDF5 file format, II.A: where MATLAB (512) and others put the superblock.
+_SIGNATURE, _SUPERBLOCKS = b"\x89HDF\r\n\x1a\n", (0, 512, 1024, 2048)
 # Structures of logs are one or two deep; deeper ones are loops or hostile.
 _MAX_DEPTH = 4
 
@@ -146,11 +149,15 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
     Raises:
         FileFormatError: no MAT file.
         DataError: a variable lies in another file or declares an impossible size.
+        SettingsError: of version 7.3, and h5py is not installed.
     """
     try:
-        arrays = _hdf5(source) if _is_hdf5(source) else read_mat5(source.read_bytes())
+        hdf5 = _is_hdf5(source)
+        if hdf5:
+            require_package("h5py")
+        arrays = _hdf5(source) if hdf5 else read_mat5(source.read_bytes())
         found = _by_name(arrays, room(8 * source.stat().st_size))
-    except (DataError, FileFormatError):
+    except SoftneckError:
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
@@ -172,11 +179,8 @@ def _by_name(arrays: Iterator[tuple[str, np.ndarray]], left: int) -> dict[str, n
 
 def _is_hdf5(source: Path) -> bool:
     with source.open("rb") as file:
-        if is_mat5(file.read(_HEADER)):
-            return False
-    import h5py  # slow to import, and an extra that version 5 does without
-
-    return h5py.is_hdf5(source)
+        head = file.read(_SUPERBLOCKS[-1] + len(_SIGNATURE))
+    return any(head.startswith(_SIGNATURE, at) for at in _SUPERBLOCKS)
 
 
 def _hdf5(source: Path) -> Iterator[tuple[str, np.ndarray]]:
