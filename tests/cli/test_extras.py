@@ -9,6 +9,7 @@ from pathlib import Path
 import control
 import pytest
 
+from softneck.cli import _new
 from softneck.cli._main import run
 from softneck.core import SettingsError, _errors
 from softneck.core._errors import EXTRAS, missing_extra
@@ -48,6 +49,17 @@ def test_a_file_without_its_package_is_one_line(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "a.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + b"\x89HDF\r\n\x1a\n")
     with pytest.raises(SettingsError, match=r"h5py is not installed.*pip install .*h5py"):
         mat_arrays(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_new_project_says_how_its_test_runs(
+    there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(_new, "find_spec", lambda name: name if there else None)
+    assert run(["new", str(tmp_path / "p")]) == 0
+    said = capsys.readouterr().out
+    assert "python identify.py && python design.py && softneck simulate loop.toml\n" in said
+    assert ("pip install pytest" in said) != there
 
 
 def test_a_function_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
