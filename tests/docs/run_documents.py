@@ -42,11 +42,9 @@ SHOWN_LINES = 40
 # Pages whose blocks are not run yet, and why. It shall become empty.
 NOT_YET: dict[str, str] = {
     "README.md": "`start` and `verify` lack packages of an extra, and are being repaired",
-    "docs/tutorials/design_study.md": "studies write Parquet alone, and are being repaired",
     "docs/howto/bring_up.md": "for real drives; `drives scan`, `jog` and `zero` become steps of `commission`",
     "docs/howto/drives.md": "`drives scan`, `jog` and `zero` become steps of `commission`, `replay` one of `simulate`",
     "docs/howto/mpc.md": "its blocks follow what is left of the kinds of controllers",
-    "docs/howto/payloads.md": "its blocks follow what is left of the kinds of controllers",
 }
 
 _BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>[\w-]+)\n(?P<text>.*?)^ *```$", flags=re.MULTILINE | re.DOTALL)
