@@ -63,13 +63,10 @@ class World:
 
     def start(self, loop: str = "loop") -> None:
         """Start all three and wait until the controller runs."""
-        path = self.folder / "inclinometer.socket"
-        module = "softneck.drives.simulated"
-        self.sensor = self._spawn("-m", f"{module}.inclinometer", self.drives_bus or self.bus, str(path))
-        self.wait(path.exists, "the inclinometer", 60.0)
-        self.drives = self._spawn("-m", module, self.drives_bus or self.bus, "--homed", "--report",
-                                  "--cycle", str(self.period), "--profile", self.profile,
-                                  "--sensor-socket", str(path), stdout=subprocess.PIPE)  # fmt: skip
+        self.drives = self._spawn(
+            "-m", "softneck.drives.simulated", self.drives_bus or self.bus, "--homed", "--report",
+            "--cycle", str(self.period), "--profile", self.profile, stdout=subprocess.PIPE,
+        )  # fmt: skip
         threading.Thread(target=self._read, daemon=True).start()
         self.wait(lambda: len(self.changes) >= 3, "the drives", 60.0)
         self.notify = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -282,7 +279,7 @@ def bus_off(world: World) -> dict[str, Any]:
 def sensor_stopped(world: World) -> dict[str, Any]:
     """The inclinometer's process stands still: the host goes to rest and off."""
     since = time.monotonic()
-    world.sensor.send_signal(signal.SIGSTOP)
+    world.drives.send_signal(signal.SIGUSR2)
     code, result, _ = world.ended()
     fault = result["fault"]
     return {"reaction_s": fault["time_s"] - since, "exit": code, "event": fault["event"], **rest(world, since)}

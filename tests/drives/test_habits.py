@@ -20,7 +20,6 @@ from softneck.drives.master._cia402 import DriveState, Goal
 from softneck.drives.master._fieldbus import BusSettings, Fieldbus
 from softneck.drives.running._bus_loop import Session, run_session
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
-from softneck.drives.simulated._frame import CanFrame
 from softneck.drives.simulated._habits import WireHabits, habits_of
 from softneck.drives.simulated._servo_runtime import SERVO_SCALE, SERVO_ZERO
 from softneck.plant import NeckParameters
@@ -28,7 +27,7 @@ from softneck.plant import NeckParameters
 from ..data import ROOT
 from .bench import DISABLED, FAST, Bench, T
 from .pairwise import covering
-from .test_strict import Direct, Talk
+from .test_strict import Direct
 
 ENABLED_MODE_3 = ((0x6060, b"\3"), (0x6040, b"\6\0"), (0x6040, b"\7\0"), (0x6040, b"\x0f\0"))
 OPTIONAL = (0x1003, 0x1005, 0x1014, 0x1200, 0x2000, 0x2002)
@@ -61,15 +60,15 @@ def test_each_habit_stands_in_the_reference() -> None:
     ("texts", "said"),
     [
         ([], WireHabits()),
-        (["sdo_latency=0.05", "queue=4", "write_only=true"], WireHabits(sdo_latency=0.05, queue=4, write_only=True)),
+        (["sdo_latency=0.05", "twin=4", "write_only=true"], WireHabits(sdo_latency=0.05, twin=4, write_only=True)),
         (["mode_when=off", "lacks=[0x1003, 0x1014]"], WireHabits(mode_when="off", lacks=(0x1003, 0x1014))),
-        (["bitrate=500000"], WireHabits(bitrate=5e5)),
-        (["queues=4"], "`habit` must be"),
-        (["queue=many"], "`queue` takes a value such as 0; got `many`"),
-        (["queue=0.5"], "`queue` takes a value such as 0; got `0.5`"),
+        (["sdo_latency=1"], WireHabits(sdo_latency=1.0)),
+        (["twins=4"], "`habit` must be"),
+        (["twin=many"], "`twin` takes a value such as 0; got `many`"),
+        (["twin=0.5"], "`twin` takes a value such as 0; got `0.5`"),
         (["write_only=1"], "`write_only` takes a value such as False; got `1`"),
         (["sdo_latency=2"], "`sdo_latency`"),
-        (["queue"], "`queue` takes a value such as 0; got ``"),
+        (["twin"], "`twin` takes a value such as 0; got ``"),
         (["lacks=[0x6041]"], "`lacks` may not hold 6041h"),
     ],
 )
@@ -114,19 +113,6 @@ def test_a_mode_is_taken_before_or_after_operation_enabled(mode_when: str, off: 
         assert axis.state == 0x27
 
 
-def test_mode_7_is_refused_where_a_drive_does_not_have_it() -> None:
-    assert refusal(client(linked()).download, 0x6060, 0, b"\7") == 0x06090030
-    drive = client(linked(modes=(1, 3, 6, 7, 8)))
-    drive.download(0x6060, 0, b"\7")
-    assert drive.upload(0x6061, 0) == b"\7"
-
-
-def test_one_abort_code_for_everything_tells_nothing() -> None:
-    drive = client(linked(one_abort=True))
-    refused = [(drive.upload, 0x1234, 0), (drive.download, 0x6041, 0, b"\0\0"), (drive.download, 0x6060, 0, b"\7")]
-    assert {refusal(*act) for act in refused} == {0x08000000}
-
-
 @pytest.mark.parametrize("index", OPTIONAL)
 def test_an_object_that_a_drive_lacks_is_not_there(index: int) -> None:
     there, lacking = client(linked()), client(linked(lacks=(index,)))
@@ -140,21 +126,6 @@ def test_no_drive_lacks_what_makes_it_one() -> None:
         WireHabits(lacks=(0x1003, 0x6041))
     with pytest.raises(SettingsError, match="`mode_when` must be"):
         WireHabits(mode_when="never")
-
-
-def test_plain_pdos_have_two_types_no_timers_and_no_remote_answers() -> None:
-    link = linked(plain_pdo=True)
-    drive = client(link)
-    for kind in (0, 2, 240, 252, 253, 254):
-        assert refusal(drive.download, 0x1800, 2, bytes([kind])) == 0x06090030
-    for kind in (1, 255):
-        drive.download(0x1800, 2, bytes([kind]))
-    assert {refusal(drive.download, 0x1800, sub, b"\0\0") for sub in (3, 5)} == {0x06090011}
-    talk, ask = Talk(1), CanFrame(0x181, b"", True)
-    assert talk.say(ask)
-    talk.drive.axis.habits = WireHabits(plain_pdo=True)
-    talk.drive._map()
-    assert talk.say(ask) == []
 
 
 def test_a_twin_answers_with_its_own_serial_number_and_turns_nothing() -> None:
@@ -171,14 +142,8 @@ def test_a_twin_answers_with_its_own_serial_number_and_turns_nothing() -> None:
 
 QUIRKS: dict[str, tuple[Any, ...]] = {
     "sdo_latency": (0.0, 0.05),
-    "queue": (0, 8),
-    "bitrate": (0.0, 1e6),
-    "plain_sdo": (False, True),
-    "one_abort": (False, True),
     "write_only": (False, True),
     "mode_when": ("always", "off", "enabled"),
-    "modes": ((1, 3, 6, 8), (1, 3, 6, 7, 8)),
-    "plain_pdo": (False, True),
     "lacks": ((), OPTIONAL),
     "profile": ("ipos2015", "ds402"),
 }
@@ -189,7 +154,7 @@ QUIRKS: dict[str, tuple[Any, ...]] = {
     [
         ({"write_only": True}, "3 values written and read back (not 6060h, 60C2h: write only)"),
         ({"mode_when": "enabled"}, "2 values written and read back"),
-        ({"mode_when": "off", "one_abort": True, "plain_pdo": True, "lacks": OPTIONAL}, "3 values written and read"),
+        ({"mode_when": "off", "lacks": OPTIONAL}, "3 values written and read"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
@@ -219,8 +184,9 @@ def test_a_drive_that_takes_its_mode_late_must_hold_until_then(mode: int, holds:
     assert not holds or axis.values[(0x60FF, 0)] == 0, "it would turn as soon as it is enabled"
 
 
-def test_a_mode_that_a_drive_does_not_have_is_not_asked_for_later() -> None:
-    report = preflight(linked(mode_when="enabled", modes=(1, 3, 6)), default_drives())
+def test_a_mode_that_a_drive_does_not_have_is_not_asked_for_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("softneck.drives.simulated._habits._MODES", (1, 3, 6))
+    report = preflight(linked(mode_when="enabled"), default_drives())
     assert [row.found for row in report.rows if row.found.startswith("6502h")] == [
         "6502h is 001F0065h, mode 8 is refused"
     ] * 3
@@ -313,9 +279,12 @@ def test_a_run_waits_for_the_late_mode_and_is_then_like_any_other() -> None:
 
 
 @pytest.mark.parametrize("what", ["lost", "refused"])
-def test_a_late_mode_that_is_not_taken_stops_the_run_before_anything_moves(what: str) -> None:
-    modes = (1, 3, 6) if what == "refused" else (1, 3, 6, 8)
-    bench = Bench(habits=WireHabits(mode_when="enabled", modes=modes))
+def test_a_late_mode_that_is_not_taken_stops_the_run_before_anything_moves(
+    what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if what == "refused":
+        monkeypatch.setattr("softneck.drives.simulated._habits._MODES", (1, 3, 6))
+    bench = Bench(habits=WireHabits(mode_when="enabled"))
     if what == "lost":
         bench.link.lose = lambda _from_master, frame: 0x580 <= frame.identifier < 0x680
     bench.start()

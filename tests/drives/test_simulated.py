@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.drives.simulated import SimulatedDrive, SimulatedNeck, SimulatedSettings
-from softneck.drives.simulated.__main__ import hardware_stop
+from softneck.drives.simulated.__main__ import signals
 from softneck.drives.simulated._frame import CanFrame
 from softneck.plant import NeckParameters
 
@@ -226,13 +226,15 @@ def test_no_frame_crashes_a_drive(frames: list[CanFrame]) -> None:
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="needs SIGUSR1")
-def test_the_hardware_stop_can_be_practised() -> None:
+def test_signals_and_unplugged_sensor_can_be_practised() -> None:
     virtual = neck()
     before = signal.getsignal(signal.SIGUSR1)
-    with hardware_stop(virtual):
+    with signals(virtual):
         for pressed in (True, False):
             signal.raise_signal(signal.SIGUSR1)
+            signal.raise_signal(signal.SIGUSR2)
             assert [drive.axis.enable_input for drive in virtual.drives] == [not pressed] * 3
+            assert virtual.sensor == ("silent" if pressed else "works")
     assert signal.getsignal(signal.SIGUSR1) is before
 
 

@@ -6,10 +6,8 @@ import contextlib
 import gc
 import json
 import signal
-import socket
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import click
@@ -19,7 +17,6 @@ from softneck.plant import NeckParameters
 from softneck.robot import Robot, find_robot
 
 from ._drives import SimulatedSettings
-from ._frame import CanFrame
 from ._habits import habits_of
 from ._neck import SimulatedNeck
 from ._profiles import PROFILES
@@ -46,17 +43,16 @@ _GAIN, _REACH, _CURRENT = 0.483 / 5.293, 6.0, 0.0299
     metavar="NAME=VALUE",
     help="How strict the drives are, such as sdo_latency=0.05; again for more (docs/reference/drives.md).",
 )
-@click.option("--sensor-socket", type=click.Path(path_type=Path),
-              help="The inclinometer is softneck.drives.simulated.inclinometer and listens there.")  # fmt: skip
 def main(
     bus: str, neck: str, robot: str | None, profile: str, homed: bool, seed: int, report: bool, cycle: float,
-    habits: tuple[str, ...], sensor_socket: Path | None,
+    habits: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C.
 
     With --robot as many drives as it has motors, from node 1 on.
 
-    SIGUSR1 presses the hardware stop at the drives' Enable inputs, and releases it when it is sent again.
+    SIGUSR1 presses the hardware stop at the drives' Enable inputs, SIGUSR2 unplugs the inclinometer; sent again they
+    release it and plug it in.
     """
     import can
 
@@ -75,14 +71,10 @@ def main(
     virtual.move()
     virtual.sample(0.0)
     gc.freeze()
-    with (
-        can.Bus(interface=interface, channel=channel) as opened,
-        _forwarded(sensor_socket) as sensor,
-        hardware_stop(virtual),
-    ):
+    with can.Bus(interface=interface, channel=channel) as opened, signals(virtual):
         count = {3: "three"}.get(len(virtual.drives), str(len(virtual.drives)))
         click.echo(f"{count} {profile} drives on {bus}; Ctrl-C ends them", err=True)
-        serve(opened, virtual, sensor=sensor, report=_print if report else None)
+        serve(opened, virtual, report=_print if report else None)
 
 
 def _springs(robot: Robot, common: dict[str, Any]) -> SimulatedSprings:
@@ -109,10 +101,9 @@ def _print(now: float, neck: SimulatedNeck | SimulatedSprings, row: int) -> None
 
 
 @contextlib.contextmanager
-def hardware_stop(neck: SimulatedNeck | SimulatedSprings) -> Iterator[None]:
-    """Let SIGUSR1 open and close the Enable inputs of all drives, as the push-button does that one hand is at."""
-    number = getattr(signal, "SIGUSR1", None)
-    if number is None:
+def signals(neck: SimulatedNeck | SimulatedSprings) -> Iterator[None]:
+    """Let SIGUSR1 open and close the Enable inputs of all drives, and SIGUSR2 silence and wake the inclinometer."""
+    if not hasattr(signal, "SIGUSR1"):
         yield
         return
 
@@ -120,27 +111,16 @@ def hardware_stop(neck: SimulatedNeck | SimulatedSprings) -> Iterator[None]:
         for drive in neck.drives:
             drive.axis.enable_input = not drive.axis.enable_input
 
-    before = signal.signal(number, push)
+    def unplug(*_: object) -> None:
+        neck.sensor = "works" if neck.sensor == "silent" else "silent"
+
+    before = [(number, signal.signal(number, act)) for number, act in
+              ((signal.SIGUSR1, push), (signal.SIGUSR2, unplug))]  # fmt: skip
     try:
         yield
     finally:
-        signal.signal(number, before)
-
-
-@contextlib.contextmanager
-def _forwarded(path: Path | None) -> Iterator[Callable[[CanFrame], None] | None]:
-    """Yield what hands frames to the process behind socket `path`; one that does not read them loses them."""
-    if path is None:
-        yield None
-        return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
-        out.setblocking(False)
-
-        def hand_over(frame: CanFrame) -> None:
-            with contextlib.suppress(OSError):
-                out.sendto(frame.identifier.to_bytes(2, "little") + frame.data, str(path))
-
-        yield hand_over
+        for number, handler in before:
+            signal.signal(number, handler)
 
 
 if __name__ == "__main__":

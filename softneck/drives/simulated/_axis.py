@@ -158,7 +158,7 @@ class Axis:
         if len(data) != item.size:
             return WRONG_LENGTH
         value = int.from_bytes(data, "little", signed=item.signed)
-        refused = self.habits.unwritable(index, subindex, value, enabled=self.state == power.ENABLED)
+        refused = self.habits.unwritable(index, value, enabled=self.state == power.ENABLED)
         return refused or self.store((index, subindex), value, item)
 
     def store(self, key: tuple[int, int], value: int, item: Item) -> int:
@@ -181,7 +181,7 @@ class Axis:
             (0x6007, 0): (0, 1, 2, 3),
             (0x6098, 0): (0, 35, 37),
             (0x1003, 0): (0,),
-            **{(0x1800 + n, 2): (*range(241), 252, 253, 254, 255) for n in range(4)},
+            **{(0x1800 + n, 2): (*range(241), 254, 255) for n in range(4)},
         }.get(key)
         return allowed is None or value in allowed
 

@@ -27,7 +27,6 @@ from ._servo_runtime import (
     SERVO_SIZE,
     SERVO_ZERO,
 )
-from ._wire import Wire
 
 _TICK = 1e-3
 # What the ring must hold: the upper end of `drive_latency`, 0.1 s, in ticks.
@@ -51,7 +50,7 @@ class SimulatedSettings(Shown):
             the neck's drive latency.
         homed: the drives were zeroed with the neck at rest before.
         seed: of the inclinometer's noise.
-        habits: of drives and wire that are stricter than a wire without time.
+        habits: of drives that are stricter than the most obliging ones.
     """
 
     nodes: tuple[int, ...] = (1, 2, 3)
@@ -80,7 +79,7 @@ class SimulatedDrives:
     """All drives of a robot, stepped by whoever owns the time and what they turn.
 
     Attributes:
-        nodes: on the bus; twins: with the number of one of them; wire: between them and whoever speaks with them.
+        nodes: on the bus; twins: with the number of one of them.
         motion: (motors, SERVO_SIZE), see the servo runtime; ring: (motors, n) past demands.
         ticks: of the servo loops in one bus cycle; h: time of one [s].
     """
@@ -107,7 +106,22 @@ class SimulatedDrives:
         self.nodes = tuple(self._drive(settings, row, current_limit) for row in range(count))
         # A second device with somebody's number turns nothing; its boot-up message was long ago.
         self.twins = tuple(twin(node, settings) for node in (settings.habits.twin,) if node)
-        self.wire = Wire(settings.habits, settings.cycle)
+        self._latency = settings.habits.sdo_latency
+        self._late: list[tuple[float, CanFrame]] = []
+
+    def exchange(self, drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
+        """Deliver `frames` at `now` [s] to `drives`, and return what they say; SDO answers after their latency."""
+        for frame in frames:
+            for drive in drives:
+                drive.receive(now, frame)
+        said = [frame for drive in drives for frame in drive.tick(now)]
+        if not self._latency:
+            return said
+        answers = [frame for frame in said if 0x580 <= frame.identifier < 0x600]
+        self._late += [(now + self._latency, frame) for frame in answers]
+        due = [frame for time, frame in self._late if time <= now + 1e-9]
+        self._late = [entry for entry in self._late if entry[0] > now + 1e-9]
+        return [*(frame for frame in said if frame not in answers), *due]
 
     def _drive(self, s: SimulatedSettings, row: int, current_limit: float) -> SimulatedDrive:
         m = self.motion[row]
@@ -135,21 +149,6 @@ def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
     drive = SimulatedDrive(axis)
     drive.tick(0.0)
     return drive
-
-
-def exchange(drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float, wire: Wire) -> list[CanFrame]:
-    """Deliver `frames` at `now` [s] to all drives, and return what comes from them over the wire."""
-    for frame in frames:
-        for drive in drives:
-            drive.receive(now, frame)
-    said = [drive.tick(now) for drive in drives]
-    if not wire.habits.on_wire:
-        return [frame for frames in said for frame in frames]
-    out = wire.passed(now, frames, said)
-    for row, drive in enumerate(drives):
-        if code := wire.overrun(row):
-            drive.axis.emergencies.append((code, 0x10))
-    return out
 
 
 def sensed(

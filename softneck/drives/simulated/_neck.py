@@ -15,7 +15,7 @@ from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.runtime._bundle import sized
 
-from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, exchange, sample_at, sensed
+from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
 from ._frame import CanFrame
 from ._servo_runtime import SERVO_GEARING, SERVO_STUCK
 
@@ -27,7 +27,7 @@ class SimulatedNeck:
         drives: the nodes on the bus.
         outputs: the neck's outputs at the inclinometer's last sample, in the order of its block; of a neck (14,).
         disturbance: payload [kg], pushes [N], tilt of the base [rad]; of a neck (5,).
-        sensor: "works", "drops", "freezes", "nan" or "jumps".
+        sensor: "works", "drops", "freezes", "nan", "jumps", or "silent" on a bus.
     """
 
     def __init__(self, parameters: NeckParameters, settings: SimulatedSettings, robot: Robot | None = None) -> None:
@@ -79,7 +79,7 @@ class SimulatedNeck:
 
     def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
         """Deliver `frames` at `now`, and return what the drives send in answer."""
-        return exchange((*self.drives, *self._on_bus.twins), frames, now, self._on_bus.wire)
+        return self._on_bus.exchange((*self.drives, *self._on_bus.twins), frames, now)
 
     def move(self) -> None:
         """Let one cycle of time pass for drives and neck."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from ._sdo import WRONG_STATE, WRONG_VALUE, SdoServer
 
 _PREOPERATIONAL, _OPERATIONAL, _STOPPED = 0x7F, 0x05, 0x04
 _COMMANDS = {0x01: _OPERATIONAL, 0x02: _STOPPED, 0x80: _PREOPERATIONAL}
-_DISABLED, _NO_REMOTE = 0x80000000, 0x40000000
+_DISABLED = 0x80000000
 
 
 @dataclass(slots=True)
@@ -28,10 +27,6 @@ class _Pdo:
     waiting: tuple[int, ...] | None = None
     sent: bytes = b""
     syncs: int = 0
-    inhibit: float = 0.0
-    timer: float = 0.0
-    sent_at: float = -math.inf
-    remote: bool = True
 
 
 class SimulatedDrive:
@@ -47,8 +42,7 @@ class SimulatedDrive:
         """Put `axis` on the bus; it speaks first when `tick` is called."""
         self.axis, self.alive = axis, True
         self._out: list[CanFrame] = []
-        plain, one = axis.habits.plain_sdo, axis.habits.one_abort
-        self._sdo = SdoServer(axis.read, self._write, plain=plain, one_abort=one, size=axis.size)
+        self._sdo = SdoServer(axis.read, self._write, axis.size)
         self._boot(0.0)
 
     def _boot(self, now: float) -> None:
@@ -60,7 +54,6 @@ class SimulatedDrive:
         self._beat_at = now
         self._receive_pdos: dict[int, _Pdo] = {}
         self._transmit_pdos: list[_Pdo] = []
-        self._asked: dict[int, _Pdo] = {}
         self._errors: list[int] = []
         node = self.axis.node
         self._ids = (0x600 + node, 0x700 + node)
@@ -89,9 +82,7 @@ class SimulatedDrive:
                 else:
                     self._apply(pdo, values)
         elif identifier == self.axis.values[(0x1005, 0)] & 0x7FF and not remote:
-            self._sync(now)
-        elif remote and identifier in self._asked:
-            self._requested(now, self._asked[identifier])
+            self._sync()
         elif identifier == self._ids[1] and remote:
             self._guard(now)
         elif identifier == self._ids[0] and not remote:
@@ -118,7 +109,7 @@ class SimulatedDrive:
         self._toggle ^= 0x80
         self._guarded_at, self._told = now, False
 
-    def _sync(self, now: float) -> None:
+    def _sync(self) -> None:
         if self.nmt != _OPERATIONAL:
             return
         for pdo in self._receive_pdos.values():
@@ -127,8 +118,6 @@ class SimulatedDrive:
                 self._apply(pdo, values)
         self.axis.synchronise()
         for pdo in self._transmit_pdos:
-            if pdo.kind == 252:  # sampled with SYNC, sent when asked
-                pdo.sent = self._packed(pdo)
             if pdo.kind > 240:
                 continue
             pdo.syncs += 1
@@ -136,15 +125,10 @@ class SimulatedDrive:
             # Type n: with each n-th SYNC; type 0: with the SYNC after a change (CiA 301, 7.5.2.35).
             if pdo.syncs == pdo.kind or (pdo.kind == 0 and data != pdo.sent):
                 pdo.syncs = 0
-                self._send(now, pdo, data)
+                self._send(pdo, data)
 
-    def _requested(self, now: float, pdo: _Pdo) -> None:
-        """Answer a remote request: type 252 with what it had at the last SYNC, all others with what they have."""
-        if self.nmt == _OPERATIONAL and pdo.remote:
-            self._send(now, pdo, (pdo.sent or self._packed(pdo)) if pdo.kind == 252 else self._packed(pdo))
-
-    def _send(self, now: float, pdo: _Pdo, data: bytes) -> None:
-        pdo.sent, pdo.sent_at = data, now
+    def _send(self, pdo: _Pdo, data: bytes) -> None:
+        pdo.sent = data
         self._out.append(CanFrame(pdo.identifier, data))
 
     def _apply(self, pdo: _Pdo, values: tuple[int, ...]) -> None:
@@ -188,7 +172,7 @@ class SimulatedDrive:
             if self.nmt != _STOPPED and not told & _DISABLED:
                 self._out.append(CanFrame(told & 0x7FF, struct.pack("<HB5x", code, register)))
         if self.nmt == _OPERATIONAL:
-            self._events(now)
+            self._events()
         frames, self._out = self._out, []
         return frames
 
@@ -199,14 +183,11 @@ class SimulatedDrive:
         v[(0x1003, 0)] = len(self._errors)
         v |= {(0x1003, place): error for place, error in enumerate(self._errors, start=1)}
 
-    def _events(self, now: float) -> None:
-        """Send what changed, or what the event timer asks for; never sooner than the inhibit time allows."""
+    def _events(self) -> None:
+        """Send what changed."""
         for pdo in self._transmit_pdos:
-            since = now - pdo.sent_at + 1e-9
-            if pdo.kind >= 254 and since >= pdo.inhibit:
-                data = self._packed(pdo)
-                if data != pdo.sent or (pdo.timer and since >= pdo.timer):
-                    self._send(now, pdo, data)
+            if pdo.kind >= 254 and (data := self._packed(pdo)) != pdo.sent:
+                self._send(pdo, data)
 
     def _watch_times(self) -> None:
         v = self.axis.values
@@ -252,7 +233,7 @@ class SimulatedDrive:
     def _map(self) -> None:
         """Build the active PDOs from the objects."""
         v, axis = self.axis.values, self.axis
-        self._receive_pdos, self._transmit_pdos, self._asked = {}, [], {}
+        self._receive_pdos, self._transmit_pdos = {}, []
         items = dict(axis.profile.items)
         for n in range(4):
             for base, mapping in ((0x1400, 0x1600), (0x1800, 0x1A00)):
@@ -270,10 +251,7 @@ class SimulatedDrive:
                 else:
                     actions = [self._getter(key) for key in keys]
                     pdo = _Pdo(packed, keys, v[(base + n, 2)], identifier & 0x7FF, actions)
-                    pdo.inhibit, pdo.timer = v[(base + n, 3)] * 1e-4, v[(base + n, 5)] * 1e-3
-                    pdo.remote = not (identifier & _NO_REMOTE or axis.habits.plain_pdo)
                     self._transmit_pdos.append(pdo)
-                    self._asked[pdo.identifier] = pdo
 
     def _setter(self, key: tuple[int, int]) -> Callable[[int], object]:
         axis, item = self.axis, self.axis.profile.items[key]

@@ -137,9 +137,6 @@ def _pdo(communication: int, mapping: int, identifier: int) -> dict[Key, Item]:
         (communication, 2): Item(255, 1),
         (mapping, 0): Item(0, 1),
     }
-    if communication >= 0x1800:
-        # Inhibit time [0.1 ms] and event timer [ms].
-        items |= {(communication, 0): _ro(5, 1), (communication, 3): Item(0, 2), (communication, 5): Item(0, 2)}
     return items | {(mapping, i): Item(0) for i in range(1, 5)}
 
 

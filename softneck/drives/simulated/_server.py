@@ -29,7 +29,6 @@ def serve(
     *,
     sensor_node: int = 10,
     stopped: Callable[[], bool] | None = None,
-    sensor: Callable[[CanFrame], None] | None = None,
     report: Callable[[float, SimulatedNeck | SimulatedSprings, int], None] | None = None,
 ) -> None:
     """Answer frames on `bus` and let the neck move, until `stopped` returns True.
@@ -39,7 +38,6 @@ def serve(
         neck: what hangs on it; of more than two outputs the first two are sent.
         sensor_node: node of the inclinometer, which sends its slopes in a TPDO of its own (CiA 410, 0.001 deg).
         stopped: asked in each cycle.
-        sensor: takes the inclinometer's frames instead of `bus`: it is then a process of its own.
         report: called with (monotonic time, neck, row) whenever the drive in that row changes its power state.
     """
     import can
@@ -64,10 +62,7 @@ def serve(
             if moved * cycle >= sampled * sample_time:
                 sampled += 1
                 slopes = _slopes(neck, now, sensor_node)
-                if sensor is None:
-                    _send(bus, [slopes])
-                else:
-                    sensor(slopes)
+                _send(bus, [slopes] if neck.sensor != "silent" else [])
             _send(bus, neck.run((), moved * cycle))
             tell()
         rest = max(0.0, moved * cycle - (time.monotonic() - begin))

@@ -23,7 +23,7 @@ from softneck.plant._index_runtime import (
 from softneck.plant._mechanics_runtime import neck_drive
 from softneck.runtime import load_functions
 
-from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, exchange, sample_at, sensed
+from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
 from ._frame import CanFrame
 from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_STUCK, SERVO_ZERO
 from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRING_SIZE, SPRING_STIFFNESS
@@ -77,7 +77,7 @@ class SimulatedSprings:
         drives: the nodes on the bus.
         outputs: (2, outputs) values [rad] and rates [rad/s] as they are.
         motion: of the drives, see the servo runtime.
-        sensor: "works", "drops", "freezes", "nan" or "jumps".
+        sensor: "works", "drops", "freezes", "nan", "jumps", or "silent" on a bus.
     """
 
     def __init__(self, springs: SpringSettings, settings: SimulatedSettings) -> None:
@@ -123,7 +123,7 @@ class SimulatedSprings:
 
     def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
         """Deliver `frames` at `now`, and return what the drives send in answer."""
-        return exchange((*self.drives, *self._on_bus.twins), frames, now, self._on_bus.wire)
+        return self._on_bus.exchange((*self.drives, *self._on_bus.twins), frames, now)
 
     def move(self) -> None:
         """Let one cycle of time pass."""
