@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from typing import Any
 
 import control
@@ -121,6 +122,15 @@ def test_nu_gaps_of_textbooks(first: Any, second: Any, expected: float) -> None:
     P1, P2 = control.TransferFunction(*first), control.TransferFunction(*second)
     assert nugap(P1, P2) == pytest.approx(expected, abs=0.005)
     assert nugap(P2, P1) == pytest.approx(nugap(P1, P2), abs=1e-6)  # it is a metric; 1e-6 is the refined peak
+
+
+def test_a_plant_of_more_inputs_than_outputs_has_a_gap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three motors, two angles; python-control knows the zeros of such a plant with Slycot alone."""
+    monkeypatch.setitem(sys.modules, "slycot", None)
+    wide = [control.StateSpace(-p * np.eye(2), np.eye(2, 3), np.eye(2), np.zeros((2, 3))) for p in (1.0, 2.0)]
+    square = [control.StateSpace(-p * np.eye(2), np.eye(2), np.eye(2), np.zeros((2, 2))) for p in (1.0, 2.0)]
+    # The third motor moves nothing; grids may differ by the zeros.
+    assert nugap(*wide) == pytest.approx(nugap(*square), rel=1e-4)
 
 
 def test_the_gap_of_gains_is_the_chordal_distance() -> None:

@@ -284,7 +284,9 @@ def grid(system: Any, frequency: Vector | None) -> Vector:
         return np.asarray(frequency, dtype=np.float64)
     if is_data(system):
         return np.asarray(system.omega, dtype=np.float64)
-    features = np.concatenate([np.asarray(system.poles()), np.asarray(system.zeros())])
+    # Other systems have no zeros but by chance, and python-control finds those with Slycot alone.
+    zeros = system.zeros() if system.ninputs == system.noutputs else []
+    features = np.concatenate([np.asarray(system.poles()), np.asarray(zeros)])
     if _continuous(system):
         sizes = np.abs(features[np.abs(features) > 1e-8])
         low, high = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
