@@ -18,6 +18,7 @@ import platformdirs
 from softneck.core import atomic_write
 
 from ._bundle import bundle, content_name
+from ._numba_cache import compile_without_failing_cache, numba_cache_name
 from ._tangent import with_tangent
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
@@ -154,7 +155,7 @@ def _compile(namespace: ModuleType, called: Sequence[str] | None = None) -> bool
     for name, value in list(vars(namespace).items()):
         if isinstance(value, FunctionType):
             inner = {} if called is None or name in called else _INNER
-            setattr(namespace, name, njit(**COMPILE_OPTIONS, **inner)(value))
+            setattr(namespace, name, compile_without_failing_cache(njit(**COMPILE_OPTIONS, **inner)(value)))
     return True
 
 
@@ -201,7 +202,7 @@ def _import_text(text: str, *, compiled: bool) -> ModuleType:
 
 
 def _cache_folder() -> Path:
-    folder = Path(platformdirs.user_cache_dir("softneck", appauthor=False)) / "runtime"
+    folder = Path(platformdirs.user_cache_dir("softneck", appauthor=False)) / "runtime" / numba_cache_name("softneck")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

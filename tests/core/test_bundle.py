@@ -118,7 +118,7 @@ def test_a_compiled_bundle_is_kept_in_a_folder_of_the_user(
     monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
     (runtime_folder / "kept_a_runtime.py").write_text(STEP)
     runtime = load_runtime("kept_a_runtime", compiled=False)
-    assert [path.suffix for path in (tmp_path / "cache" / "runtime").glob("*.py")] == [".py"]
+    assert [path.suffix for path in (tmp_path / "cache" / "runtime").glob("*/*.py")] == [".py"]
     y = np.zeros((3, 1))
     runtime.run_steps((), np.zeros(0), np.zeros(1), np.array([[1.0], [2.0], [3.0]]), y)
     assert y.ravel().tolist() == [0.0, 1.0, 2.0]
@@ -165,6 +165,26 @@ def test_only_what_runs_is_compiled_and_it_runs_from_the_cache_too(
     assert found[1] == set(), "nothing is compiled twice"
 
 
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_an_entry_of_the_cache_that_does_not_load_is_compiled_anew(
+    suffix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runtime_folder: Path
+) -> None:
+    event = pytest.importorskip("numba.core.event")
+    monkeypatch.setattr("platformdirs.user_cache_dir", lambda *_a, **_k: str(tmp_path / "cache"))
+    (runtime_folder / "damaged_a_runtime.py").write_text(STEP.replace("0.0", "0.5"))
+    compiled = []
+    # Compiled, from a damaged cache, from the one that was written anew.
+    for _ in range(3):
+        _forget()
+        with event.install_recorder("numba:compile") as recorder:
+            outputs = np.zeros(1)
+            load_runtime("damaged_a_runtime").step((), np.zeros(0), np.zeros(1), np.ones(1), outputs)
+        compiled.append(bool(recorder.buffer))
+        for path in (tmp_path / "cache").rglob(f"*.{suffix}") if len(compiled) == 1 else ():
+            path.write_bytes(b"csoftneck_absent\nthing\n.")  # pickle's line for a name of a module
+    assert compiled == [True, True, False]
+
+
 WORDY = '"""A module."""\n' + STEP.replace(
     "    return 1\n", '    """Return the length."""\n\n    # One delay.\n    return 1  # sample\n'
 )  # fmt: skip
@@ -197,7 +217,7 @@ def test_a_changed_comment_keeps_the_compiled_code_and_a_broken_file_is_replaced
     for name, text in (("wordy_a_runtime", STEP), ("wordy_b_runtime", WORDY)):
         (runtime_folder / f"{name}.py").write_text(text)
     load_runtime("wordy_a_runtime", compiled=False)
-    (kept,) = (tmp_path / "cache" / "runtime").glob("*.py")
+    (kept,) = (tmp_path / "cache" / "runtime").glob("*/*.py")
     # numba asks for the file's time and size: a file that nobody touches is not compiled again.
     before = (kept.stat().st_mtime_ns, kept.read_text())
     load_runtime("wordy_b_runtime", compiled=False)

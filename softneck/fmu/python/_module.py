@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SettingsError
-from softneck.runtime import bundle
+from softneck.runtime import _numba_cache, bundle
 from softneck.runtime._bundle import content_name
 from softneck.runtime._compile import COMPILE_OPTIONS, compiled_name
 
@@ -74,11 +74,12 @@ def slave_module(runtime: str) -> SlaveModule:
         SettingsError: the runtime defines a name that the slave uses.
     """
     text = bundle(runtime)
-    parts = [Path(__file__).with_name(name).read_text(encoding="utf-8") for name in _SLAVE]
+    files = [Path(_numba_cache.__file__), *(Path(__file__).with_name(name) for name in _SLAVE)]
+    parts = [file.read_text(encoding="utf-8") for file in files]
     clash = _names(text) & set[str]().union(*map(_names, parts))
     if clash:
         raise SettingsError(f"runtime module {runtime} defines {', '.join(sorted(clash))}; the FMU's slave does too.")
-    border = _constant(parts[0], "_FMU_BORDER")
+    border = _constant(parts[1], "_FMU_BORDER")
     source = border + text + border + "\n".join(map(_without_own_imports, parts))
     name = content_name(source)
     script = f"{_CHECK}{_TAKE.format(name=name)}"

@@ -174,10 +174,10 @@ class SoftneckSlave(Fmi2Slave):
 
     def _choose(self, *, always: bool) -> None:
         """Take `step` from numba where that pays, or where it must be (`always`), else as it stands here."""
-        found = _fmu_compiled_step(self.facts, self.folder, always=always)
+        # What numba takes its time for is done now, on copies.
+        copies = (self.arrays, self.parameters, self.memory.copy(), np.zeros(self.n_in), self.pending.copy())
+        found = _fmu_compiled_step(self.facts, self.folder, copies, always=always)
         self.compiled, self.advance = found is not None, found or step
-        if found is not None:  # what numba takes its time for is done now, on copies
-            found(self.arrays, self.parameters, self.memory.copy(), np.zeros(self.n_in), self.pending.copy())
 
     def do_step(self, current_time: float, step_size: float) -> bool:
         """Take all samples in [current_time, current_time + step_size); False refuses the step and changes nothing."""

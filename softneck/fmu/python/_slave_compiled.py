@@ -1,7 +1,8 @@
 """The part of every FMU that takes its `step` from numba where the host has it (docs, how-to, FMUs).
 
-It writes the runtime's text to the folder, under the name and with the options, that softneck itself uses
-(`core._compile`): what either has compiled, the other finds. Standard library, numpy and numba only.
+Where softneck is installed too, it writes the runtime's text to the folder, under the name and with the options, that
+softneck itself uses (`runtime._compile`): what either has compiled, the other finds. Elsewhere FMUs have a folder of
+their own: code that softneck compiled may need its modules. Standard library, numpy and numba only.
 """
 
 import importlib.util
@@ -12,39 +13,48 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from softneck.runtime._numba_cache import compile_without_failing_cache, numba_cache_name
+
 # In the environment of the host: "0" never, "1" always, else by the cost that the FMU states.
 _FMU_SWITCH = "SOFTNECK_FMU_NUMBA"
 # The line before and behind the runtime in the module's text.
 _FMU_BORDER = "# --- runtime ---\n"
 
 
-def _fmu_compiled_step(facts: dict[str, Any], folder: str, *, always: bool = False) -> Callable[..., None] | None:
+def _fmu_compiled_step(
+    facts: dict[str, Any], folder: str, arguments: tuple[Any, ...], *, always: bool = False
+) -> Callable[..., None] | None:
     """Return the compiled `step` of the FMU unpacked in `folder`, or None where plain Python is to run.
+
+    numba takes its time at the first call, which is made here, with `arguments`.
 
     A light runtime is not worth numba's start of half a second; a middling one is where it is compiled already;
     a heavy one is compiled here, once for all FMUs of its kind on this machine.
     """
     switch = os.environ.get(_FMU_SWITCH, "")
     wanted = always or switch == "1"
-    if switch == "0" or not (wanted or facts["cost"] != "light") or not _fmu_have_numba():
+    if switch == "0" or not (wanted or facts["cost"] != "light") or not _fmu_have("numba"):
         return None
     alias = facts["runtime"] + "_compiled"
     here = sys.modules.get(alias)
-    if hasattr(getattr(here, "step", None), "py_func"):
-        return here.step  # type: ignore[union-attr]
-    cache = _fmu_cache_folder()
-    ready = any((cache / "__pycache__").glob(f"{facts['runtime']}.step-*.nbi"))
-    if not (ready or wanted or facts["cost"] == "heavy"):
-        return None
     try:
-        if not ready:
-            _fmu_print(
-                f"{facts['name']}: compiling its runtime, once on this machine; {_FMU_SWITCH}=0 leaves that out."
-            )
-        return _fmu_compile(alias, _fmu_cached_text(facts, folder, cache), facts["options"])
+        if hasattr(getattr(here, "step", None), "py_func"):
+            found: Any = here.step  # type: ignore[union-attr]
+        else:
+            cache = _fmu_cache_folder()
+            ready = any((cache / "__pycache__").glob(f"{facts['runtime']}.step-*.nbi"))
+            if not (ready or wanted or facts["cost"] == "heavy"):
+                return None
+            if not ready:
+                _fmu_print(
+                    f"{facts['name']}: compiling its runtime, once on this machine; {_FMU_SWITCH}=0 leaves that out."
+                )
+            found = _fmu_compile(alias, _fmu_cached_text(facts, folder, cache), facts["options"])
+        found(*arguments)
     except Exception as error:  # whatever is wrong with this numba or this disk, plain Python still runs
         _fmu_print(f"{facts['name']}: runs without numba, which failed: {error}")
         return None
+    return found
 
 
 def _fmu_print(text: str) -> None:
@@ -52,9 +62,9 @@ def _fmu_print(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def _fmu_have_numba() -> bool:
+def _fmu_have(package: str) -> bool:
     try:
-        return importlib.util.find_spec("numba") is not None
+        return importlib.util.find_spec(package) is not None
     except (ImportError, ValueError):
         return False
 
@@ -67,7 +77,7 @@ def _fmu_cache_folder() -> Path:
         cache = Path.home() / "Library" / "Caches" / "softneck"
     else:
         cache = Path(os.environ.get("XDG_CACHE_HOME", "").strip() or Path.home() / ".cache", "softneck")
-    return cache / "runtime"
+    return cache / "runtime" / numba_cache_name("softneck" if _fmu_have("softneck") else "fmu")
 
 
 def _fmu_cached_text(facts: dict[str, Any], folder: str, cache: Path) -> Path:
@@ -98,5 +108,5 @@ def _fmu_compile(alias: str, path: Path, options: dict[str, Any]) -> Callable[..
         names["COMPILED"] = 1
     for name, value in list(names.items()):
         if callable(value) and getattr(value, "__module__", None) == alias:
-            names[name] = njit(**options)(value)
+            names[name] = compile_without_failing_cache(njit(**options)(value))
     return names["step"]
