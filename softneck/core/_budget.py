@@ -14,7 +14,7 @@ from pathlib import Path
 from ._errors import FileFormatError, SettingsError
 
 # [bytes] Of TOML that people write (the reader takes 2 s for 4 MB), of JSON that commands write, and of an EDS.
-MOST_TOML, MOST_JSON, MOST_EDS = 2**20, 2**24, 2**22
+MOST_TOML, MOST_JSON = 2**20, 2**24
 # [bytes] Of a log as it lies on the disk: a day of 12 columns at 100 Hz is 1 GB of text. Of what an archive unpacks to.
 MOST_LOG, MOST_UNPACKED = 2**30, 2 * 2**30
 # Of one table or variable (1 GB as doubles); a neck has 15 columns, and 10,000 names take a screen of a minute to read.

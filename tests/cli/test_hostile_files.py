@@ -103,8 +103,6 @@ def two_corners(path: Path) -> None:
         archive.writestr("xl/worksheets/a.xml", f'<worksheet xmlns="{main}"><sheetData>{cells}</sheetData></worksheet>')
 
 
-EDS = "[1018]\nParameterName=a\nObjectType=8\nCompactSubObj=1\nDataType=7\nAccessType=ro\n"
-DRIVES = ["drives", "check", "--simulated", "--drives", "drives.toml"]
 LOOP = '[plant]\nneck = "paper"\n[controller]\nfile = "pi.npz"\n[reference]\nkind = "step"\npitch_deg = 10\n'
 IMPORT, GUESS = "import", ("--guess", "-o", "out.csv")
 CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
@@ -144,8 +142,6 @@ CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "needs.toml": (holes(b"version = 1\n"), ["verify", "pi.npz", "pi.npz", "--requirements", "needs.toml"]),
     "a.certificate.json": (holes(b"{\n"), ["info", "a.certificate.json"]),
     "line.log": (text("(1.000000) can0 181#00\n" + "0" * 300_000_000), ["info", "line.log"]),
-    "names.eds": (text(EDS + "[1018Name]\nNrOfEntries=2000000000\n"), DRIVES),
-    "holes.eds": (holes(EDS.encode()), DRIVES),
     "start.json": (holes(b"{}"), ["start", "log.csv", "-o", ".", "--yes"]),
     "given.toml": (holes(b"a = 1\n"), ["new", "made", "--loop", "given.toml"]),
     "robot_given.toml": (holes(b"a = 1\n"), ["robot", "new", "--preset", "robot_given.toml"]),
@@ -160,9 +156,6 @@ def test_a_hostile_file_is_one_line_soon_and_in_little_memory(
     write, arguments = CASES[name]
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pi.npz").write_bytes((ROOT / "tests" / "golden" / "pi.npz").read_bytes())
-    if name.endswith(".eds"):
-        example = (ROOT / "examples" / "drives" / "drives.toml").read_text()
-        (tmp_path / "drives.toml").write_text(f'eds = "{name}"\n{example}')
     (tmp_path / "log.csv").write_bytes(LOG)
     write(tmp_path / name)
     before = {path.name for path in tmp_path.iterdir()} | {"stderr", "stdout"}

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import canopen
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,15 +16,14 @@ from hypothesis import strategies as st
 from softneck.core import FileFormatError, SettingsError, SoftneckError
 from softneck.drives import DrivesFile, default_drives, load_drives, open_bus, preflight, simulated_neck
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.bus._objects import SIZES, require_eds
-from softneck.drives.bus._sdo import Objects, SdoError, load_eds
+from softneck.drives.bus._sdo import NUMBERS, Objects, SdoError
 from softneck.drives.master import Frame
+from softneck.drives.running._stop import disarm, stop
 from softneck.drives.simulated._profiles import PROFILES
 from softneck.plant import NeckParameters
 
 from ..data import ROOT
 
-IPOS = load_eds("ipos2015")
 EXAMPLE = ROOT / "examples" / "drives" / "drives.toml"
 
 
@@ -89,41 +89,34 @@ def test_two_drives_are_not_enough(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("profile", list(PROFILES))
-def test_our_eds_is_what_the_simulated_drives_have(profile: str) -> None:
-    dictionary = load_eds(profile)
-    require_eds(dictionary, profile, profile)
-    for (index, subindex), item in PROFILES[profile]().items.items():
+def test_our_eds_is_what_the_simulated_drives_have_and_a_run_uses(profile: str) -> None:
+    dictionary = canopen.import_od(str(ROOT / "softneck" / "drives" / "bus" / "eds" / f"{profile}.eds"))
+    items = PROFILES[profile]().items
+    for (index, subindex), item in items.items():
         variable = dictionary.get_variable(index, subindex)
         assert variable is not None, f"{index:04X}h:{subindex}"
         if item.size:
             assert (len(variable) // 8, variable.writable) == (item.size, item.writable), f"{index:04X}h:{subindex}"
-    assert set(SIZES) <= set(PROFILES[profile]().items)
+    others = {(0x207E, 0), (0x207F, 0)} if profile == "ds402" else {(0x1016, 1), (0x6073, 0), (0x6078, 0)}
+    assert set(NUMBERS) - set(items) == others
+    for key, code in NUMBERS.items():
+        if key in items:
+            assert (struct.calcsize(code), code.islower()) == (items[key].size, items[key].signed), key
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda text: text.replace("[607A]", "[607F]").replace("=0x607A", "=0x607F"), "it has no number at 607Ah:0"),
-        (lambda text: text.replace("ParameterName=Target position\nObjectType=0x7\nDataType=0x0004",
-                                   "ParameterName=Target position\nObjectType=0x7\nDataType=0x0003"),
-         "607Ah:0 has 2 bytes there and 4 here"),
-        (lambda _: "no eds at all", "is not an EDS"),
-        (lambda _: "", "is not an EDS|has no objects"),
-    ],
-    ids=["object missing", "another size", "no EDS", "empty"],
-)  # fmt: skip
-def test_an_eds_that_does_not_fit(tmp_path: Path, change: Callable[[str], str], message: str) -> None:
-    ours = ROOT / "softneck" / "drives" / "bus" / "eds" / "ipos2015.eds"
-    path = tmp_path / "mine.eds"
-    path.write_text(change(ours.read_text(encoding="utf-8")), encoding="utf-8")
-    file = default_drives(eds=path)
+def test_no_file_is_opened_once_a_drive_may_have_power() -> None:
+    """Neither by pre-flight, stop and the end of guarding: files may be gone by then."""
+    file = default_drives()
     link = link_to(file)
-    sent: list[Frame] = []
-    link.tap = lambda _now, from_master, frame: sent.append(frame) if from_master else None
-    logging.getLogger("canopen").setLevel(logging.CRITICAL)
-    with pytest.raises(FileFormatError, match=message):
-        preflight(link, file)
-    assert sent == []
+    preflight(link, file).require()  # imports are done
+    opened: list[str] = []
+    listening = [True]
+    sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == "open" and listening[0] else None)
+    preflight(link, file).require()
+    stop(link, file)
+    disarm(link, file, "life", ())
+    listening[0] = False
+    assert opened == []
 
 
 # -- what is on the bus -----------------------------------------------------------------------------------------------
@@ -236,7 +229,7 @@ class Liar:
     index=st.sampled_from([0x1000, 0x1008, 0x6064, 0x607D]),
 )
 def test_any_answer_is_a_value_or_one_clear_error(answers: list[bytes], index: int) -> None:
-    objects = Objects(Liar(answers), 1, IPOS)
+    objects = Objects(Liar(answers), 1)
     with contextlib.suppress(SdoError):
         if index == 0x1008:
             objects.read_text(index)
@@ -246,4 +239,4 @@ def test_any_answer_is_a_value_or_one_clear_error(answers: list[bytes], index: i
 
 def test_a_value_is_what_the_node_sent() -> None:
     answer = struct.pack("<BHBi", 0x43, 0x6064, 0, -12345)
-    assert Objects(Liar([answer]), 1, load_eds("ipos2015")).read(0x6064) == -12345
+    assert Objects(Liar([answer]), 1).read(0x6064) == -12345

@@ -10,12 +10,12 @@ import struct
 from typing import Any
 
 import pytest
+from canopen.objectdictionary import ObjectDictionary
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.drives.bus._sdo import load_eds
 from softneck.drives.master import Phase
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
 from softneck.drives.simulated._frame import CanFrame
@@ -27,8 +27,6 @@ from .bench import Bench
 from .pairwise import all_pairs, covering, pairs_of
 from .scenarios import SCENARIOS
 
-IPOS = load_eds("ipos2015")
-
 
 def neck(profile: str = "ipos2015", **habits: Any) -> SimulatedNeck:
     return SimulatedNeck(NeckParameters.paper(), SimulatedSettings(profile=profile, habits=WireHabits(**habits)))
@@ -39,7 +37,7 @@ class Direct:
 
     def __init__(self, server: SdoServer) -> None:
         self.server = server
-        self.client = SdoClient(0x601, 0x581, IPOS)
+        self.client = SdoClient(0x601, 0x581, ObjectDictionary())
         self.client.RESPONSE_TIMEOUT = 0.0
         self.client.network = self  # pyright: ignore[reportAttributeAccessIssue]
         self.client.responses = queue.Queue()

@@ -12,8 +12,6 @@ from softneck.cli._main import run
 from softneck.core import CheckFailedError
 from softneck.drives import DrivesFile, default_drives, preflight, scan, simulated_neck
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.bus._objects import require_eds
-from softneck.drives.bus._sdo import load_eds
 from softneck.drives.bus._why import reason
 from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.master import Frame
@@ -140,10 +138,3 @@ def test_what_a_drive_lacks_to_be_guarded_is_named(
     file = replace(file, guarding=replace(file.guarding, kind=wanted))
     with pytest.raises(CheckFailedError, match=rf"node 1: guarding: {told}"):
         preflight(linked(file), file).require()
-
-
-def test_an_eds_without_life_guarding_fits_if_it_has_a_heartbeat_consumer() -> None:
-    dictionary = load_eds("ds402")
-    for index in (0x100C, 0x100D):
-        del dictionary[index]
-    require_eds(dictionary, "ds402", "mine.eds")

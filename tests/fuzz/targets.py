@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import resource
@@ -22,9 +21,7 @@ from softneck.cosim import load_loop, load_ssp, load_study
 from softneck.cosim.parts._fmu_part import FmuPart
 from softneck.cosim.parts._ours import block_of
 from softneck.cosim.studies._store import read_description, read_runs
-from softneck.drives.bus._objects import require_eds
 from softneck.drives.bus._read import load_drives
-from softneck.drives.bus._sdo import load_eds
 from softneck.drives.logs._cycle import Cycle
 from softneck.drives.logs._log_file import read_run_log
 from softneck.drives.logs._run_log import _Entry, _McapSink
@@ -161,16 +158,8 @@ xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" name="a" version=
 <ssd:DefaultExperiment startTime="0" stopTime="1"/><ssd:Annotations><ssc:Annotation type="softneck">
 <Master stepSize="0.02" order="jacobi"/></ssc:Annotation></ssd:Annotations></ssd:SystemStructureDescription>"""
 
+
 # All of what an EDS may say, but not the objects that a run needs.
-SMALL_EDS = """[FileInfo]\nFileName=a.eds\n[Comments]\nLines=1\nLine1=a\n[DeviceInfo]\nVendorName=a\nBaudRate_1000=1
-[DummyUsage]\nDummy0001=1\nDummy0002=1\nDummy0003=1\nDummy0004=1\nDummy0005=1\nDummy0006=1\nDummy0007=1
-[1000]\nParameterName=a\nObjectType=0x7\nDataType=0x0007\nAccessType=ro\nDefaultValue=$NODEID+0x192\nPDOMapping=0
-LowLimit=0\nHighLimit=0xFFFF\n[1018]\nParameterName=b\nObjectType=0x9\nSubNumber=2\n[1018sub0]\nParameterName=c
-DataType=0x0005\nAccessType=ro\nDefaultValue=1\n[1018sub1]\nParameterName=d\nDataType=0x0007\nAccessType=ro
-[2000]\nParameterName=e\nObjectType=0x8\nDataType=0x0003\nAccessType=rw\nCompactSubObj=3\n[2000Name]\nNrOfEntries=2
-1=f\n2=g\n"""
-
-
 def sheet(path: Path) -> None:
     """As the reader, but that a fork tries a file first: a process of its own would take most of the time."""
     with mock.patch.object(_sheets, "_try", tried):
@@ -198,13 +187,6 @@ def tried(path: Path) -> None:
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code < 0 or code == 2:
         raise FileFormatError(f"{path}: its sheets would fill the memory.")
-
-
-def eds(path: Path) -> None:
-    """Whether it fits is another question, with a line of its own."""
-    dictionary = load_eds("ipos2015", path)
-    with contextlib.suppress(FileFormatError):
-        require_eds(dictionary, "ipos2015", path.name)
 
 
 def runs(path: Path) -> None:
@@ -266,7 +248,6 @@ TARGETS: dict[str, Target] = {
     ),
     "robot": Target(".toml", Robot.read, [text(preset_text(name)) for name in ("arm", "trunk4")]),
     "drives": Target(".toml", load_drives, [copy("examples", "drives", "drives.toml")]),
-    "eds": Target(".eds", eds, [copy("softneck", "drives", "bus", "eds", "ipos2015.eds"), text(SMALL_EDS)]),
     "runs": Target(".csv", runs_beside, [runs]),
     "layout": Target(
         ".toml",

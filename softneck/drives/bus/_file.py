@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from softneck.core import (
@@ -143,7 +142,6 @@ class DrivesFile(Shown):
     Attributes:
         profile: "ipos2015" or "ds402".
         drives: of the motors, in their order.
-        eds: an EDS of one's own, None for ours.
         cycle: bus period [s].
         bit_rate: [bit/s].
         guarding, zero, neck, limits, sensor, watch, ramps: the tables of those names.
@@ -159,7 +157,6 @@ class DrivesFile(Shown):
 
     profile: str
     drives: tuple[DriveEntry, ...]
-    eds: Path | None = None
     cycle: float = 0.01
     bit_rate: int = 1_000_000
     guarding: Guarding = field(default_factory=Guarding)

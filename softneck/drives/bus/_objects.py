@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-from softneck.core import FileFormatError
 
 from ._file import DriveEntry, DrivesFile
-from ._sdo import is_integer
 from ._units import (
     acceleration_to_internal,
     current_to_internal,
@@ -18,10 +14,6 @@ from ._units import (
     speed_to_internal,
 )
 
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
-
-
 # Home offset [counts] that `softneck drives zero` sets: no drive has it after a reset, so it proves the zero.
 HOMED_MARK = 1
 CSP = 8
@@ -30,20 +22,6 @@ MASTER_NODE = 127
 # Speeds of the profile ds402: counts per second.
 _PLAIN = "ds402"
 
-# (index, subindex) -> bytes, of what a run reads or writes.
-SIZES: dict[tuple[int, int], int] = {
-    (0x1000, 0): 4, (0x1018, 1): 4, (0x1018, 2): 4, (0x1018, 3): 4, (0x1018, 4): 4, (0x100C, 0): 2, (0x100D, 0): 1,
-    (0x1017, 0): 2, (0x6007, 0): 2, (0x6040, 0): 2, (0x6041, 0): 2, (0x605A, 0): 2, (0x605E, 0): 2, (0x6060, 0): 1,
-    (0x6061, 0): 1, (0x6064, 0): 4, (0x6065, 0): 4, (0x6066, 0): 2, (0x606C, 0): 4, (0x607A, 0): 4, (0x607C, 0): 4,
-    (0x607D, 1): 4, (0x607D, 2): 4, (0x6083, 0): 4, (0x6085, 0): 4, (0x6093, 1): 4, (0x6093, 2): 4, (0x6094, 1): 4,
-    (0x6094, 2): 4, (0x6097, 1): 4, (0x6097, 2): 4, (0x6098, 0): 1, (0x60C2, 1): 1, (0x60C2, 2): 1, (0x60FF, 0): 4,
-    (0x6502, 0): 4, (0x1400, 1): 4, (0x1400, 2): 1, (0x1600, 0): 1, (0x1600, 1): 4, (0x1600, 2): 4, (0x1800, 1): 4,
-    (0x1800, 2): 1, (0x1A00, 0): 1, (0x1A00, 1): 4, (0x1A00, 2): 4, (0x1A00, 3): 4,
-}  # fmt: skip
-_PROFILE_SIZES = {
-    "ipos2015": {(0x207E, 0): 2, (0x207F, 0): 2},
-    "ds402": {(0x1016, 1): 4, (0x6073, 0): 2, (0x6078, 0): 2},
-}
 _CURRENT = {"ipos2015": 0x207E, "ds402": 0x6078}
 # Rated current of the motor, to which 6073h and 6078h are relative (maxon 118739) [A].
 RATED_CURRENT = 0.060
@@ -69,21 +47,6 @@ class Write:
 GUARDED_BY = {"heartbeat": (0x1016, 0x1017), "life": (0x100C, 0x100D)}
 GUARDING_OBJECTS = ((0x1016, 1), (0x1017, 0), (0x100C, 0), (0x100D, 0))
 _ANY_GUARDING = frozenset(index for index, _ in GUARDING_OBJECTS)
-
-
-def require_eds(dictionary: ObjectDictionary, profile: str, name: str) -> None:
-    """Raise FileFormatError unless the EDS has what a run needs, in the right sizes."""
-    for (index, subindex), size in {**SIZES, **_PROFILE_SIZES[profile]}.items():
-        if index in GUARDED_BY["life"] and index not in dictionary and 0x1016 in dictionary:
-            continue  # guarded by heartbeat alone, as CiA 301 recommends
-        integer, found = is_integer(dictionary, index, subindex)
-        place = f"{index:04X}h:{subindex}"
-        if not integer:
-            raise FileFormatError(f"{name}: the EDS does not fit profile {profile}: it has no number at {place}.")
-        if found != size:
-            raise FileFormatError(
-                f"{name}: the EDS does not fit profile {profile}: {place} has {found} bytes there and {size} here."
-            )
 
 
 def speed_units(speed: float, entry: DriveEntry, profile: str) -> int:

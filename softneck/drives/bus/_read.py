@@ -91,7 +91,7 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
         "product": ("product", 0.0), "serial": ("serial", 0.0), "firmware": ("firmware", 0.0),
     },
 }  # fmt: skip
-_TOP = ("profile", "eds", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
+_TOP = ("profile", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
         "supervision")  # fmt: skip
 _CLASSES = {
     "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings, "sensor": SensorSettings,
@@ -101,7 +101,7 @@ _FIELDS = {"ramp": "ramps"}
 
 
 def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | None = None) -> DrivesFile:
-    """Return what a table with the keys of a drives file describes for `robot`; an EDS is looked for in `folder`."""
+    """Return what a table with the keys of a drives file describes for `robot`; files are looked for in `folder`."""
     table = require_table(table, robot)
     _refuse_unknown("the file", table, _TOP)
     if "profile" not in table:
@@ -135,8 +135,6 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
         if not isinstance(content.get("baseline"), str):
             raise SettingsError("[supervision] `baseline` must name the file that `drives record --supervision` wrote.")
         values["baseline"] = load_baseline(folder / content["baseline"])
-    if "eds" in table:
-        values["eds"] = folder / str(table["eds"])
     return DrivesFile(**values)
 
 

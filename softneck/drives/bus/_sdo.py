@@ -1,23 +1,39 @@
-"""Objects of a drive by SDO, through canopen, over any link."""
+"""Objects of a drive by SDO, through canopen's client, over any link.
+
+What a run reads and writes has its type here and no EDS is read: no file can be missing once drives have power.
+"""
 
 from __future__ import annotations
 
 import logging
 import struct
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
 
-from softneck.core import FileFormatError, SoftneckError
-from softneck.core._budget import MOST_EDS, settings_text
+from softneck.core import SoftneckError
 
 from ..master import Frame
 from ._link import Link
 
 if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
     from canopen.sdo.client import SdoClient
 
 
+_T = TypeVar("_T")
+# (index, subindex) -> type of each number (CiA 301, CiA 402; 207Eh and 207Fh: Technosoft's), as `struct` writes it.
+NUMBERS: dict[tuple[int, int], str] = {
+    **dict.fromkeys(((0x100D, 0), (0x1400, 2), (0x1600, 0), (0x1800, 2), (0x1A00, 0), (0x60C2, 1)), "B"),
+    **dict.fromkeys(((0x6060, 0), (0x6061, 0), (0x6098, 0), (0x60C2, 2)), "b"),
+    **dict.fromkeys(((0x100C, 0), (0x1017, 0), (0x207F, 0), (0x6040, 0), (0x6041, 0), (0x6066, 0), (0x6073, 0),
+                     (0x60B8, 0)), "H"),
+    **dict.fromkeys(((0x207E, 0), (0x6007, 0), (0x605A, 0), (0x605E, 0), (0x6078, 0)), "h"),
+    **dict.fromkeys(((0x1000, 0), (0x1016, 1), *((0x1018, sub) for sub in range(1, 5)), (0x1400, 1), (0x1600, 1),
+                     (0x1600, 2), (0x1800, 1), *((0x1A00, sub) for sub in range(1, 4)), (0x6065, 0), (0x6083, 0),
+                     (0x6085, 0), *((index, sub) for index in (0x6093, 0x6094, 0x6097) for sub in (1, 2)),
+                     (0x6502, 0)), "I"),
+    **dict.fromkeys(((0x6064, 0), (0x606C, 0), (0x607A, 0), (0x607C, 0), (0x607D, 1), (0x607D, 2), (0x60BA, 0),
+                     (0x60FF, 0)), "i"),
+}  # fmt: skip
 # A drive answers within some slow-loop samples; 0.3 s is canopen's own patience.
 _ANSWER_TIME = 0.3
 # Which of these a drive tells only hardware can say; that it took the value it did say, and none of them is a guard.
@@ -35,26 +51,8 @@ class SdoError(SoftneckError):
         self.aborted, self.code = aborted, code
 
 
-def load_eds(profile: str, path: Path | None = None) -> ObjectDictionary:
-    """Return our EDS of `profile`, or the one at `path`.
-
-    Raises:
-        FileFormatError: no EDS.
-    """
-    import canopen
-    from canopen.objectdictionary import ObjectDictionary
-
-    source = path or Path(__file__).parent / "eds" / f"{profile}.eds"
-    try:
-        settings_text(source, MOST_EDS)  # canopen opens it again, whatever its size
-        dictionary = canopen.import_od(str(source))
-    except Exception as error:  # canopen raises what its parser meets: KeyError, ValueError, configparser's
-        raise FileFormatError(
-            f"{source}: is not an EDS ({type(error).__name__}: {' '.join(str(error).split())})."
-        ) from error
-    if not isinstance(dictionary, ObjectDictionary) or not len(dictionary):
-        raise FileFormatError(f"{source}: has no objects; is it an EDS?")
-    return dictionary
+def _number(index: int, subindex: int) -> struct.Struct:
+    return struct.Struct("<" + NUMBERS[index, subindex])
 
 
 class Objects:
@@ -65,16 +63,16 @@ class Objects:
         untold: objects that took a value and cannot be read.
     """
 
-    def __init__(self, link: Link, node: int, dictionary: ObjectDictionary) -> None:
-        """Talk to `node` over `link`, with names and types of `dictionary`."""
+    def __init__(self, link: Link, node: int) -> None:
+        """Talk to `node` over `link`."""
+        from canopen.objectdictionary import ObjectDictionary
         from canopen.sdo.client import SdoClient
 
         self.node, self.untold = node, set[str]()
-        self._client = SdoClient(0x600 + node, 0x580 + node, dictionary)
+        self._client = SdoClient(0x600 + node, 0x580 + node, ObjectDictionary())
         # The network below has put the answer into the queue before canopen looks, or there is none.
         self._client.RESPONSE_TIMEOUT = 0.0
         self._client.network = _Network(link, self._client, 0x580 + node)  # pyright: ignore[reportAttributeAccessIssue]
-        self._dictionary = dictionary
 
     def read(self, index: int, subindex: int = 0) -> int:
         """Return a number.
@@ -82,16 +80,15 @@ class Objects:
         Raises:
             SdoError: the drive has no such object or does not answer.
         """
-        return int(self._call(index, subindex, lambda item: item.raw))
+        kind = _number(index, subindex)
+        return self._call(index, subindex, lambda: kind.unpack(self._client.upload(index, subindex))[0])
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Return whether the drive, and its EDS, have a number there.
+        """Return whether the drive has a number there.
 
         Raises:
             SdoError: the drive does not answer.
         """
-        if index not in self._dictionary:
-            return False
         try:
             self.read(index, subindex)
         except SdoError as error:
@@ -102,7 +99,8 @@ class Objects:
 
     def read_text(self, index: int, subindex: int = 0) -> str:
         """Return a text."""
-        return str(self._call(index, subindex, lambda item: item.raw)).strip("\0 ")
+        data = self._call(index, subindex, lambda: self._client.upload(index, subindex))
+        return data.decode("ascii", "ignore").strip("\0 ")
 
     def write(self, index: int, subindex: int, value: int) -> None:
         """Write a number.
@@ -110,11 +108,10 @@ class Objects:
         Raises:
             SdoError: the drive refuses it or does not answer.
         """
-
-        def put(item: Any) -> None:
-            item.raw = value
-
-        self._call(index, subindex, put, value=value)
+        kind = _number(index, subindex)
+        # A type without sign takes the bits of a negative number.
+        data = (value & ((1 << 8 * kind.size) - 1)).to_bytes(kind.size, "little")
+        self._call(index, subindex, lambda: self._client.download(index, subindex, data), value=value)
 
     def written(self, index: int, subindex: int, value: int) -> int:
         """Write a number and return what the drive says that it has now: what was written where it may keep silent."""
@@ -127,13 +124,12 @@ class Objects:
             self.untold.add(f"{index:04X}h")
             return value
 
-    def _call(self, index: int, subindex: int, act: Any, *, value: int | None = None) -> Any:
+    def _call(self, index: int, subindex: int, act: Callable[[], _T], *, value: int | None = None) -> _T:
         from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
         place = f"{index:04X}h" + (f":{subindex}" if subindex else "")
         try:
-            entry = self._client[index]
-            return act(entry if _plain(self._dictionary, index) else entry[subindex])  # pyright: ignore[reportIndexIssue]
+            return act()
         except SdoAbortedError as error:
             asked = "" if value is None else f" the value {value} for"
             raise SdoError(
@@ -145,8 +141,6 @@ class Objects:
             ) from error
         except (struct.error, ValueError, IndexError) as error:
             raise SdoError(f"node {self.node} sends an invalid answer (object {place}: {error}).") from error
-        except KeyError as error:
-            raise SdoError(f"the EDS has no object {place}; it does not fit the drive's profile.") from error
 
 
 class _Network:
@@ -167,19 +161,3 @@ class _Network:
                 if frame.identifier == self._answer and not frame.remote and not frame.error and len(frame.data) == 8:
                     self._client.on_response(frame.identifier, bytearray(frame.data), 0.0)
                     return
-
-
-def _plain(dictionary: ObjectDictionary, index: int) -> bool:
-    from canopen.objectdictionary import ODVariable
-
-    return isinstance(dictionary[index], ODVariable)
-
-
-def is_integer(dictionary: ObjectDictionary, index: int, subindex: int) -> tuple[bool, int]:
-    """Return whether an object is an integer there, and its size in bytes."""
-    from canopen.objectdictionary.datatypes import INTEGER_TYPES
-
-    variable = dictionary.get_variable(index, subindex)
-    if variable is None or variable.data_type not in INTEGER_TYPES:
-        return False, 0
-    return True, len(variable) // 8

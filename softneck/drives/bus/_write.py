@@ -14,8 +14,6 @@ from ._sensor_source import SOURCE_KEYS
 def drives_table(file: DrivesFile) -> dict[str, Any]:
     """Return the keys and values that `make_drives` reads `file` from; all of them, with paths made absolute."""
     table: dict[str, Any] = {"profile": file.profile}
-    if file.eds is not None:
-        table["eds"] = str(file.eds.resolve())
     table["bus"] = _values(file, "bus")
     table["stop"] = _values(file, "quick")
     table["drive"] = [_values(entry, "drive") | _values(entry.scale, "scale") for entry in file.drives]

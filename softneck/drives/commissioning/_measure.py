@@ -14,7 +14,7 @@ from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
-from ..bus._sdo import Objects, SdoError, load_eds
+from ..bus._sdo import Objects, SdoError
 from ..master import Frame, Master, MasterSettings
 from ..master._settings import ChannelSettings
 from ..running._bus_loop import RunEnd, Session, run_session
@@ -122,8 +122,7 @@ def _from_here(
     link: CanLink | VirtualLink, file: DrivesFile, settings: MasterSettings, guards: Guards, probe: _Probe
 ) -> MasterSettings:
     """Take where the winches stand as P = 0, and set the drives' own limits around it."""
-    dictionary = load_eds(file.profile, file.eds)
-    objects = [Objects(link, node, dictionary) for node in file.nodes]
+    objects = [Objects(link, node) for node in file.nodes]
     here = _still(link, objects, settings.counts_per_radian)
     for one, entry, counts in zip(objects, file.drives, here, strict=True):
         far = round(abs(1.1 * guards.travel * entry.scale.counts_per_radian))

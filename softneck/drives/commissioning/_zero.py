@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from softneck.core import CheckFailedError, SoftneckError
 
@@ -20,17 +20,13 @@ from ..bus._objects import (
     speed_of_units,
     speed_units,
 )
-from ..bus._sdo import Objects, SdoError, load_eds
+from ..bus._sdo import Objects, SdoError
 from ..bus._units import counts_to_position
 from ..master import Frame, Tilt
 from ..master._cia402 import DriveState, state_of
 from ..master._gate import Reading
 from ..running._stop import disarm, wait
 from ..running._timing import Operator
-
-if TYPE_CHECKING:
-    from canopen.objectdictionary import ObjectDictionary
-
 
 _MODE, _VELOCITY, _HOMING, _HERE = 0x6060, 3, 6, 35
 # A winch that holds is slower [rad/s], and moves less between two looks [rad].
@@ -73,9 +69,9 @@ class ZeroResult:
 class _Motor:
     """One drive while it is zeroed."""
 
-    def __init__(self, link: Link, entry: DriveEntry, file: DrivesFile, dictionary: ObjectDictionary) -> None:
+    def __init__(self, link: Link, entry: DriveEntry, file: DrivesFile) -> None:
         self.entry, self.file = entry, file
-        self.objects = Objects(link, entry.node, dictionary)
+        self.objects = Objects(link, entry.node)
         self.link = link
         self.start = self.pulled = 0.0
         self.held, self.late_mode = 0, False
@@ -170,11 +166,10 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
     Raises:
         CheckFailedError: a tendon does not get tight in time, the neck is not upright, or the slow loop is another.
     """
-    dictionary = load_eds(file.profile, file.eds)
     signs = _signs_of_life(file, guarding)
     # Fed from every wait of this thread, those for answers too: a master that hangs stops feeding.
     guarded = GuardedLink(link, signs, file.guard_cycles * file.cycle)
-    motors = [_Motor(guarded, entry, file, dictionary) for entry in file.drives]
+    motors = [_Motor(guarded, entry, file) for entry in file.drives]
     left: dict[int, str] = {}
     zeroed = False
     try:

@@ -23,10 +23,9 @@ from ..bus._objects import (
     mode_writes,
     option_writes,
     pdo_writes,
-    require_eds,
 )
 from ..bus._robot import limits_said
-from ..bus._sdo import Objects, SdoError, load_eds
+from ..bus._sdo import Objects, SdoError
 from ..master import Frame
 from ..master._cia301 import Command, nmt_frame
 from ..master._cia402 import DriveState, state_of
@@ -170,11 +169,8 @@ def preflight(
         sensor: the inclinometer, which must give a sample.
 
     Raises:
-        FileFormatError: an EDS that does not fit.
         BusError: the bus takes no frames.
     """
-    dictionary = load_eds(file.profile, file.eds)
-    require_eds(dictionary, file.profile, str(file.eds or f"{file.profile}.eds"))
     rows = _Checks()
     if file.robot is not None:
         _tell_robot(file, rows)
@@ -191,7 +187,7 @@ def preflight(
     if any(devices.values()):
         return Report(tuple(rows.rows), "none")
     for entry in file.drives:
-        objects = Objects(link, entry.node, dictionary)
+        objects = Objects(link, entry.node)
         try:
             kind = _check_drive(objects, file, entry, guarding, rows)
             if homed:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..bus._link import BusError, Link
-from ..bus._sdo import Objects, SdoError, load_eds
+from ..bus._sdo import Objects, SdoError
 from ..master import Frame
 from ..master._cia402 import state_of
 
@@ -51,8 +51,7 @@ def scan(link: Link, *, bit_rate: int = 1_000_000) -> list[dict[str, Any]]:
         take(link.now + pause, node)
     take(link.now + _SCAN_TIME)
     require_bus(link)
-    dictionary = load_eds("ipos2015")
-    return [_identity(link, Objects(link, node, dictionary), kind) for node, kind in sorted(answers.items())]
+    return [_identity(link, Objects(link, node), kind) for node, kind in sorted(answers.items())]
 
 
 def _question(node: int, index: int, subindex: int = 0) -> Frame:

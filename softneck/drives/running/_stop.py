@@ -9,7 +9,7 @@ from softneck.core import CheckFailedError
 from ..bus._file import DrivesFile
 from ..bus._link import GuardedLink, Link
 from ..bus._objects import disarm_writes
-from ..bus._sdo import Objects, SdoError, load_eds
+from ..bus._sdo import Objects, SdoError
 from ..master import Frame
 from ..master._cia402 import OFF, DriveState, state_of
 from ._scan import require_bus
@@ -31,8 +31,7 @@ def stop(link: Link, file: DrivesFile) -> dict[int, str]:
     Raises:
         BusError: the bus takes no frames: nobody was stopped.
     """
-    dictionary = load_eds(file.profile, file.eds)
-    drives = {entry.node: Objects(link, entry.node, dictionary) for entry in file.drives}
+    drives = {entry.node: Objects(link, entry.node) for entry in file.drives}
     # At once and to all, without waiting for answers; then with answers.
     for word in (0x02, 0x02):
         link.send([Frame(0x600 + node, bytes([0x2B, 0x40, 0x60, 0, word, 0, 0, 0])) for node in drives])
@@ -54,10 +53,9 @@ def reset(link: Link, file: DrivesFile) -> dict[int, str]:
     Raises:
         BusError: the bus takes no frames.
     """
-    dictionary = load_eds(file.profile, file.eds)
     states = {}
     for entry in file.drives:
-        objects = Objects(link, entry.node, dictionary)
+        objects = Objects(link, entry.node)
         try:
             for word in (0x00, 0x80, 0x00):
                 objects.write(0x6040, 0, word)
@@ -82,10 +80,9 @@ def disarm(link: Link, file: DrivesFile, guarding: str, signs: Sequence[Frame]) 
         node -> why it is not known to be off; empty where all confirmed it.
     """
     guarded = GuardedLink(link, signs, file.guard_cycles * file.cycle)
-    dictionary = load_eds(file.profile, file.eds)
     left = {}
     for node in file.nodes:
-        objects = Objects(guarded, node, dictionary)
+        objects = Objects(guarded, node)
         try:
             for write in disarm_writes(guarding):
                 objects.write(write.index, write.subindex, write.value)
@@ -93,7 +90,7 @@ def disarm(link: Link, file: DrivesFile, guarding: str, signs: Sequence[Frame]) 
             left[node] = str(error).rstrip(".")
     for node in [node for node in file.nodes if node not in left]:
         try:
-            state = state_of(Objects(guarded, node, dictionary).read(0x6041))
+            state = state_of(Objects(guarded, node).read(0x6041))
         except SdoError as error:
             left[node] = str(error).rstrip(".")
             continue
