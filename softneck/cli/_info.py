@@ -52,7 +52,7 @@ def describe_log(file: Path) -> dict[str, Any]:
         "first_error": fault or _first_error(frames) or "none",
         "files": ", ".join(f"{role} {entry.get('path')}" for role, entry in files.items()) or "none",
         "cut": log.cut or "no",
-        "replay": f"softneck drives replay {file}",
+        "replay": f"softneck simulate {file}",
         "import": f"softneck import {file} -o {file.stem}.csv",
     }
 

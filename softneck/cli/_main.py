@@ -38,7 +38,7 @@ _COMMANDS = {
     "design": ("_design", "Design a controller on a linear model."),
     "tune": ("_tune", "Search kinds and settings for the controller that keeps requirements."),
     "verify": ("_verify", "Verify a controller against requirements, or fail loudly."),
-    "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it."),
+    "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it; replay the log of a run."),
     "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
     "drives": ("drives._commands", "Run controllers on CANopen drives, or on simulated ones."),
     "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),

@@ -1,4 +1,4 @@
-"""softneck simulate: a closed loop over FMUs and files, or an SSP archive, judged against its limits."""
+"""softneck simulate: a closed loop over FMUs and files, or an SSP archive, judged; the log of a run, replayed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from softneck.core import CheckFailedError, SettingsError, atomic_write, refuse_existing, write_certificate
 
+from ._replay import replay_log
 from .shared._console import print_json, print_table, progress
 from .shared._options import force_option, json_option, output_option, target, trust_option
 from .shared._robot import robot_option
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
-@click.argument("loop_file", metavar="LOOP.toml|X.ssp", type=click.Path(path_type=Path))
+@click.argument("loop_file", metavar="LOOP.toml|X.ssp|LOG.mcap", type=click.Path(path_type=Path))
 @output_option("recording of the run", "REC")
 @click.option(
     "--certificate",
@@ -42,7 +43,15 @@ def command(
 
     X.ssp: an SSP 1.0 or 2.0 archive of FMUs for co-simulation, of any tool. A closed loop in it is judged like any
     other; the signals of other systems are named part.output in the result.
+
+    LOG.mcap: the log of `softneck drives` is replayed: what the run saw goes to the same core and controller again, and
+    every frame out is compared, bit for bit; exit code 1 with the first difference. Nothing is sent to any bus.
     """
+    if loop_file.suffix.lower() == ".mcap":
+        if output is not None or certificate is not None or html is not None:
+            raise SettingsError(f"{loop_file}: is replayed, which writes nothing; `softneck import` makes a recording.")
+        replay_log(loop_file, as_json=as_json)
+        return
     from softneck.cosim import load_loop, load_ssp
     from softneck.cosim.loops._simulate import run_setup
     from softneck.cosim.loops._trust import require_trusted

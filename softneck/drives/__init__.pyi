@@ -8,6 +8,7 @@ from .commissioning._neck_file import neck_drives as neck_drives
 from .commissioning._record import Experiment as Experiment
 from .commissioning._record import record_signal as record_signal
 from .commissioning._zero import zero as zero
+from .logs._baseline import baseline as baseline
 from .logs._log_file import read_run_log as read_run_log
 from .logs._replay import replay as replay
 from .logs._result import DrivesResult as DrivesResult

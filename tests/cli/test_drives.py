@@ -48,20 +48,26 @@ def files(tmp_path_factory: pytest.TempPathFactory, models: dict) -> Path:
 
 @pytest.mark.slow
 def test_scan_check_zero_stop_and_reset_answer_in_json(call: Call) -> None:
-    nodes = json.loads(call("drives", "scan", "--simulated", "--json").out)["nodes"]
+    nodes = json.loads(call("drives", "commission", "--only", "scan", "--simulated", "--json").out)["nodes"]
     assert [node["node"] for node in nodes] == [1, 2, 3]
     report = json.loads(call("drives", "check", "--simulated", "--json").out)
     assert report["holds"]
     assert report["guarding"] == "life"
-    assert json.loads(call("drives", "zero", "--simulated", "--json").out)["zeroed"]
+    assert json.loads(call("drives", "commission", "--only", "zero", "--simulated", "--json").out)["zeroed"]
     for name, key in (("stop", "stopped"), ("reset", "reset")):
         states = json.loads(call("drives", name, "--simulated", "--json").out)[key]
         assert [item["state"] for item in states] == ["DISABLED"] * 3
 
 
 def test_tables_for_people(call: Call) -> None:
-    for name in ("scan", "check", "zero", "stop", "reset"):
-        said = call("drives", name, "--simulated")
+    for words in (
+        ("commission", "--only", "scan"),
+        ("check",),
+        ("commission", "--only", "zero"),
+        ("stop",),
+        ("reset",),
+    ):
+        said = call("drives", *words, "--simulated")
         assert said.code == 0
         assert "3" in said.out
 
@@ -87,8 +93,10 @@ def test_run_writes_a_recording(call: Call, files: Path) -> None:
         (("check", "--bus", "virtual:x"), "drives on a bus need --drives DRIVES.toml"),
         (("check", "--simulated", "--override", "luck"), "--override takes one of certificate, identity"),
         (("check", "--simulated", "--drives", "none.toml"), "none.toml: cannot be read"),
-        (("zero", "--bus", "virtual:x", "--drives", "{example}"), "say --arm if they may. Nothing was sent"),
-        (("scan", "--bus", "socketcan:can_that_is_not"), "bus socketcan:can_that_is_not cannot be opened"),
+        (("commission", "--only", "zero", "--bus", "virtual:x", "--drives", "{example}"),
+         "say --arm if they may. Nothing was sent"),
+        (("commission", "--only", "scan", "--bus", "socketcan:can_that_is_not"),
+         "bus socketcan:can_that_is_not cannot be opened"),
         (("run", "{pi}", "--loop", "{loop}", "--simulated"), "loop.toml: has no certificate of `softneck simulate`"),
         (("run", "none.npz", "--loop", "{loop}", "--simulated"), "none.npz: no such file"),
         (("run", "{pi}", "--loop", "none.toml", "--simulated"), "none.toml"),

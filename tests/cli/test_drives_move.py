@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from softneck.cli.drives._target import require_armed, sensor_of, words
-from softneck.core import SettingsError
-from softneck.drives import load_drives
+from softneck.core import DataError, SettingsError, SoftneckError
+from softneck.drives import baseline, default_drives, load_drives
 from softneck.drives.supervision._baseline import load_baseline
 from softneck.drives.supervision._motor_models import Motion
 from softneck.signals import read_recording
@@ -22,12 +22,12 @@ EXAMPLE = ROOT / "examples" / "drives" / "drives.toml"
 
 
 def test_jog_says_what_it_expected_and_saw(call: Call) -> None:
-    said = call("drives", "jog", "2", "--simulated", "--json")
+    said = call("drives", "commission", "--only", "jog", "--motor", "2", "--simulated", "--json")
     assert said.code == 0, said.err
     found = json.loads(said.out)
     assert (found["motor"], found["verdict"], found["holds"], found["phase"]) == (2, "ok", True, "done")
     assert found["expected"]["direction_deg"] == pytest.approx(120.0)
-    assert "direction_deg" in call("drives", "jog", "1", "--simulated").out
+    assert "direction_deg" in call("drives", "commission", "--only", "jog", "--motor", "1", "--simulated").out
 
 
 def test_record_is_a_recording_for_identify(call: Call) -> None:
@@ -43,18 +43,26 @@ def test_record_is_a_recording_for_identify(call: Call) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("jog", "4", "--simulated"), "4 is not in the range"),
-        (("jog", "1"), "say which drives"),
-        (("jog", "1", "--simulated", "--amplitude", "9"), "--amplitude"),
-        (("jog", "1", "--simulated", "--pace", "-1"), "--pace"),
-        (("jog", "1", "--bus", "virtual:x", "--drives", EXAMPLE), "say --arm if they may. Nothing was sent"),
-        (("jog", "1", "--bus", "virtual:x", "--drives", EXAMPLE, "--pace", "2"), "--pace is for --simulated"),
-        (("jog", "1", "--bus", "socketcan:can_no", "--drives", EXAMPLE, "--arm"), "stdin is not one"),
+        (("commission", "--only", "jog", "--motor", "4", "--simulated"), "4 is not in the range"),
+        (("commission", "--only", "jog", "--motor", "1"), "say which drives"),
+        (("commission", "--only", "jog", "--motor", "1", "--simulated", "--travel", "9"), "amplitude"),
+        (("commission", "--only", "jog", "--motor", "1", "--simulated", "--pace", "-1"), "--pace"),
+        (
+            ("commission", "--only", "jog", "--motor", "1", "--bus", "virtual:x", "--drives", EXAMPLE),
+            "say --arm if they may. Nothing was sent",
+        ),
+        (
+            ("commission", "--only", "jog", "--motor", "1", "--bus", "virtual:x", "--drives", EXAMPLE, "--pace", "2"),
+            "--pace is for --simulated",
+        ),
+        (
+            ("commission", "--only", "jog", "--motor", "1", "--bus", "socketcan:can_no", "--drives", EXAMPLE, "--arm"),
+            "stdin is not one",
+        ),
         (("record", "music", "--simulated", "-o", "r.csv"), "`signal` must be one of"),
         (("record", "sine", "--simulated", "-o", "r.txt"), "r.txt"),
         (("record", "sine", "--simulated", "-o", "r.csv", "--max-position", "7"), "beyond the 6 rad of [limits]"),
         (("record", "sine", "--simulated", "-o", "r.csv", "--payload", "9"), "--payload"),
-        (("record", "eq22", "--duration", "5", "--simulated", "-o", "r.csv", "--ramp", "0"), "--ramp"),
     ],
 )
 def test_bad_input(call: Call, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], message: str) -> None:
@@ -88,36 +96,30 @@ def test_a_recording_is_no_sensor_for_real_drives(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_baseline_is_of_this_experiment_and_those_beside_it(call: Call) -> None:
+def test_a_baseline_is_of_all_logs(call: Call) -> None:
     """Two payloads: what the supervisor compares with is of both, and is the same whenever it is asked for."""
-    first = ("drives", "record", "aprbs", "--simulated", "--duration", 25, "--max-position", 1.5)
-    assert call(*first, "-o", "a.csv", "--log", "a.mcap").code == 0
-    second = (*first, "--payload", 0.5, "--no-log")
-    assert call(*second, "-o", "b.csv", "--supervision", "b.json", "--beside", "a.mcap").code == 0
-    assert call(*second, "-o", "c.csv", "--supervision", "c.json", "--beside", "a.mcap").code == 0
+    record = ("drives", "record", "aprbs", "--simulated", "--duration", 25, "--max-position", 1.5)
+    assert call(*record, "-o", "a.csv", "--log", "a.mcap").code == 0
+    assert call(*record, "-o", "b.csv", "--log", "b.mcap", "--payload", 0.5).code == 0
+    baseline(["a.mcap", "b.mcap"]).save("b.json")
     told = load_baseline("b.json")
-    assert told == load_baseline("c.json")
+    assert told == baseline(["a.mcap", "b.mcap"])
     # Each run of 25 s, and a moment before and after it.
     assert 50.0 < told.seconds < 56.0
-    said = call(*second, "-o", "d.csv", "--supervision", "d.json")
-    assert said.code == 2
-    assert "too few to compare with" in said.error
+    with pytest.raises(DataError, match="too few to compare with"):
+        baseline(["a.mcap"])
 
 
-def test_beside_is_refused_before_anything_moves(call: Call) -> None:
-    record = ("drives", "record", "aprbs", "--simulated", "-o", "a.csv", "--no-log", "--beside", "a.mcap")
-    said = call(*record)
-    assert (said.code, "needs --supervision" in said.error) == (2, True)
-    said = call(*record, "--supervision", "b.json")
-    assert (said.code, "a.mcap" in said.error) == (2, True)
-
-
-def test_a_minute_of_a_loop_is_refused_before_anything_moves(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_baseline_of_no_log_or_of_a_minute_of_a_loop_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SettingsError, match="no log was given"):
+        baseline([])
+    with pytest.raises(SoftneckError, match=r"a\.mcap"):
+        baseline(["a.mcap"])
     rows = np.zeros((6000, 3))
     loop = Motion(setpoints=rows, positions=rows, tensions=rows, values=rows[:, :2], rates=rows[:, :2],
                   due=np.ones(6000, dtype=bool), references=rows[:, :2])  # fmt: skip
-    monkeypatch.setattr("softneck.drives.read_run_log", lambda path: path)
-    monkeypatch.setattr("softneck.drives.logs._replay.logged_motion", lambda *_: loop)
-    record = ("drives", "record", "aprbs", "--simulated", "-o", "a.csv", "--no-log", "--supervision", "b.json")
-    said = call(*record, "--beside", "run.mcap")
-    assert (said.code, "60 s of a loop's motion" in said.error, Path("a.csv").exists()) == (2, True, False)
+    run = SimpleNamespace(settings=lambda: default_drives().master_settings(0.02))
+    monkeypatch.setattr("softneck.drives.logs._baseline.read_run_log", lambda _: run)
+    monkeypatch.setattr("softneck.drives.logs._baseline.logged_motion", lambda *_: loop)
+    with pytest.raises(DataError, match="60 s of a loop's motion"):
+        baseline(["run.mcap"])

@@ -81,14 +81,14 @@ def test_a_drives_file_that_does_not_fit_the_robot_is_one_line(
 @pytest.mark.usefixtures("files")
 def test_two_motors_are_zeroed_jogged_recorded_replayed_and_identified(call: Call) -> None:
     drives = ("--simulated", "--drives", "drives.toml")
-    zeroed = call("drives", "zero", *drives, "--json")
+    zeroed = call("drives", "commission", "--only", "zero", *drives, "--json")
     assert zeroed.code == 0, zeroed
     assert set(json.loads(zeroed.out)) == {"zeroed", "motors", "pitch_deg"}
-    assert call("drives", "jog", "2", *drives).code == 0
+    assert call("drives", "commission", "--only", "jog", "--motor", "2", *drives).code == 0
     said = call("drives", "record", "aprbs", "-o", "rec.csv", "--duration", "16", "--log", "rec.mcap", *drives)
     assert said.code == 0, said
     assert Path("rec.csv").read_text(encoding="utf-8").startswith('# robot {"name": "bench"')
-    assert call("drives", "replay", "rec.mcap").code == 0
+    assert call("simulate", "rec.mcap").code == 0
     assert call("import", "rec.mcap", "-o", "again.csv").code == 0
     assert Path("again.csv").read_bytes() == Path("rec.csv").read_bytes()
     assert call("identify", "oe", "rec.csv", "-o", "m.npz").code == 0
@@ -139,7 +139,7 @@ def test_a_robot_runs_what_was_identified_designed_verified_and_simulated(name: 
         ("verify", "pi.npz", "m.npz", "--observer", "observer.npz", "--requirements", "requirements.toml", "-o",
          "pi.certificate.json", "--html", "verify.html"),
         ("simulate", "loop.toml", "--certificate", "loop.certificate.json"),
-        ("drives", "zero", "--simulated", "--drives", "drives.toml"),
+        ("drives", "commission", "--only", "zero", "--simulated", "--drives", "drives.toml"),
     )  # fmt: skip
     for step in steps:
         said = call(*step)
@@ -153,6 +153,6 @@ def test_a_robot_runs_what_was_identified_designed_verified_and_simulated(name: 
 
 
 def test_a_motor_that_the_robot_does_not_have(call: Call) -> None:
-    said = call("drives", "jog", "3", "--simulated", "--robot", "antagonist")
+    said = call("drives", "commission", "--only", "jog", "--motor", "3", "--simulated", "--robot", "antagonist")
     assert said.code == 2
     assert "3 is not in the range 1<=x<=2" in said.err

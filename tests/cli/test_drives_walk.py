@@ -48,7 +48,7 @@ def test_the_walk_of_an_owner(
 
     def step(*words: str) -> dict[str, Any]:
         with pytest.raises(SystemExit) as ended:
-            main(["drives", *words, "--json"])
+            main([*words, "--json"] if words[0] == "simulate" else ["drives", *words, "--json"])
         said = capsys.readouterr()
         assert not ended.value.code, (words, said.err)
         return json.loads(said.out)
@@ -56,14 +56,14 @@ def test_the_walk_of_an_owner(
     found = step("commission", "--simulated", "-o", "found")
     assert (tmp_path / "found" / "drives.toml").is_file(), found
     drives = ("--drives", str(tmp_path / "found" / "drives.toml"), "--simulated")
-    assert [item["node"] for item in step("scan", *drives)["nodes"]] == [1, 2, 3]
-    assert step("zero", *drives)["zeroed"]
-    step("jog", "1", "--amplitude", "0.3", *drives)
+    assert [item["node"] for item in step("commission", "--only", "scan", *drives)["nodes"]] == [1, 2, 3]
+    assert step("commission", "--only", "zero", *drives)["zeroed"]
+    step("commission", "--only", "jog", "--motor", "1", "--travel", "0.3", *drives)
     step("record", "aprbs", "--duration", "4", "-o", "r.csv", "--log", "r.mcap", *drives)
     step("run", str(project.controller), "--loop", str(project.loop), "--certificate", str(project.certificate),
          "--log", "run.mcap", "-o", "run.csv", "--simulated")  # fmt: skip
     for log in ("r.mcap", "run.mcap"):
-        assert step("replay", log)["equal"], log
+        assert step("simulate", log)["equal"], log
     with pytest.raises(SystemExit) as ended:
         main(["import", "r.mcap", "-o", "again.csv"])
     assert not ended.value.code

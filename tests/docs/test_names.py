@@ -141,7 +141,7 @@ def test_every_command_line_has_its_command_options_and_settings() -> None:
         ("desing pi rls.npz", "no command desing"),
         ("design pi rls.npz --ouput x", "no option --ouput"),
         ("design pi rls.npz --set slew=3", "pi has no setting slew"),
-        ("drives scan|chek", "no command chek"),
+        ("drives stop|chek", "no command chek"),
         ("observer rls.npz --set gamma=1", "kalman has no setting gamma"),
         ("design pi rls.npz -o pi.npz --set phase_margin_deg=50", None),
     ],

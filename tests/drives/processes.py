@@ -90,7 +90,7 @@ class World:
         files = {"--loop": f"{loop}.toml", "--drives": "drives.toml", "-o": f"run_{time.monotonic_ns()}.csv"}
         words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--json", *(["--arm"] if arm else [])]
         # On SocketCAN a run is logged unasked, into the folder of whoever plays this.
-        words += [] if "--log" in self.extra else ["--no-log"]
+        words += [] if "--log" in self.extra else ["--log", "none"]
         words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime and realtime else [])]
         for option, name in files.items():
             words += [option, str(self.folder / name)]

@@ -232,7 +232,7 @@ def test_no_zero_is_taken_for_one_where_homing_did_not_end(what: str, latency: f
         zero(link, file, lambda: link.newest, guarding=report.guarding)
     assert all(drive.axis.state == 0x40 for drive in link.neck.drives)
     # Nor does a mark stay that would let a run start from it.
-    with pytest.raises(CheckFailedError, match=r"node 1: homed: no\. Run `softneck drives zero`"):
+    with pytest.raises(CheckFailedError, match=r"node 1: homed: no\. Run `softneck drives commission --only zero`"):
         preflight(link, file, homed=True).require()
 
 
@@ -281,7 +281,7 @@ def test_another_slow_loop_is_found_while_zeroing() -> None:
 
 def test_a_run_without_zero_is_refused() -> None:
     file, link = default_drives(), virtual()
-    with pytest.raises(CheckFailedError, match=r"node 1: homed: no\. Run `softneck drives zero`"):
+    with pytest.raises(CheckFailedError, match=r"node 1: homed: no\. Run `softneck drives commission --only zero`"):
         preflight(link, file, homed=True).require()
 
 

@@ -219,7 +219,13 @@ def test_every_end_of_a_recording(
 def test_every_end_of_a_jog(
     tmp_path: Path, key: bytes | signal.Signals, code: int, how: tuple[str, set[str], str]
 ) -> None:
-    ended = played(tmp_path, ("jog: motor 1", key, 1.0), simulated=True, command=("jog", "1"), pace="1")
+    ended = played(
+        tmp_path,
+        ("jog: motor 1", key, 1.0),
+        simulated=True,
+        command=("commission", "--only", "jog", "--motor", "1"),
+        pace="1",
+    )
     assert ended.code == code, ended.said
     assert ended.how == how
     assert ended.restored
@@ -243,7 +249,9 @@ def test_a_closed_terminal_costs_neither_recording_nor_log(tmp_path: Path) -> No
 )  # fmt: skip
 def test_every_end_of_zero_switches_off(tmp_path: Path, key: bytes | signal.Signals, code: int) -> None:
     """On the bus, in real time: one drive after the other gets power, so that the first one says when."""
-    ended = played(tmp_path, ("to go on", b"MOVE served\n", 0.0), ("ANY POWER", key, 0.2), command=("zero",))
+    ended = played(
+        tmp_path, ("to go on", b"MOVE served\n", 0.0), ("ANY POWER", key, 0.2), command=("commission", "--only", "zero")
+    )
     said = " ".join(ended.said.split())
     if "by the operator" not in said and any(word in said for word in _STALLS):
         pytest.skip(f"this machine stalled: {said[-200:]}")

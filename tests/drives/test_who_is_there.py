@@ -56,7 +56,7 @@ def test_scan_of_two_devices_with_one_number_is_exit_code_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("softneck.drives.running._scan.devices_at", lambda _link, nodes: {nodes[0]: [11, None]})
-    assert run(["drives", "scan", "--simulated", "--json"]) == 1
+    assert run(["drives", "commission", "--only", "scan", "--simulated", "--json"]) == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["nodes"][0]["serials"] == [11, None]
     assert "node 1: 2 devices answer (serial numbers 11, not told)" in said.err

@@ -8,27 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import CheckFailedError, SettingsError, refuse_existing
+from softneck.core import SettingsError, refuse_existing
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._groups import NearGroup
-from ..shared._neck import load_neck
 from ..shared._options import force_option, json_option, output_option, target, trust_option
 from ._commission import commission_command
-from ._log import acting_files, drives_of, log_options, opened_log, require_log
-from ._move import jog_command, record_command
-from ._replay import replay_command
+from ._log import acting_files, opened_log, require_log
+from ._record import record_command
 from ._target import (
-    SAMPLE_TIME,
-    Target,
-    checked_names,
+    Asked,
     drives_options,
     leave_if_asked,
-    look_of,
-    neck_option,
     open_drives,
     open_link,
-    override_option,
     sensor_of,
     sensor_or_reason,
     target_of,
@@ -46,7 +39,7 @@ if TYPE_CHECKING:
     epilog="Example: softneck drives check --simulated. Every command takes --json, and --help lists its options.",
 )
 def command() -> None:
-    """CANopen drives (CiA 301/402): commission, scan, check, jog, zero, record, run, replay, stop, reset.
+    """CANopen drives (CiA 301/402): commission, check, record, run, stop, reset.
 
     While drives move on a bus, Escape and space stop them at once; Ctrl-C ramps to rest first.
 
@@ -54,67 +47,20 @@ def command() -> None:
     """
 
 
-@command.command("scan")
-@drives_options
-@json_option
-def scan_command(
-    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, as_json: bool
-) -> None:
-    """List the nodes on the bus; sends reads only. Exit code 1 if none answers, or several devices at one number."""
-    from softneck.drives import default_drives, scan
-    from softneck.drives.running._scan import several_devices
-
-    if bus is not None and drives_file is None:
-        chosen = Target(default_drives(), bus, False, arm)
-    else:
-        chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
-    with open_link(chosen, moves=False) as link:
-        found = scan(link, bit_rate=chosen.file.bit_rate)
-    if as_json:
-        print_json({"nodes": found})
-    else:
-        rows = [[str(item["node"]), str(item["name"] or "-"), str(item["firmware"] or "-"), _serials(item["serials"]),
-                 str(item["state"] or "-")] for item in found]  # fmt: skip
-        print_table(f"{len(found)} node(s)", ["node", "name", "firmware", "serial", "state"], rows)
-    if not found:
-        raise CheckFailedError(
-            f"{bus or 'the bus'}: no node answers. Are the drives on, is the bit rate right, is the line terminated "
-            "(60 ohm between CAN_H and CAN_L)?"
-        )
-    shared = [(item["node"], several_devices(item["serials"])) for item in found]
-    listed = "; ".join(f"node {node}: {told}" for node, told in shared if told)
-    if listed:
-        raise CheckFailedError(f"{listed}. Give each device a node number of its own.")
-
-
-def _serials(serials: list[int | None]) -> str:
-    return ", ".join(str(serial or "-") for serial in serials) or "-"
-
-
 @command.command("check", epilog="Example: softneck drives check --simulated")
-@drives_options
-@override_option
+@drives_options("override")
 @json_option
-def check_command(
-    drives_file: Path | None,
-    bus: str | None,
-    simulated: bool,
-    robot: str | None,
-    arm: bool,
-    overrides: tuple[str, ...],
-    as_json: bool,
-) -> None:
+def check_command(asked: Asked, as_json: bool) -> None:
     """Pre-flight: identity, firmware, factors, modes, options, limits, guarding; each value written is read back.
 
     Writes the configuration, moves nothing. Exit code 1 if a check does not hold.
     """
     from softneck.drives import preflight
 
-    chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
-    names = checked_names(overrides)
+    chosen = asked.target()
     with open_link(chosen, moves=False, homed=True) as link:
         sensor = None if chosen.simulated else sensor_or_reason(chosen.file, str(chosen.bus))
-        report = preflight(link, chosen.file, override=names, sensor=sensor)
+        report = preflight(link, chosen.file, override=asked.override, sensor=sensor)
     _show(report, as_json=as_json)
     report.require()
 
@@ -130,53 +76,6 @@ def _show(report: Report, *, as_json: bool) -> None:
     print_table(f"Pre-flight, guarding by {report.guarding}", ["check", "found", "verdict"], rows)
 
 
-@command.command("zero", epilog="Example: softneck drives zero --drives drives.toml --bus socketcan:can0 --arm")
-@drives_options
-@override_option
-@neck_option
-@log_options
-@force_option
-@json_option
-def zero_command(
-    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool,
-    overrides: tuple[str, ...],
-    neck: str | None, log_file: Path | None, no_log: bool, force: bool, as_json: bool,
-) -> None:  # fmt: skip
-    """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
-    from softneck.drives import preflight, zero
-    from softneck.drives.logs._run_log import run_facts
-    from softneck.drives.running._keyboard import Keyboard
-
-    virtual = load_neck(neck) if neck else None
-    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=robot)
-    require_log(log_file, no_log=no_log, force=force)
-    with (
-        open_link(chosen, moves=True) as link,
-        opened_log(chosen, "zero", log_file, no_log=no_log, force=force) as log,
-    ):
-        link.tap = None if log is None else log.frame
-        look = look_of(link, chosen.file)
-        report = preflight(link, chosen.file, override=checked_names(overrides))
-        report.require()
-        if log is not None:
-            # It has no cycles: what was set up, and the frames.
-            settings = chosen.file.master_settings(SAMPLE_TIME, guarding=report.guarding)
-            log.describe(run_facts(settings, drives_of(chosen.path), simulated=chosen.simulated))
-        with Keyboard() as keyboard:
-            try:
-                zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
-            except CheckFailedError as error:
-                if keyboard.interrupted or keyboard.terminated:
-                    note(str(error))
-                leave_if_asked(keyboard)
-                raise
-    if as_json:
-        print_json(zeroed.table())
-        return
-    rows = [[f"node {node}", f"{pulled:.3f}"] for node, pulled in zip(zeroed.nodes, zeroed.pulled, strict=True)]
-    print_table("Zeroed", ["motor", "pulled [rad]"], rows)
-
-
 @command.command("run", epilog="Example: softneck drives run pi.npz --loop loop.toml --simulated")
 @click.argument("controller", metavar="CONTROLLER", type=click.Path(path_type=Path))
 @click.option("--loop", "loop_file", required=True, type=click.Path(path_type=Path), metavar="LOOP.toml",
@@ -184,13 +83,7 @@ def zero_command(
 @click.option("--certificate", "certificates", multiple=True, type=click.Path(path_type=Path),
               help="Certificate of `softneck verify`, or of `simulate`: both are needed. [default: CONTROLLER and LOOP "
               "with .certificate.json]")  # fmt: skip
-@drives_options
-@override_option
-@neck_option
-@click.option(
-    "--pace", type=float, help="With --simulated: run at this multiple of real time instead of as fast as possible."
-)
-@log_options
+@drives_options("override", "pace", "log")
 @click.option(
     "--realtime", is_flag=True, help="On a bus: run ahead of all ordinary processes (SCHED_FIFO), with memory locked."
 )
@@ -199,10 +92,8 @@ def zero_command(
 @force_option
 @json_option
 def run_command(
-    controller: Path, loop_file: Path, certificates: tuple[Path, ...], drives_file: Path | None, bus: str | None,
-    simulated: bool, robot: str | None, arm: bool, overrides: tuple[str, ...], neck: str | None, pace: float | None,
-    realtime: bool,
-    log_file: Path | None, no_log: bool, output: Path | None, trust: bool, force: bool, as_json: bool,
+    asked: Asked, controller: Path, loop_file: Path, certificates: tuple[Path, ...], realtime: bool,
+    output: Path | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
 
@@ -224,19 +115,19 @@ def run_command(
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
     refuse_existing(path, force=replace)
-    require_log(log_file, no_log=no_log, force=force)
-    names = checked_names(overrides)
+    require_log(asked.log, force=force)
     require_trusted(loop_file, trust=trust)
     setup = load_loop(loop_file)
+    drives_file = asked.drives
     if drives_file is None and "drives" in setup.files:
         drives_file = Path(setup.files["drives"][0])
-    virtual = load_neck(neck) if neck else neck_of(setup.loop)
-    moves: Any = robot if robot or setup.loop.robot.is_neck else setup.loop.robot
-    chosen = target_of(drives_file, bus, simulated, arm, neck=virtual, robot=moves)
+    virtual = neck_of(setup.loop)
+    moves: Any = asked.robot if asked.robot or setup.loop.robot.is_neck else setup.loop.robot
+    chosen = target_of(drives_file, asked.bus, asked.simulated, asked.arm, neck=virtual, robot=moves)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
     moved = chosen.file.moves
-    certified = require_certified(setup, controller, certificates, names, drives=chosen.path, robot=moved)
+    certified = require_certified(setup, controller, certificates, asked.override, drives=chosen.path, robot=moved)
     deployed = prepare(setup, controller, moved)
     for text in deployed.notes:
         note(text)
@@ -244,11 +135,11 @@ def run_command(
         again = require_same_again(deployed.loop, certified[1])
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, chosen.path)
-    live = not as_json and (not chosen.simulated or pace is not None)
+    live = not as_json and (not chosen.simulated or asked.pace is not None)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
     with contextlib.ExitStack() as stack:
         link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
-        log = stack.enter_context(opened_log(chosen, "run", log_file, no_log=no_log, force=force))
+        log = stack.enter_context(opened_log(chosen, "run", asked.log, force=force))
         with (
             live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
             # Two things that draw in place would draw over each other; the view tells the time as well.
@@ -258,12 +149,12 @@ def run_command(
             report = lambda done: tell(done, controller.name)  # noqa: E731
             if link is None:
                 result = run_simulated(
-                    deployed, chosen.file, neck=virtual, override=names, pace=pace,
+                    deployed, chosen.file, neck=virtual, override=asked.override, pace=asked.pace,
                     report=report, operator=keyboard, watches=watches, log=log, files=files,
                 )  # fmt: skip
             else:
                 result = run_on_bus(
-                    deployed, chosen.file, link, sensor, override=names, report=report, operator=keyboard,
+                    deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=keyboard,
                     watches=watches, realtime=realtime, log=log, files=files,
                 )  # fmt: skip
         # Before the log is closed: a full disk must not cost the recording and the result as well.
@@ -290,16 +181,14 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 
 
 @command.command("stop")
-@drives_options
+@drives_options()
 @json_option
-def stop_command(
-    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, as_json: bool
-) -> None:
+def stop_command(asked: Asked, as_json: bool) -> None:
     """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
     from softneck.drives import stop
     from softneck.drives.running._stop import require_stopped
 
-    chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
+    chosen = asked.target()
     with open_link(chosen, moves=False) as link:
         states = stop(link, chosen.file)
     _states(states, "stopped", as_json=as_json)
@@ -307,16 +196,14 @@ def stop_command(
 
 
 @command.command("reset")
-@drives_options
+@drives_options()
 @json_option
-def reset_command(
-    drives_file: Path | None, bus: str | None, simulated: bool, robot: str | None, arm: bool, as_json: bool
-) -> None:
+def reset_command(asked: Asked, as_json: bool) -> None:
     """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
     from softneck.drives import reset
     from softneck.drives.running._stop import require_reset
 
-    chosen = target_of(drives_file, bus, simulated, arm, robot=robot)
+    chosen = asked.target()
     with open_link(chosen, moves=False) as link:
         states = reset(link, chosen.file)
     _states(states, "reset", as_json=as_json)
@@ -331,6 +218,4 @@ def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:
 
 
 command.add_command(commission_command)
-command.add_command(replay_command)
-command.add_command(jog_command)
 command.add_command(record_command)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
 import platformdirs
 
-from softneck.core import OutputFileError, SettingsError
+from softneck.core import OutputFileError
 
 from ..shared._console import note
 from ._target import Target
@@ -22,43 +21,26 @@ if TYPE_CHECKING:
     from softneck.drives.logs._run_log import RunLogger
 
 
-def log_options(function: Callable) -> Callable:
-    """Add the options that say what is logged."""
-    options = (
-        click.option(
-            "--log", "log_file", type=click.Path(path_type=Path), metavar="FILE.mcap",
-            help="Log of all that happened (`softneck drives replay`, `import`, Foxglove). [default: on a bus that may "
-            "move something a file under ~/.local/state/softneck/log, or in $LOGS_DIRECTORY]",
-        ),
-        click.option("--no-log", is_flag=True, help="Write no log, not even on such a bus."),
-    )  # fmt: skip
-    for option in reversed(options):
-        function = option(function)
-    return function
+# What `--log` takes for no log at all.
+_NONE = "none"
 
 
-def require_log(log_file: Path | None, *, no_log: bool, force: bool) -> None:
-    """Raise where the options cannot be followed, before anybody is asked to arm anything."""
+def require_log(log: str | None, *, force: bool) -> None:
+    """Raise where a log cannot be written, before anybody is asked to arm anything."""
     from softneck.drives.logs._run_log import require_log_path
 
-    if log_file is None:
-        return
-    if no_log:
-        raise SettingsError("--log and --no-log contradict each other; give one of them.")
-    require_log_path(log_file, force=force)
+    if log not in (None, _NONE):
+        require_log_path(Path(log), force=force)
 
 
 @contextlib.contextmanager
-def opened_log(
-    chosen: Target, command: str, log_file: Path | None, *, no_log: bool, force: bool
-) -> Iterator[RunLogger | None]:
+def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool) -> Iterator[RunLogger | None]:
     """Yield a logger, None where nothing is logged; what it wrote has its names at the end.
 
     Args:
         chosen: the drives; where they may be real and no log is asked for, one is written to `log_folder`.
         command: what runs, for its name.
-        log_file: the one asked for.
-        no_log: write none that was not asked for.
+        wanted: the one asked for; "none": write none that was not asked for.
         force: replace an existing file.
 
     Raises:
@@ -67,8 +49,8 @@ def opened_log(
     from softneck.drives.bus._link import HARMLESS
     from softneck.drives.logs._run_log import RunLogger
 
-    own = log_file is None and not no_log and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
-    path = _new_path(command) if own else log_file
+    own = wanted is None and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
+    path = _new_path(command) if own else None if wanted in (None, _NONE) else Path(wanted)
     if path is None:
         yield None
         return
@@ -77,7 +59,7 @@ def opened_log(
     try:
         log = RunLogger(path, force=force, wait=chosen.simulated, epoch=epoch)
     except OutputFileError as error:
-        raise OutputFileError(f"{error} Or --no-log. Nothing was sent." if own else str(error)) from error
+        raise OutputFileError(f"{error} Or --log none. Nothing was sent." if own else str(error)) from error
     if own:
         note(f"log: {path}")
     try:

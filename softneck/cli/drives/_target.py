@@ -6,6 +6,7 @@ And what lets drives on a bus move: --arm, and the words typed by somebody who l
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import SettingsError, SoftneckError
+from softneck.core import SettingsError, SoftneckError, require_between
 from softneck.drives.bus._link import HARMLESS
 from softneck.drives.running._preflight import OVERRIDES
 
@@ -92,21 +93,65 @@ class Target:
         return self.file.moves.is_neck
 
 
-def drives_options(function: Callable) -> Callable:
-    """Add the options that say which drives."""
-    options = (
-        click.option("--drives", "drives_file", type=click.Path(path_type=Path), metavar="DRIVES.toml",
-                     help="Node ids, gear, encoder, signs, limits, sensor, guarding."),
-        click.option("--bus", metavar="INTERFACE:CHANNEL", help="CAN bus, such as socketcan:can0 or virtual:x."),
-        click.option("--simulated", is_flag=True, help="Simulated drives on the virtual neck, in this process."),
-        click.option("--robot", metavar="ROBOT",
-                     help="What the drives move: a preset or a robot file.  [default: robot.toml beside the drives "
-                     "file or above it, else the neck]"),
-        click.option("--arm", is_flag=True, help="Allow drives on a bus to move."),
-    )  # fmt: skip
-    for option in reversed(options):
-        function = option(function)
-    return function
+_OPTIONS = {
+    "drives": click.option("--drives", type=click.Path(path_type=Path), metavar="DRIVES.toml",
+                           help="Node ids, gear, encoder, signs, limits, sensor, guarding.  [default: the robot's]"),
+    "bus": click.option("--bus", metavar="INTERFACE:CHANNEL", help="CAN bus, such as socketcan:can0 or virtual:x."),
+    "simulated": click.option("--simulated", is_flag=True,
+                              help="Simulated drives on the robot's virtual plant, in this process."),
+    "robot": click.option("--robot", metavar="ROBOT",
+                          help="What the drives move: a preset or a robot file.  [default: robot.toml beside the "
+                          "drives file or above it, else the neck]"),
+    "arm": click.option("--arm", is_flag=True, help="Allow drives on a bus to move."),
+    "override": click.option("--override", multiple=True, metavar="NAME",
+                             help=f"Ignore a check that fails, by name: {', '.join(OVERRIDES)}."),
+    "pace": click.option("--pace", type=float, help="With --simulated: run at this multiple of real time."),
+    "log": click.option("--log", metavar="FILE.mcap|none",
+                        help="Log of all that happened (`softneck simulate` replays it, `import` reads it; Foxglove). "
+                        "[default: on a bus that may move something a file under ~/.local/state/softneck/log, or in "
+                        "$LOGS_DIRECTORY]"),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What the options of a command said of the drives; a command has those options that it needs."""
+
+    drives: Path | None
+    bus: str | None
+    simulated: bool
+    robot: str | None
+    arm: bool
+    override: tuple[str, ...] = ()
+    pace: float | None = None
+    log: str | None = None
+
+    def __post_init__(self) -> None:
+        checked_names(self.override)
+        if self.pace is not None:
+            require_between("--pace", self.pace, 0.01, 1000.0)
+            if not self.simulated:
+                raise SettingsError("--pace is for --simulated; a bus runs in real time.")
+
+    def target(self) -> Target:
+        """Return which drives are meant."""
+        return target_of(self.drives, self.bus, self.simulated, self.arm, robot=self.robot)
+
+
+def drives_options(*more: str) -> Callable[[Callable], Callable]:
+    """Return a decorator that adds the options that say which drives, and `more`; all arrive as one `Asked`."""
+    names = ("drives", "bus", "simulated", "robot", "arm", *more)
+
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def called(**values: Any) -> None:
+            function(Asked(**{name: values.pop(name) for name in names}), **values)
+
+        for name in reversed(names):
+            called = _OPTIONS[name](called)
+        return called
+
+    return decorate
 
 
 def target_of(
@@ -188,13 +233,6 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
         if name not in OVERRIDES:
             raise SettingsError(f"--override takes one of {', '.join(OVERRIDES)}; got `{name}`.")
     return tuple(names)
-
-
-override_option = click.option(
-    "--override", "overrides", multiple=True, metavar="NAME",
-    help=f"Ignore a check that fails, by name: {', '.join(OVERRIDES)}.",
-)  # fmt: skip
-neck_option = click.option("--neck", metavar="paper|lab|rough|NECK.toml", help="The virtual neck of --simulated.")
 
 
 def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | Reading | None]:

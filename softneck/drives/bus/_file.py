@@ -87,7 +87,7 @@ class Guarding:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZeroSettings:
-    """How `softneck drives zero` tensions the tendons.
+    """How `softneck drives commission --only zero` tensions the tendons.
 
     Attributes:
         current: of the motor while it pulls [A]; by default 3.25 N with [neck]'s radius, constant and efficiency, the
@@ -197,7 +197,8 @@ class DrivesFile(Shown):
         if self.baseline is not None and (self.baseline.motors, self.baseline.outputs) != (motors, self._outputs):
             raise SettingsError(
                 f"[supervision] `baseline` is of {self.baseline.motors} motors and {self.baseline.outputs} outputs; "
-                f"there are {motors} and {self._outputs}. Record one on these drives (`record --supervision`)."
+                f"there are {motors} and {self._outputs}. Make one from logs of these drives "
+                "(`softneck.drives.baseline`)."
             )
         if self.robot is not None:
             require_signs([drive.scale.reversed for drive in self.drives], self.robot)

@@ -14,7 +14,8 @@ from ._units import (
     speed_to_internal,
 )
 
-# Home offset [counts] that `softneck drives zero` sets: no drive has it after a reset, so it proves the zero.
+# Home offset [counts] that `softneck drives commission --only zero` sets: no drive has it after a reset, so it proves
+# the zero.
 HOMED_MARK = 1
 CSP = 8
 # Our own node number, for heartbeats.

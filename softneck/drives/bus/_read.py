@@ -133,7 +133,9 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
         content = _table("supervision", table["supervision"])
         _refuse_unknown("[supervision]", content, ("baseline",))
         if not isinstance(content.get("baseline"), str):
-            raise SettingsError("[supervision] `baseline` must name the file that `drives record --supervision` wrote.")
+            raise SettingsError(
+                "[supervision] `baseline` must name the file that `softneck.drives.baseline(...).save` wrote."
+            )
         values["baseline"] = load_baseline(folder / content["baseline"])
     return DrivesFile(**values)
 

@@ -141,7 +141,7 @@ def commission(
     if isinstance(session.link, VirtualLink) and isinstance(session.link.neck, SimulatedSprings):
         raise SettingsError(
             f"robot {file.moves.label()} has no virtual plant, and the springs that stand in for it pull both "
-            "ways: moves say nothing of them. Give it one: --neck, or [plant] neck in the robot file."
+            "ways: moves say nothing of them. Give it one: [plant] neck in the robot file."
         )
     for motor in motors:
         require_whole("--motor", motor, 1, count)

@@ -69,7 +69,7 @@ class JogResult:
             raise CheckFailedError(f"motor {self.motor} (node {self.node}): {self.verdict}. {self.advice}")
 
     def table(self) -> dict[str, Any]:
-        """Return the JSON of `softneck drives jog`."""
+        """Return the JSON of `softneck drives commission --only jog`."""
 
         def way(angles: tuple[float, ...]) -> dict[str, float | None]:
             size = math.hypot(*angles)
@@ -260,7 +260,10 @@ def judge(
             f"({math.degrees(wanted):.1f} deg); look at it, or raise --amplitude."
         )
     if size < _MOVED * wanted:
-        return "no movement", "Is its tendon attached and tight (`softneck drives zero`)? Is the inclinometer fixed?"
+        return (
+            "no movement",
+            "Is its tendon attached and tight (`softneck drives commission --only zero`)? Is the inclinometer fixed?",
+        )
     gaps = {(number, sign): _gap(seen, way, sign) for number, way in enumerate(ways, start=1) for sign in (1, -1)}
     # Where two motors pull the same way, or against each other, this one is meant.
     number, sign = min(gaps, key=lambda key: (round(gaps[key], 6), key[0] != motor))

@@ -64,8 +64,8 @@ class ExperimentResult:
         if fault is not None and fault.name == "following":
             raise CheckFailedError(
                 f"stopped at t = {fault.time:.3f} s: {fault}. The motors do not follow the signal within their "
-                "current; the drives are off: lower --max-speed, or look whether a motor is blocked or a tendon caught "
-                "(`softneck drives jog`)."
+                "current; the drives are off: lower speed_rad_s in [limits] of the drives file, or look whether a "
+                "motor is blocked or a tendon caught (`softneck drives commission --only jog`)."
             )
         self.ended.require()
 
@@ -88,8 +88,8 @@ def drive_limits(
     whose = "[limits] in the drives file" if file.robot is None else "[limits] in the drives file, or of the robot"
     for name, value, most, unit in (
         ("--max-position", position, farthest, "rad"),
-        ("--max-speed", speed, slowest, "rad/s"),
-        ("--max-slack", slack, farthest, "rad"),
+        ("speed", speed, slowest, "rad/s"),
+        ("slack", slack, farthest, "rad"),
     ):
         if value is not None and value > most:
             raise SettingsError(f"{name} {value:g} is beyond the {most:g} {unit} of {whose}.")
@@ -179,7 +179,7 @@ def _require_playable(excitation: Excitation, file: DrivesFile, sample_time: flo
         j = int(np.argmax(speeds / fastest))
         raise SettingsError(
             f"{excitation.name} asks for {speeds[j]:.3g} rad/s; the {whose} {fastest[j]:g} rad/s. "
-            "Lower --max-speed, and ramp it in and out (--ramp)."
+            "Slow it down, and ramp it in and out."
         )
 
 

@@ -58,7 +58,7 @@ class ZeroResult:
     outputs: Mapping[str, float]
 
     def table(self) -> dict[str, Any]:
-        """Return the JSON of `softneck drives zero`."""
+        """Return the JSON of `softneck drives commission --only zero`."""
         return {
             "zeroed": True,
             "motors": [{"node": n, "pulled_rad": p} for n, p in zip(self.nodes, self.pulled, strict=True)],

@@ -66,7 +66,7 @@ class Replay:
             raise CheckFailedError(f"the replay differs from the log at {self.difference}.")
 
     def table(self) -> dict[str, Any]:
-        """Return the JSON of `softneck drives replay`."""
+        """Return the JSON of `softneck simulate`."""
         found = self.difference
         return {
             "equal": found is None,

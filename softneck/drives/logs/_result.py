@@ -61,7 +61,7 @@ def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
     """Raise CheckFailedError if `fault` ended a run early."""
     if fault is None:
         return
-    after = " Run `softneck drives zero` before the next run." if rehome else ""
+    after = " Run `softneck drives commission --only zero` before the next run." if rehome else ""
     if fault.name == "operator":
         raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
     # Where no word reaches the drives, what they do is theirs, and nobody here can know it.

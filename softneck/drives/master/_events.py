@@ -27,7 +27,7 @@ class Rule:
         cycles: deadline in cycles; 0 where `seconds` counts.
         seconds: deadline [s].
         text: for people.
-        rehome: the drives' zero is lost: `softneck drives zero` is due.
+        rehome: the drives' zero is lost: `softneck drives commission --only zero` is due.
     """
 
     reaction: Reaction

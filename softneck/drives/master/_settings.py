@@ -164,7 +164,7 @@ class MasterSettings(Shown):
     Attributes:
         counts_per_radian: of each winch, with sign.
         zero_counts: counts at the zero of P, of all motors or of each (1: the mark of a homed drive, see `softneck
-            drives zero`).
+            drives commission --only zero`).
         newton_per_unit: tension for one unit of each drive's current, with sign.
         sample_cycles: bus cycles for one sample of the controller.
         bus, limits, sensor, watch, ramps: as their classes say.

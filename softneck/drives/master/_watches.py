@@ -123,7 +123,11 @@ class Watches:
         for i in range(len(nodes)):
             if self._pushes[i].over(now, tensions[i] < -self._settings.pushed):
                 text = f"motor {i + 1}, about {tensions[i]:.1f} N: is `reversed` of its drive right?"
-                events.append(Event(now, "pushed", nodes[i], f"{text} See `softneck drives jog {i + 1}`"))
+                events.append(
+                    Event(
+                        now, "pushed", nodes[i], f"{text} See `softneck drives commission --only jog --motor {i + 1}`"
+                    )
+                )
 
     def tilt(self, now: float, step: float, positions: Sequence[float], measured: Sequence[float] | None,
              events: list[Event]) -> None:  # fmt: skip

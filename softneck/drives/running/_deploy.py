@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from softneck.core import CheckFailedError, SettingsError, load
+from softneck.core import CheckFailedError, load
 from softneck.cosim import FmuPart
 from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.cosim.loops._validity import reach_beyond
@@ -27,7 +27,7 @@ from ._bus_loop import Session, run_session
 from ._pilot import LoopPilot
 from ._signals import RunLog
 from ._timing import Operator
-from ._virtual import Watch, simulated_plant
+from ._virtual import Watch, physics_of, simulated_plant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +115,7 @@ def run_simulated(
     Args:
         deployed: the loop.
         file: how drives and master are set up.
-        neck: the virtual neck; that of the loop where it has one and none is given.
+        neck: the virtual neck; if not given, that of the loop, else that of the robot.
         override: names of pre-flight checks that may fail.
         pace: at this multiple of real time; as fast as possible if not given.
         report: called now and then with the done fraction.
@@ -128,11 +128,10 @@ def run_simulated(
 
     Raises:
         CheckFailedError: the pre-flight failed.
-        SettingsError: no neck is known.
     """
     parameters = neck or deployed.neck
     if parameters is None and file.moves.is_neck:
-        raise SettingsError("the loop's plant is not a virtual neck; say which one the drives are to turn (--neck).")
+        parameters = physics_of(file.moves)
     loop = deployed.loop
     pilot = LoopPilot(loop, file.moves)
     virtual = simulated_plant(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))

@@ -192,7 +192,7 @@ def preflight(
             kind = _check_drive(objects, file, entry, guarding, rows)
             if homed:
                 found = objects.read(0x607C)
-                advice = "Run `softneck drives zero`: a drive loses its zero with every reset."
+                advice = "Run `softneck drives commission --only zero`: a drive loses its zero with every reset."
                 rows.add(entry.node, "homed", "yes" if found == HOMED_MARK else "no", found == HOMED_MARK, advice)
         except SdoError as error:
             if error.aborted:

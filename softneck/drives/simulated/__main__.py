@@ -32,7 +32,7 @@ _GAIN, _REACH, _CURRENT = 0.483 / 5.293, 6.0, 0.0299
 @click.option("--neck", default="paper", show_default=True, help="paper, lab, rough or a neck file (.toml).")
 @click.option("--robot", help="Instead of a neck: a robot's preset or file; its motors turn springs here.")
 @click.option("--profile", type=click.Choice(list(PROFILES)), default="ipos2015", show_default=True)
-@click.option("--homed", is_flag=True, help="As if `softneck drives zero` had been run.")
+@click.option("--homed", is_flag=True, help="As if `softneck drives commission --only zero` had been run.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inclinometer's noise.")
 @click.option("--report", is_flag=True, help="Print one JSON line for each change of a drive's power state.")
 @click.option("--cycle", type=float, default=0.01, show_default=True, help="Bus period the drives expect [s].")

@@ -132,7 +132,7 @@ class SimulatedDrives:
         axis.tick, axis.counts_per_turn = self.h, s.counts_per_turn[row]
         m[SERVO_CURRENT_LIMIT] = current_limit
         if s.homed:
-            # As `drives zero` leaves it: home offset 1 count, which no drive has after a reset.
+            # As `drives commission --only zero` leaves it: home offset 1 count, which no drive has after a reset.
             axis.values[(0x607C, 0)] = 1
             m[SERVO_ZERO], m[SERVO_POSITION] = 1.0, 1.0
             axis.homed = True

@@ -30,7 +30,7 @@ from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRI
 
 # From rest to the end of its range a tendon pulls by this part more than at rest, if its motor can.
 _MORE, _SPARE = 0.4, 0.8
-# How far winches are loose before `drives zero` [rad].
+# How far winches are loose before `drives commission --only zero` [rad].
 _LOOSE = 1.0
 
 

@@ -141,7 +141,7 @@ def load_baseline(path: str | Path) -> Baseline:
     try:
         table = json.loads(settings_text(source, MOST_JSON))
         if not isinstance(table, dict) or table.pop("kind", "") != _KIND:
-            raise FileFormatError(f"{source}: is not what `softneck drives record --supervision` writes.")
+            raise FileFormatError(f"{source}: is not what `softneck.drives.baseline(...).save` writes.")
         if table.pop("version", 0) != _VERSION:
             raise FileFormatError(f"{source}: is of another version of softneck; record it anew.")
         return Baseline.from_dict(table)

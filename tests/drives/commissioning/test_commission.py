@@ -169,7 +169,7 @@ def test_robots_with_other_tendons_are_commissioned(name: str, mistake: str, fou
 def test_springs_that_stand_in_for_a_robot_are_not_commissioned() -> None:
     """They pull both ways, so that the sign of each motor came out as the noise had it."""
     file = default_drives(robot=Robot.preset("arm"))
-    with pytest.raises(SettingsError, match=r"has no virtual plant.*Give it one: --neck"):
+    with pytest.raises(SettingsError, match=r"has no virtual plant.*Give it one: \[plant\] neck"):
         commission(Session(file=file, link=VirtualLink(simulated_plant(file, None, sample_time=0.02, homed=False))))
 
 

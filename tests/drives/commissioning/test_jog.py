@@ -85,7 +85,9 @@ def test_a_reversed_motor_is_seen_by_its_current() -> None:
     assert fault.time < 8.0
     other = jogged(2, wired=reversed_first())
     assert other.advice == "The current of motor 1 says that its tendon pushes: jog that one first."
-    with pytest.raises(CheckFailedError, match=r"pushes its tendon.*\(node 1\).*See `softneck drives jog 1`"):
+    with pytest.raises(
+        CheckFailedError, match=r"pushes its tendon.*\(node 1\).*See `softneck drives commission --only jog --motor 1`"
+    ):
         other.require()
 
 
@@ -105,7 +107,8 @@ def test_record_and_run_name_a_reversed_motor_on_the_way_in(motor: int, preset: 
     # The ramp in takes 1 to 6 s, at the end of which a tendon is tight; its time-out was 30 s.
     assert fault.time < 8.0
     with pytest.raises(
-        CheckFailedError, match=rf"is `reversed` of its drive right\? See `softneck drives jog {motor}`"
+        CheckFailedError,
+        match=rf"is `reversed` of its drive right\? See `softneck drives commission --only jog --motor {motor}`",
     ):
         done.require()
 

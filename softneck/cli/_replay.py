@@ -1,45 +1,33 @@
-"""softneck drives replay: a recorded run through the same core gives the same decisions."""
+"""softneck simulate LOG.mcap: a recorded run through the same core gives the same decisions."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import click
+from softneck.core import FileFormatError, SoftneckError
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError
-
-from ..shared._console import note, print_json, print_table
-from ..shared._options import json_option
+from .shared._console import note, print_json, print_table
 
 if TYPE_CHECKING:
     from softneck.drives.logs._log_file import LoggedRun
     from softneck.drives.master._measured import Pilot
 
 
-@click.command("replay", epilog="Example: softneck drives replay run.mcap")
-@click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
-@click.option("--loop", "loop_file", type=click.Path(path_type=Path), metavar="LOOP.toml",
-              help="The run's loop file, if it is no longer where the log says.")  # fmt: skip
-@click.option(
-    "--controller",
-    type=click.Path(path_type=Path),
-    help="The run's controller, if it is no longer where the log says.",
-)
-@click.option("--core-only", is_flag=True, help="Use the logged answers of the controller instead of computing them.")
-@json_option
-def replay_command(log: Path, loop_file: Path | None, controller: Path | None, core_only: bool, as_json: bool) -> None:
+def replay_log(log: Path, *, as_json: bool) -> None:
     """Feed what a run saw to the same core and controller again, and compare every frame out, bit for bit.
 
-    LOG is the .mcap of `run`, `jog` or `record` with --log; one that is cut is replayed up to the cut, and says so.
-    Exit code 0 if all is equal, 1 with the first difference if not. Nothing is sent to any bus.
+    A log that is cut is replayed up to the cut, which is said. Nothing is sent to any bus.
+
+    Raises:
+        CheckFailedError: a frame differs, with the first one.
     """
     from softneck.drives import read_run_log, replay
     from softneck.drives.logs._log_file import changed_files
 
     run = read_run_log(log)
     notes = changed_files(run)
-    pilot = None if core_only else _pilot(run, loop_file, controller)
+    pilot = _pilot(run)
     if pilot is None:
         notes.append("the controller was not computed again: its logged answers were used")
     result = replay(run, pilot, notes)
@@ -56,7 +44,7 @@ def replay_command(log: Path, loop_file: Path | None, controller: Path | None, c
     result.require()
 
 
-def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> Pilot | None:
+def _pilot(run: LoggedRun) -> Pilot | None:
     """Return what led the run: controller and observer, a jog or an experiment.
 
     None where the log names none, or the files of the loop are gone.
@@ -76,13 +64,7 @@ def _pilot(run: LoggedRun, loop_file: Path | None, controller: Path | None) -> P
     except (SoftneckError, TypeError) as error:
         raise FileFormatError(f"{run.path}: what it played does not fit this softneck ({error}).") from error
     files = {role: Path(str(entry.get("path"))) for role, entry in run.facts.get("files", {}).items()}
-    loop = loop_file or files.get("loop")
-    chosen = controller or files.get("controller")
-    if loop is None or chosen is None:
+    loop, controller = files.get("loop"), files.get("controller")
+    if loop is None or controller is None or not (loop.is_file() and controller.is_file()):
         return None
-    for path, given in ((loop, loop_file), (chosen, controller)):
-        if not path.is_file():
-            if given is not None:
-                raise SettingsError(f"{path}: no such file.")
-            return None
-    return LoopPilot(prepare(load_loop(loop), chosen, run.robot).loop, run.robot)
+    return LoopPilot(prepare(load_loop(loop), controller, run.robot).loop, run.robot)

@@ -1,0 +1,104 @@
+"""softneck drives record: an identification experiment on the drives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from softneck.core import refuse_existing, require_between
+from softneck.signals import signal_names, write_recording
+
+from ..shared._console import note, print_json, progress
+from ..shared._options import force_option, json_option, output_option
+from ._log import drives_of, opened_log, require_log
+from ._steps import session_of
+from ._target import Asked, drives_options, leave_if_asked, open_link
+
+if TYPE_CHECKING:
+    from softneck.drives.commissioning._record import ExperimentResult
+
+# From rest and out to it [s]: Eq. 22 begins at up to 1.9 rad, which a winch turns in half a second at the least.
+_RAMP = 2.0
+
+
+@click.command(
+    "record",
+    help="Record SIGNAL on the drives: an identification experiment, ramped in and out.\n\n"
+    "Signals: "
+    + ", ".join(signal_names())
+    + ", or a recording whose set-points are played. The drives must be zeroed. If a fault ends it early, what was "
+    "recorded until then is written, and the exit code is 1; Ctrl-C ramps to rest, keeps the data, and exits with 130.",
+    epilog="Example: softneck drives record eq22 -o eq22.csv --drives drives.toml --bus socketcan:can0 --arm",
+)
+@click.argument("signal_name", metavar="SIGNAL")
+@output_option("recording", "REC", required=True)
+@click.option("--duration", type=float, metavar="S", help="Length in seconds. [default: the signal's own]")
+@click.option("--seed", type=click.IntRange(0, 2**31 - 200), default=0, show_default=True, help="Seed of the signal.")
+@click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: drives file]")
+@click.option("--payload", type=float, default=0.0, metavar="KG", help="Payload on the platform of --simulated.")
+@drives_options("override", "pace", "log")
+@force_option
+@json_option
+def record_command(
+    asked: Asked, signal_name: str, output: Path, duration: float | None, seed: int, max_position: float | None,
+    payload: float,
+    force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Record SIGNAL on the drives."""
+    from softneck.drives import Experiment, record_signal
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.commissioning._record import drive_limits
+    from softneck.drives.running._keyboard import Keyboard
+    from softneck.signals.recording._files import recording_suffix
+
+    recording_suffix(output)
+    refuse_existing(output, force=force)
+    require_log(asked.log, force=force)
+    require_between("--payload", payload, 0.0, 1.0, "kg")
+    chosen = asked.target()
+    moved, limits = chosen.file.robot, drive_limits(chosen.file, position=max_position)
+    experiment = Experiment(
+        signal=signal_name, limits=limits, duration=duration, seed=seed, ramp=_RAMP,
+        robot=moved,
+        ranges=() if moved is None else chosen.file.ranges,
+    )  # fmt: skip
+    prepared = experiment.prepared()
+    with (
+        open_link(chosen, moves=True, homed=True, seed=seed) as link,
+        opened_log(chosen, "record", asked.log, force=force) as log,
+    ):
+        if isinstance(link, VirtualLink):
+            link.neck.set(payload=payload)
+        with progress("record", quiet=as_json) as tell, Keyboard() as keyboard:
+            files = {**drives_of(chosen.path), **({"signal": signal_name} if Path(signal_name).is_file() else {})}
+            session = session_of(asked, chosen, link, keyboard, log, files)
+            recorded = record_signal(
+                [excitation for excitation, _ in prepared],
+                replace(session, facts={"record": experiment.facts()}),
+                report=lambda done: tell(done, signal_name),
+            )
+        # Before the log is closed: a full disk must not cost the recording as well.
+        if recorded.recording is not None:
+            write_recording(output, recorded.recording, force=force)
+        facts: dict[str, Any] = {"signal": signal_name, "runs": len(prepared), "changes": prepared[0][1].as_dict()}
+        _print_record(output, recorded, facts, str(prepared[0][1]), as_json=as_json)
+        leave_if_asked(keyboard, terminated=recorded.ended.terminated)
+        recorded.require()
+
+
+def _print_record(
+    output: Path, recorded: ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
+) -> None:  # fmt: skip
+    if as_json:
+        where = None if recorded.recording is None else str(output)
+        print_json({"recording": where, **facts, **recorded.table()})
+        return
+    if recorded.recording is None:
+        note(f"{output}: nothing was recorded")
+        return
+    click.echo(f"{output}: {recorded.rows} of {recorded.planned} rows of {facts['signal']}; set-points: {changes}")
+    for name, count in recorded.ended.master.counts.items():
+        click.echo(f"{name}: {count}")
