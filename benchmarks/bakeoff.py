@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SoftneckError, load
-from softneck.design import FopiSettings, HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings
+from softneck.design import FopiSettings, HinfSettings, LqgSettings, PidSettings, PiSettings
 from softneck.design.plants._step_and_load import StepAndLoadResult
 from tests.oracles.bake_off import bake_off_neck, bake_off_samples, block_stepper, run_bake_off
 
@@ -36,7 +36,6 @@ KINDS: dict[str, Any] = {
     "fopi": FopiSettings(max_sensitivity=3.0, **TEST),
     "fopid": FopiSettings(max_sensitivity=3.5, derivative=0.1, **TEST),
     "hinf": HinfSettings(max_sensitivity=3.0, **TEST),
-    "ncf": NcfSettings(max_sensitivity=3.0, **TEST),
     "lqg": LqgSettings(max_sensitivity=3.0, **TEST),
 }  # fmt: skip
 

@@ -61,7 +61,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     everywhere = (*CHOOSING, *OURS)
     parser.add_argument("--necks", nargs="+", choices=everywhere, default=everywhere, help=", ".join(everywhere))
-    parser.add_argument("--kinds", nargs="+", default=["pi", "pid", "lqg", "hinf", "ncf"], help="of controllers")
+    parser.add_argument("--kinds", nargs="+", default=["pi", "pid", "lqg", "hinf"], help="of controllers")
     parser.add_argument("--known", action="store_true", help="designs that know of the look-ahead")
     wanted = parser.parse_args()
     settings = {"least_delay": KNOWN} if wanted.known else {}

@@ -36,7 +36,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "scheduled": TAUT,
     "adaptive": {**TAUT, "lead_limit": 1.0},
     "hinf": {**TAUT, "lead_limit": 1.2, "reference_time": 0.08},
-    "ncf": {**TAUT, "lead_limit": 0.8, "reference_time": 0.06},
     "pid": {**TAUT, "lead_limit": 0.8, "reference_time": 0.25},
     "fopi": {**TAUT, "lead_limit": 0.8, "reference_time": 0.14},
     "lqg": {**TAUT, "lead_limit": 0.8, "reference_time": 0.16},

@@ -43,7 +43,7 @@ from softneck.tuning._tune import BUDGET, task_of
 OUT = Path("build/tune")
 PAYLOADS, JUDGED = (0.32, 1.0), (0.32, 0.66, 1.0)
 ORIENTATIONS = (0.0, 45.0, 90.0)
-PLAIN = ("pi", "pid", "fopi", "hinf", "ncf", "lqg")
+PLAIN = ("pi", "pid", "fopi", "hinf", "lqg")
 SIZE, CIRCLE, TURN = math.radians(15.0), math.radians(12.0), 1.2
 # Overshoot [%], rise [s], steady rms [deg], circle unknown and known ahead [deg].
 GOALS = {"overshoot": 5.0, "rise": 0.4, "steady": 0.15, "circle": 3.0, "ahead": 1.5}

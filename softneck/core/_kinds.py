@@ -110,9 +110,6 @@ KINDS: dict[str, Kind] = {
         Kind("hinf", "controller", "softneck.design:HinfSettings", "softneck.design:LinearController",
              f"{_DESIGN}.linear._linear_controller_runtime",
              "H-infinity mixed sensitivity on the exact-delay plant, verified on every sample"),
-        Kind("ncf", "controller", "softneck.design:NcfSettings", "softneck.design:LinearController",
-             f"{_DESIGN}.linear._linear_controller_runtime",
-             "loop shaping with normalised coprime factors (Glover, McFarlane)"),
         Kind("pid", "controller", "softneck.design:PidSettings", "softneck.design:LinearController",
              f"{_DESIGN}.linear._linear_controller_runtime",
              "PID tuned on the worst sample of the plant, or by placed poles"),
@@ -140,6 +137,7 @@ REMOVED: dict[str, str] = {
     "online_nlsm": "nlsm",
     "change": "nonlinear",
     "switched": "pi",
+    "ncf": "hinf",
 }
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 

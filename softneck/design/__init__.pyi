@@ -14,17 +14,9 @@ from .predictive._nmpc import NmpcController as NmpcController
 from .predictive._nmpc import NmpcSettings as NmpcSettings
 from .predictive._settings import MpcSettings as MpcSettings
 from .robust._hinf import HinfSettings as HinfSettings
-from .robust._lqgsyn import lqgsyn as lqgsyn
 from .robust._mu import mu_bounds as mu_bounds
-from .robust._ncf import NcfSettings as NcfSettings
-from .robust._nu_gap import nugap as nugap
-from .robust._robustness import diskmargin as diskmargin
-from .robust._robustness import robstab as robstab
-from .robust._robustness import wcgain as wcgain
 from .robust._synthesis import hinfsyn as hinfsyn
-from .robust._synthesis import loopsyn as loopsyn
 from .robust._synthesis import mixsyn as mixsyn
-from .robust._synthesis import ncfsyn as ncfsyn
 from .robust._weights import makeweight as makeweight
 from .robust._weights import ucover as ucover
 from .varying._adaptive import AdaptiveSettings as AdaptiveSettings

@@ -175,20 +175,6 @@ def delay_sensitivity(part: LinearEvidence, sample_time: float) -> Chart:
     )  # fmt: skip
 
 
-def gap_chart(part: LinearEvidence) -> Chart:
-    """Return the nu-gaps of all plants, sorted, beside the controller's margin."""
-    panels = []
-    for pair in part.gaps:
-        for axis, found in zip(part.plants.axes, pair, strict=True):
-            share = np.linspace(0.0, 100.0, found.gap.size)
-            curve = Curve(share, np.sort(found.gap), "nu-gap to the nominal", BLUE)
-            panels.append(Panel([curve], axis, levels=(Level(found.margin, "margin b of the nominal loop", RED),)))
-    return Chart(
-        "Nu-gaps", panels, "part of the plants [%]", columns=2, row_height=2.2,
-        caption="Plants with a gap below the margin are proven stable by the gap alone.",
-    )  # fmt: skip
-
-
 def step_chart(steps: Steps, plants: Plants, robot: Robot) -> Chart:
     """Return the steps of all plants, the worst drawn through, and what its motors did."""
     t = steps.time

@@ -17,7 +17,7 @@ from softneck.runtime import Block
 from ._confidence import MarginInterval, intervals
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
-from ._linear import Gaps, LinearLaw, gaps, judged, margins
+from ._linear import LinearLaw, judged, margins
 from ._neck_loops import (
     NeckRun,
     direction,
@@ -28,7 +28,7 @@ from ._neck_loops import (
     step_at,
 )
 from ._own_plants import OwnPlant, payloads_left_out
-from ._plants import Plants, UncertainNeck, all_plants, join, nominal_plants
+from ._plants import Plants, UncertainNeck, all_plants, join
 from ._requirements import Requirements
 from ._search import SearchResult, search
 from ._steps import UNTOLD, Steps, StepTest, run_steps
@@ -69,7 +69,6 @@ class LinearEvidence:
         margins: name -> (n,).
         found: by the search; None where it was switched off.
         structured: by neck.
-        gaps: by neck, of each axis.
         intervals: of the margins.
         delays: rows of (samples added, largest radius, least disk margin, largest sensitivity).
     """
@@ -80,7 +79,6 @@ class LinearEvidence:
     margins: dict[str, Vector]
     found: SearchResult | None
     structured: list[list[StructuredResult]]
-    gaps: list[tuple[Gaps, ...]]
     intervals: list[MarginInterval]
     delays: np.ndarray
 
@@ -189,17 +187,8 @@ def _linear(
     drawn[: _SCALED // 3] = np.sign(drawn[: _SCALED // 3])
     wanted = detailed or any(item.metric == "robust.sensitivity" for item in asked.bounds)
     parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted) for neck in necks]
-    nominals = [plant.later(extra) for plant in nominal_plants(necks)]
-    distances = []
-    for source, nominal in enumerate(nominals):
-        distances.append(gaps(nominal, tried.take(np.flatnonzero(tried.source == source)), law, w))
-    ratio = np.zeros((len(plants.axes), len(tried)))
-    for source, each in enumerate(distances):
-        for i, found_gaps in enumerate(each):
-            ratio[i, tried.source == source] = found_gaps.ratio
-    table |= {f"{axis}.nu_gap_ratio": ratio[i] for i, axis in enumerate(plants.axes)}
     spread = [row for neck in necks for row in intervals(neck, law, w, extra=extra)] if detailed else []
-    return LinearEvidence(name, law, tried, table, found, parts, distances, spread, _delays(plants, law, w))
+    return LinearEvidence(name, law, tried, table, found, parts, spread, _delays(plants, law, w))
 
 
 def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:

@@ -13,7 +13,6 @@ from ._charts import (
     delay_sensitivity,
     frequency_charts,
     gain_unit,
-    gap_chart,
     margin_map,
     mu_charts,
     neck_chart,
@@ -170,8 +169,7 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
             f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
         ),
         Section(
-            f"Delay and gaps{title}", tables=[_delay_table(part, Ts)],
-            charts=[delay_sensitivity(part, Ts), gap_chart(part)],
+            f"Delay{title}", tables=[_delay_table(part, Ts)], charts=[delay_sensitivity(part, Ts)],
         ),
     ]  # fmt: skip
     if part.intervals:

@@ -21,7 +21,7 @@ from ._steps import METRICS
 
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
-_AXIS_METRICS = (*LARGE, *SMALL, "nu_gap_ratio")
+_AXIS_METRICS = (*LARGE, *SMALL)
 _NECK_METRICS = (
     "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
     "slack_s",

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector
-from softneck.design.robust._mu import Structure, mu_lower, mu_upper
-from softneck.design.robust._robustness import worst_gains
+from softneck.design.robust._mu import Structure, mu_lower, mu_upper, worst_gains
 from softneck.identification.uncertainty._measured import response_of
 
 from ._axis_box import AxisBox

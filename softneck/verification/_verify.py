@@ -150,11 +150,6 @@ class Verification(Shown):
                 for part in evidence.linear[:1] for row in part.delays
             ],
             "confidence": [asdict(row) for part in evidence.linear for row in part.intervals],
-            "nu_gap": [
-                {"source": neck.name, "axis": axis, "largest_gap": pair[i].gap.max(), "margin": pair[i].margin}
-                for part in evidence.linear[:1] for neck, pair in zip(self.necks, part.gaps, strict=True)
-                for i, axis in enumerate(neck.names)
-            ],
             "settings": {
                 name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "neck")
             },

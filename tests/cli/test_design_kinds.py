@@ -18,7 +18,6 @@ from ..data import neck_recording
 Call = Callable[..., Any]
 SETTINGS = {
     "hinf": "bandwidth=3.0",
-    "ncf": "crossover=4.0",
     "lqg": "load_rate=10.0",
     "pid": "max_sensitivity=1.8",
     "fopi": "phase_margin_deg=75",
@@ -47,11 +46,10 @@ def test_it_designs_every_kind(kind: str, models: list[str], call: Call) -> None
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("ncf", "m0.npz", "--set", "crossover=200.0"), "below the Nyquist frequency"),
         (("pi", "m0.npz", "--observer", "m0.npz"), "`--observer` is for mpc and nmpc, and pi does not ask for it"),
         (("mpc", "m0.npz", "--observer", "m0.npz"), "m0.npz: is a model (rls), not an observer"),
         (("lqg", "m0.npz", "--set", "sample_time=0.01"), "`sample_time` is for continuous plants"),
-        (("ncf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),
+        (("hinf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),
         (("custom", "m0.npz"), "`controller` must be a control.StateSpace"),
         (("switched", "m0.npz"), "kind `switched` was removed after softneck 0.2.0"),
         (("hinf", "m0.npz", "--mat", "c.txt"), "must end in `.mat`"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softneck.core import FileFormatError, SettingsError, load, read_archive
-from softneck.design import CustomSettings, LqgSettings, MpcController, MpcSettings, PidSettings, lqgsyn
+from softneck.design import CustomSettings, LqgSettings, MpcController, MpcSettings, PidSettings, makeweight, mixsyn
 from softneck.design.linear._linear_parts_runtime import LinearArrays
 from softneck.design.linear._rise import rise_time
 from softneck.design.plants._coupled import CoupledPlant, coupled_plant
@@ -156,7 +156,7 @@ def test_a_controller_of_ones_own_is_taken_with_its_plant() -> None:
     G = plant(3, 2, seed=1)
     found = taken(G)
     # K of u = K e in the plant's inputs is T K in its redefined ones.
-    K: Any = lqgsyn(G, load_rate=0.5)
+    K: Any = mixsyn(G, makeweight(10.0, 1.0, 0.5), 0.5).controller
     K = control.StateSpace(K.A, K.B, found.redefinition[0][:2] @ K.C, found.redefinition[0][:2] @ K.D, TS)
     controller = CustomSettings(controller=K, **LIMITS).design(G)
     z = np.exp(1j * np.array([0.3, 3.0]) * TS)
@@ -224,7 +224,7 @@ UNSTABLE = control.StateSpace(np.diag([1.1, 0.5, 0.5]), np.ones((3, 3)), np.ones
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        (UNSTABLE, r"not stable \(spectral radius 1.1000\).*`lqgsyn`"),
+        (UNSTABLE, r"not stable \(spectral radius 1.1000\).*`mixsyn`"),
         (plant(1, 2), "1 input.s. cannot bring 2 output.s. to references of their own: they are too few"),
         (plant(3, 2) * 0.0, "`output_1` answers to none of them at rest"),
         (plant(9, 2), "`motors.names` must hold 1 to 8 names; got 9"),

@@ -11,7 +11,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from softneck.core import SettingsError
-from softneck.design import HinfSettings, LqgSettings, NcfSettings, PidSettings, PiSettings, fopi
+from softneck.design import HinfSettings, LqgSettings, PidSettings, PiSettings, fopi
 from softneck.design.linear._assembly import AxisController
 from softneck.design.linear._axis_loop import (
     axis_margins,
@@ -181,7 +181,7 @@ def test_lqg_separates() -> None:
 
 
 def test_conditioning_is_hanus_where_its_zeros_are_stable() -> None:
-    K = NcfSettings().design(bake_off_neck())
+    K = PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(bake_off_neck())
     axis = axis_of(K)
     hanus = axis.Br / axis.Dr
     assert np.abs(np.linalg.eigvals(axis.A - hanus @ axis.C)).max() < 1.0
@@ -207,7 +207,7 @@ def test_a_hidden_integrator_has_no_conditioning() -> None:
 
 @pytest.mark.parametrize("order", slow_but([2, 3, 4, 5, 6], [2, 5]))
 def test_reduction_keeps_its_bound_and_its_integrator(order: int) -> None:
-    K: Any = NcfSettings(gain_spread=0.0, conditioning="hanus").design(bake_off_neck())
+    K: Any = HinfSettings(gain_spread=0.0, conditioning="hanus").design(bake_off_neck())
     axis = axis_of(K)
     full = control.StateSpace(axis.A, np.hstack([axis.Br, axis.By]), axis.C, [[axis.Dr, axis.Dy]], TS)
     found = reduce_controller(full, order)
@@ -222,14 +222,14 @@ def test_reduction_keeps_its_bound_and_its_integrator(order: int) -> None:
 
 @pytest.mark.slow
 def test_a_reduced_design_says_what_it_lost() -> None:
-    full = NcfSettings().design(bake_off_neck())
-    small = NcfSettings(controller_order=4).design(bake_off_neck())
+    full = HinfSettings().design(bake_off_neck())
+    small = HinfSettings(controller_order=4).design(bake_off_neck())
     loss = small.design["pitch"]["reduction"]
     assert loss["states_before"] == full.design["pitch"]["states"]
     assert small.design["pitch"]["states"] == 4
     assert loss["sensitivity_before"] == pytest.approx(full.design["pitch"]["margins"]["sensitivity"], rel=1e-9)
     assert closed_radius(axis_of(small), PLANT, 0) < 1.0
-    assert "4 of 7 states" in small.summary()
+    assert "4 of 6 states" in small.summary()
     with pytest.raises(SettingsError, match="less than the 2 integrators"):
         reduce_controller(full.ss()[0, 2], 0)
 

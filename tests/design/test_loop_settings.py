@@ -22,7 +22,6 @@ from softneck.design import (
     HinfSettings,
     LqgSettings,
     MpcSettings,
-    NcfSettings,
     NmpcSettings,
     PidSettings,
     PiSettings,
@@ -42,7 +41,7 @@ def _custom(**settings: Any) -> CustomSettings:
 
 
 KINDS: dict[str, Callable[..., Any]] = {
-    "pi": PiSettings, "pid": PidSettings, "fopi": FopiSettings, "hinf": HinfSettings, "ncf": NcfSettings,
+    "pi": PiSettings, "pid": PidSettings, "fopi": FopiSettings, "hinf": HinfSettings,
     "lqg": LqgSettings, "custom": _custom, "scheduled": ScheduledSettings, "adaptive": AdaptiveSettings,
 }  # fmt: skip
 LIMITS: dict[str, Any] = {
@@ -155,7 +154,7 @@ def test_a_small_move_is_as_quick_whatever_slow_pole_hides_behind_a_zero() -> No
     np.testing.assert_allclose(with_it / plain, 1.0, atol=6e-3)
 
 
-@pytest.mark.parametrize("kind", ["pi", "pid", "fopi", "hinf", "ncf", "lqg"])
+@pytest.mark.parametrize("kind", ["pi", "pid", "fopi", "hinf", "lqg"])
 def test_a_slow_pole_that_hides_behind_a_zero_spoils_no_design(kind: str) -> None:
     """Taken for what small moves are quicker by, it made the plant sixty times as loud: most kinds had no solution."""
     plain, with_it = (

@@ -20,7 +20,7 @@ from .test_robots import plant as lag
 
 TS = 0.02
 # The kinds whose controller has a linear form.
-LINEAR = ("pi", "pid", "fopi", "hinf", "ncf", "lqg")
+LINEAR = ("pi", "pid", "fopi", "hinf", "lqg")
 # Static gain [deg/rad], pole [1/s], dead time [samples]: the paper's, and what foreign necks are like.
 PLANTS = {"paper": (5.23, 5.293, 4), "quick": (6.0, 9.8, 4), "slow": (4.0, 3.3, 5), "late": (5.0, 7.0, 7)}
 
@@ -98,7 +98,7 @@ def test_the_formula_for_a_lag_is_right_to_nine_percent(ratio: float) -> None:
     assert found == pytest.approx(ratio * LAG * lag, rel=0.09)
 
 
-@pytest.mark.parametrize("kind", ["pi", "ncf"])
+@pytest.mark.parametrize("kind", ["pi", "hinf"])
 def test_what_the_motors_cannot_give_is_refused_in_a_line(kind: str) -> None:
     settings = resolve(KINDS[kind].settings)
     with pytest.raises(SettingsError, match=r"`rise_s` = 0\.02: within the motors' slew and range no step of 10 deg"):

@@ -35,7 +35,7 @@ BELLOWS = Robot.from_dict({
     "directions": {"kind": "identified"},
 })  # fmt: skip
 LEARNED = np.array([[0.8, -0.6, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0], [0.5, 0.5, 0.5, 0.5]])
-KINDS = ("pi", "pid", "fopi", "hinf", "ncf", "lqg")
+KINDS = ("pi", "pid", "fopi", "hinf", "lqg")
 
 
 def plant(robot: Robot, *, gain: float = 0.08, rest: float = 0.0) -> Model:

@@ -19,7 +19,6 @@ from softneck.design import (
     HinfSettings,
     LinearController,
     LqgSettings,
-    NcfSettings,
     PidSettings,
     PiSettings,
     uncertain_plant,
@@ -49,7 +48,6 @@ KINDS: dict[str, Any] = {
     "fopi": FopiSettings(max_sensitivity=3.0, **TEST),
     "fopid": FopiSettings(max_sensitivity=3.5, derivative=0.1, **TEST),
     "hinf": HinfSettings(max_sensitivity=3.0, **TEST),
-    "ncf": NcfSettings(max_sensitivity=3.0, **TEST),
     "lqg": LqgSettings(max_sensitivity=3.0, **TEST),
 }
 
@@ -87,7 +85,7 @@ def test_the_worst_sensitivity_is_kept_and_is_what_it_says(kind: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(["pid", "fopid", "hinf", "ncf", "lqg"], ["pid", "hinf"]))
+@pytest.mark.parametrize("kind", slow_but(["pid", "fopid", "hinf", "lqg"], ["pid", "hinf"]))
 def test_the_figures_of_the_bake_off_are_reached_from_the_file(kind: str, tmp_path: Path) -> None:
     robust(kind).save(tmp_path / "c.npz")
     row = run_bake_off(block_stepper(load(tmp_path / "c.npz", role="controller").block())).row
@@ -150,18 +148,16 @@ def test_matlab_gets_the_same_system(kind: str, tmp_path: Path) -> None:
 def test_equal_axes_are_designed_once_and_others_are_not() -> None:
     b = bake_off_plant(0.8, 0.7)
     neck = LinearNeck(pitch=bake_off_plant().tf(), roll=b.tf())
-    controller = NcfSettings().design(neck)
-    pitch, roll = (controller.design[axis]["gains"]["crossover_rad_s"] for axis in ("pitch", "roll"))
+    controller = HinfSettings().design(neck)
+    pitch, roll = (controller.design[axis]["gains"]["bandwidth_rad_s"] for axis in ("pitch", "roll"))
     assert pitch != roll
-    alone = NcfSettings().design(LinearNeck(pitch=b.tf(), roll=b.tf()))
-    assert alone.design["pitch"]["gains"]["crossover_rad_s"] == roll
+    alone = HinfSettings().design(LinearNeck(pitch=b.tf(), roll=b.tf()))
+    assert alone.design["pitch"]["gains"]["bandwidth_rad_s"] == roll
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("order", ["sequential", "jacobi"])
-@pytest.mark.parametrize(
-    "settings", [HinfSettings, NcfSettings, LqgSettings, FopiSettings, PidSettings], ids=lambda item: item.KIND
-)
+@pytest.mark.parametrize("settings", [HinfSettings, LqgSettings, FopiSettings, PidSettings], ids=lambda item: item.KIND)
 def test_one_model_is_enough(settings: Any, order: str) -> None:
     """Its gain is taken to spread, and the samples of the loop's order are added to its delay."""
     controller = settings(order=order).design(bake_off_neck())
@@ -184,8 +180,8 @@ def test_names_and_dt_of_what_comes_out() -> None:
 
 
 def test_a_design_of_a_control_system_equals_that_of_a_model() -> None:
-    one = NcfSettings().design(bake_off_neck())
-    two = NcfSettings().design(bake_off_plant().tf())
+    one = HinfSettings().design(bake_off_neck())
+    two = HinfSettings().design(bake_off_plant().tf())
     for a, b in zip(one.arrays, two.arrays, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -208,8 +204,6 @@ def test_hinf_with_a_cover_proves_what_it_covers(method: str) -> None:
         (HinfSettings(cover=True, **TEST), bake_off_samples(), r"infeasible weights: .* spread by 133 %"),
         (HinfSettings(max_sensitivity=1.1, **TEST), bake_off_samples(), "not even a bandwidth of"),
         (HinfSettings(bandwidth=60.0, control_weight=1e-3, **TEST), bake_off_samples(), "not stable around"),
-        (NcfSettings(crossover=160.0), bake_off_neck(), "below the Nyquist frequency"),
-        (NcfSettings(crossover=100.0), bake_off_neck(), "stability margin of 0.*lower `crossover`"),
         (LqgSettings(max_sensitivity=1.05, **TEST), bake_off_samples(), "not even a load_rate of"),
         (FopiSettings(crossover=40.0), bake_off_neck(), "no integration order between 0 and 2"),
         (LqgSettings(load_rate=1e4, control_weight=1e-4, **TEST), bake_off_samples(), r"samples \(the first is sample"),
@@ -232,9 +226,9 @@ def test_no_solution_is_said_with_the_remedy(settings: Any, plant: Any, message:
     ("kind", "field", "value"),
     [
         (HinfSettings, "bandwidth", -1.0), (HinfSettings, "peak", 0.9), (HinfSettings, "method", "lmi"),
-        (NcfSettings, "crossover", 0.0), (LqgSettings, "control_weight", 0.0), (FopiSettings, "derivative_order", 2.0),
+        (LqgSettings, "control_weight", 0.0), (FopiSettings, "derivative_order", 2.0),
         (PidSettings, "tuning", "luck"), (PidSettings, "noise_gain", 0.0), (PiSettings, "tuning", "luck"),
-        (HinfSettings, "max_sensitivity", 1.0), (NcfSettings, "controller_order", -1), (LqgSettings, "order", "x"),
+        (HinfSettings, "max_sensitivity", 1.0), (HinfSettings, "controller_order", -1), (LqgSettings, "order", "x"),
     ],
 )  # fmt: skip
 def test_settings_are_checked(kind: Any, field: str, value: Any) -> None:

@@ -16,7 +16,6 @@ from softneck.design import (
     HinfSettings,
     LqgSettings,
     MpcSettings,
-    NcfSettings,
     NmpcSettings,
     PidSettings,
     PiSettings,
@@ -183,10 +182,6 @@ def _hinf() -> Block:
     return HinfSettings(bandwidth=4.0, gain_spread=0.0).design(_linear()).block()
 
 
-def _ncf() -> Block:
-    return NcfSettings(crossover=6.0, gain_spread=0.0).design(_linear()).block()
-
-
 def _pid() -> Block:
     return PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(_linear()).block()
 
@@ -305,7 +300,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "scheduled": (_scheduled, _REFERENCES, MOTORS, ("lead_limit", "least_position", "least_cocontraction")),
     "adaptive": (_adaptive, _REFERENCES, MOTORS, ("lead_limit", "least_cocontraction", "adapt")),
     "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
-    "ncf": (_ncf, _REFERENCES, MOTORS, ("slew_limit",)),
     "pid": (_pid, _REFERENCES, MOTORS, ("slew_limit",)),
     "fopi": (_fopi, _REFERENCES, MOTORS, ("slew_limit",)),
     "lqg": (_lqg, _REFERENCES, MOTORS, ("slew_limit",)),

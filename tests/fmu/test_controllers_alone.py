@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
 )
 # All that run as C; nonlinear predictive control is added below.
-CONTROLLERS = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "custom", "scheduled", "adaptive", "mpc")
+CONTROLLERS = ("pi", "pid", "fopi", "hinf", "lqg", "custom", "scheduled", "adaptive", "mpc")
 POSITIONS = [f"motor_position_{j}" for j in (1, 2, 3)]
 STEP = math.radians(15.0)
 GOLDEN = ROOT / "tests" / "golden"

@@ -94,7 +94,6 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
         "scheduled": lambda: design.ScheduledSettings(inclinations=(0.05, 0.3)).design([linear, linear]),
         "adaptive": lambda: design.AdaptiveSettings().design(linear),
         "hinf": lambda: design.HinfSettings(bandwidth=4.0, gain_spread=0.0).design(linear),
-        "ncf": lambda: design.NcfSettings(crossover=6.0, gain_spread=0.0).design(linear),
         "pid": lambda: design.PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(linear),
         "fopi": lambda: design.FopiSettings(crossover=4.0, gain_spread=0.0).design(linear),
         "lqg": lambda: design.LqgSettings(load_rate=20.0, gain_spread=0.0).design(linear),

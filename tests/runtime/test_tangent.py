@@ -28,7 +28,7 @@ from softneck.runtime._tangent import with_tangent
 from ..data import ROOT
 
 KINDS = ("rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble", "nlsm", "residual")
-LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "ncf", "custom", "kalman_steady", "nonlinear")
+LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "kalman_steady", "nonlinear")
 
 
 def block_of(name: str) -> Block:

@@ -22,7 +22,7 @@ BOUNDS = (
     Requirement("neck.rise_s", "max", 0.4, True), Requirement("neck.overshoot_pct", "max", 5.0, True),
 )  # fmt: skip
 # Of a kind: what its Ms is certified as, in parts of what is asked of the design.
-CERTIFIED = {"pi": 1.6, "ncf": 1.2}
+CERTIFIED = {"pi": 1.6, "hinf": 1.2}
 
 
 def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgement:
@@ -41,7 +41,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) 
     task: Any = SimpleNamespace(
         asked=SimpleNamespace(bounds=BOUNDS), own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
-    each = spaces(("pi", "ncf"), rise=0.4, cocontraction=None, neck=True)
+    each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, neck=True)
     found = Search(task, each, Here(), Log(None, ""), budget, lambda *_: None)
     found.run()
     return found

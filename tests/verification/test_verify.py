@@ -67,7 +67,7 @@ def test_a_good_controller_holds(held: Verification) -> None:
     values = {v.requirement.metric: v.value for v in held.verdicts}
     assert values["stability.radius"] is not None
     assert values["stability.radius"] < 1.0
-    assert set(held.evidence.metrics) <= set(METRIC_NAMES) | {"axes.nu_gap_ratio"}
+    assert set(held.evidence.metrics) <= set(METRIC_NAMES)
     json.dumps(held.contents(), allow_nan=False)
 
 

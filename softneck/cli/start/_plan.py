@@ -22,7 +22,7 @@ PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu",
 _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
 # Of `tune`: without `scheduled`, which needs several models, and `adaptive`, which was the best on none of the foreign
 # necks `column`, `spring` and `chain`, and takes a fifth of a search with empty caches.
-_KINDS = "pi,pid,fopi,hinf,ncf,lqg"
+_KINDS = "pi,pid,fopi,hinf,lqg"
 # Beside a family nothing is certified of it: its loops pull no tendons as the recordings do.
 _UNCERTIFIED = ",mpc"
 _TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"

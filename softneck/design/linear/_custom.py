@@ -29,7 +29,7 @@ class CustomSettings(AxisSettings):
     """A discrete `control` system as the controller of each axis, or of all; limits and filter are as everywhere.
 
     Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`. One system of all
-    outputs (from `ncfsyn`, say) is taken as it is: `reference_time` is 0 where it is not given, and nothing is reduced.
+    outputs (from `mixsyn`, say) is taken as it is: `reference_time` is 0 where it is not given, and nothing is reduced.
 
     Attributes:
         controller: K of `v = K (r - y)`, or a system of two inputs, reference and angle, `v = K (r, y)`; one for

@@ -195,8 +195,8 @@ def _check(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:
     radius = float(np.abs(np.linalg.eigvals(A)).max(initial=0.0))
     if radius >= 1.0:
         raise SettingsError(
-            f"the plant is not stable (spectral radius {radius:.4f}), which limits of the motors ask for; `lqgsyn`, "
-            "`mixsyn` and `ncfsyn` take it."
+            f"the plant is not stable (spectral radius {radius:.4f}), which limits of the motors ask for; "
+            "`mixsyn` takes it."
         )
 
 
@@ -207,8 +207,7 @@ def _require_apart(at_rest: Matrix, robot: Robot) -> None:
     if motors < outputs or dead.size or sizes.max(initial=0.0) == 0.0:
         what = f"`{robot.outputs.names[dead[0]]}` answers to none of them at rest" if dead.size else "they are too few"
         raise SettingsError(
-            f"{motors} input(s) cannot bring {outputs} output(s) to references of their own: {what}. Leave outputs "
-            "out, or take `lqgsyn`, which brings the rest as near as it can."
+            f"{motors} input(s) cannot bring {outputs} output(s) to references of their own: {what}. Leave outputs out."
         )
 
 

@@ -1,5 +1,5 @@
-"""Robust control: H-infinity and loop shaping, structured singular values, disk margins, nu-gap, weights.
+"""Robust control: H-infinity synthesis, structured singular values, weights.
 
-Functions carry the field's names: `hinfsyn`, `mixsyn`, `ncfsyn`, `diskmargin`, `robstab`, `wcgain`.
+Functions carry the field's names: `hinfsyn`, `mixsyn`, `makeweight`, `ucover`, `mu_bounds`.
 May import `design.linear` and `design.plants`.
 """

@@ -1,9 +1,8 @@
-"""Names of the field on `control` systems: `mixsyn`, `hinfsyn`, `ncfsyn`, `loopsyn`."""
+"""Names of the field on `control` systems: `mixsyn`, `hinfsyn`."""
 
 from __future__ import annotations
 
 import importlib.util
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +13,7 @@ from softneck.core._errors import require_package
 
 from ._bilinear import to_continuous, to_discrete
 from ._riccati import least_gamma, partition, solve_at
-from ._weights import repeated, weight_image
+from ._weights import weight_image
 
 if TYPE_CHECKING:
     import control
@@ -25,8 +24,6 @@ METHODS = ("auto", "slycot", "riccati")
 _ABOVE = 1.05
 # |T_zw| found on a grid may exceed gamma by rounding of the synthesis, not more.
 _SLACK = 1e-3
-# Of a zero's place: rounding of an eigenvalue.
-_BORDER = 1e-9
 # A weight below this at infinity counts as strictly proper.
 _LEAST_DIRECT = 1e-9
 
@@ -37,7 +34,7 @@ class Synthesis:
 
     Attributes:
         controller: K for negative feedback, `u = K (r - y)`, with the plant's dt and names.
-        gamma: the least possible norm (`mixsyn`, `hinfsyn`), or 1/e_max (`ncfsyn`).
+        gamma: the least possible norm.
         achieved: the norm with this controller, on a grid of frequencies.
         method: "slycot" or "riccati".
     """
@@ -46,11 +43,6 @@ class Synthesis:
     gamma: float
     achieved: float
     method: str
-
-    @property
-    def margin(self) -> float:
-        """1/achieved: for `ncfsyn` the stability margin against coprime factor uncertainty."""
-        return 1.0 / self.achieved
 
 
 def have_slycot() -> bool:
@@ -132,145 +124,6 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, method: str = "auto", above: float
     )
 
 
-def ncfsyn(G: Any, W: Any = None, *, above: float = _ABOVE) -> Synthesis:
-    """Return the loop-shaping controller of Glover and McFarlane: `K = W Ks`, robust about the shaped plant G W.
-
-    Against coprime factor uncertainty, at `above` times the least gamma = 1/e_max (McFarlane and Glover 1992, IEEE
-    TAC 37:759; Zhou, Doyle and Glover 1996, sec. 18.3).
-
-    Args:
-        G: plant of any number of inputs and outputs, continuous or discrete.
-        W: the shape at the plant's inputs, a scalar one the same for each; integrators are welcome. Continuous, or of
-            the plant's dt.
-        above: factor above the least gamma.
-    """
-    found, weight = ncf_parts(G, W, above=above)
-    dt = _dt_of(G)
-    K: Any = weight * found.controller
-    return Synthesis(
-        controller=_named(to_discrete(K, dt) if dt else K, G, dt),
-        gamma=found.gamma,
-        achieved=found.achieved,
-        method="riccati",
-    )
-
-
-def ncf_parts(G: Any, W: Any, *, above: float = _ABOVE) -> tuple[Synthesis, Any]:
-    """Return the continuous images of Ks, for negative feedback, and of W."""
-    import control
-    from scipy.linalg import solve_continuous_are
-
-    require_between("above", above, 1.001, 100.0)
-    dt = _dt_of(G)
-    weight: Any = control.StateSpace([], [], [], np.eye(G.ninputs), 0) if W is None else control.ss(W)
-    if weight.ninputs == weight.noutputs == 1:
-        weight = repeated(weight, G.ninputs)
-    # As many inputs as outputs of the plant: what `loopsyn` makes of a plant that has more inputs.
-    if weight.noutputs != G.ninputs or weight.ninputs not in (G.ninputs, G.noutputs):
-        raise SettingsError(
-            f"W must be scalar or have {G.ninputs} inputs and outputs, as the plant has inputs; "
-            f"got {weight.ninputs} and {weight.noutputs}."
-        )
-    if weight.dt not in (0, None) and not math.isclose(float(weight.dt), dt, rel_tol=1e-9):
-        raise SettingsError(f"W has dt = {weight.dt:g} s, the plant dt = {dt:g} s; they must agree.")
-    weight = to_continuous(weight)
-    image: Any = to_continuous(G)
-    shaped: Any = image * weight
-    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (shaped.A, shaped.B, shaped.C, shaped.D))
-    S, R = np.eye(B.shape[1]) + D.T @ D, np.eye(C.shape[0]) + D @ D.T
-    try:
-        # X of the control, Z of the filter equation; the cross terms come from D.
-        X = solve_continuous_are(A, B, C.T @ C, S, s=C.T @ D)
-        Z = solve_continuous_are(A.T, C.T, B @ B.T, R, s=B @ D.T)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise SettingsError(
-            "the shaped plant has no stabilising controller: W cancels a pole of the plant that is not stable, or "
-            "a mode of either is hidden. Give another W."
-        ) from error
-    gamma = math.sqrt(1.0 + float(np.abs(np.linalg.eigvals(X @ Z)).max(initial=0.0)))
-    n, g2 = A.shape[0], (above * gamma) ** 2
-    F = -np.linalg.solve(S, D.T @ C + B.T @ X)
-    Q = (1.0 - g2) * np.eye(n) + X @ Z
-    H = g2 * np.linalg.solve(Q.T, Z @ C.T)
-    # Theirs is for positive feedback.
-    Ks = control.StateSpace(A + B @ F + H @ (C + D @ F), H, -B.T @ X, D.T, 0)
-    return Synthesis(controller=Ks, gamma=gamma, achieved=_coprime(shaped, Ks), method="riccati"), weight
-
-
-def loopsyn(G: Any, Gd: Any, *, above: float = _ABOVE) -> Synthesis:
-    """Return the controller whose loop G K follows `Gd` to within gamma, above and below (Glover and McFarlane).
-
-    W = Gd/G needs the plant's inverse: its stable, minimum-phase part is inverted, its delay is left alone. A plant of
-    several outputs is inverted whole, each output behind its own dead time or roll-off, so that each follows `Gd`.
-
-    Args:
-        G: plant of at least as many inputs as outputs.
-        Gd: the loop that is wanted, scalar (the same for each output) or from each output of G to each.
-        above: factor above the least gamma.
-
-    Raises:
-        SettingsError: fewer inputs than outputs, or zeros outside the stability border; shape with `ncfsyn` there.
-    """
-    import control
-
-    dt = _dt_of(G)
-    plant: Any = control.ss(G)
-    if plant.ninputs < plant.noutputs:
-        raise SettingsError(
-            f"`loopsyn` inverts plants of at least as many inputs as outputs; got {G.ninputs} and {G.noutputs}. "
-            "Use `ncfsyn` with a weight of your own."
-        )
-    target: Any = to_discrete(to_continuous(Gd), dt) if dt and control.isctime(Gd) else control.ss(Gd)
-    if target.ninputs == target.noutputs == 1:
-        target = repeated(target, plant.noutputs)
-    if (target.ninputs, target.noutputs) != (plant.noutputs, plant.noutputs):
-        raise SettingsError(
-            f"Gd must be scalar or have {plant.noutputs} inputs and outputs, as the plant has outputs; "
-            f"got {target.ninputs} and {target.noutputs}."
-        )
-    return ncfsyn(G, _inverse(plant, dt) * target, above=above)
-
-
-def _inverse(G: Any, dt: float) -> Any:
-    """Return the inverse of G but for each output's delay of r samples, or lags in the place of its roll-off.
-
-    With (z^r) or (1 + s/f)^r before each output G has a direct way and an inverse (Silverman 1969, IEEE TAC 14:270).
-    """
-    import control
-
-    A, B, C = (np.asarray(part, dtype=np.float64) for part in (G.A, G.B, G.C))
-    poles = np.abs(np.linalg.eigvals(A))
-    fast = 1e3 * max(1.0, float(poles.max(initial=1.0)))
-    rise = A if dt else np.eye(A.shape[0]) + A / fast
-    rows, direct = [], []
-    for c, d in zip(C, np.asarray(G.D, dtype=np.float64), strict=True):
-        row, seen, scale = c, d, 1.0
-        for _ in range(A.shape[0] + 1):
-            if np.abs(seen).max() > _LEAST_DIRECT * np.abs(c).max() * np.abs(B).max() * scale:
-                break
-            # Once more before the output: A-row, and what of the input now shows at once.
-            row, seen = row @ rise, (row @ B if dt else row @ B / fast)
-            scale = scale if dt else scale / fast
-        rows.append(row)
-        direct.append(seen)
-    D = np.array(direct)
-    if np.linalg.matrix_rank(D) < D.shape[0]:
-        raise SettingsError(
-            "the plant's outputs are not moved apart from each other by the fastest of its inputs, so that it has no "
-            "inverse with diagonal delays; use `ncfsyn` with a weight of your own."
-        )
-    right = np.linalg.pinv(D)
-    inner = A - B @ right @ np.array(rows)
-    zeros = np.linalg.eigvals(inner)
-    outside = zeros[np.abs(zeros) >= 1.0 - _BORDER] if dt else zeros[zeros.real >= -_BORDER]
-    if outside.size:
-        raise SettingsError(
-            f"the plant has a zero at {_number(outside[0])} outside the stability border, whose inverse is not stable; "
-            "use `ncfsyn` with a weight of your own."
-        )
-    return control.StateSpace(inner, B @ right, -right @ np.array(rows), right, dt)
-
-
 def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
     """Return P from (r, u) to (W1 e, W2 u, W3 y, e) with e = r - G u (python-control's `augw`, which warns)."""
     import control
@@ -330,24 +183,6 @@ def _verified(closed: Any, bound: float) -> float:
     return size
 
 
-def _coprime(G: Any, K: Any) -> float:
-    """Return `|[K; 1] (1 + G K)^-1 [1, G]|` on a grid, which 1/margin is; raise if the loop is not stable."""
-    import control
-
-    one: Any = control.StateSpace([], [], [], np.eye(G.noutputs), 0)
-    closed: Any = control.feedback(G * K, one)
-    if float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf)) >= 0.0:
-        raise SettingsError("the result is not stable: shape a slower loop, or build further `above` gamma.")
-    s = 1j * np.geomspace(1e-4, 1e5, 400)
-    if (G.ninputs, G.noutputs) == (1, 1):
-        g, k = np.asarray(G(s)), np.asarray(K(s))
-        return float(np.max(np.sqrt((1.0 + np.abs(g) ** 2) * (1.0 + np.abs(k) ** 2)) / np.abs(1.0 + g * k)))
-    g, k = (np.moveaxis(np.asarray(system(s, squeeze=False)), -1, 0) for system in (G, K))
-    unit = np.broadcast_to(np.eye(G.noutputs), (len(s), G.noutputs, G.noutputs))
-    inner = np.linalg.solve(unit + g @ k, np.concatenate([unit, g], axis=2))
-    return float(np.linalg.norm(np.concatenate([k @ inner, inner], axis=1), 2, axis=(1, 2)).max())
-
-
 def _dt_of(system: Any) -> float:
     import control
 
@@ -356,10 +191,6 @@ def _dt_of(system: Any) -> float:
     if system.dt is None or system.dt is True:
         raise SettingsError("the system must say its sample time: give it dt = 0 (continuous) or dt in seconds.")
     return float(system.dt)
-
-
-def _number(value: complex) -> str:
-    return f"{value.real:.4g}" if abs(value.imag) < 1e-9 else f"{value.real:.4g}{value.imag:+.4g}j"
 
 
 def _named(K: Any, G: Any, dt: float) -> control.StateSpace:

@@ -150,11 +150,11 @@ def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordin
     assert said.code == 0, said.err
     assert "no models/family.npz, and what comes after does without: log.csv: too short." in " ".join(said.err.split())
     assert not Path("p", _plan.FAMILY).exists()
-    assert planned[0][2:5] == ("models/auto.npz", "--kinds", "pi,pid,fopi,hinf,ncf,lqg,mpc")
+    assert planned[0][2:5] == ("models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg,mpc")
     Path("models").mkdir()
     Path(_plan.FAMILY).touch()
     beside = next(_plan._controller(Asked(logs=()))).command
-    assert beside[2:6] == (_plan.FAMILY, "models/auto.npz", "--kinds", "pi,pid,fopi,hinf,ncf,lqg")
+    assert beside[2:6] == (_plan.FAMILY, "models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg")
 
 
 def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
