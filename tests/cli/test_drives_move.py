@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from softneck.cli.drives._target import require_armed, sensor_of, words
+from softneck.cli.drives._target import require_armed, words
 from softneck.core import DataError, SettingsError, SoftneckError
-from softneck.drives import baseline, default_drives, load_drives
+from softneck.drives import baseline, default_drives
 from softneck.drives.supervision._baseline import load_baseline
 from softneck.drives.supervision._motor_models import Motion
 from softneck.signals import read_recording
@@ -84,15 +84,6 @@ def test_a_service_says_the_same_words(monkeypatch: pytest.MonkeyPatch, capsys: 
         require_armed("socketcan:can0", arm=False)
     require_armed("socketcan:can0", arm=True)
     assert "nobody was asked" in capsys.readouterr().err
-
-
-def test_a_recording_is_no_sensor_for_real_drives(tmp_path):
-    (tmp_path / "drives.toml").write_text(
-        EXAMPLE.read_text().replace('kind = "can" ', 'kind = "replay"\nfile = "run.csv" ', 1)
-    )
-    file = load_drives(tmp_path / "drives.toml")
-    with pytest.raises(SettingsError, match="for simulated drives; on socketcan:can0"):
-        sensor_of(file, "socketcan:can0")
 
 
 @pytest.mark.slow

@@ -22,7 +22,6 @@ from softneck.drives import (
     default_drives,
     jog,
     load_drives,
-    open_sensor,
     preflight,
     prepare,
     read_run_log,
@@ -34,7 +33,6 @@ from softneck.drives import (
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._load import bus_load, frame_bits
 from softneck.drives.bus._objects import limit_writes
-from softneck.drives.bus._sensor_source import SensorSource
 from softneck.drives.commissioning._neck_file import neck_drives
 from softneck.drives.commissioning._record import drive_limits
 from softneck.drives.logs._cycle import decode_cycle, encode_cycle
@@ -312,19 +310,6 @@ def test_a_one_axis_inclinometer_on_the_bus() -> None:
     assert not none.valid
     with pytest.raises(SettingsError, match="has one axis or two; the robot has 4 outputs"):
         CanInclinometer(10, 4)
-
-
-def test_a_recording_of_the_robot_is_replayed_as_its_sensor(tmp_path: Path) -> None:
-    moved, t = robot(8), np.arange(5) * TS
-    channels = dict.fromkeys(moved.set_points, 0.0 * t)
-    channels |= {name: k + t for k, name in enumerate(moved.outputs.names)}
-    write_recording(tmp_path / "rec.parquet", Recording(t, TS, channels, robot=moved))
-    source = SensorSource(file="rec.parquet", folder=tmp_path)
-    with open_sensor("replay", 10, source, moved) as sensor:
-        assert sensor.read(0.0, []).values == pytest.approx((0.0, 1.0, 2.0, 3.0))
-        assert sensor.read(0.04, []).values == pytest.approx((0.04, 1.04, 2.04, 3.04))
-    with pytest.raises(SoftneckError, match="outputs of two robots"), open_sensor("replay", 10, source, robot(2)):
-        pass
 
 
 def test_a_sensor_of_ones_own_says_a_number_for_each_output() -> None:

@@ -59,7 +59,7 @@ def check_command(asked: Asked, as_json: bool) -> None:
 
     chosen = asked.target()
     with open_link(chosen, moves=False, homed=True) as link:
-        sensor = None if chosen.simulated else sensor_or_reason(chosen.file, str(chosen.bus))
+        sensor = None if chosen.simulated else sensor_or_reason(chosen.file)
         report = preflight(link, chosen.file, override=asked.override, sensor=sensor)
     _show(report, as_json=as_json)
     report.require()
@@ -136,7 +136,7 @@ def run_command(
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, chosen.path)
     live = not as_json and (not chosen.simulated or asked.pace is not None)
-    sensor: Any = None if chosen.simulated else sensor_of(chosen.file, str(chosen.bus))
+    sensor: Any = None if chosen.simulated else sensor_of(chosen.file)
     with contextlib.ExitStack() as stack:
         link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
         log = stack.enter_context(opened_log(chosen, "run", asked.log, force=force))

@@ -141,7 +141,7 @@ def session_of(
     from softneck.drives.bus._link import VirtualLink
     from softneck.drives.running._bus_loop import Session
 
-    sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file, str(chosen.bus))
+    sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file)
     return Session(
         file=chosen.file, link=link, sensor=sensor, override=asked.override, pace=asked.pace, operator=keyboard,
         log=log, files=files,

@@ -241,7 +241,7 @@ def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt 
 
     if isinstance(link, VirtualLink):
         return lambda: link.newest
-    sensor = sensor_of(file, link.name)
+    sensor = sensor_of(file)
 
     def look() -> Tilt | Reading | None:
         until = link.now + _LOOK
@@ -254,19 +254,12 @@ def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt 
     return look
 
 
-def sensor_of(file: DrivesFile, bus: str) -> Any:
+def sensor_of(file: DrivesFile) -> Any:
     """Return the inclinometer that the drives file names, open until the command ends.
 
     Raises:
-        SettingsError: a recording as sensor where the drives may be real.
         SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
     """
-    from softneck.drives.bus._link import HARMLESS
-
-    if file.sensor_kind == "replay" and bus.partition(":")[0] not in HARMLESS:
-        raise SettingsError(
-            f'[sensor] kind "replay" is for simulated drives; on {bus} the loop would not see the neck it moves.'
-        )
     return click.get_current_context().with_resource(_told(file))
 
 
@@ -300,9 +293,9 @@ class _NoSensor:
         return None
 
 
-def sensor_or_reason(file: DrivesFile, bus: str) -> Sensor:
+def sensor_or_reason(file: DrivesFile) -> Sensor:
     """Return the inclinometer, or something silent that knows why there is none."""
     try:
-        return sensor_of(file, bus)
+        return sensor_of(file)
     except SoftneckError as error:
         return _NoSensor(str(error))

@@ -67,7 +67,7 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
     "sensor": {
         "dropout_s": ("dropout", 1.0), "frozen_samples": ("frozen_samples", 0.0), "bad_samples": ("bad_samples", 0.0),
         "angle_deg": ("angle", math.radians(1.0)), "rate_deg_s": ("rate", math.radians(1.0)),
-        "margin_deg": ("margin", math.radians(1.0)), "on_loss": ("on_loss", 0.0), "hold_s": ("hold", 1.0),
+        "margin_deg": ("margin", math.radians(1.0)),
     },
     "watch": {
         "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),

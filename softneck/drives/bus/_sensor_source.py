@@ -9,7 +9,7 @@ from typing import Any
 
 from softneck.core import SettingsError, require_between, require_whole
 
-SENSORS = ("simulated", "can", "serial", "replay", "python")
+SENSORS = ("simulated", "can", "serial", "python")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,17 +18,15 @@ class SensorSource:
 
     Attributes:
         port, baud, request, start: of kind "serial", see `SerialInclinometer`.
-        file: of kind "replay": a recording, or the log of a run.
         python: of kind "python": `package.module:factory`, called with `options`.
         options: for the factory.
-        folder: of the drives file, where files and modules are looked for.
+        folder: of the drives file, where modules are looked for.
     """
 
     port: str = ""
     baud: int = 9600
     request: bool = False
     start: float = 10.0
-    file: str = ""
     python: str = ""
     options: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
@@ -44,11 +42,10 @@ SOURCE_KEYS: dict[str, tuple[str, type]] = {
     "baud": ("baud", int),
     "request": ("request", bool),
     "start_s": ("start", float),
-    "file": ("file", str),
     "python": ("python", str),
     "options": ("options", dict),
 }
-_NEEDS = {"serial": "port", "replay": "file", "python": "python"}
+_NEEDS = {"serial": "port", "python": "python"}
 
 
 def make_source(kind: str, table: Mapping[str, Any], folder: Path) -> SensorSource:

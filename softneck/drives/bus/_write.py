@@ -44,6 +44,4 @@ def _source(file: DrivesFile) -> dict[str, Any]:
     known = {field.name for field in dataclasses.fields(source)}
     values = {key: getattr(source, name) for key, (name, _) in SOURCE_KEYS.items() if name in known}
     told = {key: value for key, value in values.items() if value != getattr(nothing, SOURCE_KEYS[key][0])}
-    if "file" in told:
-        told["file"] = str((source.folder / source.file).resolve())
     return {key: dict(value) if key == "options" else value for key, value in told.items()}

@@ -70,7 +70,6 @@ class Master:
         self._missing, self._index = 0, -1
         self._part, self._arrived_at = 0, _NEVER
         self._enabling, self._enabling_since = 0, _NEVER
-        self._hold_at: Motors | None = None
         self._asked: list[Signal] = []
         self.requests: list[tuple[str, str]] = []
         self.taken: tuple[tuple[str, str], ...] = ()
@@ -218,10 +217,8 @@ class Master:
             self._run(now, due, fresh, events)
         elif phase is Phase.ENABLING:
             self._enable(now, events)
-        elif phase in (Phase.RAMP_IN, Phase.RAMP_OUT):
+        elif phase in (Phase.RAMP_IN, Phase.RAMP_OUT, Phase.RETREAT):
             self._ramp(now, events)
-        elif phase is Phase.RETREAT:
-            self._retreat(now, events)
         elif phase in (Phase.DISABLING, Phase.STOPPING):
             self._switch_off(now, events)
         if self.supervisor.phase not in _MOVED:
@@ -341,17 +338,6 @@ class Master:
             events.append(Event(now, "clamped", 0, why))
         if self._clamped.over(bool(why)):
             events.append(Event(now, "clamp_persistent", 0, why))
-
-    def _retreat(self, now: float, events: list[Event]) -> None:
-        """Without a sensor: to rest, or stand where the set-points can stop."""
-        if self.settings.sensor.on_loss == "rest":
-            self._ramp(now, events)
-            return
-        if self._hold_at is None:
-            self._hold_at = self.setpoints
-        self._limit(now, self._hold_at, events, count=False)
-        if now - self.supervisor.since >= self.settings.sensor.hold:
-            self._change(now, Signal.ARRIVED)
 
     def _switch_off(self, now: float, events: list[Event]) -> None:
         """A run is done when each drive has said in this cycle that it is off; after a stop silence is enough."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from softneck.core import require_between, require_one_of, require_whole
+from softneck.core import require_between, require_whole
 from softneck.core._shown import Shown
 
 from ..supervision._baseline import Baseline
@@ -56,8 +56,6 @@ class SensorSettings:
         angle: |pitch|, |roll| beyond this are not angles of this neck [rad].
         rate: faster changes are outliers [rad/s].
         margin: change that is always allowed: noise [rad].
-        on_loss: "rest" or "hold": where to ramp when the sensor is lost.
-        hold: how long "hold" holds before the drives are switched off [s].
     """
 
     dropout: float = 0.08
@@ -66,8 +64,6 @@ class SensorSettings:
     angle: float = 1.2
     rate: float = 8.0
     margin: float = math.radians(3.0)
-    on_loss: str = "rest"
-    hold: float = 5.0
 
     def __post_init__(self) -> None:
         require_between("dropout", self.dropout, 0.01, 0.09, "s")
@@ -76,8 +72,6 @@ class SensorSettings:
         require_between("angle", self.angle, 0.1, 1.6, "rad")
         require_between("rate", self.rate, 0.1, 100.0, "rad/s")
         require_between("margin", self.margin, 0.0, 0.5, "rad")
-        require_one_of("on_loss", self.on_loss, ("rest", "hold"))
-        require_between("hold", self.hold, 0.0, 600.0, "s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

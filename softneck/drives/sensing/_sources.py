@@ -1,54 +1,22 @@
-"""How the inclinometer that a drives file names is opened: on the bus, serial, from a recording, or one's own."""
+"""How the inclinometer that a drives file names is opened: on the bus, serial, or one's own."""
 
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
-
-from softneck.core import SettingsError, Vector
+from softneck.core import SettingsError
 from softneck.robot import Robot
-from softneck.signals import read_recording
 from softneck.signals.recording._channels import NECK
-from softneck.signals.recording._recording import require_same_robot
 
 from ..bus._axes import Axes, axes_of, turned
 from ..bus._sensor_source import SENSORS, SensorSource
-from ..logs._log_file import read_run_log
 from ..master import Frame, Tilt
 from ..master._gate import Reading, sample_of
 from ._python_sensor import make_python_sensor
 from ._sensor import CanInclinometer
 from ._serial import SerialInclinometer
-
-
-class ReplaySensor:
-    """Plays a recording as inclinometer: the sample that is due since the first reading, each once."""
-
-    def __init__(self, time: Vector, *outputs: Vector) -> None:
-        """Play the outputs, such as pitch and roll [rad], at `time` [s], all of shape (N,)."""
-        self._time, self._outputs = time - time[0], np.column_stack(outputs)
-        self._begin: float | None = None
-        self._told = -1
-
-    def take(self, frames: Sequence[Frame]) -> None:
-        """Nothing on the bus is of interest."""
-        del frames
-
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
-        """Return the newest sample that is due, None if it was told already or the recording is over."""
-        del frames
-        self._begin = now if self._begin is None else self._begin
-        # A cycle's rounding must not move a sample into the next one.
-        k = int(self._time.searchsorted(now - self._begin + 1e-6, side="right")) - 1
-        if k == self._told or k < 0:
-            return None
-        self._told = k
-        values = self._outputs[k].tolist()
-        return sample_of(values, valid=all(map(math.isfinite, values)))
 
 
 class _FirstAngle:
@@ -93,10 +61,8 @@ def open_sensor(
     Its samples are turned by `axes`, see `DrivesFile.sensor_axes`.
 
     Raises:
-        DataError: a recording of another robot.
         SettingsError: a simulated one, a factory that cannot be called, or that returns no sensor.
         SensorError: no port, no permission, silent, or another protocol.
-        FileFormatError: no such recording.
     """
     sensor = _opened(kind, node, source, robot)
     if axes:
@@ -122,12 +88,6 @@ def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
                 )
             sensor = SerialInclinometer(source.port, baud=source.baud, request=source.request, start=source.start)
             return sensor if count == 2 else _FirstAngle(sensor)
-        case "replay":
-            path = source.folder / source.file
-            log = path.suffix.lower() == ".mcap"
-            recording = read_run_log(path).recording() if log else read_recording(path)
-            require_same_robot(robot, recording.robot, f"{path} and the drives: outputs")
-            return ReplaySensor(recording.time, *recording.outputs.T)
         case "python":
             return make_python_sensor(source.python, source.options, source.folder, outputs=count)
         case _:

@@ -182,19 +182,6 @@ def test_without_a_sensor_nothing_is_ramped() -> None:
     assert bench.phase is Phase.STOPPED
 
 
-def test_hold_stands_still_where_the_sensor_was_lost() -> None:
-    def hold(given: MasterSettings) -> MasterSettings:
-        return replace(given, sensor=replace(given.sensor, on_loss="hold", hold=0.5))
-
-    bench = Bench(change=hold).start()
-    bench.neck.sensor = "drops"
-    bench.pass_time(0.3)
-    held = bench.master.setpoints
-    assert bench.phase is Phase.RETREAT
-    assert bench.pass_time(0.2).master.setpoints == held
-    assert bench.finish(2.0).phase is Phase.DONE
-
-
 def test_the_drive_backs_up_the_position_limit() -> None:
     """Set-points that bypass ours: 607Dh holds the drive, it says FF06h, and that is no fault."""
     bench = Bench(off=frozenset({"following", "second_master"})).start()

@@ -36,7 +36,6 @@ RANGES = [
     (SensorSettings, "angle", 1.2, 0.1, 1.6),
     (SensorSettings, "rate", 8.0, 0.1, 100.0),
     (SensorSettings, "margin", math.radians(3.0), 0.0, 0.5),
-    (SensorSettings, "hold", 5.0, 0.0, 600.0),
     (WatchSettings, "following", 1.5, 0.01, 20.0),
     (WatchSettings, "tilt", math.radians(12.0), 0.01, 1.6),
     (WatchSettings, "gain", 0.483 / 5.293, 0.001, 2.0),
@@ -67,7 +66,6 @@ def test_each_setting_has_its_default_and_its_range(kind: Any, name: str, defaul
 def test_the_settings_without_a_range_have_their_defaults() -> None:
     third = 2.0 * math.pi / 3.0
     assert WatchSettings().tendon_angles == (0.0, third, 2.0 * third)
-    assert SensorSettings().on_loss == "rest"
     made = MasterSettings(counts_per_radian=(1.0, 1.0, 1.0))
     assert (made.newton_per_unit, made.zero_counts, made.sample_cycles) == ((0.0, 0.0, 0.0), 1, 2)
     bus = made.bus

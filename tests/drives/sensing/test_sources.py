@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError
+from softneck.core import SettingsError, SoftneckError
 from softneck.drives import DrivesFile, load_drives, open_sensor
 from softneck.drives.sensing._serial import SensorError
-from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.signals import signal, write_recording
 
 from ...data import ROOT
 
@@ -50,19 +47,6 @@ def file_with(folder: Path, lines: str) -> DrivesFile:
     return load_drives(path)
 
 
-def test_a_recording_is_played_as_sensor(tmp_path: Path) -> None:
-    recording = record(signal("steps", duration=2.0), VirtualNeck(NeckParameters.paper()), seed=0)
-    write_recording(tmp_path / "rec.csv", recording)
-    file = file_with(tmp_path, 'kind = "replay"\nfile = "rec.csv"')
-    with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
-        # Twice as often as there are samples, at any clock: each sample comes once.
-        read = [sensor.read(1234.5 + 0.01 * k, ()) for k in range(2 * len(recording))]
-        assert sensor.read(2000.0, ()) is None
-    assert all(tilt is None for tilt in read[1::2])
-    # Files hold degrees: one rounding.
-    np.testing.assert_allclose([tilt.pitch for tilt in read[::2]], recording.channels["pitch"], rtol=1e-15)
-
-
 def test_a_sensor_of_ones_own(tmp_path: Path) -> None:
     (tmp_path / "my_sensor_for_test.py").write_text(MODULE, encoding="utf-8")
     lines = 'kind = "python"\npython = "my_sensor_for_test:make"\noptions = { offset = 0.25 }'
@@ -78,12 +62,11 @@ def test_a_sensor_of_ones_own(tmp_path: Path) -> None:
         ('kind = "serial"\nport = 3', SettingsError, r"\[sensor\] port must be of type str; got 3"),
         ('kind = "serial"\nport = "/dev/ttyNONE"', SensorError, "inclinometer /dev/ttyNONE: cannot be opened"),
         ('kind = "serial"\nport = "x"\nbaud = 1', SettingsError, "`baud` must be"),
-        ('kind = "replay"\nfile = "none.csv"', FileFormatError, r"none\.csv"),
         ('kind = "python"\npython = "nowhere:make"', SettingsError, r"cannot be found .*package\.module:factory"),
         ('kind = "python"\npython = "bad_sensor_for_test:broken"', SensorError, "OSError: no such sensor"),
         ('kind = "python"\npython = "bad_sensor_for_test:nothing"', SettingsError, "a sensor without `take`"),
         ('kind = "simulated"', SettingsError, r'kind is "simulated"; on a bus it must be one of can, serial'),
-        ('kind = "gx5"', SettingsError, "`kind` must be one of simulated, can, serial, replay, python"),
+        ('kind = "gx5"', SettingsError, "`kind` must be one of simulated, can, serial, python"),
     ],
 )
 def test_a_sensor_that_cannot_be_opened_is_one_line(
