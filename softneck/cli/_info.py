@@ -17,9 +17,11 @@ from softneck.core import (
     file_hash,
     load,
     read_archive,
+    read_certificate,
     refuse_existing,
 )
 from softneck.core._budget import MOST_JSON, open_zip, settings_text
+from softneck.core._certificate import CERTIFICATE_KINDS
 from softneck.core._files import require_file
 from softneck.core._kinds import KINDS, fitting
 
@@ -85,8 +87,8 @@ _LARGE = 20_000_000
 @force_option
 @json_option
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, loop, layout, robot, neck, study, certificate or
-    log (tables, and those of `softneck drives run --log`).
+    """Say what FILE is: a recording, model, observer, controller, FMU, SSP, loop, layout, robot, neck, study,
+    certificate or log (tables, and those of `softneck drives run --log`).
 
     For a recording it also reports the quality: faults of its channels, and what its inputs can teach a model. For a
     log it reports what `softneck import --guess` would take each column for.
@@ -133,6 +135,8 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
             return {"type": KINDS[kind].role if kind in KINDS else kind, "kind": kind, "summary": summary}
         case ".fmu":
             return _fmu(file)
+        case ".ssp":
+            return _ssp(file)
         case ".toml":
             return _toml(file)
         case ".json":
@@ -236,7 +240,8 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 def _toml(file: Path) -> dict[str, Any]:
     """Say what a TOML file is: a robot names motors, a loop a plant, a study what varies; else it must be a neck."""
-    from softneck.cosim import load_study
+    from softneck.cosim import load_loop, load_study
+    from softneck.cosim.loops._trust import python_of
     from softneck.plant import NeckParameters, VirtualNeck
     from softneck.robot import Robot
     from softneck.signals import read_layout
@@ -249,6 +254,8 @@ def _toml(file: Path) -> dict[str, Any]:
         robot = Robot.read(file)
         return {"type": "robot", "robot": robot.name, "hash": robot.hash, "summary": robot.summary()}
     if "plant" in table:
+        if not next(python_of(table), ""):  # nothing of a file that is only asked about is run
+            load_loop(file)
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
     if "vary" in table:
         study = load_study(file)
@@ -268,4 +275,32 @@ def _certificate(file: Path) -> dict[str, Any]:
         raise FileFormatError(f"{file}: is not a JSON file ({error}).") from error
     if not isinstance(content, dict):
         raise FileFormatError(f"{file}: holds no JSON object, so it is not a softneck file.")
-    return {"type": "certificate" if "limits" in content else "JSON", "keys": ", ".join(content)}
+    if content.get("certificate") not in CERTIFICATE_KINDS:
+        return {"type": "JSON", "keys": ", ".join(content)}
+    said = {"type": "certificate", "of": f"softneck {content['certificate']}"}
+    try:
+        certificate = read_certificate(file)
+    except FileFormatError as error:
+        return {**said, "seal": f"not genuine: {str(error).removeprefix(f'{file}: ')}"}
+    return {
+        **said,
+        "seal": "genuine",
+        "holds": certificate.holds,
+        "requirements": [
+            f"{row.get('metric')}: {row.get('value')}, limit {row.get('limit')}"
+            + ("" if row.get("holds") else ", does not hold")
+            for row in certificate.rows
+        ],
+        "files": [f"{role}: {path}" for role, (path, _) in certificate.files.items()],
+    }
+
+
+def _ssp(file: Path) -> dict[str, Any]:
+    """Return the parts of an SSP archive; what `simulate` cannot run is refused with its words."""
+    from softneck.cosim import load_ssp
+    from softneck.loop._system import System
+
+    read = load_ssp(file)
+    if isinstance(read, System):
+        return {"type": "SSP", "system": "no closed loop", "parts": ", ".join(read.parts)}
+    return {"type": "SSP", "system": "closed loop", "robot": read.loop.robot.label()}

@@ -37,9 +37,10 @@ def command(folder: Path, output: Path | None, no_run: bool, force: bool, as_jso
     path, replace = target(output, "report.html", force=force, ending=".html")
     refuse_existing(path, force=replace)
     with progress("report", quiet=as_json) as report:
-        project = read_project(folder, run_loops=not no_run, progress=lambda done, word: report(0.8 * done, word))
-        report(0.8, "drawing")
-        write_page(path, project_page(project), force=replace)
+        project = read_project(folder, run_loops=not no_run, progress=lambda done, word: report(0.4 * done, word))
+        write_page(
+            path, project_page(project, progress=lambda done, word: report(0.4 + 0.5 * done, word)), force=replace
+        )
     if as_json:
         print_json({"report": str(path), **_counts(project), "problems": project.problems})
         return

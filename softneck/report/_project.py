@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -16,7 +17,7 @@ from softneck.cosim.loops._loop_values import read_toml
 from softneck.cosim.loops._trust import python_of
 from softneck.cosim.studies._store import read_description
 from softneck.identification.models._directions import bandwidth_of
-from softneck.signals import assess_quality, read_recording
+from softneck.signals import assess_quality, import_log, read_layout, read_recording
 from softneck.signals.importing._layout_text import doubts_in
 
 # Folders that are no part of a project, beside those whose name begins with a dot.
@@ -138,8 +139,22 @@ def _recording(project: Project, path: Path, name: str) -> None:
     if path.stat().st_size > _LARGEST:
         project.problems[name] = f"larger than {_LARGEST / 1e6:.0f} MB: left out"
         return
-    recording = read_recording(path)
+    try:
+        recording = read_recording(path)
+    except SoftneckError:
+        if _is_raw_log(path):
+            return
+        raise
     project.recordings[name] = (recording, assess_quality(recording, bandwidth=bandwidth_of(recording)))
+
+
+def _is_raw_log(path: Path) -> bool:
+    """Return whether a layout beside a table reads it: a logger's own, of which the project has the recording."""
+    for layout in sorted(path.parent.glob(f"*{_LAYOUT}")):
+        with contextlib.suppress(SoftneckError):
+            import_log(path, read_layout(layout))
+            return True
+    return False
 
 
 def _archive(project: Project, path: Path, name: str) -> None:

@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from softneck.core import SoftneckError, file_hash
+from softneck.core import Progress, SoftneckError, file_hash, silent
 from softneck.core._certificate import required_rows
 from softneck.core._shown import Shown
 from softneck.cosim import Result
-from softneck.identification import INFINITE, validate
+from softneck.identification import INFINITE
+from softneck.identification.validation._validation import Rules, judge, judged_parts
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import loop_chart, recording_chart, validation_chart
 from softneck.signals import Recording
@@ -28,13 +29,14 @@ _MOST_DATA = 6
 # Thumbnails of one sort.
 _MOST_CARDS = 12
 _HORIZONS: tuple[int | str, ...] = (1, 25, INFINITE)
+_RULES = Rules(horizons=_HORIZONS)
 
 
-def project_page(project: Project) -> str:
+def project_page(project: Project, *, progress: Progress = silent) -> str:
     """Return the HTML page of a project: what it holds, what that is worth, what held and what failed."""
     title = f"Project {project.folder.resolve().name}"
-    sections = [_loops(project), _certificates(project), _data(project), _models(project), _uncertain(project)]
-    sections += [_design(project), _fmus(project), *_studies(project), _problems(project)]
+    sections = [_loops(project), _certificates(project), _data(project), _models(project, progress)]
+    sections += [_uncertain(project), _design(project), _fmus(project), *_studies(project), _problems(project)]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     kept = [section for section in sections if section is not None]
     places = {section.title: f"#s{number}" for number, section in enumerate(kept, start=2)}
@@ -138,7 +140,7 @@ def _recorded(name: str, recording: Recording) -> Chart:
     )
 
 
-def _models(project: Project) -> Section | None:
+def _models(project: Project, progress: Progress) -> Section | None:
     if not project.models:
         return None
     head = [
@@ -151,11 +153,16 @@ def _models(project: Project) -> Section | None:
         "persistence, one step",
     ]
     rows, charts, texts = [], [], []
-    for name, model in project.models.items():
+    judged_on = list(project.recordings.items())[:_MOST_DATA]
+    # What stands beside a model is the same for all that have seen the same rows: it takes longer than to judge one.
+    baselines: dict[str, dict[bytes, Any]] = {data: {} for data, _ in judged_on}
+    for number, (name, model) in enumerate(project.models.items()):
         texts.append([name, getattr(model, "kind", type(model).__name__), *_first_lines(model)])
-        for data, (recording, _) in list(project.recordings.items())[:_MOST_DATA]:
+        for count, (data, (recording, _)) in enumerate(judged_on):
+            progress((number + count / len(judged_on)) / len(project.models), f"{name} on {data}")
             try:
-                result = validate(model, recording, names=(name, data), horizons=_HORIZONS)
+                parts = judged_parts(model, recording, _RULES, baselines[data])
+                result = judge(model, parts, _RULES, names=(name, data))
             except (SoftneckError, AttributeError):
                 # Another sample time, or nothing left that the model was not trained on.
                 continue

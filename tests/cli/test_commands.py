@@ -13,7 +13,8 @@ import click
 import pytest
 
 from softneck.cli import _main
-from softneck.core import CheckFailedError, load
+from softneck.core import CheckFailedError, load, write_certificate
+from softneck.core._certificate import certificate_contents
 from softneck.signals import read_recording
 
 from ..browser import own_text
@@ -156,9 +157,47 @@ def test_info_knows_recordings_models_and_certificates(call: Call, recording: Pa
     assert (facts["type"], facts["rows"], facts["sample_time_s"]) == ("recording", 600, 0.02)
     facts = one_object(call("info", rls_file, "--json"))
     assert (facts["type"], facts["kind"]) == ("model", "rls")
-    Path("c.json").write_text('{"limits": []}')
-    assert one_object(call("info", "c.json", "--json"))["type"] == "certificate"
+    row = {"metric": "pitch.rise_s", "limit": 0.4, "value": 0.3, "holds": True}
+    contents = certificate_contents(
+        "verify", holds=True, files={"controller": ("pi.npz", "0" * 64)}, more={"requirements": [row]}
+    )
+    write_certificate("c.json", contents)
+    facts = one_object(call("info", "c.json", "--json"))
+    assert (facts["type"], facts["of"], facts["seal"], facts["holds"]) == (
+        "certificate", "softneck verify", "genuine", True,
+    )  # fmt: skip
+    assert facts["requirements"] == ["pitch.rise_s: 0.3, limit 0.4"]
+    edited = Path("c.json").read_text().replace("0.3", "0.2")
+    Path("c.json").write_text(edited)
+    facts = one_object(call("info", "c.json", "--json"))
+    assert (facts["type"], facts["seal"]) == (
+        "certificate", "not genuine: was changed after it was written; verify again.",
+    )  # fmt: skip
     assert "rows: 600" in call("info", recording).out
+
+
+def test_info_refuses_the_loops_and_archives_that_simulate_refuses(call: Call) -> None:
+    Path("loop.toml").write_text('duration_s = 1.0\n[plant]\nmodel = "absent.npz"\n')
+    Path("x.ssp").write_bytes(b"no archive")
+    for name in ("loop.toml", "x.ssp"):
+        asked, run = call("info", name), call("simulate", name)
+        assert (asked.code, asked.err) == (run.code, run.err)
+        assert asked.code == 2
+
+
+def test_a_report_takes_a_raw_log_whose_layout_lies_beside_it_for_what_it_is(call: Call, recording: Path) -> None:
+    Path("project").mkdir()
+    _, *rows = recording.read_text().splitlines()
+    # As a logger titles its columns.
+    Path("project/log.csv").write_text("\n".join(["t,m1,m2,m3,q1,q2,q3,x,y", *rows]))
+    assert "log.csv" in one_object(call("report", "project", "--json", "-o", "before.html"))["problems"]
+    motors = [f'motor_setpoint_{k} = {{ column = "m{k}", unit = "rad" }}' for k in (1, 2, 3)]
+    angles = [f'{name} = {{ column = "{column}", unit = "deg" }}' for name, column in (("pitch", "x"), ("roll", "y"))]
+    Path("neck.layout.toml").write_text("\n".join(['[time]\ncolumn = "t"\n[channels]', *motors, *angles]))
+    assert call("import", "project/log.csv", "--layout", "neck.layout.toml", "-o", "project/neck.csv").code == 0
+    Path("neck.layout.toml").rename("project/neck.layout.toml")
+    told = one_object(call("report", "project", "--json", "-o", "after.html"))
+    assert (told["recordings"], told["problems"]) == (1, {})
 
 
 def test_info_says_what_the_columns_of_a_log_seem_to_be(call: Call, recording: Path) -> None:
