@@ -61,13 +61,17 @@ def _of_loop(loop_file: Path, folder: Path, project: str) -> dict[str, str]:
 
 def _texts(project: str) -> dict[str, str]:
     """Return file name -> text of the template."""
+    from softneck.loop.default_limits import LOOP
+
     template = files("softneck.cli").joinpath("template")
+    words = {"NAME": project, **{name.upper(): str(limit) for name, limit in LOOP.items()}}
     found = {}
     for entry in sorted(template.iterdir(), key=lambda item: item.name):
         name = entry.name.removesuffix(".txt")
-        found[".gitignore" if name == "gitignore" else name] = entry.read_text(encoding="utf-8").replace(
-            "NAME", project
-        )
+        text = entry.read_text(encoding="utf-8")
+        for word, value in words.items():
+            text = text.replace(word, value)
+        found[".gitignore" if name == "gitignore" else name] = text
     return found
 
 

@@ -80,9 +80,11 @@ def command(
     if view is not None:
         refuse_existing(view, force=force)
     if certificate is not None and not setup.limits:
+        from softneck.loop.default_limits import LOOP
+
         raise SettingsError(
             f"{loop_file}: has no [limits], so a certificate would show nothing; state some, such as "
-            '"pitch.overshoot_pct" = 10.0.'
+            f'"pitch.overshoot_pct" = {LOOP["overshoot_pct"]}.'
         )
     with progress("simulate", quiet=as_json) as report:
         result = run_setup(setup, report=lambda done: report(done, loop_file.name))

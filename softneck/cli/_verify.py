@@ -24,10 +24,10 @@ _PATH = click.Path(path_type=Path)
 
 
 def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
-    from softneck.verification._requirements import DEFAULT_FILE
+    from softneck.verification._requirements import default_text
 
     if value:
-        click.echo(DEFAULT_FILE.read_text(encoding="utf-8"), nl=False)
+        click.echo(default_text(), nl=False)
         context.exit()
 
 

@@ -12,13 +12,12 @@ from softneck.design import LinearController, PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings
 from softneck.fmu import build_fmu, fmu_info
 from softneck.identification import Model
+from softneck.loop import default_limits
 
 from ._experiments import Tell
 
-# 15 deg as in the lab's own tests. Its loop there, on the real neck: overshoot 7.4 to 21.4 %, rise 0.28 to
-# 0.42 s, steady rms 0.19 to 0.34 deg.
+# 15 deg as in the lab's own tests.
 _STEPS = {"pitch_step": (15.0, 0.0), "roll_step": (0.0, 15.0), "oblique_step": (10.6, 10.6)}
-_LIMITS = {"overshoot_pct": 10.0, "rise_s": 0.8, "settling_s": 1.5, "steady_rms_deg": 0.3}
 
 _LOOP = """# Written by `softneck demo`; run it again with `softneck simulate {name}.toml`.
 duration_s = 8.0
@@ -77,7 +76,7 @@ def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Re
 
 def _limits(pitch: float, roll: float) -> str:
     stepped = [axis for axis, size in (("pitch", pitch), ("roll", roll)) if size]
-    lines = [f'"{axis}.{metric}" = {limit}' for axis in stepped for metric, limit in _LIMITS.items()]
+    lines = [f'"{axis}.{metric}" = {limit}' for axis in stepped for metric, limit in default_limits.LOOP.items()]
     # An axis without a step shall stay where it is.
     lines += [f'"{axis}.rms_error_deg" = 1.0' for axis, size in (("pitch", pitch), ("roll", roll)) if not size]
     return "\n".join(lines)

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +50,7 @@ def write_tuned(
     )
     certificate = folder / CERTIFICATE
     if found.holds:  # those of [track] too, which `verify` does not look at
-        write_certificate(certificate, verification.contents(), force=True)
+        write_certificate(certificate, {**verification.contents(), "loosened": _loosened(found)}, force=True)
     else:
         certificate.unlink(missing_ok=True)
     _write_loop(found, folder, steps)
@@ -71,9 +71,14 @@ def tuned_values(found: Tuned, path: Path) -> dict[str, Any]:
         "binding": found.binding,
         "prices": [{"metric": p.metric, "limit": p.limit, "other": p.other, "least": p.least} for p in found.prices],
         "requirements": found.task.asked.lines(),
+        "loosened": _loosened(found),
         "evaluations": found.evaluations,
         "dropped": dict(found.dropped),
     }  # fmt: skip
+
+
+def _loosened(found: Tuned) -> dict[str, dict[str, float]]:
+    return {metric: asdict(one) for metric, one in found.loosened.items()}
 
 
 def _metrics(item: Candidate) -> dict[str, float | None]:

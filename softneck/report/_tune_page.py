@@ -30,10 +30,17 @@ def tune_page(found: Tuned) -> str:
     return page(
         f"Controller for {found.task.robot.label()}, tuned",
         [_result(found, _steps(found, items)), _coordinates(found, items), _front(found), _asked(found)],
-        verdict="All requirements hold." if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}",
+        verdict=said_of(found) if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}",
         holds=found.holds,
         footer="Written by softneck tune.",
     )
+
+
+def said_of(found: Tuned) -> str:
+    """Return the verdict of a search whose certificate holds."""
+    if not found.loosened:
+        return "All requirements hold."
+    return f"All requirements hold but {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
 
 
 def requirement_rows(found: Tuned) -> list[list[str]]:

@@ -13,6 +13,7 @@ from softneck.design.linear._loop_settings import LoopSettings
 from softneck.design.linear._rise import least_rise
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.estimation import AxisPlant
+from softneck.loop.default_limits import usual_rise
 
 from ._requirements import TuneRequirements
 
@@ -49,6 +50,21 @@ def quickest(plant: Any) -> float:
         for axis in (uncertain.axis(name).nominal for name in uncertain.names)
     ]
     return max((least for least in found if math.isfinite(least)), default=0.0)
+
+
+def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
+    """Return the rise [s] that is asked of a neck by default: of the slowest axis; None where no step is reached."""
+    uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
+    limits, size = LoopSettings().of_robot(uncertain), asked.certificate.si(float(asked.certificate.neck["size_deg"]))
+    found = []
+    for name in uncertain.names:
+        axis = uncertain.axis(name)
+        test = axis_test(axis.nominal, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1])
+        latest = max((plant.delay + 1) * plant.sample_time for plant in (axis.nominal, *axis.samples))
+        least = least_rise(axis.nominal, test, size)
+        found.append(usual_rise(least, latest) if math.isfinite(least) else math.inf)
+    # Who asks for an earlier settling asks for a rise before it.
+    return min(max(found), asked.wanted("neck.settling_s") or math.inf) if max(found) < math.inf else None
 
 
 def _refuse_order(asked: TuneRequirements) -> None:

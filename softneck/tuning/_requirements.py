@@ -11,11 +11,13 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.core._budget import settings_text
+from softneck.loop import default_limits
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import VERSION, Requirement
 from softneck.verification._reserve import TRACK_METRICS, kept_back
 
+_RISE = "neck.rise_s"
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Least, largest and unit of the numbers of [track].
 _TRACK = {
@@ -33,6 +35,7 @@ class TuneRequirements:
         track: the loops that are judged besides.
         bounds: all requirements, those of `certificate` first; the reserve is taken off.
         reserve: metric -> what is kept back of its limit for a robot that is not quite as its models.
+        stated: metrics that somebody asks something of; the others are as the defaults have them.
         table: of a requirements file that asks `tune` and `verify` for the same: limits as asked, the reserve beside.
     """
 
@@ -41,6 +44,7 @@ class TuneRequirements:
     bounds: tuple[Requirement, ...]
     reserve: Mapping[str, float]
     table: Mapping[str, Any]
+    stated: frozenset[str] = frozenset()
 
     def wanted(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric of the robot itself: its limit with the reserve."""
@@ -64,7 +68,7 @@ class TuneRequirements:
 
 
 def read_tune_requirements(
-    path: str | Path | None = None, *, robot: Robot | None = None, stepping: bool = True
+    path: str | Path | None = None, *, robot: Robot | None = None, stepping: bool = True, rise: float | None = None
 ) -> TuneRequirements:
     """Return the defaults, with what the file at `path` says instead.
 
@@ -72,13 +76,14 @@ def read_tune_requirements(
         path: a requirements file, also one for `verify`.
         robot: whose controller is asked for; None: a neck's.
         stepping: whether there are plants that step; else `neck.*` of the defaults is asked of the linear plants.
+        rise: the default of a neck's [s]; None: that of the paper's neck.
 
     Raises:
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
     if path is None:
-        return make_tune_requirements({}, robot=robot, stepping=stepping)
+        return make_tune_requirements({}, robot=robot, stepping=stepping, rise=rise)
     try:
         table = tomllib.loads(settings_text(path))
     except (ValueError, RecursionError) as error:
@@ -90,17 +95,19 @@ def read_tune_requirements(
     if table.get("version") != VERSION:
         raise FileFormatError(f"{path}: must say `version = {VERSION}`; it says {table.get('version')}.")
     try:
-        return make_tune_requirements(table, robot=robot, stepping=stepping)
+        return make_tune_requirements(table, robot=robot, stepping=stepping, rise=rise)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from error
 
 
 def make_tune_requirements(
-    table: Mapping[str, Any], *, robot: Robot | None = None, stepping: bool = True
+    table: Mapping[str, Any], *, robot: Robot | None = None, stepping: bool = True, rise: float | None = None
 ) -> TuneRequirements:
     """Return the defaults with what a table like a requirements file says instead."""
     whose = Robot.preset() if robot is None else robot
-    defaults = tomllib.loads(DEFAULT_FILE.read_text(encoding="utf-8"))
+    defaults = tomllib.loads(default_text())
+    if rise is not None:
+        defaults["require"][_RISE] = {"max": rise}
     # The defaults of tuning are a neck's; those of `verify` know how other robots differ.
     usual = _for_linear(defaults) if not stepping else defaults
     if not whose.is_neck:
@@ -119,13 +126,33 @@ def make_tune_requirements(
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
         table={"version": VERSION, **merged},
+        stated=frozenset(metric for metric, entry in table.get("require", {}).items() if entry is not False),
     )  # fmt: skip
+
+
+def default_text() -> str:
+    """Return the defaults of tuning as a requirements file, with the rise of the paper's neck."""
+    limits = default_limits.TUNE | {_RISE: default_limits.NECK_RISE_S}
+    return DEFAULT_FILE.read_text(encoding="utf-8") + default_limits.as_toml(limits)
 
 
 def with_certificate(asked: TuneRequirements, certificate: Requirements) -> TuneRequirements:
     """Return them with other requirements for `verify`, such as ones stretched to another robot."""
     own = tuple(item for item in asked.bounds if item.metric.startswith("track."))
     return replace(asked, certificate=certificate, bounds=(*certificate.bounds, *own))
+
+
+def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:
+    """Return them with other largest values of some metrics on the plants; what is kept back of them stays."""
+    require = {metric: {"max": round(limit + asked.reserve.get(metric, 0.0), 9)} for metric, limit in limits.items()}
+    table = {**asked.table, "require": {**asked.table.get("require", {}), **require}}
+    bounds = tuple(replace(b, limit=limits[b.metric]) if b.metric in limits else b for b in asked.bounds)
+    own = {key: value for key, value in table.items() if key != "version"}
+    certificate = replace(
+        asked.certificate, own=own | {"version": VERSION},
+        bounds=tuple(b for b in bounds if not b.metric.startswith("track.")),
+    )  # fmt: skip
+    return replace(asked, certificate=certificate, bounds=bounds, table=table)
 
 
 def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:

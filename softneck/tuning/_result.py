@@ -12,7 +12,9 @@ import numpy as np
 from softneck.cosim.studies._study_results import pareto_rows
 from softneck.verification._linear import LARGE
 from softneck.verification._requirements import Requirement
+from softneck.verification._verify import Verdict
 
+from ._requirements import TuneRequirements
 from ._search import Candidate, ratio
 
 # What is traded, the first of each that was found; of the least ones the reciprocal counts.
@@ -26,6 +28,11 @@ _LOOSER = (1.0, 1.25, 1.5, 2.0)
 # Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
 # loosened, and beyond it is another requirement ("disk_margin 0.0151 costs sensitivity 66.7").
 _NEAR = 2.0
+# Of these a default is a wish about speed and precision: what the best reaches is told instead. Margins of stability,
+# slack tendons and what a load may do are never loosened.
+_LOOSENED = ("neck.rise_s", "neck.settling_s", "neck.overshoot_pct", "neck.steady_rms_", "step.rise_s",
+             "step.settling_s", "step.overshoot_pct", "step.steady_rms_", "track.")  # fmt: skip
+_ROOM = 1.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +103,55 @@ def binding(
         return None, None
     found = {name: value for name, value in best.ratios(bounds, tested=tested).items() if name in best.metrics}
     return (max(found, key=lambda name: found[name]) if max(found.values(), default=0.0) > 1.0 else None), None
+
+
+@dataclass(frozen=True, slots=True)
+class Loosened:
+    """A default that no candidate keeps beside the rest.
+
+    Attributes:
+        default: what it asks.
+        reached: by the best candidate.
+        limit: what is certified instead.
+    """
+
+    default: float
+    reached: float
+    limit: float
+
+    def in_words(self, metric: str) -> str:
+        """Return it as a clause for people: `neck.rise_s: 0.44, by default 0.40 is required`."""
+        return f"{metric}: {self.reached:.3g}, by default {self.default:.3g} is required (certified: {self.limit:g})"
+
+
+def nearest(item: Candidate, failed: Sequence[Verdict], asked: TuneRequirements) -> dict[str, Loosened]:
+    """Return metric -> the default that the candidate does not keep, where it keeps all the rest.
+
+    Nothing where anything else fails: a margin of stability, what somebody asked for, what was not computed, or what is
+    missed by more than a factor of two.
+    """
+    broken = {verdict.requirement: verdict.value for verdict in failed}
+    looped = [bound for bound in asked.bounds if bound.metric.startswith(("neck.", "track."))]
+    for bound in looped:  # in loops with noise, which `verify` does not close
+        seen = item.metrics.get(bound.metric)
+        if seen is not None and not bound.holds(seen):
+            broken[bound] = max(seen, broken.get(bound) or 0.0)
+    found = {}
+    for bound, value in broken.items():
+        free = bound.metric.startswith(_LOOSENED) and bound.metric not in asked.stated and bound.bound == "max"
+        kept = math.inf if value is None else _above(value)
+        if not free or not kept <= _NEAR * bound.limit:
+            return {}
+        found[bound.metric] = Loosened(bound.limit, value or math.nan, kept)
+    return found
+
+
+def _above(value: float) -> float:
+    """Return a limit that a value keeps with some room, in two digits: the next loop has other noise."""
+    if not 0.0 < value < math.inf:
+        return math.inf
+    step = 10.0 ** (math.floor(math.log10(_ROOM * value)) - 1)
+    return round(math.ceil(_ROOM * value / step - 1e-9) * step, 9)
 
 
 def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,26 @@ from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import robot_of
 from softneck.identification.models._ports import payloads
+from softneck.robot import Robot
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
 from softneck.verification._own_plants import OwnPlant, is_own_plant
 from softneck.verification._scale import scaled
 from softneck.verification._verify import sources_of, standing_for
 
-from ._beforehand import quickest, refuse_impossible
+from ._beforehand import default_rise, quickest, refuse_impossible
 from ._digest import digest_of
 from ._judge import LEVELS, designed, made_ready, watched
 from ._log import Log
-from ._requirements import TuneRequirements, make_tune_requirements, read_tune_requirements, with_certificate
+from ._requirements import (
+    TuneRequirements,
+    loosened,
+    make_tune_requirements,
+    read_tune_requirements,
+    with_certificate,
+)
 from ._responses import kept_with
-from ._result import Price, binding, front, objectives, prices
+from ._result import Loosened, Price, binding, front, nearest, objectives, prices
 from ._search import Candidate, Search
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
 from ._task import Task
@@ -62,6 +70,7 @@ class Tuned:
         binding: the requirement that stands in the way; None where nothing does.
         nearest: the value to which that alone would have to be loosened; None where that would not do.
         prices: what it costs.
+        loosened: metric -> the default that the best does not keep; the requirements of `task` have what it keeps.
         evaluations: judgements that were asked for.
         dropped: kind -> why it was not searched.
         task: what was tuned.
@@ -85,6 +94,7 @@ class Tuned:
     dropped: Mapping[str, str]
     task: Task
     own: Sequence[OwnPlant] = ()
+    loosened: Mapping[str, Loosened] = field(default_factory=dict)
 
 
 @one_blas_thread
@@ -173,17 +183,26 @@ def task_of(
             f"loops over {next(iter(own))} would begin at zero, where `{robot.name}` cannot be; give linear plants "
             "alone."
         )
-    if isinstance(requirements, TuneRequirements):
-        asked = requirements
-    elif isinstance(requirements, Mapping):
-        asked = make_tune_requirements(requirements, robot=robot, stepping=bool(own))
-    else:
-        asked = read_tune_requirements(requirements, robot=robot, stepping=bool(own))
+    asked = _asked(requirements, robot, list(linear.values()), stepping=bool(own))
     if not robot.is_neck:
         asked = with_certificate(asked, scaled(asked.certificate, sources_of(linear, asked.certificate)))
     return Task(
         digest="", linear=linear, own=own, asked=asked, robot=robot, cocontraction=_held(linear), seed=seed
     )  # fmt: skip
+
+
+def _asked(
+    requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, robot: Robot, linear: list[Any], *,
+    stepping: bool,
+) -> TuneRequirements:  # fmt: skip
+    """Return what is asked, the default rise as the robot's slew, range and dead time have it."""
+    if isinstance(requirements, TuneRequirements):
+        return requirements
+    if isinstance(requirements, Mapping):
+        read = partial(make_tune_requirements, requirements, robot=robot, stepping=stepping)
+    else:
+        read = partial(read_tune_requirements, requirements, robot=robot, stepping=stepping)
+    return read(rise=default_rise(linear, read())) if robot.is_neck else read()
 
 
 def _held(linear: Mapping[str, Any]) -> float | None:
@@ -234,7 +253,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         # The search saw nothing broken, and knows no price; the certificate of the whole box does.
         stuck = known[0].requirement.metric
         nearest = known[0].value if len(verification.failed) == 1 else None
-    return Tuned(
+    found = Tuned(
         best=best, controller=controller, observer=eyes,
         assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
         own=made_ready(task).own,
@@ -244,6 +263,29 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         prices=paid,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
+    )  # fmt: skip
+    return found if holds else _nearest(found, files, progress)
+
+
+def _nearest(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+    """Return the result with the defaults of speed and precision as the best keeps them, if it keeps all the rest.
+
+    What somebody asks stands, and so do the margins of stability; the loosened set is verified anew.
+    """
+    task, kept = found.task, nearest(found.best, found.verification.failed, found.task.asked)
+    if not kept:
+        return found
+    asked = loosened(task.asked, {metric: one.limit for metric, one in kept.items()})
+    progress(0.9, "verify what holds")
+    verification = verify(
+        found.controller, {**task.linear, **task.own}, asked.certificate, files=files, progress=silent,
+        observer=task.observer if watched(task, found.best.kind) is not None else None,
+    )  # fmt: skip
+    if not verification.holds:
+        return found
+    return replace(
+        found, task=replace(task, asked=asked), verification=verification, holds=True,
+        loosened=kept,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from typing import Any
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
 from softneck.core._budget import settings_text
 from softneck.core._shown import Shown
+from softneck.loop import default_limits
 from softneck.loop._result import shown_unit
 from softneck.robot import Robot
 
@@ -203,7 +204,7 @@ def read_requirements(path: str | Path | None = None, *, robot: Robot = _NECK) -
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
-    defaults = _read(DEFAULT_FILE)
+    defaults = _defaults()
     if path is None:
         return _requirements(defaults, {}, robot)
     table = _read(Path(path))
@@ -215,7 +216,16 @@ def read_requirements(path: str | Path | None = None, *, robot: Robot = _NECK) -
 
 def make_requirements(table: Mapping[str, Any], *, robot: Robot = _NECK) -> Requirements:
     """Return the defaults with what a table like a requirements file says instead."""
-    return _requirements(_read(DEFAULT_FILE), {"version": VERSION, **table}, robot)
+    return _requirements(_defaults(), {"version": VERSION, **table}, robot)
+
+
+def default_text() -> str:
+    """Return the defaults as a requirements file."""
+    return DEFAULT_FILE.read_text(encoding="utf-8") + default_limits.as_toml(default_limits.VERIFY)
+
+
+def _defaults() -> dict[str, Any]:
+    return tomllib.loads(default_text())
 
 
 def _read(source: Path) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from softneck.robot import Robot
 
 from ..shared._console import note
 from ._possible import FILE, lacking, possible, require_known
+from ._preflight import kinds_here
+from ._sensor import propose_sensor
 from ._step import Step, Unmet
 
 AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/kalman.npz", "tune/best.npz"
@@ -41,6 +43,8 @@ class Asked:
         budget: of `tune`: by default half its own, so that a sitting ends within minutes.
         seed: of kinds of models and of the search.
         yes: take all guesses.
+        backend: of the FMUs.
+        tested: whether the closed loop's test can be run here.
     """
 
     logs: tuple[str, ...]
@@ -51,6 +55,8 @@ class Asked:
     budget: int = 80
     seed: int = 0
     yes: bool = False
+    backend: str = "compiled"
+    tested: bool = True
 
 
 def steps(asked: Asked) -> Iterator[Step]:
@@ -65,6 +71,7 @@ def steps(asked: Asked) -> Iterator[Step]:
         # Of a log of one axis the import proposes a robot of one output.
         proposed = Path(recordings[0]).with_suffix(".robot.toml")
         yield _robot(proposed.as_posix() if proposed.is_file() else "neck")
+    yield from _with_sensor(recordings, asked)
     for recording in recordings:
         page = f"build/quality/{Path(recording).stem}.html"
         command = ("softneck", "info", recording, "--html", page, "--force")
@@ -72,7 +79,16 @@ def steps(asked: Asked) -> Iterator[Step]:
     yield from _of_one_sample_time(recordings)
     yield from _models(recordings, asked)
     yield from _controller(asked)
-    yield from _loops()
+    yield from _loops(asked)
+
+
+def _with_sensor(recordings: list[str], asked: Asked) -> Iterator[Step]:
+    """Propose what `robot.toml` does not say of the sensor; recordings that say their robot then say that too."""
+    from softneck.signals import read_recording
+
+    proposed = propose_sensor(Path("robot.toml"), [read_recording(recording) for recording in recordings])
+    if proposed and asked.robot is not None:
+        yield from (_import(log, recording, asked) for log, recording in zip(asked.logs, recordings, strict=True))
 
 
 def _robot(source: str) -> Step:
@@ -162,7 +178,7 @@ def _controller(asked: Asked) -> Iterator[Step]:
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
-    kinds = asked.kinds or (_KINDS if family else _KINDS + _UNCERTIFIED)
+    kinds = asked.kinds or kinds_here(_KINDS if family else _KINDS + _UNCERTIFIED)
     # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
     finding = possible(plants) if asked.requirements is None else ""
     stated = FILE if finding else asked.requirements
@@ -183,7 +199,7 @@ def _controller(asked: Asked) -> Iterator[Step]:
     yield Step(stage="verify", command=command, makes=(certificate, "build/verify.html"),
                reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
     for file, fmu in ((plants[-1], PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU)):
-        command = ("softneck", "fmu", file, "--backend", "compiled", "-o", fmu, "--force")
+        command = ("softneck", "fmu", file, "--backend", asked.backend, "-o", fmu, "--force")
         yield Step(stage="FMUs", command=command, makes=(fmu,), reads=(file,))
 
 
@@ -195,7 +211,7 @@ def observed() -> bool:
         raise SettingsError(f"{_TUNED_LOOP}: is not the loop that `softneck tune` wrote ({error}).") from error
 
 
-def _loops() -> Iterator[Step]:
+def _loops(asked: Asked) -> Iterator[Step]:
     files = ("README.md", "loop.toml", "study.toml", "test_closed_loop.py", "pyproject.toml", ".gitignore")
     command = ("softneck", "new", ".", "--loop", _TUNED_LOOP, "--force")
     yield Step(stage="loop", command=command, makes=("loop.toml", *files), reads=(_TUNED_LOOP, "robot.toml"))
@@ -208,8 +224,9 @@ def _loops() -> Iterator[Step]:
                makes=("build/study/runs.csv", "build/study/report.html"),
                reads=("study.toml", "loop.toml", *_FMUS), resumes="build/study/study.json")  # fmt: skip
     command = ("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml", "build/test.xml")
-    yield Step(stage="test", command=command, makes=("build/test.xml",),
-               reads=("test_closed_loop.py", "loop.toml", *_FMUS))  # fmt: skip
+    if asked.tested:
+        yield Step(stage="test", command=command, makes=("build/test.xml",),
+                   reads=("test_closed_loop.py", "loop.toml", *_FMUS))  # fmt: skip
     command = ("softneck", "report", ".", "-o", "build/report.html", "--force")
     yield Step(stage="report", command=command, makes=("build/report.html",),
                reads=(AUTO, BEST, "certificates/best.certificate.json", "results/loop.csv", "build/study/runs.csv",

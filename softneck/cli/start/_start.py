@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 from collections.abc import Iterator
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,19 @@ from softneck.core import (
     SoftneckError,
     find_kind,
 )
+from softneck.core._budget import MOST_JSON, settings_text
 from softneck.core._files import require_file
 
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import json_option
 from ..shared._settle import is_terminal
 from ._plan import BEST, PI, Asked, linear_model, nonlinear_model, steps
+from ._preflight import backend, has_pytest, require_disk
 from ._sitting import FILE, Sitting
 from ._step import STAGES, Step
 
 _PATH = click.Path(path_type=Path)
+_TUNED = "tune/best.certificate.json"
 _NEXT = "Record 60 s of `mixed` and start with that."
 _MIXED = (
     "in `mixed` every motor moves by itself and all move together: `softneck drives record mixed` plays it on drives"
@@ -73,12 +77,17 @@ def command(
     given = {"robot": _robot_of(logs[0], robot), "requirements": requirements and str(requirements.absolute()),
              "kinds": kinds, "sample_time": sample_time, "budget": budget, "seed": seed}  # fmt: skip
     paths = tuple(str(log.absolute()) for log in logs)
+    require_disk(folder)
     with _project(folder):
         sitting = Sitting.read(as_json=as_json)
         guided = is_terminal() and not yes and not as_json
         asked = _asked(paths, {**sitting.answers, **{k: v for k, v in given.items() if v is not None}}, yes=yes,
                        guided=guided and not sitting.done)  # fmt: skip
         sitting.answers = {key: value for key, value in asdict(asked).items() if key in given}
+        asked = replace(asked, backend=backend(), tested=has_pytest())
+        not_run = {} if asked.tested else {"test": "pytest is not installed"}
+        for stage, why in not_run.items():
+            note(f"not run: {stage}: {why}")
         if not as_json:
             click.echo(f"$ cd {folder}")
         try:
@@ -87,7 +96,7 @@ def command(
                 sitting.do(step)
         except SoftneckError as error:
             raise _advised(error, sitting, folder, paths) from error
-        facts = _facts(sitting, folder)
+        facts = {**_facts(sitting, folder), "not_run": not_run}
     _tell(facts, as_json=as_json)
 
 
@@ -241,16 +250,26 @@ def _facts(sitting: Sitting, folder: Path) -> dict[str, Any]:
         "failed": [row["stage"] for row in rows if not row["holds"]],
         "models": {sort: _model(file) for sort, file in models.items() if file is not None},
         "controller": BEST,
+        "loosened": _loosened(),
         "report": "build/report.html",
         "steps": rows,
     }
+
+
+def _loosened() -> dict[str, dict[str, float]]:
+    """Return metric -> which default the tuned controller does not keep, and what it reaches."""
+    certificate = Path(_TUNED)
+    if not certificate.is_file():
+        return {}
+    return json.loads(settings_text(certificate, MOST_JSON)).get("loosened", {})
 
 
 def _doubts() -> dict[str, list[str]]:
     """Return layout -> what the import was not sure of, and nobody settled since."""
     from softneck.signals.importing._layout_text import doubts_in
 
-    found = {path.as_posix(): doubts_in(path) for path in sorted(Path("recordings").glob("*.layout.toml"))}
+    files = [*sorted(Path("recordings").glob("*.layout.toml")), *filter(Path.is_file, [Path("robot.toml")])]
+    found = {path.as_posix(): doubts_in(path) for path in files}
     return {name: list(doubts) for name, doubts in found.items() if doubts}
 
 
@@ -272,6 +291,8 @@ def _model(file: str) -> dict[str, Any]:
 
 
 def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
+    from softneck.tuning._result import Loosened
+
     folder, failed = facts["folder"], [row for row in facts["steps"] if not row["holds"]]
     if as_json:
         print_json(facts)
@@ -281,7 +302,9 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
             click.echo(
                 f"\nbest {sort} model: {model['kind']}, free run {fits} % over the rows held out, {model['file']}"
             )
-        print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts["steps"]))
+        print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts))
+        for metric, one in facts["loosened"].items():
+            click.echo(f"all holds but {Loosened(**one).in_words(metric)}")
         for doubt in (one for found in facts["doubts"].values() for one in found):
             click.echo(f"not sure: {doubt}")
         click.echo(f"report: {folder}/{facts['report']}")
@@ -294,12 +317,16 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
         raise CheckFailedError(f"{failed[0]['stage']} does not hold{more}: {failed[0]['said']}{also}")
 
 
-def _rows(steps_done: list[dict[str, Any]]) -> list[list[str]]:
+def _rows(facts: dict[str, Any]) -> list[list[str]]:
     found = []
     for stage in STAGES:
-        rows = [row for row in steps_done if row["stage"] == stage]
+        rows = [row for row in facts["steps"] if row["stage"] == stage]
         verdict = "holds" if stage in ("tune", "verify", "loop", "test") else "done"
+        if stage == "tune" and facts["loosened"]:
+            verdict = f"holds all but {', '.join(facts['loosened'])}"
         if not all(row["holds"] for row in rows):
             verdict = "fails"
+        if not rows:
+            verdict = f"not run: {facts['not_run'].get(stage, 'not needed')}"
         found.append([stage, verdict, f"{sum(row['seconds'] for row in rows):.1f}"])
     return found

@@ -12,6 +12,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive, require_whole
 from softneck.estimation import AxisPlant
+from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
 
 from ..plants._held import USUAL_PERIOD, held
 from ..plants._step_and_load import StepAndLoad
@@ -75,7 +76,7 @@ class AxisSettings(LoopSettings, ABC):
     max_sensitivity: float = 2.0
     reference_time: float | None = None
     reference_lead: float = 0.0
-    overshoot_pct: float = 4.0
+    overshoot_pct: float = DESIGN_OVERSHOOT_IN_LIMITS_PCT
     gain_spread: float = 0.2
     controller_order: int = 0
     conditioning: str = "tuned"

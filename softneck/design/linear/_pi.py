@@ -8,6 +8,7 @@ from typing import Any
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive
 from softneck.estimation._axis import HasTransferFunctions
+from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
 from softneck.robot._neck_default import NeckDefault
 
 from ..plants._held import held
@@ -62,7 +63,7 @@ class PiSettings(LoopSettings):
     # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
     reference_time: float | None = NeckDefault(0.2)
     reference_lead: float = 0.0
-    overshoot_pct: float = 2.0
+    overshoot_pct: float = DESIGN_OVERSHOOT_PCT
     gain_spread: float = 0.2
     sample_time: float | None = None
 

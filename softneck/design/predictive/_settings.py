@@ -21,6 +21,7 @@ from softneck.core import (
 from softneck.core._shown import Shown
 from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
+from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
@@ -148,7 +149,7 @@ class MpcSettings(Shown):
     worst_sensitivity: float = 2.5
     reference_time: float | None = NeckDefault(0.05)
     rise_s: float | None = None
-    overshoot_pct: float = 2.0
+    overshoot_pct: float = DESIGN_OVERSHOOT_PCT
     gain_spread: float = 0.2
     horizon: int = NeckCount(30)
     moves: int = NeckCount(10)
