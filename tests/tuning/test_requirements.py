@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.estimation import LinearNeck
+from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune_files import _told
 from softneck.robot import Robot
 from softneck.tuning._beforehand import refuse_impossible
@@ -37,7 +38,7 @@ def test_the_defaults_are_those_of_verify_with_what_tuning_adds() -> None:
     assert set(theirs) <= set(mine)
     changed = {key for key in theirs if theirs[key] != mine[key]}
     assert changed == {("neck.overshoot_pct", "max"), ("neck.steady_rms_deg", "max")}
-    assert (asked.wanted("neck.rise_s"), asked.wanted("track.circle_rms_deg")) == (0.4, 3.0)
+    assert (asked.wanted("neck.rise_s"), asked.wanted("track.circle_rms_deg")) == (NECK_RISE_S, 3.0)
 
 
 def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
@@ -84,7 +85,7 @@ def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path,
 
 def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
     asked = make_tune_requirements({}, stepping=False)
-    assert asked.limit("step.rise_s") == 0.4
+    assert asked.limit("step.rise_s") == NECK_RISE_S
     assert asked.limit("neck.rise_s") is None
 
 
@@ -99,7 +100,7 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "must be a positive number"),
         ({"reserve": {"axes.gain_margin": 0.1}}, "is of loops over plants that step"),
         ({"reserve": {"neck.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
-        ({"reserve": {"neck.rise_s": 0.4}}, "<= 0.4 leaves nothing beside its reserve of 0.4"),
+        ({"reserve": {"neck.rise_s": 0.49}}, "<= 0.49 leaves nothing beside its reserve of 0.49"),
         ({"require": {"neck.overshoot_pct": {"max": 0.0}}}, "<= 0 leaves nothing beside its reserve of 1.6"),
         ({"reserve": {"neck.ris_s": 0.1}}, r"of which \[require\] asks nothing"),
         ({"reserve": 1.0}, "must be a table"),

@@ -14,7 +14,7 @@ from softneck.robot import Robot
 
 from ..shared._console import note
 from ._possible import FILE, lacking, possible, require_known
-from ._preflight import kinds_here
+from ._preflight import backend, kinds_here
 from ._sensor import propose_sensor
 from ._step import Step, Unmet
 
@@ -198,8 +198,11 @@ def _controller(asked: Asked) -> Iterator[Step]:
                "-o", certificate, "--html", "build/verify.html", "--force")  # fmt: skip
     yield Step(stage="verify", command=command, makes=(certificate, "build/verify.html"),
                reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
+    made = asked.backend
+    if made == "compiled" and not Robot.read("robot.toml").is_neck:
+        made = backend(neck=False)
     for file, fmu in ((plants[-1], PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU)):
-        command = ("softneck", "fmu", file, "--backend", asked.backend, "-o", fmu, "--force")
+        command = ("softneck", "fmu", file, "--backend", made, "-o", fmu, "--force")
         yield Step(stage="FMUs", command=command, makes=(fmu,), reads=(file,))
 
 

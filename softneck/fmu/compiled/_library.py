@@ -20,7 +20,7 @@ import platformdirs
 from softneck.core import FileFormatError, SettingsError, atomic_write
 
 from ..python._zip import deflated
-from ._compilers import compile_for, compile_here, local_compiler
+from ._compilers import compile_for, compile_here, have_zig, local_compiler
 from ._platforms import PLATFORMS, here
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
 from .translate._chunks import only_kinds
@@ -59,7 +59,7 @@ def find_library(modules: set[str] | None = None, *, sensitivities: bool = False
 
     Raises:
         FileFormatError: a library is damaged.
-        SettingsError: there is none, and no C compiler.
+        SettingsError: there is none, and neither a C compiler nor zig.
     """
     if modules and not modules <= set(RUNTIMES):
         return _local_library(tuple(sorted(modules)), sensitivities=sensitivities)
@@ -119,9 +119,9 @@ def platforms_built() -> tuple[list[str], str]:
         return list(manifest["platforms"]), "built with this softneck"
     stale = "; those in binaries/ are of other sources, run `make native`" if manifest is not None else ""
     machine, compiler = here(), local_compiler()
-    if machine is None or compiler is None:
+    if machine is None or (compiler is None and not have_zig()):
         return [], f"none is built and there is no C compiler{stale}"
-    return [machine.name], f"by {compiler[0]} at the first export{stale}"
+    return [machine.name], f"by {compiler[0] if compiler else 'zig'} at the first export{stale}"
 
 
 def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Library:
@@ -179,7 +179,7 @@ def _packed(data: bytes) -> bytes:
 def _local_library(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> Library:
     """Return the library of this machine: from the user's cache, or compiled now."""
     machine, compiler = here(), local_compiler()
-    if machine is None or compiler is None:
+    if machine is None or (compiler is None and not have_zig()):
         raise SettingsError(
             "there is no compiled library here and no C compiler to make one; run `make native` (it needs "
             "`pip install ziglang`), install a C compiler, or use `--backend python`."
@@ -191,7 +191,7 @@ def _local_library(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool =
         folder.mkdir(parents=True, exist_ok=True)
         # The last one is the sign that all are there.
         for path, data in (
-            (library, compile_here(sources, compiler)),
+            (library, compile_here(sources, compiler) if compiler else compile_for(sources, machine)),
             (generated, sources.files[GENERATED].encode()),
             (refused, json.dumps(sources.refused).encode()),
         ):
@@ -200,7 +200,7 @@ def _local_library(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool =
     files = {path.name: path.read_text(encoding="utf-8") for path in sorted((HERE / "c").glob("*.[ch]"))}
     files[GENERATED] = generated.read_text(encoding="utf-8")
     sources = Sources(files, json.loads(refused.read_text(encoding="utf-8")))
-    origin = f"compiled by {compiler[0]} for this machine alone ({machine.name})"
+    origin = f"compiled by {compiler[0] if compiler else 'zig'} for this machine alone ({machine.name})"
     ours = set(modules) <= set(RUNTIMES)
     origin += "; `make native` builds all platforms" if ours else ", as the robot's sizes are its own"
     return Library({machine.name: library.read_bytes()}, sources, origin)

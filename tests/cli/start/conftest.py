@@ -29,7 +29,7 @@ def facts_of(sitting: Sitting, folder: Path) -> dict[str, Any]:
     """What a sitting that ends before its models says of itself."""
     rows = [{"stage": key.partition(":")[0], "done_before": kept, **sitting.done[key]}
             for key, kept in sitting.ran.items()]  # fmt: skip
-    more = {"models": {}, "report": "none", "doubts": _doubts(), "failed": [], "steps": rows}
+    more = {"models": {}, "report": "none", "doubts": _doubts(), "loosened": {}, "failed": [], "steps": rows}
     return {"folder": str(folder), **more}
 
 

@@ -86,7 +86,15 @@ def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
 
     def facts(sitting: _sitting.Sitting, folder: Path) -> dict[str, Any]:
         rows = [{"stage": "tune", "done_before": False, **entry} for entry in sitting.done.values()]
-        return {"folder": str(folder), "models": {}, "report": "", "doubts": {}, "failed": ["tune"], "steps": rows}
+        return {
+            "folder": str(folder),
+            "models": {},
+            "loosened": {},
+            "report": "",
+            "doubts": {},
+            "failed": ["tune"],
+            "steps": rows,
+        }
 
     def failing(words: tuple[str, ...], *, as_json: bool) -> None:
         inner(words, as_json=as_json)
