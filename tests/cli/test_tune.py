@@ -185,4 +185,4 @@ def test_bad_input_is_said_before_anything_is_searched(
 
 def test_the_default_requirements_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["tune", "--print-requirements"]) == 0
-    assert '"neck.rise_s" = { max = 0.4 }' in capsys.readouterr().out
+    assert '"neck.rise_s" = { max = 0.49 }' in capsys.readouterr().out
