@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+import softneck.tuning._tune  # noqa: F401  (before a test replaces what it imports)
 from softneck.cli.start import _plan, _possible, _sitting, _start
 from softneck.cli.start._plan import PI, Asked
 from softneck.cli.start._step import Step, Unmet
