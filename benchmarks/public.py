@@ -138,8 +138,8 @@ def emps(folder: Path) -> tuple[Recording, dict[str, Recording]]:
     return found[0], {"pulses": found[1]}
 
 
-def pneumatic_arm(folder: Path) -> tuple[Recording, dict[str, Recording]]:
-    """A pneumatic arm: pressure_1..3 to x, y; of each trial (column `run`) the last 30 % is the test."""
+def pneumatic_trials(folder: Path) -> list[Recording]:
+    """A pneumatic arm: pressure_1..3 to x, y; the trials (column `run`)."""
     path = folder / "pneumatic_arm_two_trials.csv"
     names = ("time [s]", "pressure_1", "pressure_2", "pressure_3", "x", "y", "run")
     try:
@@ -152,7 +152,12 @@ def pneumatic_arm(folder: Path) -> tuple[Recording, dict[str, Recording]]:
     Y = np.column_stack([table["x"], table["y"]])
     Ts = float(np.median(np.diff(table["time [s]"])))
     trials = [table["run"] == number for number in np.unique(table["run"])]
-    parts = [recording("pneumatic arm", Ts, U[there], Y[there], units=("1", "1")).split(0.7) for there in trials]
+    return [recording("pneumatic arm", Ts, U[there], Y[there], units=("1", "1")) for there in trials]
+
+
+def pneumatic_arm(folder: Path) -> tuple[Recording, dict[str, Recording]]:
+    """A pneumatic arm: of each trial the last 30 % is the test."""
+    parts = [trial.split(0.7) for trial in pneumatic_trials(folder)]
     return concatenate([head for head, _ in parts]), {"ends": concatenate([tail for _, tail in parts])}
 
 
