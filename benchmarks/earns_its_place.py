@@ -171,7 +171,13 @@ def table(kept: Path, key: str = "score", *, least: bool = False) -> None:
         cell, found = Cell(**line["cell"]), line["found"]
         by.setdefault((cell.kind, cell.robot), {}).setdefault(cell.seed, []).append(found.get(key, found["score"]))
         spent.setdefault(cell.kind, []).append(found["seconds"])
-    scores = {where: {seed: mean(parts) for seed, parts in seeds.items()} for where, seeds in by.items()}
+    # A seed counts once all its cases are there: half of them are not comparable.
+    whole: dict[str, int] = {}
+    for (_, robot), seeds in by.items():
+        whole[robot] = max(whole.get(robot, 0), *map(len, seeds.values()))
+    scores = {where: {seed: mean(cases) for seed, cases in seeds.items() if len(cases) == whole[where[1]]}
+              for where, seeds in by.items()}  # fmt: skip
+    scores = {where: seeds for where, seeds in scores.items() if seeds}
     kinds, robots = (list(dict.fromkeys(names)) for names in zip(*scores, strict=True))
     print(f"| kind | {' | '.join(robots)} | processor [s] |\n|---|{'---|' * len(robots)}---|")
     for kind in kinds:

@@ -11,22 +11,21 @@ the others are given it earlier by what suits them best.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from benchmarks.baseline import OSCILLATES, Louder
 from benchmarks.earns_its_place import SEEDS, Cell
 from benchmarks.mpc_following import AT, CIRCLE_S, PREVIEW, SETTLED, STEP, STEP_S, circle
 from benchmarks.promises import Sensed
-from softneck.core import KINDS, resolve
+from softneck.core import KINDS, Vector, resolve
 from softneck.design import MpcSettings, NmpcSettings
 from softneck.design.varying._switched import SwitchedSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import FamilySettings, GreyBox, OutputError
-from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
 from softneck.loop._reference_parts import AheadReference
 from softneck.signals import signal
 from tests.foreign_necks.necks import ForeignNeck, record_under
@@ -36,6 +35,8 @@ KINDS_JUDGED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptiv
 # Of `benchmarks/promises.py`: the least co-contraction at which a neck with 1 kg is heard [rad].
 TAUT = {"chain": 4.0, "column": 3.0, "spring": 1.0, "foam": 3.0}
 RECORDED, JUDGED, MISSED, OVERSHOOT = (0.0, 1.0), (0.0, 0.5, 1.0), 99.0, 5.0
+# What is called oscillation, peak to peak in the last 2 s [deg].
+OSCILLATES = 2.0
 
 
 def cells(robots: list[str], kinds: list[str]) -> Iterator[Cell]:
@@ -79,7 +80,7 @@ def controller_cell(cell: Cell) -> dict[str, Any]:
 
     def run(reference: Any, duration: float, kg: float, gain: float = 1.0) -> LoopResult:
         sensed = Sensed(ForeignNeck(name=cell.robot, seed=cell.seed).block(noise_seed=cell.seed + 7))
-        plant: Any = sensed if gain == 1.0 else Louder(sensed, gain)
+        plant: Any = sensed if gain == 1.0 else _Louder(sensed, gain)
         given = AheadReference(reference, PREVIEW) if "/" in cell.kind else reference
         return run_loop(Loop(plant=plant, controller=BlockPart(controller.block()), reference=given,
                              observer=BlockPart(has["observer"].block()) if observed else None, duration=duration,
@@ -111,3 +112,35 @@ def _distance(result: LoopResult, lead: int) -> float:
     wanted = np.array([circle(t)[:2] for t in result.time[late - lead]])
     errors = np.column_stack([result[axis] for axis in ("pitch", "roll")])[late] - wanted
     return float(np.degrees(np.sqrt(np.mean(errors**2, axis=0)).max()))
+
+
+class _Louder:
+    """A plant whose tilt answers `gain` times as much: the tilt in the set-points is multiplied, their mean is not.
+
+    The motors that it shows are those of the set-points it was given: to a controller they follow as ever.
+    """
+
+    def __init__(self, plant: Part, gain: float) -> None:
+        """Wrap `plant`."""
+        self.inputs, self.outputs, self.role = plant.inputs, plant.outputs, plant.role
+        self.sample_time = plant.sample_time
+        self._plant, self._gain = plant, gain
+        names = [port.name for port in plant.outputs]
+        self._motors = [names.index(f"motor_position_{j}") for j in (1, 2, 3)]
+        self.close = plant.close
+
+    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
+        """Begin a run."""
+        return self._shown(self._plant.start(time, parameters))
+
+    def advance(self, time: float, inputs: Vector) -> Vector:
+        """Step once."""
+        mean = inputs[:3].mean()
+        return self._shown(
+            self._plant.advance(time, np.concatenate([mean + self._gain * (inputs[:3] - mean), inputs[3:]]))
+        )
+
+    def _shown(self, outputs: Vector) -> Vector:
+        motors = outputs[self._motors]
+        outputs[self._motors] = motors.mean() + (motors - motors.mean()) / self._gain
+        return outputs

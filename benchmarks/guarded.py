@@ -81,7 +81,7 @@ def of_auto(neck: str, kinds: list[str]) -> None:
     for kind in kinds:
         begin = time.process_time()
         race.whole(kind)
-        race.train_linear(race.guarded(race.tried[kind], silent))
+        race.train_other(race.guarded(race.tried[kind], silent))
         seconds = screened + time.process_time() - begin
         models = {"guarded": race.tried["guarded"].model, "alone": race.tried[kind].model}
         print(f"{neck} {kind}: {seconds:.1f} s of processor time, {screened:.1f} of them to compare all kinds")

@@ -96,7 +96,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
     parser.add_argument("--fresh", action="store_true", help="choose again; the baseline stays")
     wanted = parser.parse_args()
-    jobs = [Job("models", neck, kind, wanted.seed) for neck in wanted.necks for kind in KINDS]
+    jobs = [Job(neck, kind, wanted.seed) for neck in wanted.necks for kind in KINDS]
     truths = {
         job: _least(np.ravel(found["fits"]).tolist())
         for job, found in compute(jobs, wanted.workers, fresh=False).items()
