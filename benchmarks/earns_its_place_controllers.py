@@ -1,7 +1,7 @@
 """The controllers of `earns_its_place.py`: kind by foreign neck, judged on the neck itself, also at a payload unseen.
 
-Of each specimen 80 s of Eq. 22 with 0 and 1 kg around the co-contraction that its tendons want: a family, a line of
-each payload, and a grey box of both, over which `mpc`, `nmpc` and `switched` have an observer. Kinds have their
+Of each specimen 80 s of Eq. 22 with 0 and 1 kg around the co-contraction that its tendons want: a family, a line
+of 0 kg for `adaptive`, and a grey box of both, over which `mpc` and `nmpc` have an observer. Kinds have their
 defaults, and hold that co-contraction. Judged with 0, 0.5 and 1 kg by what a noisy sensor measures: steps of 10 deg
 of pitch and of roll, a circle of 12 deg at 1.2 rad/s, and the step of pitch again with twice the tilt (a gain margin
 of 2). The score is the rms error of the worst circle [deg] where no step overshoots by more than 5 % and twice the
@@ -21,8 +21,8 @@ from benchmarks.earns_its_place import SEEDS, Cell
 from benchmarks.mpc_following import AT, CIRCLE_S, PREVIEW, SETTLED, STEP, STEP_S, circle
 from benchmarks.promises import Sensed
 from softneck.core import KINDS, Vector, resolve
+from softneck.core._kinds import kinds_of
 from softneck.design import MpcSettings, NmpcSettings
-from softneck.design.varying._switched import SwitchedSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import FamilySettings, GreyBox, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
@@ -30,8 +30,8 @@ from softneck.loop._reference_parts import AheadReference
 from softneck.signals import signal
 from tests.foreign_necks.necks import ForeignNeck, record_under
 
-KINDS_JUDGED = ("pi", "pid", "fopi", "hinf", "ncf", "lqg", "scheduled", "adaptive", "switched", "mpc", "mpc/preview",
-                "nmpc", "nmpc/preview")  # fmt: skip
+# What `custom` is made of is one's own.
+KINDS_JUDGED = (*(kind for kind in kinds_of("controller") if kind != "custom"), "mpc/preview", "nmpc/preview")
 # Of `benchmarks/promises.py`: the least co-contraction at which a neck with 1 kg is heard [rad].
 TAUT = {"chain": 4.0, "column": 3.0, "spring": 1.0, "foam": 3.0}
 RECORDED, JUDGED, MISSED, OVERSHOOT = (0.0, 1.0), (0.0, 0.5, 1.0), 99.0, 5.0
@@ -54,7 +54,7 @@ def known(robot: str, seed: int) -> dict[str, Any]:
         run = record_under(P, ForeignNeck(name=robot, seed=seed), load, seed=10 * seed + number)
         runs.append(run.with_channels(payload=load))
     several = GreyBox().fit(runs)
-    return {"family": FamilySettings().fit(runs), "lines": [OutputError().fit(run) for run in runs],
+    return {"family": FamilySettings().fit(runs), "line": OutputError().fit(runs[0]),
             "greybox": several, "observer": KalmanSettings().design(several)}  # fmt: skip
 
 
@@ -66,9 +66,7 @@ def designed(cell: Cell, has: dict[str, Any]) -> Any:
         return MpcSettings(preview=ahead).over(has["observer"]).design(has["family"])
     if kind == "nmpc":
         return NmpcSettings(minimum_tautness=taut, preview=ahead).over(has["observer"]).design(has["greybox"])
-    if kind == "switched":
-        return SwitchedSettings(payloads=RECORDED, least_cocontraction=taut).design(has["lines"])
-    plant = has["lines"][0] if kind == "adaptive" else has["family"]
+    plant = has["line"] if kind == "adaptive" else has["family"]
     return resolve(KINDS[kind].settings)(least_cocontraction=taut).design(plant)
 
 
@@ -76,7 +74,7 @@ def controller_cell(cell: Cell) -> dict[str, Any]:
     """Return the worst of what the neck does over all payloads."""
     has = known(cell.robot, cell.seed)
     controller = designed(cell, has)
-    observed = cell.kind.partition("/")[0] in ("mpc", "nmpc", "switched")
+    observed = cell.kind.partition("/")[0] in ("mpc", "nmpc")
 
     def run(reference: Any, duration: float, kg: float, gain: float = 1.0) -> LoopResult:
         sensed = Sensed(ForeignNeck(name=cell.robot, seed=cell.seed).block(noise_seed=cell.seed + 7))
