@@ -17,7 +17,6 @@ from .running._deploy import run_on_bus as run_on_bus
 from .running._deploy import run_simulated as run_simulated
 from .running._preflight import preflight as preflight
 from .running._scan import scan as scan
-from .running._snapshot import Snapshots as Snapshots
 from .running._stop import reset as reset
 from .running._stop import stop as stop
 from .running._virtual import simulated_neck as simulated_neck

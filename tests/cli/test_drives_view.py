@@ -4,58 +4,57 @@ from __future__ import annotations
 
 import contextlib
 import io
-import itertools
+import json
 import math
 import os
 import subprocess
 import sys
 import threading
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console, RenderableType
 
 from softneck.cli.drives._screen import from_line
-from softneck.cli.drives._view import LiveView, live_view, to_line
+from softneck.cli.drives._view import LiveView, live_view, picture_of
+from softneck.cosim import load_loop
+from softneck.drives import default_drives, prepare, run_simulated
+from softneck.drives.bus._link import VirtualLink
 from softneck.drives.logs._times import CycleFigures, CycleTimes
-from softneck.drives.master import Event, Phase
-from softneck.drives.master._cia301 import NodeState
-from softneck.drives.master._cia402 import DriveState
-from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
+from softneck.drives.master import Event, Master
+from softneck.drives.running._virtual import recorded
+
+from ..drives.bench import Bench
+from ..drives.conftest import STEP, Project
+from ..drives.conftest import project as project  # the fixture
 
 DEG = math.pi / 180.0
 
 
-def _snapshot() -> Snapshot:
-    drives = tuple(DriveSnapshot(node, DriveState.ENABLED, NodeState.OPERATIONAL, 0x1237, 0, 0) for node in (1, 2, 3))
-    return Snapshot(
-        time=103.5,
-        cycle=350,
-        phase=Phase.RUNNING,
-        index=75,
-        references=(15.0 * DEG, -3.0 * DEG, 0.1),
-        angles=(14.25 * DEG, -2.5 * DEG),
-        estimates=(14.5 * DEG, -2.75 * DEG),
-        setpoints=(1.5, -0.75, -0.625),
-        positions=(1.25, -0.7, -0.6),
-        tensions=(6.0, 1.25, 11.5),
-        drives=drives,
-        events=(Event(102.0, "late_cycle"),),
-        counts={"late_cycle": 4, "clamped": 17},
-        fault=None,
-        period=0.01,
-        sample_time=0.02,
-        tension_limit=12.0,
-    )
+def _drive(node: int, **changes: Any) -> dict[str, Any]:
+    return {"node": node, "state": "enabled", "state_style": "green", "nmt": "operational", "nmt_style": "none",
+            "word": 0x1237, "silent": 0, "emergency": 0, **changes}  # fmt: skip
 
 
-def _text(snapshot: Snapshot, times: CycleFigures | None = None) -> str:
-    return _drawn(render(snapshot, times or CycleFigures(), begin=100.0, title="pi.npz", duration=4.0))
+def _picture(**changes: Any) -> dict[str, Any]:
+    return {
+        "title": "pi.npz", "duration": 4.0, "phase": "running", "phase_style": "bold green", "run_time": 1.5,
+        "since": 3.5, "cycle": 350, "fault": None, "outputs": ["pitch", "roll"], "validity": math.nan,
+        "angles": [(15.0 * DEG, 14.25 * DEG, 14.5 * DEG), (-3.0 * DEG, -2.5 * DEG, -2.75 * DEG)],
+        "motors": [(1.5, 1.25, 6.0), (-0.75, -0.7, 1.25), (-0.625, -0.6, 11.5)], "tension_limit": 12.0,
+        "drives": [_drive(node) for node in (1, 2, 3)], "times": "-", "cycles": 0, "period": 0.01,
+        "events": [(2.0, "late_cycle", "a cycle came late", False)], "counts": {"late_cycle": 4, "clamped": 17},
+        **changes,
+    }  # fmt: skip
 
 
-def render(snapshot: Snapshot, times: CycleFigures, *, size: tuple[int, int] = (104, 32), **more) -> RenderableType:
-    return from_line(to_line(snapshot, times, **more), size)
+def render(picture: dict[str, Any], size: tuple[int, int] = (104, 32)) -> RenderableType:
+    return from_line(json.dumps(picture).encode(), size)
+
+
+def _text(picture: dict[str, Any]) -> str:
+    return _drawn(render(picture))
 
 
 def _drawn(what: RenderableType, width: int = 100) -> str:
@@ -65,10 +64,9 @@ def _drawn(what: RenderableType, width: int = 100) -> str:
 
 
 def test_everything_is_on_the_screen() -> None:
-    text = _text(_snapshot(), CycleFigures(0.010, 0.0125, 0.014, 101))
+    text = _text(_picture(times=str(CycleFigures(0.010, 0.0125, 0.014, 101)), cycles=101))
     lines = [" ".join(line.strip("│ ").split()) for line in text.splitlines()]
     assert "pi.npz" in lines[0]
-    # Sample 75 of 0.02 s; begun at 100 s of the clock.
     assert "running loop 1.50 of 4.0 s since start 3.50 s bus cycle 350 validity -" in lines
     # The units are there: rich would take [deg] in a string for markup.
     assert "angle [deg] reference measured estimate error" in lines
@@ -88,13 +86,11 @@ def test_everything_is_on_the_screen() -> None:
 
 
 def test_a_fault_is_named_and_what_is_not_known_is_a_dash() -> None:
-    fault = Event(103.4, "emergency", 2, "code 2310h")
-    one, two, three = _snapshot().drives
-    faulty = replace(two, state=DriveState.FAULT, emergency=0x2310, silent=3)
-    unknown = math.nan
-    stopped = replace(_snapshot(), phase=Phase.STOPPED, fault=fault, events=(fault,), drives=(one, faulty, three))
-    text = _text(replace(stopped, references=(unknown,) * 3, estimates=(unknown, unknown), counts={}))
-    assert "a drive sent an emergency (node 2): code 2310h" in text
+    fault = "a drive sent an emergency (node 2): code 2310h"
+    drives = [_drive(1), _drive(2, state="fault", emergency=0x2310, silent=3), _drive(3)]
+    unknown = [(math.nan, 14.25 * DEG, math.nan), (math.nan, -2.5 * DEG, math.nan)]
+    text = _text(_picture(phase="stopped", fault=fault, events=[], drives=drives, angles=unknown, counts={}))
+    assert fault in text
     assert any(line.strip("│ ").split() == ["node", "2", "fault", "operational", "1237h", "3", "2310h"]
                for line in text.splitlines())  # fmt: skip
     assert "counts  none" in text
@@ -103,12 +99,12 @@ def test_a_fault_is_named_and_what_is_not_known_is_a_dash() -> None:
 
 
 def test_a_small_terminal_shows_all_of_it() -> None:
-    fault = Event(103.4, "emergency", 2, "code 2310h")
-    one, two, three = _snapshot().drives
-    drives = (one, replace(two, nmt=NodeState.PRE_OPERATIONAL, state=DriveState.SWITCHED_ON), three)
-    full = replace(_snapshot(), fault=fault, events=(fault,) * 5, drives=drives)
-    assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 31
-    drawn = _drawn(render(full, CycleFigures(0.010, 0.0125, 0.014, 1000), begin=100.0, size=(80, 24)), 80)
+    fault = "a drive sent an emergency (node 2): code 2310h"
+    drives = [_drive(1), _drive(2, nmt="pre operational", state="switched on"), _drive(3)]
+    full = _picture(fault=fault, events=[(3.4, "emergency", fault, True)] * 5, drives=drives)
+    assert len(_drawn(render(full), 104).splitlines()) <= 31
+    figures = CycleFigures(0.010, 0.0125, 0.014, 1000)
+    drawn = _drawn(render({**full, "times": str(figures), "cycles": 1000}, (80, 24)), 80)
     lines = drawn.splitlines()
     assert len(lines) <= 24
     assert "…" not in drawn
@@ -117,28 +113,77 @@ def test_a_small_terminal_shows_all_of_it() -> None:
     assert "node 2 switched on pre operational 1237h 0 -" in words
     assert "cycle [ms] p50 10.00 p99 12.50 max 14.00 due 10 late 4" in words
     assert sum("emergency a drive sent an emergency (node 2)" in line for line in words) == 5
-    # As high as a large one may get: nothing is cropped there either.
-    assert len(_drawn(render(full, CycleFigures(), begin=100.0), 104).splitlines()) <= 32
 
 
 @pytest.mark.parametrize("size", [(80, 24), (104, 32)])
 def test_what_the_supervisor_says_fits_in_two_lines(size: tuple[int, int]) -> None:
     """It is the longest; a loop of two minutes has the longest head."""
-    fault = Event(103.4, "gear_wrong", 1, "motor 1: the tilt moves as if the winch turned 0.5 times as far")
-    full = replace(_snapshot(), fault=fault, events=(fault,) * 5, index=6000, phase=Phase.STOPPING)
-    lines = _drawn(render(full, CycleFigures(), begin=0.0, duration=120.0, size=size), size[0]).splitlines()
+    fault = str(Event(103.4, "gear_wrong", 1, "motor 1: the tilt moves as if the winch turned 0.5 times as far"))
+    full = _picture(fault=fault, events=[(103.4, "gear_wrong", fault, True)] * 5, run_time=120.0, since=123.5,
+                    duration=120.0, phase="stopping")  # fmt: skip
+    lines = _drawn(render(full, size), size[0]).splitlines()
     assert len(lines) <= size[1]
     assert lines[-1].startswith("╰")
     said = " ".join(line.strip("│ ") for line in lines)
-    assert str(fault) in said
+    assert fault in said
 
 
-def test_a_picture_is_one_line_and_markup_in_it_is_text() -> None:
-    fault = Event(103.4, "emergency", 2, "code 2310h")
-    stopped = replace(_snapshot(), phase=Phase.STOPPED, fault=fault, estimates=(math.nan, math.nan))
-    line = to_line(stopped, CycleFigures(), title="pi [1].npz")
-    assert line.count(b"\n") == 1
-    assert "pi [1].npz" in _drawn(from_line(line))
+def test_markup_in_a_picture_is_text() -> None:
+    assert "pi [1].npz" in _text(_picture(title="pi [1].npz"))
+
+
+def test_a_watched_run_sends_the_same_frames_and_is_shown_as_it_is(project: Project) -> None:
+    setup = load_loop(project.write_loop("short.toml", STEP, 2.0))
+    runs = []
+    for watched in (False, True):
+        frames: list[Any] = []
+        seen: list[tuple[int, dict[str, Any]]] = []
+        times = CycleTimes(0.01)
+
+        def watch(now: float, _in: Any, _out: Any, _tilt: Any, master: Master, seen=seen, times=times) -> None:
+            seen.append((master.index, json.loads(json.dumps(picture_of(master, now, times)))))
+
+        def record(link: VirtualLink, frames=frames) -> None:
+            if not frames:
+                frames.append(recorded(link))
+
+        result = run_simulated(prepare(setup, project.controller), default_drives(), hook=record,
+                               watches=(watch,) if watched else ())  # fmt: skip
+        runs.append((result, frames[0], seen))
+    (plain, frames, _), (result, watched_frames, seen) = runs
+    assert watched_frames == frames
+    assert len(frames) > 5000
+    for name, values in plain.signals.signals.items():
+        np.testing.assert_array_equal(values, result.signals[name])
+    assert [picture["cycle"] for _, picture in seen] == list(range(1, result.cycles + 1))
+    # What it shows while the loop runs is what the run's own log has.
+    rows = {index: picture for index, picture in seen if picture["phase"] == "running" and index >= 0}
+    last, log = [rows[i] for i in range(len(result.signals.time))], result.signals
+    for k, axis in enumerate(("pitch", "roll")):
+        for column, name in enumerate(("reference", "measured", "estimate")):
+            shown = [picture["angles"][k][column] for picture in last]
+            np.testing.assert_array_equal(shown, log[f"{axis}_{name}"])
+    assert last[-1]["run_time"] == log.time[-1]
+    end = seen[-1][1]
+    assert (end["phase"], end["counts"]) == ("done", dict(result.counts))
+    assert math.isnan(end["angles"][0][0])
+    assert [event[2] for event in end["events"]] == [str(event) for event in result.events[-5:]]
+
+
+def test_a_picture_does_not_change_with_the_run_and_tells_a_fault() -> None:
+    bench, times = Bench().start(), CycleTimes(0.01)
+    before = picture_of(bench.master, bench.now, times)
+    kept = repr(before)
+    # This pilot has no named signals: nothing is made up.
+    assert all(math.isnan(row[0]) and math.isnan(row[2]) for row in before["angles"])
+    assert [(drive["state"], drive["nmt"]) for drive in before["drives"]] == [("enabled", "operational")] * 3
+    bench.master.stop("enough")
+    bench.finish()
+    after = picture_of(bench.master, bench.now, times)
+    assert repr(before) == kept
+    assert (after["phase"], after["counts"]["operator"]) == ("stopped", 1)
+    assert "enough" in after["fault"]
+    assert all(drive["state"] != "enabled" for drive in after["drives"])
 
 
 def test_the_drawing_process_imports_nothing_of_the_drives() -> None:
@@ -149,34 +194,17 @@ def test_the_drawing_process_imports_nothing_of_the_drives() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_the_newest_snapshot_and_the_last_thousand_cycles_count() -> None:
-    # 600 cycles of 20 ms, then 990 of 10 ms and ten of 14 ms: percentiles of the last 1000 by hand.
-    gaps = [0.02] * 600 + [0.01] * 989 + [0.014] * 11
-    ticks = iter([0.0, *itertools.accumulate(gaps)])
+def test_eight_pictures_a_second_and_the_cycles_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    ticks = iter(0.01 * k for k in range(1000))
     view = LiveView(title="pi.npz", clock=lambda: next(ticks))
-    assert view.line() is None
-    for k in range(1601):
-        view.show(replace(_snapshot(), cycle=k))
-    line = view.line()
-    assert line is not None
-    text = _drawn(from_line(line))
-    assert "bus cycle 1600" in text
-    assert "p50 10.00   p99 14.00   max 14.00   (of 1000 cycles" in text
-
-
-def test_the_figures_of_the_view_and_of_the_result_agree() -> None:
-    times, now = CycleTimes(0.01), 0.0
-    gaps = np.random.default_rng(0).uniform(0.009, 0.013, 900)
-    times.take(now, 0.001)
-    for gap in gaps:
-        now += gap
-        times.take(now, 0.001)
-    whole, some = times.figures(), CycleFigures.of(gaps)
-    # The histogram has bins of 10 us, and both take the sample next to the quantile: 900 samples over 4 ms.
-    np.testing.assert_allclose(whole[:3], some[:3], rtol=0, atol=2.5e-5)
-    assert whole.number == some.number == 900
-    assert math.isnan(CycleTimes(0.01).figures().p50)
-    assert CycleFigures.of(gaps[:0]).number == 0
+    drawn: list[str] = []
+    monkeypatch.setattr(view, "_draw", lambda: drawn.append(str(view._times and view._times.count)))
+    for _ in range(200):
+        view.watch(bench.now, (), (), None, bench.master)
+    # At 0.00, 0.13, 0.26, ... s of the wall clock: the first of each eighth of a second.
+    assert len(drawn) == 16
+    assert drawn[:2] == ["0", "13"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")
@@ -192,14 +220,16 @@ def test_the_last_picture_is_on_the_terminal_and_a_dead_screen_does_no_harm() ->
 
     reader = threading.Thread(target=read)
     reader.start()
+    bench = Bench()
     with LiveView(title="pi.npz", terminal=there) as view:
-        for k in range(8):
-            view.show(replace(_snapshot(), cycle=k))
+        bench.run.watches = (view.watch,)
+        for _ in range(7):
+            bench.step()
     with LiveView(title="pi.npz", terminal=there) as view:
         assert view._screen is not None
         view._screen.kill()
         view._screen.wait()
-        view.show(_snapshot())
+        view.watch(bench.now, (), (), None, bench.master)
     os.close(there)
     reader.join(10.0)
     os.close(here)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import itertools
 import math
@@ -18,7 +17,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.drives import Snapshots
 from softneck.drives.logs._times import CycleTimes
 from softneck.drives.running import _timing as timing
 from softneck.drives.running._notify import Notifier
@@ -270,31 +268,3 @@ def test_nothing_was_measured_without_a_period() -> None:
             "cycles": 0, "late": 0, "missed": 0, "missed_share": 0.0, "p50_s": 0.0, "p99_s": 0.0, "longest_s": 0.0,
             "longest_step_s": 0.0,
         }  # fmt: skip
-
-
-# -- snapshots --------------------------------------------------------------------------------------------------------
-
-
-def test_a_snapshot_is_frozen_and_no_later_step_changes_it() -> None:
-    bench, taker = Bench().start(), Snapshots()
-    bench.pass_time(0.5)
-    taken = taker.take(bench.master, bench.now)
-    kept = repr(taken)
-    bench.neck.drives[0].axis.trip(0x2310)
-    bench.pass_time(0.5)
-    assert repr(taken) == kept
-    after = taker.take(bench.master, bench.now)
-    assert (taken.fault, after.fault is not None) == (None, True)
-    assert sum(after.counts.values()) > sum(taken.counts.values())
-    with pytest.raises(dataclasses.FrozenInstanceError, match="cannot assign"):
-        taken.cycle = 0  # type: ignore[misc]
-
-
-def test_taking_a_snapshot_changes_nothing_and_two_takers_see_the_same() -> None:
-    bench = Bench().start()
-    bench.pass_time(0.5)
-    one, other = Snapshots(), Snapshots()
-    first = one.take(bench.master, bench.now)
-    assert repr(first) == repr(one.take(bench.master, bench.now)) == repr(other.take(bench.master, bench.now))
-    assert len(first.events) <= 5
-    assert list(first.events) == list(bench.master.events)[-len(first.events) :] if first.events else True

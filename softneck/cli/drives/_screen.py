@@ -29,7 +29,7 @@ def render(picture: dict[str, Any], size: tuple[int, int] = (_WIDE, _HIGH)) -> R
     """Return a panel with all of `picture`.
 
     Args:
-        picture: what `to_line` wrote.
+        picture: what `picture_of` returns, with title and duration.
         size: columns and lines of the terminal; on 80 x 24 columns move together and empty lines are left out.
     """
     from rich.console import Group
@@ -172,7 +172,7 @@ def _number(value: float, form: str) -> str:
 
 
 def from_line(line: bytes, size: tuple[int, int] = (_WIDE, _HIGH)) -> RenderableType:
-    """Return what is drawn of a line of `to_line` on a terminal of `size`."""
+    """Return what is drawn of a line of `LiveView` on a terminal of `size`."""
     return render(json.loads(line), size)
 
 

@@ -1,9 +1,8 @@
-"""The live terminal view of a drives run: the loop leaves a snapshot per cycle, another process draws the newest.
+"""The live terminal view of a drives run: eight pictures a second of numbers and words, which another process draws.
 
-Between the two a thread wakes eight times a second and writes one line to the other process. The control loop itself
-takes no lock and waits for nothing; a view that is slow, stopped or dead holds up no cycle. The line holds numbers and
-words only, so that the drawing process imports no more than rich: importing the drives costs seconds of processor time,
-just when a run begins.
+A thread writes the newest picture to that process. The control loop takes no lock and waits for nothing; a view that is
+slow, stopped or dead holds up no cycle. A picture holds numbers and words only, so that the drawing process imports no
+more than rich: importing the drives costs seconds of processor time, just when a run begins.
 """
 
 from __future__ import annotations
@@ -17,93 +16,96 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from softneck.core import Vector
+from softneck.drives.logs._times import CycleTimes
 from softneck.drives.master import Phase
+from softneck.drives.master._cia301 import NodeState
 from softneck.drives.master._cia402 import DriveState
+from softneck.drives.master._events import Reaction
 
 if TYPE_CHECKING:
-    from softneck.drives.logs._times import CycleFigures
     from softneck.drives.master import Frame, Master, Tilt
+    from softneck.drives.master._fieldbus import DriveView
     from softneck.drives.master._gate import Reading
-    from softneck.drives.running._snapshot import DriveSnapshot, Snapshot
     from softneck.drives.running._virtual import Watch
 
 _PHASES = {Phase.RUNNING: "bold green", Phase.DONE: "bold green", Phase.STOPPING: "bold red", Phase.STOPPED: "bold red",
            Phase.RETREAT: "bold yellow"}  # fmt: skip
 _BAD = (DriveState.FAULT, DriveState.REACTION, DriveState.QUICK_STOP)
-
-
-def to_line(
-    snapshot: Snapshot, times: CycleFigures, *, begin: float = 0.0, title: str = "", duration: float | None = None
-) -> bytes:
-    """Return a picture as a line.
-
-    Args:
-        snapshot: of one bus cycle.
-        times: of the last bus cycles.
-        begin: time of the run's first snapshot [s].
-        title: what runs.
-        duration: of the loop [s].
-    """
-    from softneck.drives.master._events import Reaction
-
-    picture: dict[str, Any] = {
-        "title": title,
-        "phase": str(snapshot.phase),
-        "phase_style": _PHASES.get(snapshot.phase, "bold"),
-        "run_time": snapshot.run_time,
-        "duration": duration,
-        "since": snapshot.time - begin,
-        "cycle": snapshot.cycle,
-        "fault": None if snapshot.fault is None else str(snapshot.fault),
-        "outputs": list(snapshot.outputs),
-        "validity": snapshot.validity,
-        "angles": list(zip(snapshot.references[:-1], snapshot.angles, snapshot.estimates, strict=True)),
-        "motors": list(zip(snapshot.setpoints, snapshot.positions, snapshot.tensions, strict=True)),
-        "tension_limit": snapshot.tension_limit,
-        "drives": [_drive(drive) for drive in snapshot.drives],
-        "times": str(times) if times.number else "-",
-        "cycles": times.number,
-        "period": snapshot.period,
-        "events": [
-            (event.time - begin, event.name, str(event), event.rule.reaction in (Reaction.STOP, Reaction.RETREAT))
-            for event in snapshot.events
-        ],
-        "counts": dict(snapshot.counts),
-    }
-    return json.dumps(picture).encode() + b"\n"
-
-
-def _drive(drive: DriveSnapshot) -> dict[str, Any]:
-    from softneck.drives.master._cia301 import NodeState
-
-    good = drive.state is DriveState.ENABLED
-    return {
-        "node": drive.node,
-        "state": drive.state.name.lower().replace("_", " "),
-        "state_style": "bold red" if drive.state in _BAD else "green" if good else "yellow",
-        "nmt": drive.nmt.name.lower().replace("_", " "),
-        "nmt_style": "none" if drive.nmt is NodeState.OPERATIONAL else "yellow",
-        "word": drive.word,
-        "silent": drive.silent,
-        "emergency": drive.emergency,
-    }
-
-
 _PERIOD = 1.0 / 8.0
-# Percentiles are of so many of the last bus cycles: 10 s at 100 Hz.
-_CYCLES = 1000
+# So many of the last events are shown.
+_EVENTS = 5
 # At the end of a run the drawing process gets this long for its last picture (it may still be starting) [s].
 _PATIENCE = 10.0
 
 
+def picture_of(master: Master, now: float, times: CycleTimes, *, begin: float = 0.0) -> dict[str, Any]:
+    """Return what there is to see of `master` after its step at `now` [s], in numbers and words.
+
+    Args:
+        master: of the run; it is read only.
+        now: on its clock [s].
+        times: of the cycles so far.
+        begin: when the run began [s].
+    """
+    phase, fault, settings, tilt = master.supervisor.phase, master.supervisor.fault, master.settings, master.tilt
+    count = len(settings.outputs)
+    references, estimates, validity = _signals(master)
+    figures = times.figures()
+    # A deque is indexed in constant time at its ends only; copying all of it would take longer with each event.
+    events = [master.events[i] for i in range(-min(_EVENTS, len(master.events)), 0)]
+    return {
+        "phase": str(phase),
+        "phase_style": _PHASES.get(phase, "bold"),
+        "run_time": max(0, master.index) * settings.sample_cycles * settings.bus.cycle,
+        "since": now - begin,
+        "cycle": master.cycle,
+        "fault": None if fault is None else str(fault),
+        "outputs": list(settings.outputs),
+        "validity": validity,
+        "angles": list(zip(references, tilt.values if tilt else (math.nan,) * count, estimates, strict=True)),
+        "motors": list(zip(master.setpoints, master.positions, master.tensions, strict=True)),
+        "tension_limit": settings.limits.tension,
+        "drives": [_drive(view) for view in master.bus.drives],
+        "times": str(figures) if figures.number else "-",
+        "cycles": figures.number,
+        "period": settings.bus.cycle,
+        "events": [
+            (event.time - begin, event.name, str(event), event.rule.reaction in (Reaction.STOP, Reaction.RETREAT))
+            for event in events
+        ],
+        "counts": dict(master.counts),
+    }
+
+
+def _signals(master: Master) -> tuple[Sequence[float], Sequence[float], float]:
+    """Return references and estimates of the outputs [rad], and the model's validity; NaN for what there is not."""
+    from softneck.drives.running._pilot import LoopPilot
+
+    pilot, outputs = master.pilot, master.settings.outputs
+    # Beyond the run they would be the last ones, and say something that nobody asks for any more.
+    if not isinstance(pilot, LoopPilot) or master.index < 0 or master.supervisor.phase is not Phase.RUNNING:
+        return (math.nan,) * len(outputs), (math.nan,) * len(outputs), math.nan
+    return pilot.reference, [pilot.value(f"observer.{name}") for name in outputs], pilot.validity
+
+
+def _drive(view: DriveView) -> dict[str, Any]:
+    good = view.state is DriveState.ENABLED
+    return {
+        "node": view.node,
+        "state": view.state.name.lower().replace("_", " "),
+        "state_style": "bold red" if view.state in _BAD else "green" if good else "yellow",
+        "nmt": view.nmt.name.lower().replace("_", " "),
+        "nmt_style": "none" if view.nmt is NodeState.OPERATIONAL else "yellow",
+        "word": view.word,
+        "silent": view.silent,
+        "emergency": view.emergencies[-1][1] if view.emergencies else 0,
+    }
+
+
 class LiveView:
-    """Shows the newest snapshot eight times a second while it is open; the last picture stays."""
+    """Shows a picture of a run eight times a second while it is open; the last one stays."""
 
     def __init__(
         self,
@@ -114,14 +116,12 @@ class LiveView:
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         """Prepare; `duration` [s] is the loop's, `terminal` a file descriptor (default: standard error)."""
-        from softneck.drives import Snapshots
-
-        self._title, self._duration, self._terminal, self._clock = title, duration, terminal, clock
-        self._snapshots = Snapshots()
-        self._newest: Snapshot | None = None
-        self._begin, self._before = math.nan, math.nan
-        self._gaps: Vector = np.zeros(_CYCLES)
-        self._shown = 0
+        self._about = {"title": title, "duration": duration}
+        self._terminal, self._clock = terminal, clock
+        self._times: CycleTimes | None = None
+        self._last: tuple[Master, float] | None = None
+        self._begin, self._drawn = math.nan, -math.inf
+        self._line: bytes | None = None
         self._over = threading.Event()
         self._thread: threading.Thread | None = None
         self._screen: subprocess.Popen[bytes] | None = None
@@ -141,13 +141,12 @@ class LiveView:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Draw a last time and leave that on the terminal."""
-        self._over.set()
         if self._screen is None or self._thread is None:
             return
+        self._draw()
+        self._over.set()
         try:
             self._screen.wait(_PATIENCE)
         except subprocess.TimeoutExpired:
@@ -159,30 +158,20 @@ class LiveView:
         self, now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | Reading | None, master: Master
     ) -> None:
         """Look at `master` after its cycle at `now` [s]; one of the `watches` of a run."""
-        self.show(self._snapshots.take(master, now))
+        if self._times is None:
+            self._times, self._begin = CycleTimes(master.settings.bus.cycle), now
+        wall = self._clock()
+        self._times.take(wall, 0.0)
+        self._last = (master, now)
+        if wall - self._drawn >= _PERIOD:
+            self._drawn = wall
+            self._draw()
 
-    def show(self, snapshot: Snapshot) -> None:
-        """Make `snapshot` the newest, and count the time since the last one as a cycle."""
-        now = self._clock()
-        if self._newest is None:
-            self._begin = snapshot.time
-        else:
-            self._gaps[self._shown % _CYCLES] = now - self._before
-            self._shown += 1
-        self._before = now
-        self._newest = snapshot
-
-    def line(self) -> bytes | None:
-        """Return what the drawing process gets now; None before the first snapshot."""
-        newest = self._newest
-        if newest is None:
-            return None
-        return to_line(newest, self._times(), begin=self._begin, title=self._title, duration=self._duration)
-
-    def _times(self) -> CycleFigures:
-        from softneck.drives.logs._times import CycleFigures
-
-        return CycleFigures.of(self._gaps[: min(self._shown, _CYCLES)].copy())
+    def _draw(self) -> None:
+        """Make a line of what was seen last."""
+        if self._last is not None and self._times is not None:
+            picture = picture_of(*self._last, self._times, begin=self._begin)
+            self._line = json.dumps({**self._about, **picture}).encode() + b"\n"
 
     def _feed(self, screen: subprocess.Popen[bytes]) -> None:
         # A process that draws no more ends the view, not the run.
@@ -190,7 +179,7 @@ class LiveView:
             over = False
             while not over:
                 over = self._over.wait(_PERIOD)
-                line = self.line()
+                line = self._line
                 if line is not None and screen.stdin is not None:
                     screen.stdin.write(line)
                     screen.stdin.flush()

@@ -5,10 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
-from softneck.core import Vector
-
 # 10 us a bin, up to 200 ms; what is longer falls into the last.
 _BIN = 1e-5
 _BINS = 20_000
@@ -26,14 +22,6 @@ class CycleFigures(NamedTuple):
     p99: float = math.nan
     longest: float = math.nan
     number: int = 0
-
-    @classmethod
-    def of(cls, periods: Vector) -> CycleFigures:
-        """Return those of some periods, (number,) [s]."""
-        if not len(periods):
-            return cls()
-        middle, high = np.percentile(periods, (50, 99)).tolist()
-        return cls(middle, high, float(periods.max()), len(periods))
 
     def __str__(self) -> str:
         """In ms."""

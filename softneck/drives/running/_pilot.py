@@ -28,7 +28,6 @@ class LoopPilot:
     """The parts of a loop but its plant, which is hardware here.
 
     Attributes:
-        columns: names of what `row` returns.
         robot: whose motors and outputs they are.
     """
 
@@ -79,7 +78,6 @@ class LoopPilot:
         self._rows = round(loop.duration / self.sample_time)
         self._running = self._begun({})
         self._asked = [self.slot("reference", f"{name}_reference") for name in robot.outputs.names]
-        self.columns = tuple(dict.fromkeys(f"{item.part}.{item.port.name}" for item in wiring.named))
 
     def start(self) -> None:
         """Start all parts but the plant."""
