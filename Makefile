@@ -8,7 +8,7 @@ README_VENV := .venv-readme
 .PHONY: demo test slow check docs documents benchmark conformance mutate native wheel tag constraints nightly nightly-tests nightly-documents nightly-fuzz nightly-fmu nightly-can nightly-systemd clean
 
 demo: $(VENV)/.installed
-	$(BIN)/softneck demo --out build/demo
+	$(BIN)/softneck demo -o build/demo
 
 # Run the blocks of README and of the pages as a newcomer does: installed from the checkout without tests' packages.
 # `PAGES="--page docs/howto/loops.md"` runs one.
@@ -104,7 +104,7 @@ $(VENV)/.installed: pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade "pip>=25.1"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[drives]'
-	$(BIN)/softneck doctor --compile
+	$(BIN)/softneck doctor
 	@touch $@
 
 $(VENV)/.tested: $(VENV)/.installed

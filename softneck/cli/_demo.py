@@ -16,12 +16,18 @@ if TYPE_CHECKING:
     from softneck.report._demo import Demo
 
 
-@click.command("demo", epilog="Example: softneck demo --out build/demo --quick")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for all results. [default: build/demo]")
+@click.command("demo", epilog="Example: softneck demo -o build/demo --quick")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="Folder for all results. [default: build/demo]",
+)
 @click.option("--quick", is_flag=True, help="A shorter experiment and less training: under 30 s.")
 @force_option
 @json_option
-def command(out: Path | None, quick: bool, force: bool, as_json: bool) -> None:
+def command(output: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     """Run the main job: experiment, models, FMUs, controller, closed loop, report.
 
     Records the paper's experiment on the virtual neck, identifies RLS, set membership and a network, judges them
@@ -29,7 +35,7 @@ def command(out: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     """
     from softneck.report import DemoSettings, run_demo
 
-    folder = out or Path("build/demo")
+    folder = output or Path("build/demo")
     _refuse_foreign(folder, force=force)
     settings = DemoSettings.quick(folder) if quick else DemoSettings(out=folder)
     if quick and not as_json:

@@ -34,7 +34,6 @@ _LEAST_FIT = 30.0
 @click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
 @output_option("controller", "CONTROLLER")
 @click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")
-@click.option("--mat", type=click.Path(path_type=Path), metavar="FILE.mat", help="Write it for MATLAB as well.")
 @click.option(
     "--observer", type=click.Path(path_type=Path), metavar="OBSERVER",
     help="Of the loop: `mpc` and `nmpc` plan without the delay that it makes up for, and `mpc` with tendons as taut as "
@@ -49,7 +48,6 @@ def command(
     models: tuple[Path, ...],
     output: Path | None,
     any_fit: bool,
-    mat: Path | None,
     observer: Path | None,
     robot: str | None,
     settings: tuple[str, ...],
@@ -60,9 +58,6 @@ def command(
     entry = find_kind(kind, "controller")
     path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    if mat is not None:
-        target(mat, "", force=force, ending=".mat")
-        refuse_existing(mat, force=force)
     plants = [_linear(model, robot, any_fit=any_fit) for model in models]
     asked = apply_settings(resolve(entry.settings), settings)
     if observer is not None:
@@ -72,10 +67,6 @@ def command(
     with progress(f"design {kind}", quiet=as_json):
         controller = asked.design(plants[0] if len(plants) == 1 else plants)
     controller.save(path, force=replace)
-    if mat is not None:
-        if not hasattr(controller, "to_mat"):
-            raise SettingsError(f"a controller of kind {kind} is not linear and cannot be written to a MAT file.")
-        controller.to_mat(mat, force=force)
     for model, plant in zip(models, plants, strict=True):
         if "hold_out" not in getattr(plant, "findings", {"hold_out": None}):
             note(f"warning: {model}: nothing was held out when it was identified: its fit is not known")

@@ -9,15 +9,11 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from importlib import metadata
-from pathlib import Path
 
 import click
 
-from softneck.core import silent
-
-from .shared._console import print_json, print_table, progress
+from .shared._console import print_json, print_table
 from .shared._options import json_option
 
 # Extra -> the module it brings, and what for.
@@ -29,12 +25,9 @@ _EXTRAS = {
 
 
 @click.command("doctor", epilog="Example: softneck doctor --json")
-@click.option("--compile", "compile_now", is_flag=True, help="Compile the models' code now.")
 @json_option
-def command(compile_now: bool, as_json: bool) -> None:
+def command(as_json: bool) -> None:
     """Say which parts of this machine work: packages, compilers, FMU platforms, CAN, extras."""
-    if compile_now:
-        _compile(quiet=as_json)
     checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]
     bad = [check for check in checks if check["state"] == "missing"]
     if as_json:
@@ -43,15 +36,6 @@ def command(compile_now: bool, as_json: bool) -> None:
         rows = [[check["name"], check["state"], check["detail"]] for check in checks]
         print_table("softneck doctor", ["what", "state", "detail"], rows)
     click.get_current_context().exit(1 if bad else 0)
-
-
-def _compile(*, quiet: bool) -> None:
-    """Run the shortest demo once: numba keeps what it compiled on the way."""
-    from softneck.report import DemoSettings, run_demo
-
-    with progress("compile", quiet=quiet) as report, tempfile.TemporaryDirectory() as folder:
-        settings = DemoSettings(out=Path(folder), duration=40.0, iterations=1, compare_rows=2)
-        run_demo(settings, tell=lambda what: report(0.0, what) or silent)
 
 
 def _check(name: str, state: str, detail: str) -> dict[str, str]:

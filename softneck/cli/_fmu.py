@@ -24,9 +24,8 @@ if TYPE_CHECKING:
 
 
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
-@click.argument("file", required=False)
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @output_option("FMU, or the SSP file", "X.fmu|X.ssp")
-@click.option("--all", "folder", type=click.Path(path_type=Path), help="Build an FMU from every softneck file in DIR.")
 @click.option(
     "--data",
     multiple=True,
@@ -63,11 +62,11 @@ if TYPE_CHECKING:
 @force_option
 @json_option
 def command(
-    file: str | None, output: Path | None, folder: Path | None, data: tuple[Path, ...],
+    files: tuple[str, ...], output: Path | None, data: tuple[Path, ...],
     backend: str | None, fmi: str, platforms: tuple[str, ...], sensitivities: bool, robot: str | None, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0.
+    """Package FILE as a Co-Simulation FMU of FMI 2.0 or 3.0; of several files, or of a folder, -o is a folder.
 
     FILE is a model, observer or controller (.npz), a neck parameter file (.toml), a neck preset (paper, lab, rough,
     trunk), a robot file or preset, whose virtual plant it becomes, or a loop file, from whose [reference] a reference
@@ -77,21 +76,20 @@ def command(
     """
     from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 
+    many = len(files) != 1 or Path(files[0]).is_dir()
     if output is not None and output.suffix.lower() == ".ssp":
-        if file is None or folder is not None or data or fmi != "2" or platforms or sensitivities:
+        if many or data or fmi != "2" or platforms or sensitivities:
             raise SettingsError(f"{output}: an SSP file is made of one loop file, and takes --backend only.")
-        _ssp(Path(file), output, robot, compiled=backend != "python", force=force, as_json=as_json)
+        _ssp(Path(files[0]), output, robot, compiled=backend != "python", force=force, as_json=as_json)
         return
     if backend != "compiled" and (fmi != "2" or platforms or sensitivities):
         raise SettingsError(
             "--fmi 3, --platform and --sensitivities are for compiled FMUs only; add `--backend compiled`."
         )
     origin = ""
-    jobs, replace = _what(file, folder, output, force=force)
+    jobs, replace = _what(files, output, force=force)
     # All are read before any is written: one bad file stops the command with nothing done.
-    things = [
-        (source, open_buildable(source, robot), path) for source, path in jobs if folder is None or _can_be_fmu(source)
-    ]
+    things = [(source, open_buildable(source, robot), path) for source, path in jobs if not many or _can_be_fmu(source)]
     built, left_out = [], [str(source) for source, _ in jobs if source not in {source for source, _, _ in things}]
     with progress("build FMU", quiet=as_json) as report:
         for number, (source, thing, path) in enumerate(things):
@@ -99,7 +97,7 @@ def command(
             judged = _judge(thing, source, data, robot) if data else None
             block, info = thing.block(), fmu_info(thing, validation=judged)
             if backend == "compiled":
-                ahead = sensitivities and (folder is None or _has_sensitivities(block))
+                ahead = sensitivities and (not many or _has_sensitivities(block))
                 origin = build_compiled_fmu(
                     block, path, info=info, force=replace, fmi=int(fmi), platforms=platforms, sensitivities=ahead
                 )
@@ -189,31 +187,32 @@ def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: 
     return validate(thing, read_together(data, robot), names=names)
 
 
-def _what(
-    file: str | None, folder: Path | None, output: Path | None, *, force: bool
-) -> tuple[list[tuple[str | Path, Path]], bool]:
+def _what(files: tuple[str, ...], output: Path | None, *, force: bool) -> tuple[list[tuple[str | Path, Path]], bool]:
     """Return (source, FMU) pairs and whether existing FMUs may be replaced."""
-    if file is not None and folder is None:
-        path, replace = target(output, f"fmus/{_stem(file)}.fmu", force=force)
-        return [(file, path)], replace
-    if folder is not None and file is None:
-        return _jobs(folder, output or Path("build/fmus")), force or output is None
-    raise SettingsError("name one FILE, or a folder with --all.")
+    if len(files) == 1 and not Path(files[0]).is_dir():
+        path, replace = target(output, f"fmus/{_stem(files[0])}.fmu", force=force)
+        return [(files[0], path)], replace
+    sources: list[str | Path] = []
+    for file in files:
+        sources += _inside(Path(file)) if Path(file).is_dir() else [file]
+    out = output or Path("build/fmus")
+    if out.suffix == ".fmu":
+        raise SettingsError(f"{out}: several files become several FMUs; name a folder.")
+    jobs: dict[Path, str | Path] = {}
+    for source in sources:
+        fmu = out / f"{_stem(Path(source).name)}.fmu"
+        if fmu in jobs:
+            raise SettingsError(f"{jobs[fmu]} and {source} would both become {fmu}; rename one of them.")
+        jobs[fmu] = source
+    return [(source, fmu) for fmu, source in jobs.items()], force or output is None
 
 
-def _jobs(folder: Path, out: Path) -> list[tuple[str | Path, Path]]:
-    if not folder.is_dir():
-        raise FileFormatError(f"{folder}: is not a folder.")
+def _inside(folder: Path) -> list[Path]:
+    """Return the files of a folder that are, or may be, ours."""
     sources = sorted(path for path in folder.iterdir() if path.suffix == ".npz" or _is_neck(path))
     if not sources:
         raise FileFormatError(f"{folder}: holds no model, observer, controller or neck file.")
-    jobs: dict[Path, Path] = {}
-    for path in sources:
-        fmu = out / f"{_stem(path.name)}.fmu"
-        if fmu in jobs:
-            raise SettingsError(f"{jobs[fmu]} and {path} would both become {fmu}; rename one of them.")
-        jobs[fmu] = path
-    return [(path, fmu) for fmu, path in jobs.items()]
+    return sources
 
 
 def _is_neck(path: Path) -> bool:

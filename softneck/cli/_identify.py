@@ -13,17 +13,7 @@ from softneck.core._kinds import kinds_of
 
 from ._adapt import adapt
 from ._auto import identify_auto
-from ._search import (
-    SearchOptions,
-    hold_out_option,
-    plot_option,
-    print_search,
-    run_search,
-    search_option,
-    strategy_option,
-    write_plot,
-)
-from .shared._console import note, percent, print_json, progress
+from .shared._console import percent, print_json, progress
 from .shared._groups import kinds_complete
 from .shared._kind_help import kind_command
 from .shared._options import (
@@ -40,7 +30,7 @@ from .shared._robot import robot_option
 from .shared._validate_table import left_out, useless, with_fit
 
 if TYPE_CHECKING:
-    from softneck.identification import Model, Search, Validation
+    from softneck.identification import Model, Validation
     from softneck.signals import Recording
 
 
@@ -75,10 +65,6 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @tolerance_option
 @robot_option
 @set_option
-@search_option
-@hold_out_option
-@strategy_option
-@plot_option
 @force_option
 @json_option
 def command(
@@ -93,10 +79,6 @@ def command(
     tolerance: float | None,
     robot: str | None,
     settings: tuple[str, ...],
-    searches: tuple[str, ...],
-    hold_out: Path | None,
-    strategy: str,
-    plot: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -107,10 +89,8 @@ def command(
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
     if old is not None:
-        if html is not None or refit or tolerance is not None or searches:
-            raise SettingsError(
-                "--from takes no --html, --refit, --tolerance and --search: the model stays what it is."
-            )
+        if html is not None or refit or tolerance is not None:
+            raise SettingsError("--from takes no --html, --refit and --tolerance: the model stays what it is.")
         adapt(kind, old, recordings, output, settings=settings, robot=robot, force=force, as_json=as_json)
         return
     if kind == "auto":
@@ -124,36 +104,28 @@ def command(
     _refuse_options_of_auto(kind, html=html is not None, refit=refit)
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
-    options = SearchOptions(searches, hold_out, strategy, plot)
     if not 0.0 < train <= 1.0:
         raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    if plot is not None:
-        refuse_existing(plot, force=force)
     whole = read_together(recordings, robot)
     # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
-    found = run_search(estimator, head, options, quiet=as_json)
     with progress(f"identify {kind}", quiet=as_json) as report:
-        model = found.model if found is not None else estimator.fit(head, progress=report)
+        model = estimator.fit(head, progress=report)
     if tolerance is not None:
         model = with_tolerance(model, tolerance)
     with progress("hold-out", quiet=as_json):
         held_out = _hold_out(model, tail)
     model = with_fit(model, held_out)
     model.save(path, force=replace)
-    if found is not None and plot is not None:
-        write_plot(found, plot, force=force)
     poor = poor_excitation(head)
     if as_json:
         facts = {"excitation": poor, "guarded_form": _guarded_form(kind, recordings)}
-        print_json(_facts(path, model, held_out, found) | facts)
+        print_json(_facts(path, model, held_out) | facts)
     else:
-        _print(path, model, held_out, found)
+        _print(path, model, held_out)
         click.echo("\n".join(poor), nl=bool(poor))
-    if found is not None and found.interrupted:
-        raise KeyboardInterrupt  # what was done is kept, and the exit code says that it is not all
     why = None if held_out is None else useless(held_out)
     if why is not None:
         still = tail and stands_still(tail, whole)
@@ -180,21 +152,16 @@ def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:
         raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
 
 
-def _print(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> None:
+def _print(path: Path, model: Model, held_out: Validation | None) -> None:
     from softneck.identification import INFINITE
 
-    if found is not None:
-        print_search(found)
-        for remark in found.remarks:
-            note(remark)
     click.echo(f"{path}\n{model.summary()}")
     if held_out is None:
         click.echo("nothing was held out: judge it with `softneck validate` on another recording")
         return
     one, free = held_out.fits["1"], held_out.fits[INFINITE]
     held = held_out.persistence["1"]
-    what = "hold-out" if found is None else "end of the recording, which no trial saw,"
-    click.echo(f"{what} of {held_out.rows_scored} rows, fit [%] {'/'.join(model.robot.outputs.names)}:")
+    click.echo(f"hold-out of {held_out.rows_scored} rows, fit [%] {'/'.join(model.robot.outputs.names)}:")
     click.echo(f"  persistence {_fits(held)}")
     click.echo(f"  one step    {_fits(one)}")
     click.echo(f"  free run    {_fits(free)}")
@@ -213,8 +180,8 @@ def _hold_out(model: Model, tail: Recording | None) -> Validation | None:
     return validate(model, tail, horizons=(1, INFINITE))
 
 
-def _facts(path: Path, model: Model, held_out: Validation | None, found: Search | None) -> dict:
-    facts = {
+def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:
+    return {
         "model": str(path),
         "kind": model.kind,
         "sample_time_s": model.sample_time,
@@ -224,4 +191,3 @@ def _facts(path: Path, model: Model, held_out: Validation | None, found: Search 
         "summary": model.summary(),
         "hold_out": None if held_out is None else held_out.as_dict(),
     }
-    return facts if found is None else facts | {"search": found.as_dict()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import SettingsError, find_kind, refuse_existing, resolve, to_si
+from softneck.core import find_kind, refuse_existing, resolve, to_si
 
 from .shared._console import print_json
 from .shared._kind_help import kind_command
@@ -28,22 +28,18 @@ if TYPE_CHECKING:
 @click.command(
     "observer",
     cls=kind_command("observer", "kalman"),
-    epilog="Example: softneck observer rls.npz -o observer.npz --sensor paper",
+    epilog="Example: softneck observer rls.npz -o observer.npz --set sensor=paper",
 )
 @click.argument("model", type=click.Path(path_type=Path))
 @output_option("observer", "OBSERVER")
-@click.option(
-    "--sensor", help="Sensor preset: its noise is the measurement noise. [default: paper; of another robot its own]"
-)
 @click.option(
     "--data",
     multiple=True,
     type=click.Path(path_type=Path),
     metavar="REC",
-    help="Estimate the noise levels from this recording (maximum likelihood); with --sensor all but that of the "
-    "measurement. May be given several times.",
+    help="Estimate the noise levels from this recording (maximum likelihood); with --set sensor=NAME all but that of "
+    "the measurement. May be given several times.",
 )
-@click.option("--gyro", is_flag=True, help="Driven by the gyro's rates, with their bias as a state (form=gyro).")
 @robot_option
 @set_option
 @force_option
@@ -51,9 +47,7 @@ if TYPE_CHECKING:
 def command(
     model: Path,
     output: Path | None,
-    sensor: str | None,
     data: tuple[Path, ...],
-    gyro: bool,
     robot: str | None,
     settings: tuple[str, ...],
     force: bool,
@@ -62,22 +56,21 @@ def command(
     """Build a filter over the identified MODEL.
 
     The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; of a nonlinear
-    one the free run, with a disturbance. Others: --gyro, and --set form=kinematic.
+    one the free run, with a disturbance. Others: --set form=gyro, driven by the gyro's rates with their bias as a
+    state, and --set form=kinematic.
     """
 
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    if gyro and any(setting.replace(" ", "").startswith("form=") for setting in settings):
-        raise SettingsError("--gyro is the same as --set form=gyro; give only one of them.")
-    chosen = apply_settings(resolve(kind.settings), settings, sensor=sensor, form="gyro" if gyro else None)
+    chosen = apply_settings(resolve(kind.settings), settings)
     observer = chosen.design(load_of(model, robot, role="model"))
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
-        given = any(setting.replace(" ", "").startswith("sensor_delay=") for setting in settings)
-        fixed = () if sensor is None else (observer.noise_names[0],)
-        found, lines = _fitted(observer, data, robot, fixed=fixed, delay=not given)
+        named = {setting.partition("=")[0].strip() for setting in settings}
+        fixed = (observer.noise_names[0],) if "sensor" in named else ()
+        found, lines = _fitted(observer, data, robot, fixed=fixed, delay="sensor_delay" not in named)
         observer, fit = found.observer, found.fit
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
                         "at_bound": list(fit.at_bound), "not_told": list(found.untold), "held_out": found.checks,

@@ -21,10 +21,9 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="The page. [default: build/report.html]"
 )
-@click.option("--no-run", is_flag=True, help="Do not run the loop files.")
 @force_option
 @json_option
-def command(folder: Path, output: Path | None, no_run: bool, force: bool, as_json: bool) -> None:
+def command(folder: Path, output: Path | None, force: bool, as_json: bool) -> None:
     """Write one self-contained page on all that DIR holds, to send to a colleague.
 
     Data quality, models and their fits on rows that they were not trained on, uncertain plants, observers and
@@ -37,7 +36,7 @@ def command(folder: Path, output: Path | None, no_run: bool, force: bool, as_jso
     path, replace = target(output, "report.html", force=force, ending=".html")
     refuse_existing(path, force=replace)
     with progress("report", quiet=as_json) as report:
-        project = read_project(folder, run_loops=not no_run, progress=lambda done, word: report(0.4 * done, word))
+        project = read_project(folder, progress=lambda done, word: report(0.4 * done, word))
         write_page(
             path, project_page(project, progress=lambda done, word: report(0.4 + 0.5 * done, word)), force=replace
         )

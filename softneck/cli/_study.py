@@ -15,6 +15,11 @@ from .shared._options import force_option, json_option, trust_option
 if TYPE_CHECKING:
     import pandas as pd
 
+    from softneck.cosim.studies._study import Study
+
+# Of the worst runs so many are written as loop files: who wants more reads the table.
+_WORST = 3
+
 
 @click.command("study", epilog="Example: softneck study study.toml -o build/study --workers 2")
 @click.argument("study_file", metavar="STUDY.toml", type=click.Path(path_type=Path))
@@ -23,15 +28,6 @@ if TYPE_CHECKING:
     help="Folder of runs, report and worst cases. [default: build/studies/NAME]",
 )  # fmt: skip
 @click.option("--workers", type=int, help="Number of local processes. [default: one for each core]")
-@click.option("--dask", metavar="ADDRESS", help="Run on this Dask scheduler instead, such as tcp://head:8786.")
-@click.option("--resume", is_flag=True, help="Resume the study in DIR.")
-@click.option(
-    "--worst",
-    type=click.IntRange(min=0),
-    default=3,
-    show_default=True,
-    help="Number of worst runs to write as loop files.",
-)
 @trust_option
 @force_option
 @json_option
@@ -39,9 +35,6 @@ def command(
     study_file: Path,
     output: Path | None,
     workers: int | None,
-    dask: str | None,
-    resume: bool,
-    worst: int,
     trust: bool,
     force: bool,
     as_json: bool,
@@ -52,7 +45,7 @@ def command(
     DIR gets  runs.csv       a row for each run: what varied, seed, metrics, limits, error
               report.html    ranking, Pareto front, distributions, influences
               worst/         the worst runs as loop files for softneck simulate
-    Ctrl-C or a crash loses no finished run: --resume continues.
+    Ctrl-C or a crash loses no finished run: the same command goes on where it was.
     """
     from softneck.cosim import load_study
     from softneck.cosim.loops._trust import require_trusted
@@ -66,11 +59,10 @@ def command(
     require_trusted(study_file, trust=trust)
     study = load_study(study_file)
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
-    replace = force or (output is None and not resume)
     with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
-        runs = run_study(study, folder, workers=workers, dask=dask, resume=resume, force=replace, report=report)
+        runs = run_study(study, folder, workers=workers, force=_anew(study, folder, output, force), report=report)
     write_page(folder / "report.html", study_page(read_description(folder), runs), force=True)
-    paths = write_worst(study, runs, folder / "worst", count=worst) if worst else []
+    paths = write_worst(study, runs, folder / "worst", count=_WORST)
     if as_json:
         print_json(_summary(runs, folder, study.objectives, paths))
     else:
@@ -79,6 +71,14 @@ def command(
         note(f"{len(runs)} runs, {failed} failed; report: {folder / 'report.html'}")
     if all(failures(runs)):
         raise CheckFailedError(f"{study_file}: every run failed; the first said: {runs['error'].iloc[0]}")
+
+
+def _anew(study: Study, folder: Path, output: Path | None, force: bool) -> bool:
+    """Return whether what is there is replaced: another study under build/, or what --force says."""
+    from softneck.cosim.studies._store import DESCRIPTION, read_description
+
+    there = output is None and (folder / DESCRIPTION).is_file()
+    return force or (there and read_description(folder).get("digest") != study.digest)
 
 
 def _table(runs: pd.DataFrame, keys: list[str], objectives: tuple[str, ...]) -> tuple[list[str], list[list[str]]]:

@@ -47,7 +47,6 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
 @click.option("--observer", type=_PATH, help="Of the loop. [default: a Kalman filter over the nominal plant]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the search and its noise.")
 @click.option("--workers", type=click.IntRange(min=0), help="Local processes; 0: this one. [default: one a core]")
-@click.option("--resume", is_flag=True, help="Refuse to begin anew where DIR holds nothing of the same search.")
 @click.option("-o", "--output", type=_PATH, metavar="DIR", required=True, help="Folder of the search and its results.")
 @robot_option
 @force_option
@@ -60,7 +59,6 @@ def command(
     observer: Path | None,
     seed: int,
     workers: int | None,
-    resume: bool,
     output: Path,
     robot: str | None,
     force: bool,
@@ -100,7 +98,7 @@ def command(
     with progress("tune", quiet=as_json) as report:
         found = tune(
             things, asked, kinds=() if kinds is None else tuple(kinds.split(",")), budget=budget, observer=eyes,
-            seed=seed, workers=workers, folder=output, resume=resume, force=force, progress=report,
+            seed=seed, workers=workers, folder=output, force=force, progress=report,
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
     steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)

@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option, read_together, tolerance_option
+from .shared._options import force_option, json_option, tolerance_option
 from .shared._robot import load_of, robot_option
 from .shared._validate_table import fit_table, remarks, useless
 
@@ -39,20 +39,7 @@ _NOTE = (
     show_default=True,
     help="Free run from set-points alone, or with logged motor positions as the paper does.",
 )
-@click.option(
-    "--initial",
-    type=click.Choice(["warm", "cold"]),
-    default="warm",
-    show_default=True,
-    help="Free run from 25 measured samples, or from the first row only as an FMU starts.",
-)
 @click.option("--include-training", is_flag=True, help="Also score rows that the model was trained on.")
-@click.option(
-    "--training",
-    multiple=True,
-    type=click.Path(path_type=Path),
-    help="What the models were trained on, to report how novel the data is.",
-)
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
 @tolerance_option
 @robot_option
@@ -63,9 +50,7 @@ def command(
     data: tuple[Path, ...],
     horizon: str,
     motors: str,
-    initial: str,
     include_training: bool,
-    training: tuple[Path, ...],
     html: Path | None,
     tolerance: float | None,
     robot: str | None,
@@ -90,10 +75,9 @@ def command(
         raise SettingsError("recordings only; expected a model before them: softneck validate MODEL --data REC...")
     loaded = {str(path): load_of(path, robot, role="model") for path in models}
     recordings = {str(path): read_recording(path, robot=robot) for path in data}
-    rules = Rules(horizons, motors, include_training, initial, tolerance)
-    known = read_together(training, robot) if training else None
+    rules = Rules(horizons, motors, include_training, tolerance=tolerance)
     with progress("validate", quiet=as_json) as report:
-        comparison = compare(loaded, recordings, rules=rules, training=known, progress=report)
+        comparison = compare(loaded, recordings, rules=rules, progress=report)
     results = list(comparison.validations)
     if html is not None:
         write_page(html, _page(results), force=force)

@@ -165,7 +165,7 @@ def _rate(run: Recording, axis: str) -> Vector:
             return run.channels[name]
     raise DataError(
         f"the recording has no channel `{axis}_rate`, which a filter with gyro needs; record it, or design the "
-        "observer without --gyro."
+        "observer without the gyro."
     )
 
 

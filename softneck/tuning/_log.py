@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
+from softneck.core import FileFormatError, OutputFileError, atomic_write
 from softneck.core._budget import MOST_JSON, settings_text
 
 from ._judge import Judgement
@@ -45,19 +45,16 @@ class Log:
         folder: of the search; None: nothing is written.
     """
 
-    def __init__(self, folder: Path | None, digest: str, *, resume: bool = False, force: bool = False) -> None:
+    def __init__(self, folder: Path | None, digest: str, *, force: bool = False) -> None:
         """Begin, or go on with what is there of the same search.
 
         Raises:
             OutputFileError: the folder holds another search and `force` is not given.
-            SettingsError: `resume` where there is nothing of the same search.
         """
         self.folder, self._digest = folder, digest
         self._found: dict[Job, Judgement] = {}
         path = None if folder is None else folder / FILE
         there = path is not None and path.is_file()
-        if resume and not there:
-            raise SettingsError(f"{folder}: there is no search to resume; leave --resume out to begin it.")
         if path is None or not there:
             return
         content = _read(path)
@@ -68,11 +65,6 @@ class Log:
                 self._found[Job(row["kind"], row["settings"], row["level"])] = Judgement(
                     {name: math.inf if value is None else float(value) for name, value in row["metrics"].items()}
                 )
-        elif resume:
-            raise SettingsError(
-                f"{folder}: holds a search over other plants, requirements, kinds or seed; give those that began it, "
-                "or another folder. Nothing was changed."
-            )
         elif not force:
             raise OutputFileError(
                 f"{folder}: holds a search over other plants, requirements, kinds or seed; choose another folder, or "

@@ -108,7 +108,6 @@ def tune(
     seed: int = 0,
     workers: int | None = None,
     folder: Path | None = None,
-    resume: bool = False,
     force: bool = False,
     files: Mapping[str, tuple[str, str]] | None = None,
     progress: Progress = silent,
@@ -128,7 +127,6 @@ def tune(
         seed: of the search and of the noise in its loops.
         workers: local processes, as many as cores if not given; 0 for this process.
         folder: where judgements are kept as they come; the same call goes on with what is there.
-        resume: refuse to begin anew.
         force: replace another search that `folder` holds.
         files: role -> (path, SHA-256) of what was read, for the certificate.
         progress: called with the part done and the best so far.
@@ -153,7 +151,7 @@ def tune(
     task = replace(task, observer=_observer(task) if observer is None else observer)
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
-    log = Log(folder, task.digest, resume=resume, force=force)
+    log = Log(folder, task.digest, force=force)
     with crew(workers, None) as members:
         search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
         search.dropped |= dropped

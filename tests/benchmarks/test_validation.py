@@ -61,7 +61,7 @@ def test_import_validate_and_report(
         steps = (
             ["import", folder / "log.csv", "--layout", folder / "layout.toml", "-o", data, "--force", "--json"],
             ["validate", *(folder / f"{name}.npz" for name in ("rls", "nlsm", "nn")), "--data", data, "--html", page,
-             "--training", folder / "training.csv", "--force", "--json"],
+             "--force", "--json"],
         )  # fmt: skip
         for step in steps:
             assert run([str(word) for word in step]) == 0

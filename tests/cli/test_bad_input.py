@@ -65,15 +65,13 @@ def test_a_file_that_is_not_there_is_named(call: Call, tmp_path: Path, rls_file:
     refused(call(*arguments), "none.csv: no such file", tmp_path, set())
 
 
-def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path, rls_file: Path) -> None:
+def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("\n".join(csv_lines(neck_recording(300), 300)))
     slow = neck_recording(300)
     write_recording("b.csv", Recording(2 * slow.time, 2 * slow.sample_time, slow.channels))
     message = "b.csv: is at 40 ms and a.csv at 20 ms; recordings are used together at one sample time only"
     left = {"a.csv", "b.csv"}
     refused(call("identify", "rls", "a.csv", "b.csv", "-o", "m.npz", "--json"), message, tmp_path, left)
-    training = ("--training", "a.csv", "--training", "b.csv")
-    refused(call("validate", rls_file, "--data", "a.csv", *training), message, tmp_path, left)
 
 
 def test_a_model_under_another_ending_is_refused_before_any_work(call: Call, tmp_path: Path) -> None:
@@ -173,7 +171,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
             "unknown kind of controller `lqr`; did you mean `lqg`? use one of pi",
         ),
         (("design", "pi", "MODEL", "-o", "c.npz", "--set", "luck=1"), "unknown setting `luck`"),
-        (("observer", "MODEL", "-o", "o.npz", "--sensor", "nose"), "nose"),
+        (("observer", "MODEL", "-o", "o.npz", "--set", "sensor=nose"), "nose"),
         (("simulate", "none.toml"), "none.toml: no such file"),
         (("fmu", "none.npz", "-o", "M.fmu"), "none.npz: no such file"),
         (("fmu",), ""),

@@ -42,17 +42,13 @@ def test_a_page_of_anything_but_a_recording_is_refused(call: Call, rls_file: Pat
 
 
 def test_record_keeps_to_limits_and_says_what_it_changed(call: Call) -> None:
-    bounds = ("--ramp", 1, "--max-position", 2, "--max-speed", 3, "--max-slack", 1)
-    said = call("record", "eq22", "-o", "r.csv", "--duration", 6, *bounds, "--json")
+    said = call("record", "eq22", "-o", "r.csv", "--duration", 6, "--max-position", 2, "--json")
     changes = json.loads(said.out)["changes"]
     P = read_recording("r.csv").set_points
     # Files hold 17 digits.
-    assert (P.max(), P.min()) == (2.0, -1.0)
-    assert np.abs(np.diff(P, axis=0)).max() <= 3 * 0.02 + 1e-12
-    assert not P[[0, -1]].any()
-    assert all(changes[name] > 0 for name in ("position_clipped_pct", "slack_clipped_pct", "rate_limited_pct"))
-    assert changes["ramped_pct"] > 30
-    assert "% clipped in slack" in call("record", "eq22", "-o", "s.csv", "--duration", 6, *bounds).out
+    assert (P.max(), P.min()) == (2.0, -2.0)
+    assert changes["position_clipped_pct"] > 0
+    assert "% clipped in position" in call("record", "eq22", "-o", "s.csv", "--duration", 6, "--max-position", 2).out
 
 
 def test_record_plays_the_frozen_signal_by_default(call: Call) -> None:
@@ -62,6 +58,6 @@ def test_record_plays_the_frozen_signal_by_default(call: Call) -> None:
 
 
 def test_a_wrong_limit_is_one_line(call: Call, tmp_path: Path) -> None:
-    said = call("record", "eq22", "-o", "r.csv", "--max-speed", 0)
-    assert (said.code, said.error) == (2, "softneck: `speed` must be positive [rad/s]; got 0.")
+    said = call("record", "eq22", "-o", "r.csv", "--max-position", 0)
+    assert (said.code, said.error) == (2, "softneck: `position` must be positive [rad]; got 0.")
     assert not list(tmp_path.iterdir())

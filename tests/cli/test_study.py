@@ -75,10 +75,9 @@ def test_a_study_s_table_names_what_varied(call: Call, project: Path) -> None:
     assert said.code == 0
     assert "plant.pole" in said.out
     assert "12 runs, 0 failed" in said.err
-    assert call("study", "study.toml", "-o", "out", "--workers", "0").error.endswith(
-        "--resume continues it, --force replaces it."
-    )
-    assert call("study", "study.toml", "-o", "out", "--workers", "0", "--resume").code == 0
+    before = (project / "out" / "runs.csv").read_bytes()
+    assert call("study", "study.toml", "-o", "out", "--workers", "0").code == 0
+    assert (project / "out" / "runs.csv").read_bytes() == before  # the seconds too: no run was done again
     assert call("study", "study.toml", "-o", "out", "--workers", "0", "--force").code == 0
 
 
@@ -120,7 +119,7 @@ def test_another_study_s_folder_stays_as_it_is(call: Call, project: Path) -> Non
     assert call("study", "study.toml", "-o", "out", "--workers", "0").code == 0
     before = {path: path.read_bytes() for path in (project / "out").rglob("*") if path.is_file()}
     (project / "study.toml").write_text(STUDY.replace("runs = 12", "runs = 14"))
-    said = call("study", "study.toml", "-o", "out", "--workers", "0", "--resume")
+    said = call("study", "study.toml", "-o", "out", "--workers", "0")
     assert said.code == 2
     assert "holds another study (other runs)" in said.error
     assert {path: path.read_bytes() for path in (project / "out").rglob("*") if path.is_file()} == before

@@ -127,7 +127,7 @@ def test_a_budget_too_small_is_said_and_its_search_goes_on_with_what_it_wrote(
     assert not (folder / "best.certificate.json").exists()
     # The file that was written asks for the same: another search would be refused here.
     wanted = ["--requirements", str(folder / "requirements.toml")]
-    assert run([*looped, "--budget", "3", "--resume", *wanted, "--json"]) == 0
+    assert run([*looped, "--budget", "3", *wanted, "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
     assert values["evaluations"] == 3
     assert any("less a reserve of" in line for line in values["requirements"])
@@ -167,7 +167,6 @@ def test_nobody_is_told_to_loosen_a_margin() -> None:
         (["--requirements", "{folder}/fast.toml"], "within the motors' slew and range"),
         (["--kinds", ""], "unknown kind of controller ``"),
         (["--kinds", "pie"], "unknown kind of controller `pie`"),
-        (["--resume"], "no search to resume"),
         (["--requirements", "{folder}/none.toml"], "cannot be read"),
         (["-o", "{folder}/wanted.toml"], "is a file; name a folder"),
         (["--budget", "0"], "0 is not in the range"),

@@ -77,16 +77,6 @@ def test_one_data_takes_several_recordings(call: Call, rls_file: Path) -> None:
     assert len(json.loads(together.out)["models"]) == 2
 
 
-def test_training_data_of_another_kind_is_refused(call: Call, rls_file: Path) -> None:
-    write_recording("good.csv", WHOLE)
-    refused(
-        call("validate", rls_file, "--data", "good.csv", "--training", "none.csv", "--json"), "none.csv: no such file"
-    )
-    write_recording("slow.csv", slower(WHOLE))
-    said = call("validate", rls_file, "--data", "good.csv", "--training", "slow.csv", "--json")
-    refused(said, "the recording is at 0.04 s")
-
-
 @pytest.mark.parametrize("name", ["pitch", "roll"])
 def test_an_angle_that_was_never_measured_is_named(call: Call, rls_file: Path, name: str) -> None:
     write_recording("good.csv", WHOLE)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import FileFormatError, OutputFileError, SettingsError, _errors, load
+from softneck.core import FileFormatError, SettingsError, _errors, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -198,11 +198,11 @@ def test_resume_goes_on_where_it_stood(place: Path) -> None:
     store.add([{**row, "holds": bool(row["holds"])} for row in rows[3:9]])
     store.add([{**row, "holds": bool(row["holds"])} for row in rows[7:9]])  # twice, as after a kill in a merge
     assert read_runs(place / "out")["run"].tolist() == list(range(3, 9))
-    runs: Any = study(made, workers=0, output=place / "out", resume=True)
+    runs: Any = study(made, workers=0, output=place / "out")
     pd.testing.assert_frame_equal(numbers(whole), numbers(runs), check_exact=True)
     assert runs["seconds"][3:9].tolist() == whole["seconds"][3:9].tolist()  # not run again
     assert sorted(path.name for path in (place / "out").iterdir()) == ["runs.csv", "study.json"]
-    assert study(made, workers=0, output=place / "out", resume=True)["seconds"].tolist() == runs["seconds"].tolist()
+    assert study(made, workers=0, output=place / "out")["seconds"].tolist() == runs["seconds"].tolist()
 
 
 def test_runs_read_back_to_the_bit(place: Path) -> None:
@@ -256,13 +256,9 @@ def test_a_folder_of_another_study(place: Path) -> None:
     made = load_study(place / "study.toml")
     study(made, workers=0, output=place / "out")
     before = {path.name: path.read_bytes() for path in (place / "out").iterdir()}
-    with pytest.raises(OutputFileError, match="holds a study already; --resume continues it"):
-        study(made, workers=0, output=place / "out")
     (place / "study.toml").write_text(STUDY.replace("seed = 7", "seed = 8"))
     with pytest.raises(SettingsError, match=r"holds another study \(other seed\)"):
-        study(load_study(place / "study.toml"), workers=0, output=place / "out", resume=True)
-    with pytest.raises(SettingsError, match="there is no study to resume"):
-        study(made, workers=0, output=place / "new", resume=True)
+        study(load_study(place / "study.toml"), workers=0, output=place / "out")
     assert {path.name: path.read_bytes() for path in (place / "out").iterdir()} == before
     study(load_study(place / "study.toml"), workers=0, output=place / "out", force=True)
     assert (place / "out" / "study.json").read_bytes() != before["study.json"]

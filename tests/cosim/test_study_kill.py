@@ -108,9 +108,7 @@ def test_kill_9_and_resume(place: Path) -> None:
         process.wait()
     before = read_runs(place / "out")
     assert 5 <= len(before) < 40
-    done = subprocess.run(
-        [*_COMMAND, "--workers", "2", "--resume", "--json"], cwd=place, capture_output=True, text=True
-    )
+    done = subprocess.run([*_COMMAND, "--workers", "2", "--json"], cwd=place, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["runs"] == 40
     after = pd.read_csv(place / "out" / "runs.csv")
@@ -129,7 +127,7 @@ def test_ctrl_c_ends_cleanly(place: Path) -> None:
         assert said.strip().splitlines()[-1].startswith("softneck: interrupted; files already finished are kept")
         assert "Traceback" not in said
         assert gone(process.pid)
-    runs = study(load_study(place / "study.toml"), workers=0, output=place / "out", resume=True)
+    runs = study(load_study(place / "study.toml"), workers=0, output=place / "out")
     assert runs["run"].tolist() == list(range(40))
 
 

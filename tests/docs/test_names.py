@@ -112,13 +112,13 @@ def wrong(line: str) -> str | None:
 
 
 def wrong_setting(command: str, words: list[str]) -> str | None:
-    """Return what `--set` or `--search` names that the kind does not have."""
+    """Return what `--set` names that the kind does not have."""
     kind = SETTINGS.get(command) or (words[0] if words else "")
     if kind not in KINDS:
         return None
     for option, word in pairwise(words):
         key = word.partition("=")[0]
-        if option in ("--set", "--search") and key.islower() and not {key, key.removesuffix("_deg")} & fields(kind):
+        if option == "--set" and key.islower() and not {key, key.removesuffix("_deg")} & fields(kind):
             return f"{kind} has no setting {key}"
     return None
 

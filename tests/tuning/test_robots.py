@@ -75,7 +75,7 @@ def test_a_budget_that_ends_before_the_loops_promises_nothing_and_goes_on(tmp_pa
     # Without loops nothing of the requirements on them is known, even where all that is known holds.
     easy = {**QUICK, "require": {"step.rise_s": {"max": 2.0}}}
     for budget, level in ((1, "linear"), (2, "all")):
-        found = tune(plants, easy, kinds=("pi",), budget=budget, workers=0, folder=tmp_path, resume=budget > 1)
+        found = tune(plants, easy, kinds=("pi",), budget=budget, workers=0, folder=tmp_path)
         assert (found.evaluations, found.best.level) == (budget, level)
         assert not found.holds or level == "all"
     assert len(json.loads((tmp_path / "evaluations.json").read_text())["evaluations"]) == 2

@@ -92,7 +92,7 @@ def test_a_search_that_was_stopped_goes_on_as_if_it_never_was(
     assert [path.name for path in tmp_path.iterdir()] == [FILE]
     monkeypatch.setattr(_search, "judge_candidate", lambda *arguments: calls.append(arguments) or judged(*arguments))
     calls.clear()
-    assert told(searched(tmp_path, resume=True)) == told(whole[0])
+    assert told(searched(tmp_path)) == told(whole[0])
     assert len(calls) == 14 - 4
     # And once more, where all is there: nothing is judged again, a larger budget goes on.
     calls.clear()
@@ -114,10 +114,6 @@ def test_the_folder_of_another_search_is_kept(whole: tuple[Tuned, Path], tmp_pat
     before = (folder / FILE).read_bytes()
     with pytest.raises(OutputFileError, match="holds a search over other plants"):
         searched(folder, seed=3)
-    with pytest.raises(SettingsError, match="give those that began it"):
-        searched(folder, seed=3, resume=True)
-    with pytest.raises(SettingsError, match="no search to resume"):
-        searched(tmp_path, resume=True)
     assert (folder / FILE).read_bytes() == before
     (tmp_path / FILE).write_text("{}")
     with pytest.raises(SoftneckError, match="is no log of a search"):

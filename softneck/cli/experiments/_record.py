@@ -58,21 +58,11 @@ from ._next import record_next
 @click.option("--amplitude", type=float, metavar="A", help="`multisine`: largest input. [default: 1]")
 @click.option("--band", metavar="LOW,HIGH", help="`multisine`: from where to where [rad/s]; one value: a sine.")
 @click.option(
-    "--realisations",
-    type=int,
-    metavar="N",
-    help="`multisine`: draws of the phases. [default: 4; 1 of a sine]",
-)
-@click.option(
     "--cocontraction", type=float, default=0.0, show_default=True, metavar="RAD",
     help="Played around this common position of all motors, which keeps tendons taut.",
 )  # fmt: skip
 @click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="Payload on the platform.")
-@click.option("--no-noise", is_flag=True, help="Simulate a perfect inclinometer.")
-@click.option("--ramp", type=float, default=0.0, metavar="S", help="Ramp in from rest and out to it. [default: none]")
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: the signal's own]")
-@click.option("--max-speed", type=float, metavar="RAD/S", help="Slow set-points down to this speed. [default: none]")
-@click.option("--max-slack", type=float, metavar="RAD", help="Pay out no more than RAD below rest. [default: none]")
 @force_option
 @json_option
 def command(
@@ -84,14 +74,9 @@ def command(
     seed: int,
     amplitude: float | None,
     band: str | None,
-    realisations: int | None,
     cocontraction: float,
     payload: float,
-    no_noise: bool,
-    ramp: float,
     max_position: float | None,
-    max_speed: float | None,
-    max_slack: float | None,
     force: bool,
     as_json: bool,
 ) -> None:
@@ -101,7 +86,7 @@ def command(
 
     recording_suffix(output)
     refuse_existing(output, force=force)
-    bounds = {"position": max_position, "speed": max_speed, "slack": max_slack}
+    bounds = {"position": max_position}
     if Path(signal_name).suffix.lower() == ".npz":
         duration = 60.0 if duration is None else duration
         record_next(
@@ -113,12 +98,12 @@ def command(
     whose = find_robot(robot, beside=output)
     virtual = VirtualNeck.of(whose, None if neck is None else load_neck(neck))
     limits = SetPointLimits(**_allowed(whose) | {name: value for name, value in bounds.items() if value is not None})
-    experiment = {"amplitude": amplitude, "band": _band(band), "realisations": realisations}
+    experiment = {"amplitude": amplitude, "band": _band(band)}
     asked = {name: value for name, value in experiment.items() if value is not None}
-    if asked and (signal_name != "multisine" or duration is not None or ramp > 0.0):
+    if asked and (signal_name != "multisine" or duration is not None):
         raise SettingsError(
             f"`--{next(iter(asked))}` asks for experiments of a frequency response: the signal is `multisine` "
-            "then, and takes no `--duration` and no `--ramp`, which would end its periods."
+            "then, and takes no `--duration`, which would end its periods."
         )
     if asked:
         played = multisine_experiments(seed=seed, robot=whose, **asked)
@@ -127,7 +112,7 @@ def command(
     require_finite("--cocontraction", cocontraction, "rad")
     common = to_si(whose.motors.unit)[0] * cocontraction
     played = [replace(item, set_points=item.set_points + common) for item in played]
-    prepared = [prepare(item, limits, ramp_s=ramp) for item in played]
+    prepared = [prepare(item, limits) for item in played]
     changes = prepared[0][1]
     if asked and any(item != type(changes)() for _, item in prepared):
         raise SettingsError(
@@ -137,7 +122,7 @@ def command(
     with progress("record", quiet=as_json) as report:
         runs = []
         for number, (excitation, _) in enumerate(prepared):
-            runs.append(record(excitation, virtual, seed=seed + number, payload=payload, noise=not no_noise))
+            runs.append(record(excitation, virtual, seed=seed + number, payload=payload))
             report((number + 1) / len(prepared), f"run {number + 1} of {len(prepared)}")
         recording = runs[0] if len(runs) == 1 else concatenate(runs)
     write_recording(output, recording, force=force)
@@ -146,7 +131,7 @@ def command(
         print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
-    if ramp > 0 or limits != SetPointLimits() or changes != type(changes)():
+    if limits != SetPointLimits() or changes != type(changes)():
         click.echo(f"set-points: {changes}")
 
 

@@ -148,7 +148,7 @@ def _words(step: Step, *, begun: bool) -> tuple[str, ...]:
     """Return the command's words, those that go on with what was begun where it can."""
     if not (begun and step.resumes and Path(step.resumes).is_file()):
         return step.command
-    return tuple("--resume" if word == "--force" else word for word in step.command)
+    return tuple(word for word in step.command if word != "--force")
 
 
 def _softneck(words: tuple[str, ...], *, as_json: bool) -> None:

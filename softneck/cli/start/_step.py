@@ -31,7 +31,7 @@ class Step:
         unmet: what it means where it does not hold, or where a model is refused.
         finding: what does not hold whatever comes of it; empty where that is open.
         settings: what it is done again for beside `reads`; the command where it says nothing.
-        resumes: file that an interrupted run leaves, with which `--resume` in the place of `--force` goes on.
+        resumes: file that an interrupted run leaves, with which it goes on without `--force`.
     """
 
     stage: str

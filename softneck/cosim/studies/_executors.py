@@ -127,7 +127,7 @@ def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
     """
     if dask is not None:
         if workers is not None:
-            raise SettingsError("give --workers or --dask, not both: a cluster has its own workers.")
+            raise SettingsError("give workers or a Dask scheduler, not both: a cluster has its own workers.")
         cluster = Cluster(dask)
         with contextlib.closing(cluster):
             yield cluster

@@ -39,7 +39,6 @@ def study(
     workers: int | None = None,
     dask: str | None = None,
     output: str | Path | None = None,
-    resume: bool = False,
     force: bool = False,
     parquet: bool = False,
     report: Progress | None = None,
@@ -59,14 +58,12 @@ def study(
         workers: local processes, as many as cores if not given; 0 for this process.
         dask: address of a Dask scheduler instead.
         output: folder that keeps the runs as they end, in `runs.csv`; nothing is kept without one.
-        resume: go on with the study that `output` holds.
-        force: replace the study that `output` holds.
+        force: replace the study that `output` holds; else the same one goes on, and another is an error.
         parquet: whether `output` gets them as `runs.parquet` besides; needs pyarrow.
         report: called with the part done and a word; a bar in a terminal if not given.
 
     Raises:
         SettingsError: a key that the loop does not have, an empty range, no runs, another study's folder.
-        OutputFileError: `output` holds a study already.
 
     Example:
         >>> import softneck
@@ -89,7 +86,7 @@ def study(
         raise SettingsError("a Study has its own vary, runs and objectives; make another one with `make_study`.")
     with shown_progress("study", report) as tell:
         if output is not None:
-            return run_study(made, Path(output), workers=workers, dask=dask, resume=resume, force=force, report=tell)
+            return run_study(made, Path(output), workers=workers, dask=dask, force=force, report=tell)
         with tempfile.TemporaryDirectory(prefix="softneck-study-") as folder:
             return run_study(made, Path(folder), workers=workers, dask=dask, report=tell)
 
@@ -100,7 +97,6 @@ def run_study(
     *,
     workers: int | None = None,
     dask: str | None = None,
-    resume: bool = False,
     force: bool = False,
     report: Progress = silent,
 ) -> pd.DataFrame:
@@ -108,8 +104,8 @@ def run_study(
     study.check()
     if workers != 0:
         check_sendable((dict(study.loop), [item.values for item in study.vary.values()]))
-    with crew(workers, dask) as members:
-        store = Store(study, folder, resume=resume, force=force)
+    with crew(workers, dask or study.dask) as members:
+        store = Store(study, folder, force=force)
         try:
             _Work(study, store, members, report).run()
         finally:
@@ -176,7 +172,9 @@ class _Work:
             self._died(runs)
             self._broken()
         except CancelledError as error:
-            raise OutputFileError("the Dask scheduler went away; what is done is kept, --resume continues.") from error
+            raise OutputFileError(
+                "the Dask scheduler went away; what is done is kept; the same command goes on."
+            ) from error
         except OutputFileError:
             raise
         except Exception as error:  # a worker died under Dask, or what it ran could not come back

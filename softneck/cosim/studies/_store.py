@@ -39,19 +39,16 @@ class Store:
         done: numbers of the runs that ended.
     """
 
-    def __init__(self, study: Study, folder: Path, *, resume: bool = False, force: bool = False) -> None:
-        """Begin the study in `folder`, or go on with what is there.
+    def __init__(self, study: Study, folder: Path, *, force: bool = False) -> None:
+        """Begin the study in `folder`, or go on with what is there of the same one; anew with `force`.
 
         Raises:
-            OutputFileError: the folder holds a study and neither `resume` nor `force` is given.
-            SettingsError: `resume` in a folder of another study, or of none.
+            SettingsError: the folder holds another study and `force` is not given.
         """
         if study.parquet:
             require_package("pyarrow")
         self.folder, self._study, self._parts = folder, study, folder / _PARTS
-        if (folder / DESCRIPTION).exists() and not (resume or force):
-            raise OutputFileError(f"{folder}: holds a study already; --resume continues it, --force replaces it.")
-        if resume:
+        if (folder / DESCRIPTION).is_file() and not force:
             self._check_same(study)
         else:
             self._clear()
@@ -115,9 +112,6 @@ class Store:
             (self.folder / name).unlink(missing_ok=True)
 
     def _check_same(self, study: Study) -> None:
-        path = self.folder / DESCRIPTION
-        if not path.is_file():
-            raise SettingsError(f"{self.folder}: there is no study to resume; leave --resume out to begin it.")
         there = read_description(self.folder)
         if there.get("digest") == study.digest:
             return
@@ -125,7 +119,7 @@ class Store:
         differs = [key for key in now if json.loads(json.dumps(now[key])) != there.get("study", {}).get(key)]
         raise SettingsError(
             f"{self.folder}: holds another study (other {', '.join(differs) or 'content'}); "
-            "give the study that began it, or another folder. Nothing was changed."
+            "give the study that began it, another folder, or --force to replace it. Nothing was changed."
         )
 
 

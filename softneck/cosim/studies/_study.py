@@ -26,7 +26,7 @@ from ..loops._loop_table import check_key, loop_table, set_sources, settable, wi
 from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
-_TOP = ("loop", "runs", "seed", "sampling", "objectives", "parquet", "vary")
+_TOP = ("loop", "runs", "seed", "sampling", "objectives", "parquet", "dask", "vary")
 # Runs in the picture of a study.
 _MOST_SHOWN = 200
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
@@ -46,6 +46,7 @@ class Study(Shown):
         folder: where relative paths of the loop start.
         name: for titles.
         parquet: whether the folder gets the runs as Parquet besides.
+        dask: address of a Dask scheduler that runs it, such as tcp://head:8786; None: processes here.
     """
 
     loop: Mapping[str, Any]
@@ -57,8 +58,11 @@ class Study(Shown):
     folder: Path = field(default_factory=Path.cwd)
     name: str = "study"
     parquet: bool = False
+    dask: str | None = None
 
     def __post_init__(self) -> None:
+        if self.dask is not None and (not isinstance(self.dask, str) or "://" not in self.dask):
+            raise SettingsError(f"`dask` must be a scheduler's address, such as tcp://head:8786; got {self.dask!r}.")
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise SettingsError(f"`seed` must be a whole number that is not negative; got {self.seed!r}.")
         for metric in self.objectives:
@@ -159,6 +163,7 @@ def make_study(
     name: str = "study",
     folder: str | Path | None = None,
     parquet: bool = False,
+    dask: str | None = None,
 ) -> Study:
     """Return a study of `loop`: a loop file, its table, or a loop; `vary` is as [vary] in a study file.
 
@@ -173,6 +178,7 @@ def make_study(
     start = Path(folder) if folder else start
     return Study(
         loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=start, name=name, parquet=parquet,
+        dask=dask,
         objectives=tuple(objectives) if objectives else _objectives(table, _robot_of(table, chosen, start)),
     )  # fmt: skip
 
@@ -202,7 +208,7 @@ def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
         raise SettingsError("`loop` is missing: name the loop file.")
     if not isinstance(table.get("vary", {}), dict):
         raise SettingsError("`vary` must be a table: [vary].")
-    rest = {key: table[key] for key in ("runs", "seed", "sampling", "objectives", "parquet") if key in table}
+    rest = {key: table[key] for key in ("runs", "seed", "sampling", "objectives", "parquet", "dask") if key in table}
     loop = table["loop"]
     if isinstance(loop, str):
         loop = source.parent / loop
