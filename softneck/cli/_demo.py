@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError, OutputFileError
 
 from .shared._console import Stages, note, print_json, print_table
-from .shared._options import force_option, json_option
+from .shared._options import common_options
 
 if TYPE_CHECKING:
     from softneck.report._demo import Demo
@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     help="Folder for all results. [default: build/demo]",
 )
 @click.option("--quick", is_flag=True, help="A shorter experiment and less training: under 30 s.")
-@force_option
-@json_option
+@common_options("force")
 def command(output: Path | None, quick: bool, force: bool, as_json: bool) -> None:
     """Run the main job: experiment, models, FMUs, controller, closed loop, report.
 

@@ -13,8 +13,8 @@ from softneck.core._kinds import fitting, kinds_of
 from .shared._console import note, percent, print_json, progress
 from .shared._groups import kinds_complete
 from .shared._kind_help import kind_command
-from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
-from .shared._robot import load_of, robot_option
+from .shared._options import apply_settings, common_options, output_option, set_option, target
+from .shared._robot import load_of
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 
@@ -39,10 +39,8 @@ _LEAST_FIT = 30.0
     help="Of the loop: `mpc` and `nmpc` plan without the delay that it makes up for, and `mpc` with tendons as taut as "
     "the payload that it tells wants them.",
 )  # fmt: skip
-@robot_option
 @set_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     kind: str,
     models: tuple[Path, ...],

@@ -14,7 +14,7 @@ from importlib import metadata
 import click
 
 from .shared._console import print_json, print_table
-from .shared._options import json_option
+from .shared._options import common_options
 
 # Extra -> the module it brings, and what for.
 _EXTRAS = {
@@ -25,7 +25,7 @@ _EXTRAS = {
 
 
 @click.command("doctor", epilog="Example: softneck doctor --json")
-@json_option
+@common_options()
 def command(as_json: bool) -> None:
     """Say which parts of this machine work: packages, compilers, FMU platforms, CAN, extras."""
     checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]

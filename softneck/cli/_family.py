@@ -12,8 +12,7 @@ from softneck.core import CheckFailedError, file_hash, refuse_existing
 
 from .shared._console import print_json, progress
 from .shared._kind_help import kind_command
-from .shared._options import apply_settings, force_option, json_option, output_option, set_option, target
-from .shared._robot import robot_option
+from .shared._options import apply_settings, common_options, output_option, set_option, target
 
 if TYPE_CHECKING:
     from softneck.identification import Family
@@ -39,9 +38,7 @@ _SCOPES = ("windows", "operating points", "recordings")
     help="Recording that the family is not fitted to, and judged by: where it needs more than the weight. Repeatable.",
 )
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with maps and the weight.")
-@robot_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     recordings: tuple[Path, ...],
     output: Path | None,

@@ -14,8 +14,8 @@ from softneck.fmu.compiled._platforms import PLATFORMS
 
 from .shared._console import note, print_json, progress
 from .shared._neck import load_neck
-from .shared._options import force_option, json_option, output_option, read_together, target
-from .shared._robot import load_of, robot_option
+from .shared._options import common_options, output_option, read_together, target
+from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.fmu.describe._describe import Buildable
@@ -58,9 +58,7 @@ if TYPE_CHECKING:
     help="Add outputs of the next sample (pitch_next, motor_setpoint_1_next, ..) and their directional derivatives; "
     "with --backend compiled.",
 )
-@robot_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     files: tuple[str, ...], output: Path | None, data: tuple[Path, ...],
     backend: str | None, fmi: str, platforms: tuple[str, ...], sensitivities: bool, robot: str | None, force: bool,

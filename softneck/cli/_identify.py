@@ -18,15 +18,13 @@ from .shared._groups import kinds_complete
 from .shared._kind_help import kind_command
 from .shared._options import (
     apply_settings,
-    force_option,
-    json_option,
+    common_options,
     output_option,
     read_together,
     set_option,
     target,
     tolerance_option,
 )
-from .shared._robot import robot_option
 from .shared._validate_table import left_out, useless, with_fit
 
 if TYPE_CHECKING:
@@ -63,10 +61,8 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
     help="Refit this model of KIND, or auto: its own.",
 )
 @tolerance_option
-@robot_option
 @set_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     kind: str,
     recordings: tuple[Path, ...],

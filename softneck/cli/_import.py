@@ -14,7 +14,7 @@ import click
 from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
 
 from .shared._console import note, print_json
-from .shared._options import force_option, json_option, output_option, sample_time_of, target
+from .shared._options import common_options, output_option, sample_time_of, target
 from .shared._settle import is_terminal, settle
 
 if TYPE_CHECKING:
@@ -77,11 +77,6 @@ def _writer(text: str) -> Callable[[Path], object]:
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--layout", "layout_file", type=click.Path(path_type=Path), help="How to read the log.")
 @click.option(
-    "--robot",
-    metavar="ROBOT",
-    help="Whose log it is: a preset or a robot file.  [default: robot.toml beside the log or above it, else the neck]",
-)
-@click.option(
     "--robot-out",
     type=click.Path(path_type=Path),
     metavar="ROBOT.toml",
@@ -89,7 +84,6 @@ def _writer(text: str) -> Callable[[Path], object]:
 )
 @click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
 @click.option("--sample-time", "clock", metavar="S", help="With --guess: that of a log without a clock.")
-@click.option("--yes", is_flag=True, help="Take all guesses; else a terminal is asked about those under 90 % sure.")
 @click.option(
     "--html", type=click.Path(path_type=Path), metavar="FILE", help="Page: raw columns and channels, doubts first."
 )
@@ -100,8 +94,7 @@ def _writer(text: str) -> Callable[[Path], object]:
     help="Resample the recording at this sample time [s], or at the robot's.",
 )
 @output_option("recording", "REC")
-@force_option
-@json_option
+@common_options("robot", "yes", "force")
 def command(
     log: Path,
     layout_file: Path | None,

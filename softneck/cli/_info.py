@@ -26,7 +26,7 @@ from softneck.core._files import require_file
 from softneck.core._kinds import KINDS, fitting
 
 from .shared._console import print_json, progress
-from .shared._options import force_option, json_option
+from .shared._options import common_options
 
 if TYPE_CHECKING:
     from softneck.drives.master import Frame
@@ -84,8 +84,7 @@ _LARGE = 20_000_000
 @click.command("info", epilog="Example: softneck info eq22.csv --html quality.html")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Page on a recording's quality.")
-@force_option
-@json_option
+@common_options("force")
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
     """Say what FILE is: a recording, model, observer, controller, FMU, SSP, loop, layout, robot, neck, study,
     certificate or log (tables, and those of `softneck drives run --log`).

@@ -12,7 +12,7 @@ import click
 from softneck.core import OutputFileError, atomic_write
 
 from .shared._console import print_json
-from .shared._options import force_option, json_option
+from .shared._options import common_options
 
 # Of a folder that is not empty, in the line that refuses it.
 _MOST_NAMES = 3
@@ -24,8 +24,7 @@ _MOST_NAMES = 3
     "--loop", "loop_file", type=click.Path(path_type=Path), metavar="LOOP.toml",
     help="Around this loop, as `softneck tune` writes it, over Plant, Observer and Controller.fmu in DIR/fmus.",
 )  # fmt: skip
-@force_option
-@json_option
+@common_options("force")
 def command(folder: Path, loop_file: Path | None, force: bool, as_json: bool) -> None:
     """Write a project into DIR, new or empty: identification, design, loop, study, closed-loop test, drives.
 

@@ -13,13 +13,12 @@ from .shared._console import print_json
 from .shared._kind_help import kind_command
 from .shared._options import (
     apply_settings,
-    force_option,
-    json_option,
+    common_options,
     output_option,
     set_option,
     target,
 )
-from .shared._robot import load_of, robot_option
+from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.estimation._fitted import FittedObserver
@@ -40,10 +39,8 @@ if TYPE_CHECKING:
     help="Estimate the noise levels from this recording (maximum likelihood); with --set sensor=NAME all but that of "
     "the measurement. May be given several times.",
 )
-@robot_option
 @set_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     model: Path,
     output: Path | None,

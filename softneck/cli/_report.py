@@ -10,7 +10,7 @@ import click
 from softneck.core import refuse_existing
 
 from .shared._console import note, print_json, progress
-from .shared._options import force_option, json_option, target
+from .shared._options import common_options, target
 
 if TYPE_CHECKING:
     from softneck.report._project import Project
@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), metavar="FILE", help="The page. [default: build/report.html]"
 )
-@force_option
-@json_option
+@common_options("force")
 def command(folder: Path, output: Path | None, force: bool, as_json: bool) -> None:
     """Write one self-contained page on all that DIR holds, to send to a colleague.
 

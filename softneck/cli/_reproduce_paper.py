@@ -9,7 +9,7 @@ import click
 from softneck.core import refuse_existing
 
 from .shared._console import Stages, note, print_json, print_table
-from .shared._options import force_option, json_option
+from .shared._options import common_options
 
 
 @click.command("reproduce-paper", epilog="Example: softneck reproduce-paper --html build/paper.html")
@@ -21,8 +21,7 @@ from .shared._options import force_option, json_option
     show_default=True,
     help="Number of other necks to identify on, to tell which differences come from the plant.",
 )
-@force_option
-@json_option
+@common_options("force")
 def command(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) -> None:
     """Reproduce the paper on the virtual neck: Tables 3 and 4, section 7.4 and Figures 4 to 23.
 

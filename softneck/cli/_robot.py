@@ -15,7 +15,7 @@ from softneck.core._budget import settings_text
 from .shared._console import print_json
 from .shared._groups import NearGroup
 from .shared._moved import now
-from .shared._options import force_option, json_option
+from .shared._options import common_options
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
@@ -50,7 +50,7 @@ def command() -> None:
 
 @command.command("FILE")
 @click.argument("file", required=False, metavar="[FILE|PRESET]")
-@json_option
+@common_options()
 def show(file: str | None, as_json: bool) -> None:
     """Show motors, outputs, directions, limits, and what is not given; check the files that it names.
 
@@ -69,8 +69,7 @@ def show(file: str | None, as_json: bool) -> None:
 @command.command("new")
 @click.argument("file", required=False, default="robot.toml", type=click.Path(path_type=Path))
 @click.option("--preset", default="neck", show_default=True, metavar="PRESET|FILE", help="Which robot to begin with.")
-@force_option
-@json_option
+@common_options("force")
 def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
     """Write a preset, or another robot's file, into FILE (robot.toml), to edit."""
     from softneck.robot._file import PRESETS, preset_text

@@ -12,8 +12,7 @@ from softneck.core import CheckFailedError, SettingsError, atomic_write, refuse_
 
 from ._replay import replay_log
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option, output_option, target, trust_option
-from .shared._robot import robot_option
+from .shared._options import common_options, output_option, target, trust_option
 
 if TYPE_CHECKING:
     from softneck.cosim import Result
@@ -31,10 +30,8 @@ if TYPE_CHECKING:
 @click.option(
     "--html", type=click.Path(path_type=Path), help="Write a page with plots, and beside it the robot in 3-D."
 )
-@robot_option
 @trust_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     loop_file: Path, output: Path | None, certificate: Path | None, html: Path | None, robot: str | None, trust: bool,
     force: bool, as_json: bool,

@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError
 
 from .shared._console import note, print_json, print_table, progress
-from .shared._options import force_option, json_option, trust_option
+from .shared._options import common_options, trust_option
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,8 +29,7 @@ _WORST = 3
 )  # fmt: skip
 @click.option("--workers", type=int, help="Number of local processes. [default: one for each core]")
 @trust_option
-@force_option
-@json_option
+@common_options("force")
 def command(
     study_file: Path,
     output: Path | None,

@@ -10,9 +10,9 @@ import click
 from softneck.core import CheckFailedError, file_hash
 
 from .shared._console import note, print_json, print_table, progress
-from .shared._options import force_option, json_option
+from .shared._options import common_options
 from .shared._plants import opened_plants
-from .shared._robot import load_of, robot_option
+from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.tuning._tune import Tuned
@@ -48,9 +48,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the search and its noise.")
 @click.option("--workers", type=click.IntRange(min=0), help="Local processes; 0: this one. [default: one a core]")
 @click.option("-o", "--output", type=_PATH, metavar="DIR", required=True, help="Folder of the search and its results.")
-@robot_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     plants: tuple[Path, ...],
     requirements: Path | None,

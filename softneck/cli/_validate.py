@@ -10,8 +10,8 @@ import click
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import print_json, print_table, progress
-from .shared._options import force_option, json_option, tolerance_option
-from .shared._robot import load_of, robot_option
+from .shared._options import common_options, tolerance_option
+from .shared._robot import load_of
 from .shared._validate_table import fit_table, remarks, useless
 
 if TYPE_CHECKING:
@@ -42,9 +42,7 @@ _NOTE = (
 @click.option("--include-training", is_flag=True, help="Also score rows that the model was trained on.")
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
 @tolerance_option
-@robot_option
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     models: tuple[Path, ...],
     data: tuple[Path, ...],

@@ -12,9 +12,9 @@ from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
 
 from .shared._console import note, print_json, print_table, progress
-from .shared._options import force_option, json_option, output_option, target
+from .shared._options import common_options, output_option, target
 from .shared._plants import opened_plants
-from .shared._robot import load_of, robot_option
+from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.verification import Verification
@@ -46,11 +46,9 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
 @click.option(
     "--order", type=click.Choice(ORDERS), help="Order of the loop. [default: that of the controller's design]"
 )
-@robot_option
 @output_option("certificate", "CERTIFICATE")
 @click.option("--html", type=_PATH, help="Write a page with the verdict, and all behind it in plots.")
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     controller: Path,
     plants: tuple[Path, ...],

@@ -12,7 +12,7 @@ from softneck.core import SettingsError, refuse_existing
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._groups import NearGroup
-from ..shared._options import force_option, json_option, output_option, target, trust_option
+from ..shared._options import common_options, output_option, target, trust_option
 from ._commission import commission_command
 from ._log import acting_files, opened_log, require_log
 from ._record import record_command
@@ -49,7 +49,7 @@ def command() -> None:
 
 @command.command("check", epilog="Example: softneck drives check --simulated")
 @drives_options("override")
-@json_option
+@common_options()
 def check_command(asked: Asked, as_json: bool) -> None:
     """Pre-flight: identity, firmware, factors, modes, options, limits, guarding; each value written is read back.
 
@@ -89,8 +89,7 @@ def _show(report: Report, *, as_json: bool) -> None:
 )
 @output_option("recording of the run", "REC")
 @trust_option
-@force_option
-@json_option
+@common_options("force")
 def run_command(
     asked: Asked, controller: Path, loop_file: Path, certificates: tuple[Path, ...], realtime: bool,
     output: Path | None, trust: bool, force: bool, as_json: bool,
@@ -182,7 +181,7 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 
 @command.command("stop")
 @drives_options()
-@json_option
+@common_options()
 def stop_command(asked: Asked, as_json: bool) -> None:
     """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
     from softneck.drives import stop
@@ -197,7 +196,7 @@ def stop_command(asked: Asked, as_json: bool) -> None:
 
 @command.command("reset")
 @drives_options()
-@json_option
+@common_options()
 def reset_command(asked: Asked, as_json: bool) -> None:
     """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
     from softneck.drives import reset

@@ -10,7 +10,7 @@ import click
 from softneck.core import SettingsError
 
 from ..shared._console import note, print_json, print_table, progress
-from ..shared._options import force_option, json_option
+from ..shared._options import common_options
 from ._log import drives_of, opened_log, require_log
 from ._steps import jog_step, scan_step, session_of, zero_step
 from ._target import Asked, drives_options, leave_if_asked, open_link
@@ -35,8 +35,7 @@ _PARTS = ("scan", "tendons", "zero", "jog")
 @drives_options("override", "pace", "log")
 @click.option("-o", "--output", type=click.Path(path_type=Path), metavar="DIR",
               help="Folder of the proposed files.  [default: under build/]")  # fmt: skip
-@force_option
-@json_option
+@common_options("force")
 def commission_command(
     asked: Asked, only: str | None, motors: tuple[int, ...], travel: float | None, output: Path | None, force: bool,
     as_json: bool,

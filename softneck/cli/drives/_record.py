@@ -12,7 +12,7 @@ from softneck.core import refuse_existing, require_between
 from softneck.signals import signal_names, write_recording
 
 from ..shared._console import note, print_json, progress
-from ..shared._options import force_option, json_option, output_option
+from ..shared._options import common_options, output_option
 from ._log import drives_of, opened_log, require_log
 from ._steps import session_of
 from ._target import Asked, drives_options, leave_if_asked, open_link
@@ -40,8 +40,7 @@ _RAMP = 2.0
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: drives file]")
 @click.option("--payload", type=float, default=0.0, metavar="KG", help="Payload on the platform of --simulated.")
 @drives_options("override", "pace", "log")
-@force_option
-@json_option
+@common_options("force")
 def record_command(
     asked: Asked, signal_name: str, output: Path, duration: float | None, seed: int, max_position: float | None,
     payload: float,

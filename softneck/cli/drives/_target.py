@@ -21,6 +21,7 @@ from softneck.drives.bus._link import HARMLESS
 from softneck.drives.running._preflight import OVERRIDES
 
 from ..shared._console import note
+from ..shared._options import COMMON
 
 if TYPE_CHECKING:
     from softneck.drives import CanLink, DrivesFile
@@ -99,9 +100,7 @@ _OPTIONS = {
     "bus": click.option("--bus", metavar="INTERFACE:CHANNEL", help="CAN bus, such as socketcan:can0 or virtual:x."),
     "simulated": click.option("--simulated", is_flag=True,
                               help="Simulated drives on the robot's virtual plant, in this process."),
-    "robot": click.option("--robot", metavar="ROBOT",
-                          help="What the drives move: a preset or a robot file.  [default: robot.toml beside the "
-                          "drives file or above it, else the neck]"),
+    "robot": COMMON["robot"],
     "arm": click.option("--arm", is_flag=True, help="Allow drives on a bus to move."),
     "override": click.option("--override", multiple=True, metavar="NAME",
                              help=f"Ignore a check that fails, by name: {', '.join(OVERRIDES)}."),

@@ -24,7 +24,7 @@ from softneck.signals.recording._recording import require_same_robot
 
 from ..shared._console import print_json, progress
 from ..shared._neck import load_neck
-from ..shared._options import force_option, json_option, output_option
+from ..shared._options import common_options, output_option
 from ._next import record_next
 
 
@@ -39,11 +39,6 @@ from ._next import record_next
 )
 @click.argument("signal_name", metavar="SIGNAL|MODEL")
 @output_option("recording", "REC", required=True)
-@click.option(
-    "--robot",
-    metavar="PRESET|ROBOT.toml",
-    help="Whose tendons, outputs and limits.  [default: robot.toml beside REC or above, else the neck]",
-)
 @click.option(
     "--neck",
     metavar="paper|lab|rough|NECK.toml",
@@ -63,8 +58,7 @@ from ._next import record_next
 )  # fmt: skip
 @click.option("--payload", type=float, default=0.0, show_default=True, metavar="KG", help="Payload on the platform.")
 @click.option("--max-position", type=float, metavar="RAD", help="Clip set-points to +-RAD. [default: the signal's own]")
-@force_option
-@json_option
+@common_options("robot", "force")
 def command(
     signal_name: str,
     output: Path,

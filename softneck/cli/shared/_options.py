@@ -40,8 +40,30 @@ def read_together(paths: Sequence[Path], robot: str | None = None) -> Recording:
     return concatenate(recordings)
 
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
-force_option = click.option("--force", is_flag=True, help="Replace an existing file.")
+COMMON = {
+    "robot": click.option(
+        "--robot",
+        metavar="ROBOT",
+        help="Preset or robot file.  [default: robot.toml beside the file or above it, else what the file says, else "
+        "the neck]",
+    ),
+    "yes": click.option("--yes", is_flag=True, help="Ask nothing and take all guesses."),
+    "force": click.option("--force", is_flag=True, help="Replace an existing file."),
+    "json": click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else."),
+}
+
+
+def common_options(*names: str) -> Callable[[Callable], Callable]:
+    """Return a decorator that adds those of `--robot`, `--yes` and `--force` that are named, and `--json`."""
+
+    def decorate(function: Callable) -> Callable:
+        for name in reversed((*names, "json")):
+            function = COMMON[name](function)
+        return function
+
+    return decorate
+
+
 tolerance_option = click.option(
     "--tolerance",
     type=float,

@@ -1,4 +1,4 @@
-"""The option `--robot`, and files of ours that are of the robot it names."""
+"""Files of ours that are of the robot that `--robot` names."""
 
 from __future__ import annotations
 
@@ -6,17 +6,9 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import click
-
 from softneck.core import DataError, load
 from softneck.robot import find_robot
 from softneck.robot._search import robot_file_of
-
-robot_option = click.option(
-    "--robot",
-    metavar="ROBOT",
-    help="Preset or robot file. [default: `robot.toml` beside the file or above it, else what the file says]",
-)
 
 
 def load_of(path: Path, robot: str | None, *, role: str | None = None) -> Any:
