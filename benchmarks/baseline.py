@@ -39,7 +39,7 @@ OURS = ("paper", "rough")
 SHOWN = (*OURS, *NECKS)
 OUT = Path("build/baseline")
 TESTS = ("steps", "sine", "rotation")
-# Kinds of model; `srivc` finds what `oe` does here, and `residual` and `ensemble` are made of others.
+# Kinds of model; `srivc` finds what `oe` does here.
 MODELS = ("rls", "oe", "subspace", "nlsm", "play", "greybox", "nss", "nn")
 
 

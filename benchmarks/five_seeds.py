@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from softneck.core import KINDS, resolve
-from softneck.identification import INFINITE, Model, Residual, validate
+from softneck.identification import INFINITE, Model, validate
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
 TESTS = ("steps", "sine", "rotation")
-KINDS_SHOWN = ("play", "nss", "nn", "greybox", "greybox+residual")
+KINDS_SHOWN = ("play", "nss", "nn", "greybox")
 
 
 def recordings(data: str, seed: int) -> dict[str, Recording]:
@@ -38,13 +38,11 @@ def recordings(data: str, seed: int) -> dict[str, Recording]:
 
 def trained(kind: str, train: Recording, seed: int) -> Model:
     """Return a model with the kind's defaults."""
-    base, _, residual = kind.partition("+")
-    settings = resolve(KINDS[base].settings)
+    settings = resolve(KINDS[kind].settings)
     values: dict[str, Any] = {"seed": seed} if "seed" in settings.__dataclass_fields__ else {}
     if kind == "nlsm":
         values["form"] = "residual"
-    model = settings(**values).fit(train)
-    return Residual().on(model, train) if residual else model
+    return settings(**values).fit(train)
 
 
 def table(kind: str, data: str, seeds: list[int]) -> None:

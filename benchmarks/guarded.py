@@ -73,8 +73,6 @@ def of_auto(neck: str, kinds: list[str]) -> None:
     begin = time.process_time()
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=False), 0)
     for kind in (kind for kind in kinds_to_try() if kind != "srivc"):
-        if kind in ("residual", "ensemble"):
-            race.examine()
         race.screen(kind)
     race.examine()
     screened = time.process_time() - begin

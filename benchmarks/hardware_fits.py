@@ -15,12 +15,11 @@ import time
 from pathlib import Path
 
 from softneck.core import KINDS, SoftneckError, resolve
-from softneck.identification import INFINITE, Model, OutputError, Residual, SetMembership, validate
+from softneck.identification import INFINITE, Model, OutputError, SetMembership, validate
 from softneck.signals import Recording, concatenate, import_log, read_layout
 
 LAYOUTS = Path(__file__).parents[1] / "examples" / "layouts"
-ALL = ("rls", "oe", "oe best", "srivc", "subspace", "nlsm", "play", "nss", "nn", "greybox", "play+residual",
-       "nss+residual", "greybox+residual")  # fmt: skip
+ALL = ("rls", "oe", "oe best", "srivc", "subspace", "nlsm", "play", "nss", "nn", "greybox")
 _HOLD_OUT = 0.8
 
 
@@ -43,9 +42,7 @@ def trained(kind: str, train: Recording) -> Model:
     """Return a model with the kind's defaults."""
     if kind == "oe best":
         return best_linear(train)
-    base, _, residual = kind.partition("+")
-    model = SetMembership(form="residual").fit(train) if base == "nlsm" else resolve(KINDS[base].settings)().fit(train)
-    return Residual().on(model, train) if residual else model
+    return SetMembership(form="residual").fit(train) if kind == "nlsm" else resolve(KINDS[kind].settings)().fit(train)
 
 
 def best_linear(train: Recording) -> Model:

@@ -25,10 +25,10 @@ import numpy as np
 
 from softneck.core import SettingsError
 from softneck.fmu import build_compiled_fmu
-from softneck.identification import GreyBox, Network, NeuralStateSpace, Play, Rls, SetMembership, combine
+from softneck.identification import GreyBox, Network, NeuralStateSpace, Play, Rls, SetMembership
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import Block
-from softneck.signals import Recording, signal
+from softneck.signals import signal
 
 HERE = Path(__file__).parent
 LAG = HERE.parent / "tests" / "benchmarks" / "lag_fmu.c"
@@ -44,9 +44,6 @@ def kinds() -> dict[str, Callable[[], Block]]:
     def neck(preset: str) -> Callable[[], Block]:
         return lambda: VirtualNeck(getattr(NeckParameters, preset)()).block()
 
-    def ensemble(train: Recording) -> Block:
-        return combine([Play().fit(train), Rls().fit(train)]).block()
-
     return {
         "rls": lambda: Rls().fit(training).block(),
         "nn": lambda: Network(iterations=1).fit(training).block(),
@@ -55,7 +52,6 @@ def kinds() -> dict[str, Callable[[], Block]]:
         "play": lambda: Play().fit(training).block(),
         "nss": lambda: NeuralStateSpace(starts=1, iterations=3).fit(training).block(),
         "greybox": lambda: GreyBox(evaluations=3).fit(training).block(),
-        "ensemble": lambda: ensemble(training),
         "neck paper": neck("paper"),
         "neck lab": neck("lab"),
         "neck rough": neck("rough"),

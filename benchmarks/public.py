@@ -21,7 +21,7 @@ import numpy as np
 
 from softneck import identify
 from softneck.core import DataError, Matrix, SoftneckError, Vector
-from softneck.identification import Model, combine
+from softneck.identification import Model
 from softneck.robot import Robot
 from softneck.signals import Recording, concatenate
 
@@ -178,13 +178,13 @@ BENCHMARKS = (
 )  # fmt: skip
 
 
-def identified(kind: str, train: Recording, settings: dict[str, Any]) -> Model:
-    """Return the model of `kind`; `seeds` among the settings asks for the median of so many."""
+def identified(kind: str, train: Recording, settings: dict[str, Any]) -> list[Model]:
+    """Return the model of `kind`; `seeds` among the settings asks for so many, whose median is judged."""
     settings = dict(settings)
     seeds = settings.pop("seeds", 0)
     if not seeds:
-        return identify(kind, train, **settings)
-    return combine([identify(kind, train, **settings, seed=seed) for seed in range(seeds)])
+        return [identify(kind, train, **settings)]
+    return [identify(kind, train, **settings, seed=seed) for seed in range(seeds)]
 
 
 def candidates_for(train: Recording) -> tuple[Candidate, ...]:
@@ -211,11 +211,11 @@ def left_out(train: Recording) -> list[tuple[Recording, Recording]]:
     return found
 
 
-def rmse(model: Model, test: Recording, window: int) -> Vector:
-    """Return the RMSE (outputs,) of a free run, the first `window` samples of each run left out."""
+def rmse(models: list[Model], test: Recording, window: int) -> Vector:
+    """Return the RMSE (outputs,) of the models' median, without the first `window` samples of each run."""
     errors = []
     for run in test.runs():
-        free = model.simulate(run, warm_up=window)[:, : run.outputs.shape[1]]
+        free = np.median([m.simulate(run, warm_up=window)[:, : run.outputs.shape[1]] for m in models], axis=0)
         errors.append((run.outputs - free)[window:])
     return np.sqrt(np.nanmean(np.concatenate(errors) ** 2, axis=0))
 
@@ -245,8 +245,8 @@ def run(benchmark: Benchmark, folder: Path, candidates: Sequence[Candidate] | No
     train, tests = benchmark.read(folder)
     print(f"{benchmark.name}: {len(train)} rows to learn from")
     (kind, settings), _ = choose(train, candidates or candidates_for(train), benchmark.window)
-    model = identified(kind, train, settings)
-    found = {name: rmse(model, test, benchmark.window) for name, test in tests.items()}
+    models = identified(kind, train, settings)
+    found = {name: rmse(models, test, benchmark.window) for name, test in tests.items()}
     for name, error in found.items():
         shown = ", ".join(f"{value:.4g}" for value in error)
         print(f"  {name}: RMSE {shown} {benchmark.unit} by {kind}; published: {benchmark.published}", flush=True)

@@ -17,17 +17,15 @@ from softneck.identification import (
     NeuralStateSpace,
     OutputError,
     Play,
-    Residual,
     Rls,
     SetMembership,
     Srivc,
     Subspace,
-    combine,
 )
 from softneck.signals import Recording
 
 from .browser import chromium_path, started
-from .data import ROOT, neck_recording, short_neck
+from .data import ROOT, guarded_of, neck_recording, short_neck
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -57,7 +55,7 @@ def neck() -> Recording:
 
 @pytest.fixture(scope="session")
 def models() -> dict[str, Model]:
-    """One small model of each kind, all on the same 500 rows; "any" is kind `residual`, "residual" a form of `nlsm`."""
+    """One small model of each kind, all on the same 500 rows; "residual" is a form of `nlsm`."""
     recording = short_neck()
     made = {
         "rls": Rls(max_delay=0.12).fit(recording),
@@ -71,9 +69,8 @@ def models() -> dict[str, Model]:
         "nss": NeuralStateSpace(order=1, neurons=3, starts=1, iterations=4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
         "greybox": GreyBox(evaluations=4, sensor_delay=2).fit(recording),
-        "any": Residual(base="rls", epsilon=0.004).fit(recording),
     }
-    return {**made, "ensemble": combine([made["play"], made["rls"], made["nn"]])}
+    return {**made, "guarded": guarded_of([made["rls"], made["play"], made["nn"]], recording)}
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 from softneck.core import Matrix, Vector
+from softneck.identification import Model
+from softneck.identification.uncertainty._guarded import Guarded
+from softneck.identification.uncertainty._guarded_base import Base
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
 
@@ -92,6 +95,13 @@ def neck_recording(
 def short_neck() -> Recording:
     """The 500 rows on which the shared small models are trained."""
     return neck_recording(500, seed=3, noise=1e-3)
+
+
+def guarded_of(members: list[Model], recording: Recording) -> Model:
+    """A model that holds `members`, the first of them its base too."""
+    outputs = len(recording.robot.outputs.names)
+    base = Base(members[0], np.full(outputs, 0.01), np.full(outputs, 90.0))
+    return Guarded(of="play").around(base, members, recording)
 
 
 def with_time(recording: Recording, time: Vector, run: np.ndarray | None = None) -> Recording:

@@ -17,10 +17,6 @@ PACKAGE = ROOT / "softneck"
 FILES = sorted(PACKAGE.rglob("*.py"))
 RUNTIMES = [path for path in FILES if path.name.endswith("_runtime.py")]
 ROOMS = [path for path in FILES if path.name == "__init__.py"]
-# A room is seen at one glance, and a file read in one sitting.
-LARGEST_ROOM, LONGEST_FILE = 25, 400
-# What users may rely on; everything else may change without a word.
-MOST_PUBLIC_NAMES = 300
 
 
 def name_of(path: Path) -> str:
@@ -38,11 +34,6 @@ def imports_of(path: Path) -> list[str]:
     return found
 
 
-def test_no_room_holds_more_than_25_files() -> None:
-    crowded = {name_of(room.parent): len(list(room.parent.glob("*.py"))) for room in ROOMS}
-    assert {room: count for room, count in crowded.items() if count > LARGEST_ROOM} == {}
-
-
 def test_every_folder_of_the_package_is_a_room_that_says_what_it_is_for() -> None:
     assert {path.parent for path in FILES} == {room.parent for room in ROOMS}
     for room in ROOMS:
@@ -58,11 +49,6 @@ def test_the_names_of_the_design_card_lead_to_their_rooms() -> None:
             continue
         assert link.is_symlink()
         assert link.readlink() == Path("softneck") / target
-
-
-def test_no_file_is_longer_than_400_lines() -> None:
-    lengths = {name_of(path): len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
-    assert {path: length for path, length in lengths.items() if length > LONGEST_FILE} == {}
 
 
 def test_a_room_re_exports_lazily_and_does_nothing_else() -> None:
@@ -86,10 +72,8 @@ def public_names() -> list[str]:
     return found
 
 
-def test_public_names_are_few_and_there() -> None:
-    names = public_names()
-    assert len(names) <= MOST_PUBLIC_NAMES
-    for name in names:
+def test_public_names_are_there() -> None:
+    for name in public_names():
         assert resolve(name) is not None, name
 
 

@@ -70,13 +70,6 @@ KINDS: dict[str, Kind] = {
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
              "equations of a tendon-driven neck, their numbers fitted by the error of its free run",
              f"{_IDENT}.structured._arrays:check_greybox"),
-        Kind("residual", "model", "softneck.identification:Residual", _MODEL,
-             f"{_IDENT}.uncertainty._residual_runtime",
-             "any other kind, and set membership on what its free run leaves over, with bounds",
-             f"{_IDENT}.uncertainty._arrays:check_residual"),
-        Kind("ensemble", "model", "softneck.identification:Ensemble", _MODEL,
-             f"{_IDENT}.uncertainty._ensemble_runtime",
-             "the median of several kinds, with their spread as bounds"),
         Kind("guarded", "model", f"{_IDENT}.uncertainty._guarded:Guarded", _MODEL,
              f"{_IDENT}.uncertainty._guarded_runtime",
              "several of one learned kind, fading to a base where they part or leave what was seen",
@@ -138,6 +131,8 @@ REMOVED: dict[str, str] = {
     "change": "nonlinear",
     "switched": "pi",
     "ncf": "hinf",
+    "residual": "nlsm --set form=residual",
+    "ensemble": "guarded",
 }
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 

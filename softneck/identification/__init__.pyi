@@ -26,14 +26,11 @@ from .set_membership._set_membership import SetMembership as SetMembership
 from .set_membership._set_membership import outside_seen as outside_seen
 from .structured._greybox import GreyBox as GreyBox
 from .structured._play import Play as Play
-from .uncertainty._ensemble import Ensemble as Ensemble
-from .uncertainty._ensemble import combine as combine
 from .uncertainty._family import Family as Family
 from .uncertainty._family_fit import FamilySettings as FamilySettings
 from .uncertainty._frf import FrequencyResponse as FrequencyResponse
 from .uncertainty._frf_fit import frequency_response as frequency_response
 from .uncertainty._lpv import Lpv as Lpv
-from .uncertainty._residual import Residual as Residual
 from .validation._compare import compare as compare
 from .validation._novelty import Novelty as Novelty
 from .validation._score_tables import INFINITE as INFINITE

@@ -29,10 +29,8 @@ from softneck.identification import (
     Network,
     NeuralStateSpace,
     Play,
-    Residual,
     Rls,
     SetMembership,
-    combine,
 )
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.identification.uncertainty._guarded_base import Base
@@ -61,10 +59,6 @@ def _set(rows: int) -> Block:
 @cache
 def _play() -> Block:
     return Play().fit(_training()).block()
-
-
-def _ensemble() -> Block:
-    return combine([Play().fit(_training()), Rls().fit(_training())]).block()
 
 
 def _guarded(member: Model) -> Block:
@@ -103,8 +97,6 @@ _KINDS = {
     # What is fitted hardly matters to a step's time: a few rounds do.
     "nss": _Kind(make=lambda: NeuralStateSpace(starts=1, iterations=3).fit(_training()).block()),
     "greybox": _Kind(make=lambda: GreyBox(evaluations=3).fit(_training()).block()),
-    "residual of any (rls)": _Kind(make=lambda: Residual(base="rls").fit(_training()).block()),
-    "ensemble (play, rls)": _Kind(make=_ensemble),
     "guarded (5 nn, greybox)": _Kind(
         make=lambda: _guarded(Network(starts=1, iterations=1, refine=0, prior=0.0).fit(_training())),
         wanted=10.0,

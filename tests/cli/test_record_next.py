@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.identification import OutputError, combine
+from softneck.identification import OutputError
 from softneck.signals import read_recording
 
-from ..data import Truth, recording_from, short_neck
+from ..data import Truth, guarded_of, recording_from, short_neck
 from .conftest import Call
 
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An ensemble of two lines that part in pitch."""
+    """Two lines that part in pitch."""
     path = tmp_path_factory.mktemp("models") / "two.npz"
     P = short_neck().set_points
     lines = [OutputError(delay=0.06).fit(recording_from(P, truth=Truth(gain=(gain, 0.008)))) for gain in (0.01, 0.012)]
-    combine(lines).save(path)
+    guarded_of(lines, short_neck()).save(path)
     return path
 
 

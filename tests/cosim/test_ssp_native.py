@@ -100,7 +100,7 @@ def test_omsimulator_computes_our_jacobi_loop(tmp_path: Path) -> None:
     assert np.abs(ours["pitch"]).max() > 0.02
 
 
-@pytest.mark.parametrize("kind", ["kalman", "pi", pytest.param("ensemble", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["kalman", "pi", pytest.param("guarded", marks=pytest.mark.slow)])
 def test_a_python_fmu_gives_its_block_back(kind: str, tmp_path: Path) -> None:
     """What becomes a compiled FMU is what the Python one was made of: the same arrays, ports and starts."""
     block = described_block(block_of(kind))

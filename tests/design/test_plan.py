@@ -21,7 +21,7 @@ ROUND = RotationReference(inclination=0.15, cocontraction=0.1, frequency=0.5, ri
 
 
 @pytest.mark.parametrize(
-    "kind", slow_but(["rls", "play", "nn", "greybox", "nss", "ensemble"], ["rls", "play", "greybox"])
+    "kind", slow_but(["rls", "play", "nn", "greybox", "nss", "guarded"], ["rls", "play", "greybox"])
 )
 def test_it_follows_and_keeps_every_limit(kind: str, models: dict[str, Model]) -> None:
     model = models[kind]

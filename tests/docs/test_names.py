@@ -153,7 +153,8 @@ def test_what_is_not_there_is_found(line: str, why: str | None) -> None:
 def test_every_file_of_the_source_tree_that_a_page_names_is_there() -> None:
     named = of_all_pages(r"(?<!/)\b((?:tests|benchmarks|examples|softneck|design|identification|fmu_src)/[\w./-]*\w)")
     assert len(named) > 20
-    assert [item for item in named if not (ROOT / item[1]).exists()] == []
+    # What was tried and left is named there by its old place.
+    assert [item for item in named if not (ROOT / item[1]).exists() and "tried" not in str(item[0])] == []
 
 
 def test_every_test_that_a_page_names_is_there() -> None:

@@ -15,7 +15,6 @@ from softneck.core import FileFormatError, SettingsError, load, read_archive, wr
 from softneck.design import PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings, NonlinearObserver, consistency
 from softneck.identification import GreyBox, Model, OutputError, Play, Rls
-from softneck.identification.uncertainty._ensemble import combine
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
@@ -228,13 +227,6 @@ def test_the_form_is_chosen_by_the_model(play: Model, training: Recording) -> No
     assert isinstance(KalmanSettings(form="nonlinear").design(Rls().fit([training])), NonlinearObserver)
     with pytest.raises(SettingsError, match=r"needs an identified model; got LinearNeck"):
         KalmanSettings(form="nonlinear").design(neck())
-
-
-@pytest.mark.slow
-def test_over_an_ensemble_of_equals_it_is_the_filter_over_one(play: Model, run: Recording) -> None:
-    """Members that have members of their own."""
-    one, many = (designed(OURS, model).estimate(run) for model in (play, combine([play, play])))
-    np.testing.assert_allclose(many.outputs, one.outputs, atol=1e-12)  # rounding of angles of some 0.5 rad
 
 
 def test_it_is_an_observer_of_a_loop(play: Model, training: Recording) -> None:

@@ -30,12 +30,10 @@ from softneck.identification import (
     NeuralStateSpace,
     OutputError,
     Play,
-    Residual,
     Rls,
     SetMembership,
     Srivc,
     Subspace,
-    combine,
 )
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.identification.uncertainty._guarded_base import Base
@@ -121,15 +119,6 @@ def _loaded_greybox_model() -> Model:
 
 def _loaded_greybox() -> Block:
     return _loaded_greybox_model().block()
-
-
-def _any() -> Block:
-    return Residual(base="rls").fit(recording()).block()
-
-
-def _ensemble() -> Block:
-    play = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())
-    return combine([play, Rls().fit(recording())]).block()
 
 
 def _guarded() -> Block:
@@ -232,18 +221,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         ["pitch", "roll", "motor_position_1", "validity"],
         (*_MODEL, "payload"),
     ),
-    "any": (
-        _any,
-        MOTORS,
-        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
-        _MODEL,
-    ),
-    "ensemble": (
-        _ensemble,
-        MOTORS,
-        ["pitch", "roll", "pitch_lower", "pitch_upper", "roll_lower", "roll_upper", "validity"],
-        _MODEL,
-    ),
     "guarded": (_guarded, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
     "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
     "nss_loaded": (_loaded_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], (*_MODEL, "payload")),
@@ -312,7 +289,7 @@ NATIVE = [kind for kind in KINDS if kind != "nmpc"]
 
 
 # Those whose runtimes take longest to compile.
-HEAVY = ("ensemble", "guarded", "any", "nmpc")
+HEAVY = ("guarded", "nmpc")
 # One of each sort, for tests that take long with every kind: models, one of them with bounds, an observer, a
 # controller, the neck.
 SHORT = ("rls", "nlsm", "kalman", "pi", "neck")

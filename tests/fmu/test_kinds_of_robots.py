@@ -23,8 +23,6 @@ SETTINGS: dict[str, dict[str, Any]] = {kind: {} for kind in ANY_ROBOT} | {
     "srivc": {"resamples": 0},
     "nss": {"neurons": 4, "starts": 1, "iterations": 60},
     "nn": {"hidden": (8, 8), "iterations": 150},
-    "ensemble": {"members": ("rls", "oe")},
-    "residual": {"base": "oe"},
     "greybox": {"evaluations": 40},
 }
 FREE = 100

@@ -301,7 +301,7 @@ def test_the_command_line_builds_one_and_refuses_what_python_cannot(
 # Reading one back
 
 
-@pytest.mark.parametrize("kind", ["rls", "ensemble"])
+@pytest.mark.parametrize("kind", ["rls", "guarded"])
 def test_a_model_file_is_read_as_it_was_written(kind: str) -> None:
     block = load(ROOT / "tests" / "golden" / f"{kind}.npz").block()
     data = model_bytes(block, kind, "guid")
@@ -312,7 +312,7 @@ def test_a_model_file_is_read_as_it_was_written(kind: str) -> None:
 @settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_wrong_bytes_in_a_model_file_are_refused_or_read(data: st.DataObject) -> None:
-    block = load(ROOT / "tests" / "golden" / "ensemble.npz").block()
+    block = load(ROOT / "tests" / "golden" / "guarded.npz").block()
     whole = bytearray(model_bytes(block, "x", "guid"))
     for _ in range(data.draw(st.integers(1, 4))):
         whole[data.draw(st.integers(32, len(whole) - 1))] = data.draw(st.integers(0, 255))

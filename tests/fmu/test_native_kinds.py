@@ -200,8 +200,8 @@ def test_the_same_block_gives_the_same_bytes(kind: str, path: Path, tmp_path: Pa
 
 
 def test_instances_in_threads_do_not_disturb_each_other(tmp_path: Path, running: Any) -> None:
-    build_compiled_fmu(block_of("any"), tmp_path / "Any.fmu")
-    block, u = block_of("any"), inputs_of(block_of("any"), 200)
+    build_compiled_fmu(block_of("residual"), tmp_path / "Residual.fmu")
+    block, u = block_of("residual"), inputs_of(block_of("residual"), 200)
     results: list[np.ndarray] = []
 
     def one(fmu: Any) -> None:
@@ -210,7 +210,7 @@ def test_instances_in_threads_do_not_disturb_each_other(tmp_path: Path, running:
 
     with ExitStack() as stack:
         # Loading is for one thread: fmpy changes the directory of the process meanwhile.
-        fmus = [stack.enter_context(running(tmp_path / "Any.fmu")) for _ in range(4)]
+        fmus = [stack.enter_context(running(tmp_path / "Residual.fmu")) for _ in range(4)]
         threads = [threading.Thread(target=one, args=(fmu,)) for fmu in fmus]
         for thread in threads:
             thread.start()
@@ -227,7 +227,7 @@ SCRIPTS = Path(__file__).with_name("importers")
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("importer", "name"),
-    [("libcosim", "nlsm"), ("libcosim", "neck"), ("ecos", "ensemble"), ("ecos", "kalman"), ("pathsim", "pi")],
+    [("libcosim", "nlsm"), ("libcosim", "neck"), ("ecos", "guarded"), ("ecos", "kalman"), ("pathsim", "pi")],
 )
 def test_an_importer_computes_what_python_does(importer: str, name: str, tmp_path: Path) -> None:
     package = {"libcosim": "libcosimpy", "ecos": "ecospy", "pathsim": "pathsim_fmi"}[importer]

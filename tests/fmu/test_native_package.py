@@ -109,7 +109,7 @@ def test_a_stream_deflated_before_gives_the_same_file(tmp_path: Path) -> None:
     ("kind", "fmi"),
     [
         ("kalman", 3),
-        *(pytest.param(kind, fmi, marks=pytest.mark.slow) for kind, fmi in (("ensemble", 2), ("mpc", 2), ("neck", 3))),
+        *(pytest.param(kind, fmi, marks=pytest.mark.slow) for kind, fmi in (("guarded", 2), ("mpc", 2), ("neck", 3))),
     ],
 )
 def test_its_sources_rebuild_it_for_this_machine(kind: str, fmi: int, tmp_path: Path, running: Any) -> None:

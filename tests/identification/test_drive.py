@@ -40,7 +40,7 @@ def test_a_run_shorter_than_the_longest_delay_does_no_harm(rows: int) -> None:
 
 
 # Of the models, all but the grey box, whose drives are part of its own equations.
-DRIVEN = ("rls", "mimo", "oe", "srivc", "subspace", "nlsm", "residual", "play", "nss", "nn", "any", "ensemble")
+DRIVEN = ("rls", "mimo", "oe", "srivc", "subspace", "nlsm", "residual", "play", "nss", "nn", "guarded")
 
 
 @pytest.mark.parametrize("kind", slow_but(DRIVEN, ["rls", "subspace", "nlsm", "nn"]))

@@ -23,8 +23,7 @@ KINDS = (
     "nss",
     "nn",
     "greybox",
-    "any",
-    "ensemble",
+    "guarded",
     "mimo",
     "oe",
     "srivc",
@@ -130,10 +129,8 @@ CRAFTED = [
     ("nss", "D", lambda a: a[:-1], "`D` has shape"),
     ("greybox", "neck", lambda a: a * 1e6, "drive_rate of .* is out of range"),
     ("greybox", "sensor", lambda a: a + 0.5, "the sensor's dead time"),
-    ("any", "table", lambda a: a - 1.0, "a regressor's"),
-    ("any", "0.rls.delay", lambda a: a + 1e6, "a dead time"),
-    ("ensemble", "memory", lambda a: a * 1e9, "its memory in samples"),
-    ("ensemble", "2.nn.w3", lambda a: a * np.nan, "`w3` is not of finite floats"),
+    ("guarded", "memory", lambda a: a * 1e9, "its memory in samples"),
+    ("guarded", "3.nn.w3", lambda a: a * np.nan, "`w3` is not of finite floats"),
     ("nn", "W2", lambda a: a[:, :, :-1], "`W2` has shape"),
 ]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
-from softneck.identification import Model, OutputError, Play, Rls, combine, validate
+from softneck.identification import Model, OutputError, Play, validate
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._validity import farthest, grounded, knows_validity, tolerance_of, with_tolerance
 from softneck.identification.models._validity_runtime import ground_outside
@@ -30,8 +30,6 @@ PLANTS = (
     "greybox",
     "nss",
     "nn",
-    "residual",
-    "ensemble",
     "guarded",
 )
 PLAY = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4)
@@ -118,14 +116,6 @@ def test_within_the_training_three_of_four_rows_are_inside(line: Model, training
     outputs = line.simulate(training)
     inside = 1.0 / outputs[26:, -1] - 1.0 <= line.arrays["doubt"][:, 0].max() * (1.0 + 1e-9)
     assert inside.mean() == pytest.approx(0.75, abs=0.01)
-
-
-@pytest.mark.slow  # an ensemble of its own to compile
-def test_members_that_part_lower_it(training: Recording) -> None:
-    models = [PLAY.fit(training), Rls(max_delay=0.1).fit(training)]
-    apart = [models[0], replace(models[1], arrays={**models[1].arrays, "b": 2.0 * models[1].arrays["b"]})]
-    together, parted = (combine(pair).simulate(training)[:, -1].mean() for pair in (models, apart))
-    assert parted < 0.8 * together
 
 
 def test_a_model_that_misses_more_in_training_is_trusted_less(line: Model, training: Recording) -> None:

@@ -81,8 +81,6 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
         "nss": lambda: ident.NeuralStateSpace(order=1, neurons=3, starts=1, iterations=4).fit(few),
         "nn": lambda: ident.Network(hidden=(4, 3), iterations=8).fit(few),
         "greybox": lambda: ident.GreyBox(evaluations=4, sensor_delay=2).fit(few),
-        "residual": lambda: ident.Residual(base="rls", epsilon=0.004).fit(fewer),
-        "ensemble": lambda: ident.combine([made["play"], made["rls"], made["nn"]]),
         "rls_online": learnt,
         "rls_state": lambda: made["rls_online"].recursions[0],
         "family": lambda: ident.FamilySettings(window=6.0).fit(whole),

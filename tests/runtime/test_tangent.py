@@ -27,7 +27,20 @@ from softneck.runtime._tangent import with_tangent
 
 from ..data import ROOT
 
-KINDS = ("rls", "rls_mimo", "oe", "srivc", "subspace", "nn", "play", "nss", "greybox", "ensemble", "nlsm", "residual")
+KINDS = (
+    "rls",
+    "rls_mimo",
+    "oe",
+    "srivc",
+    "subspace",
+    "nn",
+    "play",
+    "nss",
+    "greybox",
+    "guarded",
+    "nlsm",
+    "nlsm_residual",
+)
 LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "kalman_steady", "nonlinear")
 
 

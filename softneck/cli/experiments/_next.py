@@ -61,7 +61,7 @@ def _known(source: Path, robot: str | None) -> Known:
 
     model = load_of(source, robot)
     if not isinstance(model, Model):
-        raise SettingsError(f"{source}: is no model; give one of kind `guarded` or `ensemble`.")
+        raise SettingsError(f"{source}: is no model; give one of kind `guarded`.")
     return Known.of_model(model)
 
 

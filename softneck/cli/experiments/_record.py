@@ -32,7 +32,7 @@ from ._next import record_next
     "record",
     help="Record SIGNAL on the virtual neck, or on that of a robot.\n\nSignals: "
     + ", ".join(signal_names())
-    + ", or a recording whose set-points are played. A MODEL (guarded, ensemble): the next experiment, motions on "
+    + ", or a recording whose set-points are played. A MODEL (guarded): the next experiment, motions on "
     "which its members disagree, or lead where nothing was seen; REC holds its set-points, and as outputs what they "
     "expect. Play it with `softneck drives record REC`.",
     epilog="Example: softneck record eq22 -o eq22.csv --neck paper --seed 1",

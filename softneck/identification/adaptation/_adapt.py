@@ -14,7 +14,6 @@ from softneck.core import Matrix, Vector, require_positive
 from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate
 
-from ..models._arrays import members
 from ..models._fitting import row_hashes
 from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
@@ -111,11 +110,8 @@ class Adaptation:
         if not _moved(window.set_points, motion.set_points):
             why = "the window hardly moves the neck, so that it teaches nothing"
             return _kept(model, Judged(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum())))
-        base, free_window = _base_of(model), free_run(model, window)
-        free = Free.of(base)
-        # What the set adds stays; the base is to explain the rest.
-        target = window.outputs - (free_window - free_run(base, window))
-        problem = Problem(free, window, known, target, information(free, motion), self.strength)
+        free = Free.of(model)
+        problem = Problem(free, window, known, window.outputs, information(free, motion), self.strength)
         return _accepted(model, window, problem, problem.solve(), held)
 
 
@@ -133,7 +129,7 @@ def _accepted(model: Model, window: Recording, problem: Problem, z: Vector, held
         numbers = problem.numbers(part * z)
         if not (part * z).any() or not problem.free.sound(numbers):
             continue
-        trial = _with_base(model, problem.free.at(numbers))
+        trial = problem.free.at(numbers)
         after = _fits(window.outputs, free_run(trial, window), held)
         no_worse = all(new >= old for new, old in zip(after, before, strict=True))
         if no_worse and sum(after) > sum(before) and (best is None or sum(after) > sum(best[2])):
@@ -186,32 +182,9 @@ def _fits(measured: Matrix, free: Matrix, held: np.ndarray) -> tuple[float, ...]
     return tuple(float(fit) if np.isfinite(fit) else -np.inf for fit in fits)
 
 
-def _base_of(model: Model) -> Model:
-    """Return the base of a `residual`, the model itself of another kind."""
-    if model.kind != "residual":
-        return model
-    kind, arrays = members(model.arrays)[0]
-    return replace(model, kind=kind, arrays=arrays)
-
-
-def _with_base(model: Model, base: Model) -> Model:
-    if model.kind != "residual":
-        return base
-    inner = {f"0.{base.kind}.{name}": array for name, array in base.arrays.items()}
-    return replace(model, arrays={**model.arrays, **inner})
-
-
 def _widened(model: Model, window: Recording) -> Model:
-    """Return the model with bounds and doubt that hold for what was seen in the window."""
-    outputs, motors = len(model.robot.outputs.names), len(model.robot.motors.names)
-    there, run = scored(window), model.simulate(window)
-    arrays: dict[str, Matrix] = dict(model.arrays)
-    if model.kind == "residual":
-        bounds = arrays["bounds"].copy()
-        lower = run[:, outputs + motors : outputs + motors + 2 * outputs : 2]
-        upper = run[:, outputs + motors + 1 : outputs + motors + 2 * outputs : 2]
-        beyond = np.maximum(np.maximum(lower - window.outputs, window.outputs - upper), 0.0)
-        bounds[:, 1] += [np.quantile(beyond[there[:, axis], axis], _COVERED) for axis in range(outputs)]
-        arrays["bounds"] = bounds
-    errors = np.where(there, window.outputs - run[:, :outputs], np.nan)
-    return doubted(replace(model, arrays=arrays), errors)
+    """Return the model with a doubt that holds for what was seen in the window."""
+    there = scored(window)
+    run = model.simulate(window)[:, : len(model.robot.outputs.names)]
+    errors = np.where(there, window.outputs - run, np.nan)
+    return doubted(model, errors)

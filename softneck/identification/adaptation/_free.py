@@ -13,7 +13,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector
 
-from ..models._arrays import check_arrays, members
+from ..models._arrays import check_arrays
 from ..models._model import Model
 from ..structured._arrays import NUMBERS
 
@@ -25,15 +25,12 @@ _MOVED = {
     "nss": ("B", "h", "C", "c"),
     "greybox": ("neck",),
 }
-#: Kinds that can adapt; `residual` by its base.
-ADAPTING = (*_MOVED, "residual")
+#: Kinds that can adapt.
+ADAPTING = tuple(_MOVED)
 
 
 def require_adapting(model: Model) -> None:
     """Raise SettingsError for a kind that cannot adapt."""
-    bases = [kind for kind, _ in members(model.arrays)]
-    if model.kind == "residual" and bases[0] not in _MOVED:
-        raise SettingsError(f"a `residual` over `{bases[0]}` cannot adapt; its base must be {', '.join(_MOVED)}.")
     if model.kind not in ADAPTING:
         raise SettingsError(
             f"a model of kind `{model.kind}` cannot adapt; {', '.join(ADAPTING)} can. Identify it again on new data."

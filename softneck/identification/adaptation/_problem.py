@@ -63,7 +63,7 @@ class Problem:
         free: the numbers.
         window: to learn from.
         learnt: (time, outputs) which entries count.
-        target: (time, outputs) what the free run is to be; a residual's base without what its set adds.
+        target: (time, outputs) what was measured.
         information: (n, n) J'J / rows of the reference, by sizes.
         strength: of the prior.
     """

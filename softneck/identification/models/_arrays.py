@@ -19,9 +19,8 @@ from softneck.runtime._layout import Arrays, StateVector
 from ._linear_systems import AFFINE, STATE_SPACE
 from ._ports import MOST_PAYLOAD
 
-COMPOSED = ("residual", "ensemble", "guarded")
-# A base and one other at least.
-_LEAST_MEMBERS = {"guarded": 2}
+COMPOSED = ("guarded",)
+_LEAST_MEMBERS = 2  # a base and one other
 # Of `nss` where the state is corrected by what is measured.
 OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
 # Where the recordings had several payloads.
@@ -141,9 +140,6 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
     runtime, arrays = runtime_of(kind, arrays).partition("(")[0], runtime_arrays(kind, arrays)
     named = declared(runtime, Arrays)(list(arrays.values()))
     parts = declared(runtime, StateVector).parts(named)
-    if "added" in parts and kind in COMPOSED:
-        # The base stands where the neck does less what the set adds.
-        y = y - values[parts["added"]]
     if "motors" in parts:
         values[parts["motors"]], values[parts["angles"]] = m, y
     if "slow" in parts:
@@ -193,7 +189,7 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
     own, parts = own_arrays(arrays), members(arrays)
     if tuple(arrays)[: len(own)] != tuple(own) or not _named(own, names):
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
-    if len(parts) < _LEAST_MEMBERS.get(kind, 1) or (kind == "residual" and len(parts) != 1):
+    if len(parts) < _LEAST_MEMBERS:
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
     _check_numbers(kind, runtime_arrays(kind, own), KINDS[kind].runtime)
     for member, part in parts:

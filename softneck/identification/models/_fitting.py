@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Kinds that take any robot.
 ANY_ROBOT = (
-    "rls", "oe", "srivc", "subspace", "play", "nss", "nn", "ensemble", "nlsm", "residual", "greybox",
+    "rls", "oe", "srivc", "subspace", "play", "nss", "nn", "nlsm", "greybox",
     "guarded",
 )  # fmt: skip
 # Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.

@@ -46,7 +46,7 @@ _MOTORS = ("simulated", "measured")
 # Kinds that can be far off beyond their training and have a guarded form.
 _GUARDED = ("nn", "nss")
 # Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
-_SEARCHING = ("nlsm", "residual")
+_SEARCHING = ("nlsm",)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -256,7 +256,7 @@ class Model(Shown):
         of one side.
 
         Raises:
-            SettingsError: a kind that searches a set (`nlsm`, `residual`, an ensemble with one of them).
+            SettingsError: a kind that searches a set (`nlsm`, or `guarded` over it).
         """
         from softneck.runtime._casadi import step_function
 

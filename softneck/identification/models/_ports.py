@@ -136,15 +136,14 @@ def _range(findings: Mapping[str, Any], motors: int) -> tuple[list[float], list[
 
 
 #: Kinds with bounds of their outputs, which follow outputs and motors.
-BOUNDED = ("nlsm", "residual", "ensemble")
+BOUNDED = ("nlsm",)
 
 
 def outputs(kind: str, robot: Robot) -> tuple[Port, ...]:
-    """Return the outputs of a kind; set membership and ensembles have bounds as well, and `validity` is the last."""
+    """Return the outputs of a kind; set membership has bounds as well, and `validity` is the last."""
     names = robot.outputs.names
     bounds = tuple(
-        _output(robot, f"{name}_{side}", f"{side.capitalize()} bound of {name} by set membership (Eq. 19, 20) or of "
-                "the ensemble")
+        _output(robot, f"{name}_{side}", f"{side.capitalize()} bound of {name} by set membership (Eq. 19, 20)")
         for name in names
         for side in ("lower", "upper")
     )  # fmt: skip

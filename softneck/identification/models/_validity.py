@@ -7,7 +7,6 @@ these rows but of its kind: `RATIO` and `SLOPE` are chosen on necks that were no
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,9 +56,7 @@ _EQUATIONS, _LEARNED = Trust(0.7, 1.0, 0.002), Trust(2.0, 0.0, 0.02)
 TRUST = {
     **dict.fromkeys(("rls", "oe", "srivc", "subspace", "greybox"), _EQUATIONS),
     **dict.fromkeys(("play", "nlsm", "nn", "nss"), _LEARNED),
-    "ensemble": Trust(1.0, 0.0, 0.02, 1.0),
     "guarded": Trust(1.0, 0.0, 0.02, 1.0),
-    "residual": Trust(1.0, 0.0, 0.07, 0.1),
 }
 
 
@@ -120,23 +117,6 @@ def tolerance_finding(robot: Robot, allowed: Vector) -> dict[str, Any]:
 
 def _finding(unit: str) -> str:
     return f"validity_within_{unit}"
-
-
-def joined(ensemble: Model, models: Sequence[Model]) -> Model:
-    """Return an ensemble of models that are there already with what its output `validity` takes, from theirs."""
-    known = [model for model in models if knows_validity(model)]
-    if len(known) < len(models):
-        return ensemble
-    allowed = tolerance_of(known[0])
-    if allowed is None:
-        return ensemble
-    # Members are mostly trained on the same rows; in the mean their median misses no more than they do.
-    doubt = np.mean([model.arrays["doubt"] for model in known], axis=0)
-    doubt[:, 2] = TRUST["ensemble"].agreement / allowed**2
-    arrays = with_validity(ensemble.kind, ensemble.arrays, known[0].arrays["ground"], doubt)
-    return replace(
-        ensemble, arrays=arrays, findings={**ensemble.findings, **tolerance_finding(ensemble.robot, allowed)}
-    )
 
 
 def tolerance_of(model: Model) -> Vector | None:

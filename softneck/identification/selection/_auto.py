@@ -15,15 +15,12 @@ from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.quality._poor_excitation import poor_excitation
 
-from ..models._arrays import members
 from ..models._fitting import ANY_ROBOT, one_recording
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
 from ..set_membership._set_membership import noise_levels
-from ..uncertainty._ensemble import combine
 from ..uncertainty._guarded import OF, Guarded
 from ..uncertainty._guarded_base import BASES, fitted_base
-from ..uncertainty._residual import Residual
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
 from ._choice_words import ALIKE, guarded_why, reasons, remarks, why, word
@@ -31,10 +28,9 @@ from ._exam import agreement, exams, free_runs
 from ._kind_trial import EXAM, HOLD_OUT, KindTrial
 from ._left_out import Fold, everything, folds
 
-# From what can be read to what cannot: of kinds that hold as many numbers the first is taken. `_MADE_OF_OTHERS` come
-# last, as they need the others. `srivc` is tried where it is named: it has the model of `oe`.
-_SIMPLE_FIRST = ("rls", "oe", "srivc", "subspace", "greybox", "play", "nlsm", "nn", "nss", "residual", "ensemble")
-_MADE_OF_OTHERS = ("residual", "ensemble")
+# From what can be read to what cannot: of kinds that hold as many numbers the first is taken. `srivc` is tried where
+# it is named: it has the model of `oe`.
+_SIMPLE_FIRST = ("rls", "oe", "srivc", "subspace", "greybox", "play", "nlsm", "nn", "nss")
 _NAMED_ONLY = ("srivc",)
 # Settings other than the default: that form of set membership which can run free.
 _SETTINGS: dict[str, dict[str, Any]] = {"nlsm": {"form": "residual"}}
@@ -47,7 +43,6 @@ _SCREENED: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0
-_MOST_MEMBERS = 3
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
 _GUARD_COST = 2.0
 # So many kinds are trained on all rows at most, before the better of them is taken.
@@ -98,8 +93,7 @@ def choose(
     from the first row only as well; where it then falls behind the next, that one is trained too. So is the best linear
     kind, which controllers are designed on, or the best nonlinear one where the chosen is linear.
 
-    `residual` is put on the best of the others, `ensemble` is the median of the best three, and is never taken where
-    one of them is better on anything held out. Of a learned kind that wins, the guarded form is taken: it falls back to
+    Of a learned kind that wins, the guarded form is taken: it falls back to
     the better of `greybox` and `oe` where its members part. A kind that fails is listed with its reason.
 
     Args:
@@ -117,8 +111,6 @@ def choose(
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
     for number, kind in enumerate(wanted):
         progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
-        if kind in _MADE_OF_OTHERS:
-            race.examine()
         race.screen(kind)
     race.examine()
     race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
@@ -164,9 +156,9 @@ def best_others(ranking: Sequence[KindTrial], chosen: KindTrial) -> dict[str, Ki
     """Return the best "linear" kind where the chosen one cannot stand for it, and the best "nonlinear" one likewise.
 
     A linear one is to have a transfer function for each output, which most designs ask for: `subspace` of a robot
-    without directions has none. A median of others may be one of linear kinds, so it does not stand for what bends.
+    without directions has none.
     """
-    free = [one for one in ranking if one.fit > float("-inf") and one.kind != "ensemble"]
+    free = [one for one in ranking if one.fit > float("-inf")]
     sought = {
         "linear": [] if _has_axes(chosen) else [one for one in free if _has_axes(one)],
         "nonlinear": [one for one in free if one.kind not in LINEAR] if chosen.kind in LINEAR else [],
@@ -216,10 +208,7 @@ class _Race:
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
     def examine(self) -> None:
-        """Add to the scores how well the kinds agree on motions that nobody recorded.
-
-        What is made of others has no vote.
-        """
+        """Add to the scores how well the kinds agree on motions that nobody recorded."""
         if not self.folds[0].judged:
             return
         self._motions = self._motions or exams(self.folds[0].train)
@@ -229,8 +218,7 @@ class _Race:
                 self._worth[one.kind] = one.fit
         # Linear kinds share their bias: the best of them has a vote, or they would outvote what bends.
         linear = sorted((kind for kind in self._worth if kind in LINEAR), key=lambda kind: -self._worth[kind])
-        silent_ones = (*_MADE_OF_OTHERS, *linear[1:])
-        voters = {kind: fit for kind, fit in self._worth.items() if kind not in silent_ones}
+        voters = {kind: fit for kind, fit in self._worth.items() if kind not in linear[1:]}
         for kind, fit in agreement(self._free, voters).items():
             self.tried[kind] = _with(self.tried[kind], {EXAM: (fit, float("nan"))})
 
@@ -318,28 +306,18 @@ class _Race:
         self.tried[kind] = replace(one, model=model, judged=judged, whole=True)
 
     def _simplest_of_the_best(self) -> KindTrial:
-        ranking = [one for one in self.ranking() if one.kind != "ensemble" or self._no_member_is_better(one)]
+        ranking = self.ranking()
         best = ranking[0]
         if best.fit == float("-inf"):
             raise DataError(f"no kind could be identified: {reasons(ranking)}")
         alike = [one for one in ranking if one.fit > best.fit - ALIKE]
         return min(alike, key=lambda one: (one.numbers, _SIMPLE_FIRST.index(one.kind)))
 
-    def _no_member_is_better(self, ensemble: KindTrial) -> bool:
-        """Return whether no member of the ensemble beats it on anything that was left or held out."""
-        names = [] if ensemble.model is None else [kind for kind, _ in members(ensemble.model.arrays)]
-        own = ensemble.scores
-        return all(own[what] >= fit for kind in names for what, fit in self.tried[kind].scores.items() if what in own)
-
     def _short(self, kind: str, train: Recording) -> Model:
-        best = [one.model for one in self.ranking() if one.model is not None and one.fit > float("-inf")]
-        if kind == "ensemble":
-            return combine([model for model in best if model.kind != "residual"][:_MOST_MEMBERS])
         short = dict(_SCREENED.get(kind, {}))
-        if kind in ("nlsm", "residual"):
+        if kind == "nlsm":
             short["epsilon"] = _SIGMAS * float(noise_levels(train).max())
-        settings = _settings(kind, self.seed, short)
-        return settings.on(best[0], train) if kind == "residual" and best else settings.fit(train)
+        return _settings(kind, self.seed, short).fit(train)
 
     def _judged(self, kind: str, model: Model) -> Validation:
         rules = Rules((1, INFINITE))
@@ -362,14 +340,7 @@ def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:
 
 
 def _anew(model: Model, train: Recording, seed: int, progress: Progress = silent) -> Model:
-    """Return the model's kind, made of the same kinds, identified with its usual settings from `train`."""
+    """Return the model's kind identified with its usual settings from `train`."""
     if model.kind == "guarded":
         return Guarded(of=model.settings["of"], base=model.settings["base"], seed=seed).fit(train, progress=progress)
-    parts = {"residual": [model.settings.get("base")], "ensemble": list(model.settings.get("members", ()))}
-    made_of: list[Model] = []
-    for number, kind in enumerate(parts.get(model.kind, [])):
-        progress(number / (len(parts[model.kind]) + 1), f"{kind} on all rows")
-        made_of.append(_settings(str(kind), seed, {}).fit(train))
-    if model.kind == "residual":
-        return Residual().on(made_of[0], train)
-    return combine(made_of) if model.kind == "ensemble" else _settings(model.kind, seed, {}).fit(train)
+    return _settings(model.kind, seed, {}).fit(train)

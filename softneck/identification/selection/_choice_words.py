@@ -16,8 +16,7 @@ def reasons(ranking: Sequence[KindTrial]) -> str:
     """Return why kinds failed, each reason once."""
     said: dict[str, list[str]] = {}
     for one in ranking:
-        if one.kind != "ensemble" or len(ranking) == 1:  # it lacks the others
-            said.setdefault(one.failure or "its free run diverged", []).append(one.kind)
+        said.setdefault(one.failure or "its free run diverged", []).append(one.kind)
     if len(said) == 1:
         return next(iter(said))
     return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())

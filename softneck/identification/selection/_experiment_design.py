@@ -86,8 +86,8 @@ class Known:
         parts = parts[1:] if model.kind == "guarded" else parts
         if len(parts) < 2:
             raise SettingsError(
-                f"a model of kind `{model.kind}` has no members that could part; give one of kind `guarded` or "
-                "`ensemble`, or the recording."
+                f"a model of kind `{model.kind}` has no members that could part; give one of kind `guarded`, "
+                "or the recording."
             )
         own, outputs = own_arrays(model.arrays), len(model.robot.outputs.names)
         return cls(

@@ -76,8 +76,6 @@ def numbers_of(model: Model) -> int:
     """Return how many numbers of a model were found from data; a set's points are, what finds them is not."""
     parts = members(model.arrays)
     inner = [Model(kind=kind, sample_time=model.sample_time, arrays=part) for kind, part in parts]
-    if model.kind == "ensemble":
-        return sum(numbers_of(part) for part in inner)
     own = sum(values.size for name, values in model.arrays.items() if name not in _NOT_FOUND and "." not in name)
     return own + sum(numbers_of(part) for part in inner)
 

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Vector
 from softneck.signals import Recording, concatenate
 
-from ..models._arrays import members
 from ..models._fitting import MIN_ROWS
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
@@ -52,7 +51,7 @@ class Judged:
         -inf and NaN where the free run is no number.
         """
         y = np.where(self.rows[:, None], self.recording.outputs, np.nan)
-        free = simulated(model, self.recording)
+        free = model.simulate(self.recording)[:, : y.shape[1]]
         fits = [nrmse_fit(y[:, i], free[:, i]) for i in range(y.shape[1])]
         moved = np.isfinite(fits)
         if not np.isfinite(free).all() or not moved.any():
@@ -66,20 +65,6 @@ class Fold:
 
     train: Recording
     judged: tuple[Judged, ...]
-
-
-def simulated(model: Model, recording: Recording, warm_up: int = WARM_UP) -> Matrix:
-    """Return the outputs (time, outputs) of a free run.
-
-    An ensemble's is the median of its members', one by one: it compiles for each combination of kinds.
-    """
-    if model.kind != "ensemble":
-        return model.simulate(recording, warm_up=warm_up)[:, : len(model.robot.outputs.names)]
-    parts = [
-        Model(kind=kind, sample_time=model.sample_time, arrays=arrays, robot=model.robot)
-        for kind, arrays in members(model.arrays)
-    ]
-    return np.median([simulated(part, recording, warm_up) for part in parts], axis=0)
 
 
 def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> list[Fold]:

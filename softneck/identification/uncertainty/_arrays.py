@@ -9,12 +9,6 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix
 
 from ..models._arrays import within
-from ..set_membership._arrays import check_set
-
-
-def check_residual(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
-    within(arrays["table"][:, 0], 2, 3, "a regressor's source")
-    check_set(arrays, sizes)
 
 
 def check_guarded(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:

@@ -18,7 +18,6 @@ from softneck.core import DataError, Matrix, Vector
 from softneck.core._shown import Shown
 from softneck.signals import Recording, concatenate
 
-from ..models._arrays import members
 from ..models._drive import DriveModel
 from ..models._fitting import known_rows
 from ..models._model import WARM_UP, Model
@@ -154,7 +153,7 @@ def _scale(known: Matrix) -> Vector:
 def _set_novelty(model: Model, stretches: Sequence[ScoredStretch]) -> Novelty:
     """Return the novelty in the space of a set's own regressor, by its weights: form `lags` or `residual`."""
     table, scale = model.arrays["table"], model.arrays["scale"]
-    residual = model.kind == "residual" or model.arrays["b"].shape[1] > 0
+    residual = model.arrays["b"].shape[1] > 0
     # The base settles over twice the longest lag; without one, regressors need the lags alone.
     first = int(table[:, 2].max()) * (2 if residual else 1)
     tests = [stretch.recording for stretch in stretches if len(stretch.recording) > first + 2]
@@ -168,11 +167,7 @@ def _set_novelty(model: Model, stretches: Sequence[ScoredStretch]) -> Novelty:
 
 
 def _base_rows(model: Model, test: Recording, axis: int) -> Matrix:
-    """Return regressors (rows, n) of form or kind `residual`: simulated motors and angles of its base."""
-    if model.kind == "residual":
-        kind, part = members(model.arrays)[0]
-        base = Model(kind=kind, sample_time=model.sample_time, arrays=part)
-        return residual_rows(test, base, model.arrays["table"], axis)[0].T
+    """Return regressors (rows, n) of form `residual`: simulated motors and angles of its base."""
     names = ("history", "drive", "redefinition", "a", "b", "delay")
     base = Model(kind="rls", sample_time=model.sample_time, arrays={name: model.arrays[name] for name in names})
     return residual_rows(test, base, model.arrays["table"], axis)[0].T

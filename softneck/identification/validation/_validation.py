@@ -39,8 +39,8 @@ from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
 from ._validity import judged_validity
 
 _HORIZONS = (1, 5, 25, INFINITE)
-# Kinds whose bounds are guaranteed under an assumption; an ensemble's are its members' least and largest.
-_PROMISING = ("nlsm", "residual")
+# Kinds whose bounds are guaranteed under an assumption.
+_PROMISING = ("nlsm",)
 
 Scores = dict[str, dict[str, float | None]]
 

@@ -16,7 +16,6 @@ from softneck.identification import (
     NeuralStateSpace,
     OutputError,
     Play,
-    Residual,
     Rls,
     load_model,
     nrmse_fit,
@@ -30,13 +29,12 @@ from softneck.signals import Recording, signal
 from ...data import slow_but
 
 # Fitting the others takes seconds.
-KINDS = slow_but(ADAPTING, ("oe", "play", "residual"))
+KINDS = slow_but(ADAPTING, ("oe", "play"))
 NECK = VirtualNeck(NeckParameters.rough())
 SETTINGS = {
     "oe": OutputError(),
     "play": Play(rate=6.0, widths=(0.3,), degree=2),
     "greybox": GreyBox(sensor_delay=2, evaluations=10),
-    "residual": Residual(base="oe"),
     "nn": Network(hidden=(6, 6), starts=1, iterations=6, refine=3),
     "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3),
 }
@@ -204,7 +202,7 @@ def test_a_stronger_prior_leaves_more_of_what_the_window_does_not_move(old: Trai
     assert moved[1] < moved[0]
 
 
-@pytest.mark.parametrize("kind", slow_but([kind for kind in SETTINGS if kind != "residual"], ("oe", "play")))
+@pytest.mark.parametrize("kind", slow_but(SETTINGS, ("oe", "play")))
 def test_numbers_that_move_together_have_the_derivatives_they_have_alone(
     old: Trained, window: Recording, kind: str
 ) -> None:
@@ -233,15 +231,6 @@ def test_a_weak_prior_ends_where_the_estimator_does(window: Recording, old: Trai
     assert fits(model, window)[0] > fits(refit, window)[0] - 0.5
 
 
-def test_bounds_of_a_residual_hold_what_the_window_showed(old: Trained, window: Recording) -> None:
-    new = old["residual"].adapted(window)
-    run = new.simulate(window)[WARM_UP + 1 :]
-    y = window.outputs[WARM_UP + 1 :]
-    inside = (run[:, 5:9:2] <= y) & (y <= run[:, 6:9:2])
-    assert (inside.mean(axis=0) > 0.985).all()  # 99 % by construction, half a point for the rows around borders
-    assert (new.arrays["bounds"][:, 1] >= old["residual"].arrays["bounds"][:, 1]).all()
-
-
 def test_an_adapted_model_knows_its_rows_and_doubts_itself_no_less(old: Trained, window: Recording) -> None:
     new = old["play"].adapted(window)
     assert new.training_rows.size == old["play"].training_rows.size + len(window)
@@ -249,7 +238,7 @@ def test_an_adapted_model_knows_its_rows_and_doubts_itself_no_less(old: Trained,
 
 
 def test_a_kind_that_cannot_adapt_says_so(empty: Recording, window: Recording) -> None:
-    with pytest.raises(SettingsError, match="kind `rls` cannot adapt; oe, play, nn, nss, greybox, residual can"):
+    with pytest.raises(SettingsError, match="kind `rls` cannot adapt; oe, play, nn, nss, greybox can"):
         Rls().fit(empty).adapted(window)
 
 

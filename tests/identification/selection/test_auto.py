@@ -20,7 +20,6 @@ from softneck.identification.selection._exam import agreement, exams, weighted_m
 from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
 from softneck.identification.selection._left_out import folds
 from softneck.identification.uncertainty import _guarded
-from softneck.identification.uncertainty._ensemble import combine
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.identification.uncertainty._guarded_base import Base
 from softneck.signals import Recording, concatenate
@@ -32,7 +31,7 @@ TRAIN, OTHER = neck_recording(900), neck_recording(500, seed=12)
 
 @pytest.fixture(scope="module")
 def choice() -> Choice:
-    return choose(TRAIN, OTHER, kinds=("play", "rls", "nn", "residual", "ensemble"), other_excitation=True)
+    return choose(TRAIN, OTHER, kinds=("play", "rls", "nn"), other_excitation=True)
 
 
 @pytest.mark.slow
@@ -73,16 +72,9 @@ def test_a_kind_that_fails_is_listed_with_its_reason_and_costs_nothing_else(choi
 
 
 @pytest.mark.slow
-def test_the_residual_is_on_the_best_and_the_ensemble_of_the_others(choice: Choice) -> None:
-    models = {one.kind: one.model for one in choice.ranking if one.model is not None}
-    assert models["residual"].settings["base"] in ("rls", "play")
-    assert sorted(models["ensemble"].settings["members"]) == ["play", "rls"]
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "kinds",
-    slow_but([("play",), ("rls", "residual"), ("rls", "play", "ensemble")], [("play",)]),
+    slow_but([("play",), ("rls", "nlsm")], [("play",)]),
 )
 def test_a_refit_is_the_chosen_kind_on_all_rows_and_keeps_the_scores_of_before(kinds: tuple[str, ...]) -> None:
     found = choose(TRAIN, OTHER, kinds=kinds, other_excitation=True)
@@ -112,26 +104,26 @@ def test_a_hold_out_of_the_same_excitation_and_a_hopeless_one_are_remarked() -> 
 
 
 def test_nothing_to_try_and_nothing_that_works_are_errors() -> None:
-    assert {"rls", "play", "nn", "greybox", "residual", "ensemble"} <= set(kinds_to_try())
+    assert {"rls", "play", "nn", "greybox"} <= set(kinds_to_try())
     with pytest.raises(SettingsError, match="`magic` cannot be tried"):
         choose(TRAIN, OTHER, kinds=("magic",))
     with pytest.raises(DataError, match=r"no kind could be identified: .*at least 100 are needed"):
         choose(TRAIN.rows(0, 60), OTHER, kinds=("rls", "play"))
     still = TRAIN.with_channels(**{f"motor_setpoint_{j}": np.ones(len(TRAIN)) for j in (1, 2, 3)})
     with pytest.raises(DataError) as said:
-        choose(still, OTHER, kinds=("rls", "oe", "play", "ensemble"))
+        choose(still, OTHER, kinds=("rls", "oe", "play"))
     assert str(said.value).count("constant") == 1, "a reason that all share is said once"
 
 
-def test_the_best_of_the_other_sort_is_no_median_and_ran_free() -> None:
-    fits = {"rls": 80.0, "oe": 85.0, "ensemble": 99.0, "play": 70.0, "nn": 75.0, "nss": float("-inf")}
+def test_the_best_of_the_other_sort_ran_free() -> None:
+    fits = {"rls": 80.0, "oe": 85.0, "play": 70.0, "nn": 75.0, "nss": float("-inf")}
     linear = load(ROOT / "tests" / "golden" / "oe.npz")
     trials = {
         kind: KindTrial(kind, 0.0, left_out={"hold-out": fit}, model=linear if kind in ("rls", "oe") else None)
         for kind, fit in fits.items()
     }
     ranking = list(trials.values())
-    for chosen, sort, other in (("rls", "nonlinear", "nn"), ("play", "linear", "oe"), ("ensemble", "linear", "oe")):
+    for chosen, sort, other in (("rls", "nonlinear", "nn"), ("play", "linear", "oe")):
         found = best_others(ranking, trials[chosen])
         assert {name: one.kind for name, one in found.items()} == {sort: other}
     assert best_others(ranking[:2], trials["rls"]) == {}
@@ -225,18 +217,6 @@ def test_numbers_are_those_found_from_data() -> None:
     nlsm = SetMembership(epsilon=1e-3, output_weight=10.0).fit(TRAIN)
     points = nlsm.arrays["points"].size + nlsm.arrays["values"].size
     assert points < numbers_of(nlsm) < points + 20
-
-
-def test_an_ensemble_is_not_taken_where_a_member_is_better_on_anything_left_out() -> None:
-    models = [Rls().fit(TRAIN), Play().fit(TRAIN)]
-    race = _Race(TRAIN, OTHER, [], 0)
-    scores = {"rls": {"x": 70.0, "y": 95.0}, "play": {"x": 90.0, "y": 80.0}}
-    race.tried = {m.kind: KindTrial(m.kind, 1.0, m, left_out=scores[m.kind]) for m in models}
-    both = combine(models)
-    race.tried["ensemble"] = KindTrial("ensemble", 1.0, both, left_out={"x": 92.0, "y": 94.0})
-    assert race._simplest_of_the_best().kind == "play"  # its worst is 92, but `rls` has 95 on y
-    race.tried["ensemble"] = KindTrial("ensemble", 1.0, both, left_out={"x": 92.0, "y": 95.0})
-    assert race._simplest_of_the_best().kind == "ensemble"
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.identification import Model, OutputError, combine
+from softneck.identification import Model, OutputError
 from softneck.identification.selection._candidate_motions import Bounds, motions
 from softneck.identification.selection._experiment_design import Known, _greedy, next_experiment
 from softneck.identification.uncertainty._guarded import Guarded
 from softneck.robot import Robot
 from softneck.signals import SetPointLimits
 
-from ...data import Truth, neck_recording, recording_from, short_neck
+from ...data import Truth, guarded_of, neck_recording, recording_from, short_neck
 
 
 def line(roll: float) -> Model:
@@ -27,7 +27,7 @@ def line(roll: float) -> Model:
 
 @pytest.fixture(scope="module")
 def known() -> Known:
-    return Known.of_model(combine([line(0.8), line(1.0), line(1.2)]))
+    return Known.of_model(guarded_of([line(0.8), line(1.0), line(1.2)], short_neck()))
 
 
 def test_a_second_motion_is_chosen_for_what_the_first_does_not_say() -> None:

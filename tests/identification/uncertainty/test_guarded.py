@@ -18,7 +18,8 @@ from softneck.identification.uncertainty._guarded_base import Base, base_or_reas
 from softneck.identification.uncertainty._left_out import left_out, left_out_error
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
-from softneck.runtime import load_runtime
+from softneck.runtime import bundle, load_runtime
+from softneck.runtime._bundle import prefixed
 from softneck.runtime._compile import Runtime, load_tangent
 from softneck.signals import Recording, concatenate, signal
 
@@ -246,7 +247,7 @@ def test_what_cannot_be_is_refused(fitted: Model) -> None:
     with pytest.raises(SettingsError, match="of"):
         Guarded(of="rls")
     with pytest.raises(SettingsError, match="cannot be a base"):
-        Guarded(base="ensemble")
+        Guarded(base="guarded")
     arrays = dict(fitted.arrays)
     with pytest.raises(FileFormatError, match="`sigma` must be positive"):
         check_arrays("guarded", {**arrays, "sigma": np.zeros(2)})
@@ -264,3 +265,32 @@ def test_another_robot_that_tendons_bend_can_have_equations_as_base() -> None:
     assert isinstance(base, Base), base
     # 99 % on 40 s; a line has as much there, and 3 points less on four tendons.
     assert base.fit.min() > 95.0
+
+
+def test_crafted_members_are_refused(models: dict[str, Model]) -> None:
+    arrays = dict(models["guarded"].arrays)
+    check_arrays("guarded", arrays)
+    renamed = {name.replace("1.rls", "1.guarded"): array for name, array in arrays.items()}
+    with pytest.raises(FileFormatError, match="belongs to no member in order"):
+        check_arrays("guarded", renamed)
+    alone = {name: array for name, array in arrays.items() if name[0] not in "123"}
+    with pytest.raises(FileFormatError, match="cannot have 1 members"):
+        check_arrays("guarded", alone)
+    swapped = {**arrays, "0.rls.delay": arrays["0.rls.delay"] + 1e6}
+    with pytest.raises(FileFormatError, match="a dead time"):
+        check_arrays("guarded", swapped)
+
+
+def test_names_of_a_member_get_a_prefix_and_nothing_else_changes() -> None:
+    text = "SIZE = 2\nCOMPILED = 0\n\ndef size(SIZE):\n    return SIZE\n\ndef f(x):\n    return size(x) + SIZE"
+    space: dict = {}
+    exec(prefixed(text, "m0_"), space)
+    assert space["m0_f"](3) == 5
+    assert space["COMPILED"] == 0
+    assert "f" not in space
+
+
+def test_a_module_without_members_takes_none() -> None:
+    plain = "softneck.identification.linear._rls_runtime"
+    with pytest.raises(SettingsError, match="does not declare its Arrays"):
+        bundle(f"softneck.runtime._members_runtime({plain}:6)")
