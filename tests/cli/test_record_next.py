@@ -77,7 +77,7 @@ def test_a_robot_that_names_its_drives_has_their_slack_and_speed(call: Call, two
         f'profile = "ipos2015"\n[limits]\nslack_unwind_rad = 0.7\nspeed_rad_s = 8.0\n{drives}'
     )
     Path("robot.toml").write_text('name = "lab"\nextends = "neck"\n[drives]\nfile = "drives.toml"\n')
-    said = call("record", two, "-o", "next.csv", "--duration", 10, "--robot", "robot.toml")
+    said = call("record", two, "-o", "next.csv", "--duration", 20, "--robot", "robot.toml")
     assert said.code == 0, said.err
     P = read_recording("next.csv").set_points
     assert -0.7 <= P.min() < -0.6
