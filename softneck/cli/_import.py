@@ -114,7 +114,7 @@ def command(
     With --resample alone LOG is a recording. Where the new sample time is slower, measured channels are low-passed
     first, without a delay; set-points and flags hold their last value. At its own sample time it stays, to the bit.
 
-    Reads text in any encoding, spreadsheets, Parquet, MATLAB and Octave files, and ROS 2 bags (.mcap). The .mcap log of
+    Reads text in any encoding, spreadsheets, Parquet, MATLAB files, and ROS 2 bags (.mcap). The .mcap log of
     `softneck drives run --log` needs neither layout nor guess.
     """
     from softneck.robot import find_robot

@@ -118,11 +118,6 @@ CASES: dict[str, tuple[Callable[[Path], None], list[str]]] = {
     "wide_seen.csv": (text((",".join(f"c{k}" for k in range(10**6)) + "\n") * 2), [IMPORT, "wide_seen.csv", *GUESS]),
     "line.csv": (text("1" * 50_000_000), [IMPORT, "line.csv", *GUESS]),
     "zeros.mat": (mat, [IMPORT, "zeros.mat", *GUESS]),
-    "holes.mat": (holes(b"# Created by Octave\n# name: a\n# type: matrix\n"), [IMPORT, "holes.mat", *GUESS]),
-    "range.mat": (
-        text("# Created by Octave 8\n# name: t\n# type: range\n# base, limit, increment\n0 1e8 1\n"),
-        [IMPORT, "range.mat", *GUESS],
-    ),
     "holes.parquet": (holes(b"PAR1"), ["identify", "rls", "holes.parquet", "-o", "m.npz"]),
     "holes.mcap": (holes(b"\x89MCAP0\r\n"), [IMPORT, "holes.mcap", "-o", "out.csv"]),
     "holes.log": (holes(b"(1.000000) can0 181#00\n"), ["info", "holes.log"]),

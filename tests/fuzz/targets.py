@@ -227,14 +227,6 @@ TARGETS: dict[str, Target] = {
             lambda path: log_writers.write_trials_v73(path, [columns()]),
         ],
     ),
-    "octave": Target(
-        ".mat",
-        sniff,
-        [
-            lambda path: log_writers.write_octave_text(path, columns()),
-            lambda path: log_writers.write_octave_binary(path, columns()),
-        ],
-    ),
     "mcap": Target(".mcap", sniff, [lambda path: log_writers.write_mcap(path, columns())]),
     "run_log": Target(".mcap", read_run_log, [run_log]),
     "fmu": Target(".fmu", lambda path: FmuPart(path, role="plant"), [fmu], zipped=True),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -94,53 +93,6 @@ def write_trials_v73(path: Path, trials: Sequence[Columns]) -> None:
                 group[name] = np.atleast_2d(array) if array.ndim == 1 else array.T
             cell[k, 0] = group.ref
         cell.attrs["MATLAB_class"] = np.bytes_("cell")
-
-
-def write_octave_text(path: Path, columns: Columns, *, trials: bool = False) -> None:
-    """As `save -text` does: matrices by rows, structures by `ndims` and `length`."""
-    lines = ["# Created by Octave 8.4.0, Mon Nov 23 06:28:37 2026 UTC <lab@neck>"]
-    content = by_kind(columns)
-    if trials:
-        lines += ["# name: trials", "# type: cell", "# rows: 1", "# columns: 2"]
-        for _ in range(2):
-            lines += ["# name: <cell-element>", "# type: scalar struct", "# ndims: 2", " 1 1"]
-            lines += [f"# length: {len(content)}", *_text_matrices(content), "", ""]
-    else:
-        lines += ["# name: title", "# type: string", "# elements: 1", "# length: 4", "neck", "", ""]
-        lines += ["# name: gain", "# type: scalar", "3", "", "", *_text_matrices(content)]
-    path.write_text("\n".join(lines), encoding="utf-8")
-
-
-def _text_matrices(content: Mapping[str, np.ndarray]) -> list[str]:
-    lines: list[str] = []
-    for name, array in content.items():
-        rows = array[:, None] if array.ndim == 1 else array
-        lines += [f"# name: {name}", "# type: matrix", f"# rows: {rows.shape[0]}", f"# columns: {rows.shape[1]}"]
-        lines += [" " + " ".join(repr(float(value)) for value in row) for row in rows] + ["", ""]
-    return lines
-
-
-def write_octave_binary(path: Path, columns: Columns, order: str = "<") -> None:
-    """As `save -binary` does, by the comment above `read_binary_data` in Octave's ls-oct-binary.cc."""
-
-    def word(text: str) -> bytes:
-        return struct.pack(order + "i", len(text)) + text.encode()
-
-    def record(name: str, kind: str, data: bytes) -> bytes:
-        return word(name) + word("") + b"\0" + b"\xff" + word(kind) + data
-
-    def matrix(array: np.ndarray) -> bytes:
-        rows = array[:, None] if array.ndim == 1 else array
-        sizes = struct.pack(order + "3i", -2, *rows.shape)
-        return sizes + b"\x07" + rows.astype(order + "f8").tobytes(order="F")
-
-    fields = [record(name, "matrix", matrix(array)) for name, array in by_kind(columns).items()]
-    parts = [
-        record("title", "string", struct.pack(order + "3i", -2, 1, 4) + b"neck"),
-        record("gain", "scalar", b"\x07" + struct.pack(order + "d", 3.0)),
-        record("log", "scalar struct", struct.pack(order + "i", len(fields)) + b"".join(fields)),
-    ]
-    path.write_bytes((b"Octave-1-L" if order == "<" else b"Octave-1-B") + b"\0" + b"".join(parts))
 
 
 _STAMPED = (

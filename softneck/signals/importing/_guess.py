@@ -95,7 +95,7 @@ _NO_MOTORS = "no column is of a motor; record their set-points, positions or vel
 
 
 def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
-    """Return a layout for a log of which nothing is known: a text, spreadsheet, Parquet, MAT, Octave or MCAP file.
+    """Return a layout for a log of which nothing is known: a text, spreadsheet, Parquet, MAT or MCAP file.
 
     Args:
         path: the log.

@@ -76,7 +76,7 @@ class Layout(Shown):
         new_run_at_restart: a time that goes back starts a new run.
         duplicates: which row to keep of those with one time stamp, `first` or `last`; None refuses them.
         run: the column that numbers the runs, or None.
-        variable: the matrix of a MAT or Octave file; None takes its vectors by name.
+        variable: the matrix of a MAT file; None takes its vectors by name.
         sheet: of a spreadsheet; None takes the largest.
         encoding: of a text.
         header: whether the first line names the columns.

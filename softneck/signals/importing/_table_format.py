@@ -18,8 +18,9 @@ from ._layout import Column, Layout
 from .formats._arrays import table_of
 from .formats._dates import is_date, seconds
 from .formats._encodings import encoding_of, format_of
+from .formats._mat import mat_arrays
 from .formats._mcap import mcap_table
-from .formats._read import arrays_of, without_remarks
+from .formats._read import without_remarks
 from .formats._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
@@ -107,8 +108,8 @@ def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
 def _form(source: Path, fewest: int) -> Form:
     """Return a log's table, how it is read, why, and the cells of its line of units."""
     kind = format_of(source)
-    if kind in ("mat", "octave"):
-        return (*_arrays(source, kind, fewest), [])
+    if kind == "mat":
+        return (*_arrays(source, fewest), [])
     if kind == "parquet":
         form = Layout(channels={})
         return read_table(source, ".parquet", form.form), form, (), []
@@ -169,8 +170,8 @@ def _numbers(column: pd.Series) -> Vector | None:
     return values if values.size and filled.mean() > 0.5 and np.isfinite(values).any() else None
 
 
-def _arrays(source: Path, kind: str, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
-    arrays = arrays_of(source, kind)
+def _arrays(source: Path, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
+    arrays = mat_arrays(source)
     try:
         beside = table_of(source, arrays, None)
     except DataError:

@@ -133,8 +133,6 @@ WHOLE: dict[str, Callable[[Path], None]] = {
     "quaternion.csv": quaternions,
     "matrices.mat": lambda p: write.write_mat(p, neck()),
     "structures.mat": lambda p: write.write_trials(p, [neck(), neck()]),
-    "octave.mat": lambda p: write.write_octave_text(p, neck()),
-    "octave binary.bin": lambda p: write.write_octave_binary(p, neck()),
     "inclination and orientation.csv": tilted,
     "positions only.csv": lambda p: csv(p, titled(leave_out="s")),
     "velocities only.csv": velocities,

@@ -1,4 +1,4 @@
-"""What foreign files hold: text in any encoding, spreadsheets, MATLAB, Octave, MCAP; and dates as seconds.
+"""What foreign files hold: text in any encoding, spreadsheets, MATLAB, MCAP; and dates as seconds.
 
 Tables come out; what their columns mean is told in the room above.
 May import `signals.recording`.

@@ -1,4 +1,4 @@
-"""Named arrays of a MATLAB or Octave file as one table of columns."""
+"""Named arrays of a MATLAB file as one table of columns."""
 
 from __future__ import annotations
 

@@ -12,21 +12,19 @@ from softneck.core import FileFormatError
 from softneck.core._budget import open_zip, require_size, require_table
 
 #: What a logger's file may be; `text` is all that has no mark of its own.
-FORMATS = ("text", "parquet", "mat", "octave", "sheet", "mcap")
+FORMATS = ("text", "parquet", "mat", "sheet", "mcap")
 _HEAD = 2**16
 _MARKS = (
     (b"PAR1", "parquet"),
     (b"\x89HDF\r\n\x1a\n", "mat"),
     (b"MATLAB 5.0", "mat"),
     (b"MATLAB 7.3", "mat"),
-    (b"Octave-1-", "octave"),
-    (b"# Created by Octave", "octave"),
-    (b"# name: ", "octave"),
     (b"\x89MCAP0\r\n", "mcap"),
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "sheet"),
 )
 # Of these the user hears what they are, and what would do instead.
 _EXPORT = "export the log as CSV"
+_SAVE_AS_MAT = "save it there by `save -v7 log.mat`"
 _OTHERS = (
     (b"\x89PNG", "a PNG picture", _EXPORT),
     (b"\xff\xd8\xff", "a JPEG picture", _EXPORT),
@@ -39,6 +37,8 @@ _OTHERS = (
     (b"SQLite format 3", "a SQLite database", "a ROS 2 bag of this kind becomes MCAP by `ros2 bag convert`"),
     (b"#ROSBAG", "a bag of ROS 1", "convert it with `rosbags-convert` to MCAP of ROS 2, or export CSV"),
     (b"\x7fELF", "a program", _EXPORT),
+    (b"Octave-1-", "a binary file of Octave", _SAVE_AS_MAT),
+    (b"# Created by Octave", "a text of Octave's `save`", _SAVE_AS_MAT),
 )
 # A BOM says it; the longer mark first, as one begins with the other.
 _BOMS = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"),

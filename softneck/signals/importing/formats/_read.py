@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 from softneck.core import DataError
 
 from ...recording._files import TextForm, read_table
-from ._arrays import Arrays, table_of
+from ._arrays import table_of
 from ._encodings import format_of
 from ._mat import mat_arrays
 from ._mcap import mcap_table
-from ._octave import octave_arrays
 from ._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
@@ -27,7 +26,7 @@ def read_foreign(
     Args:
         source: the file.
         form: how a text, or a sheet, is a table.
-        variable: the matrix of a MATLAB or Octave file; None takes its vectors.
+        variable: the matrix of a MATLAB file; None takes its vectors.
         sheet: of a spreadsheet; None takes the largest.
         wanted: the columns that are needed, by which vectors of another length are told.
 
@@ -36,12 +35,12 @@ def read_foreign(
         DataError: no such variable or sheet.
     """
     kind = format_of(source)
-    if variable is not None and kind not in ("mat", "octave"):
+    if variable is not None and kind != "mat":
         raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
     if sheet is not None and kind != "sheet":
         raise DataError(f"{source}: the layout's `sheet` is for a spreadsheet.")
-    if kind in ("mat", "octave"):
-        return table_of(source, arrays_of(source, kind), variable, wanted)
+    if kind == "mat":
+        return table_of(source, mat_arrays(source), variable, wanted)
     if kind == "mcap":
         return mcap_table(source)
     if kind == "sheet":
@@ -58,8 +57,3 @@ def without_remarks(frame: pd.DataFrame) -> pd.DataFrame:
         return frame
     remark = frame.iloc[:, 0].astype(str).str.lstrip().str.startswith(("#", "%"))
     return frame.loc[~remark].reset_index(drop=True) if remark.any() else frame
-
-
-def arrays_of(source: Path, kind: str) -> Arrays:
-    """Return the arrays of a MATLAB or Octave file."""
-    return mat_arrays(source) if kind == "mat" else octave_arrays(source)
