@@ -14,13 +14,14 @@ import click
 from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
 
 from .shared._console import note, print_json
-from .shared._options import common_options, output_option, sample_time_of, target
+from .shared._options import columns_options, common_options, sample_time_of, target
 from .shared._settle import is_terminal, settle
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
     from softneck.signals import Guess, Layout
     from softneck.signals.importing._log import ImportResult
+    from softneck.signals.importing._robot_guess import NamedColumns
 
 
 @dataclass(slots=True)
@@ -37,6 +38,7 @@ class _Job:
         as_json: print JSON.
         sample_time: to resample at: a number [s], "robot", or None.
         clock: the sample time [s] of a log without a clock, as the user knows it.
+        named: the columns that the user named.
         texts: file -> text to write beside the recording, and whether it may be replaced.
     """
 
@@ -49,6 +51,7 @@ class _Job:
     as_json: bool = False
     sample_time: str | None = None
     clock: float | None = None
+    named: NamedColumns | None = None
     texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
 
     def beside(self, ending: str) -> Path:
@@ -83,7 +86,7 @@ def _writer(text: str) -> Callable[[Path], object]:
     help="Propose a robot by the log's titles, write it here, and import the log as its recording.",
 )
 @click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
-@click.option("--sample-time", "clock", metavar="S", help="With --guess: that of a log without a clock.")
+@click.option("--sample-time", "clock", metavar="S", help="Of a log without a clock, with --guess or named columns.")
 @click.option(
     "--html", type=click.Path(path_type=Path), metavar="FILE", help="Page: raw columns and channels, doubts first."
 )
@@ -93,7 +96,9 @@ def _writer(text: str) -> Callable[[Path], object]:
     metavar="S|robot",
     help="Resample the recording at this sample time [s], or at the robot's.",
 )
-@output_option("recording", "REC")
+@columns_options
+@click.option("-o", "output", type=click.Path(path_type=Path), metavar="REC",
+              help="Where to write the recording. [default: under build/]")  # fmt: skip
 @common_options("robot", "yes", "force")
 def command(
     log: Path,
@@ -105,11 +110,14 @@ def command(
     yes: bool,
     html: Path | None,
     sample_time: str | None,
+    motors: tuple[str, ...],
+    positions: tuple[str, ...],
+    outputs: tuple[str, ...],
     output: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
-    """Turn any logger's table LOG into a recording, by a layout file or by a guess at one.
+    """Turn any logger's table LOG into a recording: by a layout file, a guess at one, or columns that are named.
 
     With --resample alone LOG is a recording. Where the new sample time is slower, measured channels are low-passed
     first, without a delay; set-points and flags hold their last value. At its own sample time it stays, to the bit.
@@ -118,17 +126,22 @@ def command(
     `softneck drives run --log` needs neither layout nor guess.
     """
     from softneck.robot import find_robot
+    from softneck.robot._search import robot_file_of
     from softneck.signals import import_log, read_layout
+    from softneck.signals.importing._robot_guess import NamedColumns
     from softneck.signals.importing.formats._mcap import is_run_log
     from softneck.signals.recording._files import recording_suffix, said_robot
 
-    asked = guess or layout_file is not None or robot_out is not None
+    named = NamedColumns(motors, outputs, positions) if motors or outputs or positions else None
+    asked = guess or layout_file is not None or robot_out is not None or named is not None
     ours = log.suffix.lower() == ".mcap" and (not asked or is_run_log(log))
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     known = None if clock is None else sample_time_of(clock, "--sample-time")
-    if known is not None and not guess:
+    if known is not None and not guess and named is None:
         raise SettingsError("--sample-time goes with --guess; a layout says it as `sample_time_s` in [time].")
-    job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known)
+    if named is not None and (guess or layout_file is not None):
+        raise SettingsError("--motor, --position and --output are the layout; leave out --guess and --layout.")
+    job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known, named)
     if ours:
         _run_log(job, layout=asked)
         return
@@ -136,14 +149,14 @@ def command(
         _resample(job, robot)
         return
     if robot_out is not None:
-        if guess or layout_file is not None or robot is not None:
+        if guess or layout_file is not None or (robot is not None and named is None):
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
         if robot_out.suffix.lower() != ".toml":
             raise SettingsError(f"{robot_out}: must end in `.toml`, by which softneck recognises the file.")
         if (said := said_robot(log, log.suffix.lower())) is not None:
             raise SettingsError(f"{log}: is a recording of robot {said.label()} already, which commands take as it is.")
-        guess = True
-    if guess == (layout_file is not None):
+        guess = named is None
+    if named is None and guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given (a recording needs --resample)"
         raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
     recording_suffix(path)
@@ -152,8 +165,10 @@ def command(
         refuse_existing(html, force=force)
     facts: dict[str, Any] = {}
     whose = find_robot(robot, beside=log)
-    if robot_out is not None or (layout_file is None and not whose.is_neck):
-        imported, layout, facts = _of_robot(job, whose, robot_out)
+    if robot_out is not None or named is not None or (layout_file is None and not whose.is_neck):
+        imported, layout, facts = _of_robot(
+            job, whose, robot_out, known=robot is not None or robot_file_of(log) is not None
+        )
         proposed = None
     elif layout_file is None:
         proposed, imported, facts = _by_guess(job, whose)
@@ -291,17 +306,31 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, A
         raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error
 
 
-def _of_robot(job: _Job, robot: Robot, robot_out: Path | None) -> tuple[ImportResult, Layout, dict[str, Any]]:
-    """Import by titles a log of `robot`, or of the one that they speak of; propose that robot, to be written."""
+def _of_robot(
+    job: _Job, robot: Robot, robot_out: Path | None, *, known: bool
+) -> tuple[ImportResult, Layout, dict[str, Any]]:
+    """Import by columns or titles a log of `robot`, or of the one that they speak of; propose that, to be written.
+
+    `known` is whether somebody said that it is of `robot`.
+    """
     import tomli_w
 
     from softneck.signals import import_log, layout_toml
-    from softneck.signals.importing._robot_guess import guess_robot, layout_for
+    from softneck.signals.importing._robot_guess import guess_robot, layout_for, robot_of_columns
 
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
     remarks: dict[str, str] = {}
-    if robot_out is not None:
+    if job.named is not None:
+        found = robot_of_columns(job.log, job.named, robot=robot if known else None, sample_time=job.clock)
+        layout = found.layout
+        if robot_out is not None or found.robot.hash != robot.hash:
+            file = robot_out or job.beside(".robot.toml")
+            refuse_existing(file, force=job.force if robot_out else job.replace)
+            text = f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
+            job.texts[file] = (text + tomli_w.dumps(found.robot.as_dict()), job.force if robot_out else job.replace)
+            facts["robot_file"] = str(file)
+    elif robot_out is not None:
         refuse_existing(robot_out, force=job.force)
         found = guess_robot(job.log)
         remarks[found.robot.set_points[0]] = found.remark

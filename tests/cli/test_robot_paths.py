@@ -172,3 +172,71 @@ def test_a_robot_is_an_fmu_by_its_preset_or_file(call: Call) -> None:
     assert call("fmu", "antagonist", "-o", "A.fmu").code == 0
     assert call("robot", "new", "mine.toml", "--preset", "antagonist").code == 0
     assert call("fmu", "mine.toml", "-o", "B.fmu").code == 0
+
+
+# -- columns that are named -------------------------------------------------------------------------------------------
+
+
+def pneumatic_log(rows: int = 200) -> str:
+    """Return a log whose titles speak of nothing: two commands, what became of them, an answer, a counter."""
+    rng = np.random.default_rng(0)
+    lines = ["t_s,a [kPa],b [kPa],am [kPa],bm [kPa],flexion(deg),n"]
+    a, b = rng.uniform(0.0, 80.0, (2, rows))
+    for k in range(rows):
+        lines.append(
+            f"{0.02 * k:.2f},{a[k]:.6f},{b[k]:.6f},{0.9 * a[k]:.6f},{0.9 * b[k]:.6f},{a[k] - b[k]:.6f},{k % 7}"
+        )
+    return "\n".join(lines) + "\n"
+
+
+NAMED = ("--motor", "a [kPa]", "--motor", "b [kPa]", "--position", "am [kPa]", "--position", "bm [kPa]",
+         "--output", "flexion(deg)")  # fmt: skip
+
+
+def test_named_columns_are_a_layout_and_a_robot(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(pneumatic_log())
+    said = call("import", "log.csv", *NAMED, "-o", "rec.csv", "--json")
+    assert said.code == 0, said.err
+    facts = json.loads(said.out)
+    assert (facts["rows"], facts["sample_time_s"], facts["robot_file"]) == (200, 0.02, "rec.robot.toml")
+    recording = read_recording("rec.csv")
+    assert (recording.robot.motors.unit, recording.robot.outputs.display_unit) == ("kPa", "deg")
+    table = np.genfromtxt("log.csv", delimiter=",", skip_header=1)
+    # Files of ours keep all digits; the robot's own unit is Pa inside.
+    np.testing.assert_allclose(recording.set_points, 1e3 * table[:, 1:3], rtol=1e-12)
+    np.testing.assert_allclose(recording.channels["motor_position_2"], 1e3 * table[:, 4], rtol=1e-12)
+    np.testing.assert_allclose(np.degrees(recording.outputs[:, 0]), table[:, 5], rtol=1e-9, atol=1e-9)
+    # The layout and the robot that were written do the same again; and so does the robot alone.
+    again = ("import", "log.csv", "--layout", "rec.layout.toml", "--robot", "rec.robot.toml", "-o", "again.csv")
+    assert call(*again).code == 0
+    assert Path("again.csv").read_bytes() == Path("rec.csv").read_bytes()
+
+
+def test_named_columns_of_a_neck_are_the_neck_s(call: Call, tmp_path: Path) -> None:
+    rows = "\n".join(f"{0.1 * k % 1},{0.2 * k % 1},{0.3 * k % 1},{k % 5},{k % 3}" for k in range(60))
+    (tmp_path / "log.csv").write_text(f"m1,m2,m3,pitch [deg],roll [deg]\n{rows}\n")
+    named = ("--motor", "m1", "--motor", "m2", "--motor", "m3", "--output", "pitch [deg]", "--output", "roll [deg]")
+    said = call("import", "log.csv", *named, "--sample-time", "0.02", "-o", "rec.csv")
+    assert said.code == 0, said.err
+    assert read_recording("rec.csv").robot.is_neck
+    assert not Path("rec.robot.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("--motor", "a [kPa]"), "name the columns of motors and outputs, by"),
+        (("--motor", "a [kPa]", "--output", "flexon(deg)"), "there is no column `flexon(deg)`; did you mean"),
+        (("--motor", "a [kPa]", "--output", "a [kPa]"), "column `a [kPa]` is named twice"),
+        ((*NAMED, "--sample-time", "0.1"), "has a clock, `t_s`; leave out --sample-time"),
+        ((*NAMED, "--guess"), "--motor, --position and --output are the layout"),
+        ((*NAMED[:6], *NAMED[-2:]), "needs 2 --position; 1 were given"),
+        ((*NAMED, "--robot", "neck"), "needs 3 --motor; 2 were given"),
+    ],
+)
+def test_columns_that_cannot_be_are_one_line(call: Call, tmp_path: Path, words: tuple[str, ...], line: str) -> None:
+    (tmp_path / "log.csv").write_text(pneumatic_log())
+    said = call("import", "log.csv", *words, "-o", "rec.csv")
+    assert (said.code, said.out) == (2, "")
+    assert line in said.error
+    assert [path.name for path in tmp_path.iterdir()] == ["log.csv"]

@@ -81,6 +81,19 @@ set_option = click.option(
 )
 
 
+def columns_options(function: Callable) -> Callable:
+    """Add the options that name the columns of a log."""
+    for option, name, what in (
+        ("--output", "outputs", "is the next output, such as an angle"),
+        ("--position", "positions", "is the next motor's measured position"),
+        ("--motor", "motors", "is the next motor's set-point"),
+    ):
+        function = click.option(
+            option, name, multiple=True, metavar="COL", help=f"Column, by title or index, that {what}."
+        )(function)
+    return function
+
+
 def output_option(what: str, metavar: str, *, required: bool = False) -> Callable:
     """Return the option `-o`; without it a command writes under build/."""
     help_text = f"Where to write the {what}." + ("" if required else " [default: under build/]")

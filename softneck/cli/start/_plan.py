@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import isclose
 from pathlib import Path
@@ -40,6 +41,7 @@ class Asked:
         requirements: absolute path of the file for `tune`; None: the defaults.
         kinds: of controllers to search; None: those of `tune` but `scheduled` and `adaptive`.
         sample_time: of logs without a clock [s].
+        motors, positions, outputs: columns of the logs that were named; () for a guess.
         budget: of `tune`: by default half its own, so that a sitting ends within minutes.
         seed: of kinds of models and of the search.
         yes: take all guesses.
@@ -52,6 +54,9 @@ class Asked:
     requirements: str | None = None
     kinds: str | None = None
     sample_time: str | None = None
+    motors: Sequence[str] = ()
+    positions: Sequence[str] = ()
+    outputs: Sequence[str] = ()
     budget: int = 80
     seed: int = 0
     yes: bool = False
@@ -102,7 +107,7 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
 
     layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
     whose = "robot.toml" if asked.robot is not None else robot.as_posix() if robot.is_file() else None
-    page = f"build/import/{Path(recording).stem}.html"
+    page, settings = f"build/import/{Path(recording).stem}.html", f"{log} of {asked.robot}"
     if Path(log).suffix.lower() == ".mcap" and is_run_log(Path(log)):
         words: list[str] = []  # of a run on drives: its columns are known
     else:
@@ -112,10 +117,15 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
             guess = ["--robot-out", robot.as_posix()]
         by_layout = layout.is_file() and not (asked.sample_time is not None and _lacks_clock(layout))
         words = ["--layout", layout.as_posix()] if by_layout else guess
+        columns = (("--motor", asked.motors), ("--position", asked.positions), ("--output", asked.outputs))
+        if named := [word for option, titles in columns for title in titles for word in (option, title)]:
+            words = named + ([] if asked.sample_time is None else ["--sample-time", asked.sample_time])
+            settings += f", {shlex.join(named)}"
+            whose = None if asked.robot is None else whose  # else it is of what was named before
         words += ["--html", page] + ([] if whose is None else ["--robot", whose])
     return Step(
         stage="import", command=("softneck", "import", log, *words, "-o", recording, "--force"), makes=(recording,),
-        reads=(log, layout.as_posix(), *([] if whose is None else [whose])), settings=f"{log} of {asked.robot}",
+        reads=(log, layout.as_posix(), *([] if whose is None else [whose])), settings=settings,
     )  # fmt: skip
 
 

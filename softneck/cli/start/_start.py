@@ -23,7 +23,7 @@ from softneck.core._budget import MOST_JSON, settings_text
 from softneck.core._files import require_file
 
 from ..shared._console import note, percent, print_json, print_table
-from ..shared._options import common_options
+from ..shared._options import columns_options, common_options
 from ..shared._settle import is_terminal
 from ._plan import BEST, PI, Asked, linear_model, nonlinear_model, steps
 from ._preflight import backend, has_pytest, require_disk
@@ -48,16 +48,18 @@ _FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+
 
 @click.command("start", epilog="Example: softneck start log.csv -o my_neck --yes")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
-@click.option("-o", "--output", type=_PATH, metavar="DIR", help="Folder of the project. [default: build/start/LOG]")
+@click.option("-o", "output", type=_PATH, metavar="DIR", help="Folder of the project. [default: build/start/LOG]")
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What `tune` shall keep. [default: its own]")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller to search. [default: those of `tune` but `adaptive`]")
 @click.option("--sample-time", metavar="S", help="Of logs without a clock. [default: as the log tells]")
 @click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 80]")
 @click.option("--seed", type=click.IntRange(min=0), help="Of models and search. [default: 0]")
+@columns_options
 @common_options("robot", "yes")
 def command(
     logs: tuple[Path, ...], output: Path | None, yes: bool, robot: str | None, requirements: Path | None,
-    kinds: str | None, sample_time: str | None, budget: int | None, seed: int | None, as_json: bool,
+    kinds: str | None, sample_time: str | None, budget: int | None, seed: int | None, motors: tuple[str, ...],
+    positions: tuple[str, ...], outputs: tuple[str, ...], as_json: bool,
 ) -> None:  # fmt: skip
     """Go from LOGs to a verdict in one sitting: models, controller, certificate, FMUs, loop, study, test and page.
 
@@ -70,7 +72,8 @@ def command(
     _require_known(requirements, kinds)
     folder = (output or Path("build/start") / logs[0].stem).absolute()
     given = {"robot": _robot_of(logs[0], robot), "requirements": requirements and str(requirements.absolute()),
-             "kinds": kinds, "sample_time": sample_time, "budget": budget, "seed": seed}  # fmt: skip
+             "kinds": kinds, "sample_time": sample_time, "budget": budget, "seed": seed, "motors": motors or None,
+             "positions": positions or None, "outputs": outputs or None}  # fmt: skip
     paths = tuple(str(log.absolute()) for log in logs)
     require_disk(folder)
     with _project(folder):

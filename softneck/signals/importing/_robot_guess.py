@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import DataError, SettingsError, SoftneckError, to_si
+from softneck.core._errors import did_you_mean
 from softneck.robot import Robot
 
 from ._column_titles import read_title
@@ -29,6 +30,15 @@ _OF_A_NECK = ("pitch", "roll", "inclination", "orientation", "pitch_reference", 
               "set-point", "velocity")  # fmt: skip
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 _WORD = re.compile(r"[a-z]+|\d+")
+
+
+@dataclass(frozen=True, slots=True)
+class NamedColumns:
+    """Columns that a user named, each by its title or, where there are none, its index."""
+
+    motors: tuple[str, ...]
+    outputs: tuple[str, ...]
+    positions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +90,91 @@ def guess_robot(path: str | Path) -> RobotGuess:
         )
     if not outputs:
         raise DataError(f"{path}: beside {', '.join(motors)} no column moves that could be an output.")
+    robot, units = _proposed(path, table, motors, outputs)
+    layout = _layout(table, robot, motors, outputs, (time, run))
+    unknown = [f"{title}: its unit is unknown here and taken as 1" for title in rest if _unknown_unit(title)]
+    lines = (
+        *table.lines,
+        *unknown,
+        f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
+        f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and are nothing else",
+        "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
+    )
+    return RobotGuess(robot, layout, lines)
+
+
+def robot_of_columns(
+    path: str | Path, named: NamedColumns, *, robot: Robot | None = None, sample_time: float | None = None
+) -> RobotGuess:
+    """Return robot and layout of a log whose columns are named.
+
+    Args:
+        path: of the log.
+        named: its columns, in the order of the robot's channels.
+        robot: whose they are; None: the neck where they are its own, else one is proposed.
+        sample_time: [s] of a log without a clock.
+
+    Raises:
+        FileFormatError: no such file, or no table.
+        DataError: no such column, one without numbers, other numbers of them than the robot has, no clock.
+        SettingsError: no motor, no output, a column twice, a sample time beside a clock.
+    """
+    table = sniff(path, fewest=2)
+    if not named.motors or not named.outputs:
+        raise SettingsError("name the columns of motors and outputs, by --motor COL and --output COL.")
+    every = (*named.motors, *named.outputs, *named.positions)
+    if twice := next((title for title in every if every.count(title) > 1), None):
+        raise SettingsError(f"column `{twice}` is named twice.")
+    motors, outputs, positions = (
+        [_column(path, table, title) for title in titles] for titles in (named.motors, named.outputs, named.positions)
+    )
+    taken = {*motors, *outputs, *positions}
+    roles = {title: read_title(str(title)).role for title in table.columns if title not in taken}
+    time, run = (next((title for title in roles if roles[title] == role), None) for role in ("time", "run"))
+    if time is None and sample_time is None:
+        raise DataError(f"{path}: no column is a time; say its sample time: --sample-time S.")
+    if time is not None and sample_time is not None:
+        raise SettingsError(
+            f"{path}: has a clock, `{time}`; leave out --sample-time, or say --resample {sample_time:g}."
+        )
+    if robot is None:
+        robot = Robot.preset() if _of_neck(table, motors, outputs) else _proposed(path, table, motors, outputs)[0]
+    for count, needed, what in (
+        (len(motors), len(robot.motors.names), "motor"), (len(outputs), len(robot.outputs.names), "output"),
+        (len(positions), len(robot.motors.names) if positions else 0, "position"),
+    ):  # fmt: skip
+        if count != needed:
+            raise DataError(f"{path}: robot {robot.label()} needs {needed} --{what}; {count} were given.")
+    layout = _layout(table, robot, motors, outputs, (time, run))
+    logged = {name: Source((Term(title),), _unit_of(table, title) or robot.motors.unit)
+              for name, title in zip(robot.motor_positions, positions, strict=False)}  # fmt: skip
+    layout = replace(layout, channels={**layout.channels, **logged}, sample_time=sample_time or layout.sample_time)
+    return RobotGuess(robot, layout, table.lines)
+
+
+def _column(path: str | Path, table: SniffResult, asked: str) -> Column:
+    """Return a column by its title or index."""
+    column: Column = int(asked) if asked.isdecimal() and asked not in table.columns else asked
+    if column in table.words:
+        raise DataError(f"{path}: column `{asked}` holds no numbers.")
+    if column not in table.columns:
+        known = [str(title) for title in table.columns]
+        hint = did_you_mean(asked, known) or f"it has {', '.join(known)}."
+        raise DataError(f"{path}: there is no column `{asked}`; {hint.rstrip()}")
+    return column
+
+
+def _of_neck(table: SniffResult, motors: Sequence[Column], outputs: Sequence[Column]) -> bool:
+    """Return whether columns are of three winches in angles, of pitch and of roll."""
+    units = [_unit_of(table, column) or "rad" for column in motors]
+    named = [read_title(str(column)).role for column in outputs]
+    return len(motors) == 3 and named == ["pitch", "roll"] and all(to_si(unit)[1] == "rad" for unit in units)
+
+
+def _proposed(
+    path: str | Path, table: SniffResult, motors: Sequence[Column], outputs: Sequence[Column]
+) -> tuple[Robot, list[str]]:
+    """Return a robot that such columns are of, with the units of its motors and outputs."""
     units = [_common_unit(path, table, titles) for titles in (motors, outputs)]
     content = {
         "name": re.sub(r"[^A-Za-z0-9_ ]+", "_", Path(path).stem),
@@ -93,16 +188,7 @@ def guess_robot(path: str | Path) -> RobotGuess:
         raise DataError(
             f"{path}: {str(error).removesuffix('.')}. Leave out columns by a layout of your own."
         ) from error
-    layout = _layout(table, robot, motors, outputs, (time, run))
-    unknown = [f"{title}: its unit is unknown here and taken as 1" for title in rest if _unknown_unit(title)]
-    lines = (
-        *table.lines,
-        *unknown,
-        f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
-        f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and are nothing else",
-        "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
-    )
-    return RobotGuess(robot, layout, lines)
+    return robot, units
 
 
 def layout_for(path: str | Path, robot: Robot) -> Layout:
@@ -143,8 +229,8 @@ def _clock(table: SniffResult) -> tuple[Column | None, Column | None, list[str]]
 def _layout(
     table: SniffResult,
     robot: Robot,
-    motors: Sequence[str],
-    outputs: Sequence[str],
+    motors: Sequence[Column],
+    outputs: Sequence[Column],
     clock: tuple[Column | None, Column | None],
 ) -> Layout:
     pairs = [*zip(robot.set_points, motors, strict=True), *zip(robot.outputs.names, outputs, strict=True)]
@@ -167,7 +253,7 @@ def _clock_unit(table: SniffResult, column: Column) -> str:
     return DATE if column in table.dates else read_title(str(column)).unit or "s"
 
 
-def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[str]) -> str:
+def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column]) -> str:
     """Return the unit that titles name; 1 where none does.
 
     Raises:
@@ -176,8 +262,8 @@ def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[str]) ->
     named = [_unit_of(table, title) or "1" for title in titles]
     if len({to_si(unit)[1] for unit in named}) > 1:
         raise DataError(
-            f"{path}: {', '.join(titles)} are in {', '.join(named)}, and a robot has one unit for all of them; "
-            "leave out columns by a layout of your own."
+            f"{path}: {', '.join(map(str, titles))} are in {', '.join(named)}, and a robot has one unit for all of "
+            "them; leave out columns by a layout of your own."
         )
     return named[0]
 
@@ -190,8 +276,8 @@ def _unknown_unit(title: str) -> bool:
         return True
 
 
-def _unit_of(table: SniffResult, title: str) -> str | None:
-    match = _UNIT.search(title)
+def _unit_of(table: SniffResult, title: Column) -> str | None:
+    match = _UNIT.search(str(title))
     unit = match[1] if match else table.units.get(title)
     try:
         return None if unit is None else unit if to_si(unit) else None
@@ -203,11 +289,11 @@ def _words(title: str) -> set[str]:
     return set(_WORD.findall(_UNIT.sub("", title).lower()))
 
 
-def _names(titles: Sequence[str]) -> list[str]:
+def _names(titles: Sequence[Column]) -> list[str]:
     """Return titles as names: letters, digits and _, a letter first, none twice."""
     names: list[str] = []
     for number, title in enumerate(titles):
-        name = re.sub(r"\W+", "_", _UNIT.sub("", title).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"
+        name = re.sub(r"\W+", "_", _UNIT.sub("", str(title)).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"
         name = name if name[0].isalpha() else f"c_{name}"
         names.append(name if name not in names else f"{name}_{number + 1}")
     return names

@@ -210,3 +210,14 @@ def test_a_robots_file_that_lacks_something_is_to_be_mended_and_no_log_to_be_rec
         assert "Record" not in said.err
         assert "the same command goes on" in said.err
         assert len(last) <= 160
+
+
+def test_named_columns_are_given_to_the_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    log = tmp_path / "log.csv"
+    log.write_text("t,u,y\n0,1,2\n")
+    asked = Asked(logs=(str(log),), motors=("u",), outputs=("y",), sample_time="0.1")
+    step = _plan._import(str(log), "recordings/log.csv", asked)
+    assert step.command[3:9] == ("--motor", "u", "--output", "y", "--sample-time", "0.1")
+    # Other columns are another import.
+    assert step.asked != _plan._import(str(log), "recordings/log.csv", Asked(logs=(str(log),), motors=("y",))).asked
