@@ -12,7 +12,7 @@ import numpy as np
 
 from softneck.core import Matrix
 from softneck.drives.master._events import Event, Reaction
-from softneck.drives.master._gate import Tilt
+from softneck.drives.master._gate import Reading
 from softneck.drives.master._measured import Measurement
 from softneck.drives.simulated._servo_runtime import (
     SERVO_CURRENT,
@@ -74,7 +74,7 @@ def undisturbed(bench: Bench, seconds: float) -> tuple[Motion, Matrix, str]:
             watches.motors(now, sent, positions, nodes, tensions, events)
         waits = beyond
         last = gate.last
-        assert isinstance(last, Tilt)
+        assert isinstance(last, Reading)
         if due:
             watches.tilt(now, cycles * settings.bus.cycle, positions, last.values if fresh else None, events)
             index, part = index + 1, 0

@@ -234,7 +234,7 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt | Reading | None]:
+def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Reading | None]:
     """Return what gives the newest sample of the inclinometer."""
     from softneck.drives.bus._link import VirtualLink
 
@@ -242,7 +242,7 @@ def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Tilt 
         return lambda: link.newest
     sensor = sensor_of(file)
 
-    def look() -> Tilt | Reading | None:
+    def look() -> Reading | None:
         until = link.now + _LOOK
         while link.now < until:
             tilt = sensor.read(link.now, link.receive(0.02))

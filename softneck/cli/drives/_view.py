@@ -25,7 +25,7 @@ from softneck.drives.master._cia402 import DriveState
 from softneck.drives.master._events import Reaction
 
 if TYPE_CHECKING:
-    from softneck.drives.master import Frame, Master, Tilt
+    from softneck.drives.master import Frame, Master
     from softneck.drives.master._fieldbus import DriveView
     from softneck.drives.master._gate import Reading
     from softneck.drives.running._virtual import Watch
@@ -155,7 +155,7 @@ class LiveView:
         self._thread.join()
 
     def watch(
-        self, now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | Reading | None, master: Master
+        self, now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Reading | None, master: Master
     ) -> None:
         """Look at `master` after its cycle at `now` [s]; one of the `watches` of a run."""
         if self._times is None:

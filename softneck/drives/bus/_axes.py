@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from softneck.core import SettingsError
 
-from ..master import Tilt
 from ..master._gate import Reading, sample_of
 
 # For each output: number of the sensor's own axis, and its sign.
@@ -47,7 +46,7 @@ def inverse(axes: Axes) -> Axes:
     return tuple(back)
 
 
-def turned(sample: Tilt | Reading, axes: Axes) -> Tilt | Reading:
+def turned(sample: Reading, axes: Axes) -> Reading:
     """Return what the robot's outputs are in a sample of the sensor's own axes."""
     values, rates = (tuple(sign * given[number] for number, sign in axes) for given in (sample.values, sample.rates))
     return sample_of(values, rates, valid=sample.valid)

@@ -13,7 +13,7 @@ from softneck.core import SettingsError, SoftneckError
 
 from ..master import Frame
 from ..master._cia301 import BUS_OFF
-from ..master._gate import Reading, Tilt, sample_of
+from ..master._gate import Reading
 from ..simulated import SimulatedNeck
 from ..simulated._frame import CanFrame
 from ..simulated._springs import SimulatedSprings
@@ -98,10 +98,9 @@ class VirtualLink:
                 self._inbox.append(frame)
 
     @property
-    def newest(self) -> Tilt | Reading:
+    def newest(self) -> Reading:
         """The sensor's newest sample, as the master takes it."""
-        sample = self.neck.newest
-        told = sample_of(sample.values, sample.rates, valid=sample.valid)
+        told = Reading(*self.neck.newest[1:])
         return told if self.axes is None else turned(told, self.axes)
 
     def pass_time(self) -> None:

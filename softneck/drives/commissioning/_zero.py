@@ -22,7 +22,7 @@ from ..bus._objects import (
 )
 from ..bus._sdo import Objects, SdoError
 from ..bus._units import counts_to_position
-from ..master import Frame, Tilt
+from ..master import Frame
 from ..master._cia402 import DriveState, state_of
 from ..master._gate import Reading
 from ..running._stop import disarm, wait
@@ -40,7 +40,7 @@ _FAST_ENOUGH = 0.3
 _SETTLE = 1.0
 _ENABLE_TIME = 1.0
 
-Look = Callable[[], Tilt | Reading | None]
+Look = Callable[[], Reading | None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ..master import Frame, Master, Tilt
+from ..master import Frame, Master
 from ..master._gate import Reading, sample_of
 from ..master._measured import Measurement, Motors, Pilot, reference_of
 
@@ -31,7 +31,7 @@ class Cycle(NamedTuple):
 
     time: float
     received: tuple[Frame, ...]
-    tilt: Tilt | Reading | None
+    tilt: Reading | None
     taken: tuple[tuple[str, str], ...]
     answers: tuple[Answer, ...]
     sent: tuple[Frame, ...]
@@ -98,7 +98,7 @@ def cycle_of(
     pilot: LoggedPilot,
     now: float,
     received: Sequence[Frame],
-    tilt: Tilt | Reading | None,
+    tilt: Reading | None,
     sent: Sequence[Frame],
 ) -> Cycle:
     """Return the step that `master` has just done."""
@@ -183,7 +183,7 @@ def _motors(values: Sequence[Any]) -> Motors:
     return tuple(float(value) for value in values)
 
 
-def _tilt(values: Sequence[Any]) -> Tilt | Reading:
+def _tilt(values: Sequence[Any]) -> Reading:
     """Return the sample that was logged as its values, its rates, and whether it is valid."""
     *numbers, valid = values
     count = len(numbers) // 2

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 from softneck import __version__
 from softneck.core import OutputFileError, SettingsError, file_hash, refuse_existing
 
-from ..master import Event, Frame, Master, MasterSettings, Tilt
+from ..master import Event, Frame, Master, MasterSettings
 from ..master._gate import Reading
 from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle, frame_text
 
@@ -171,7 +171,7 @@ class RunLogger:
         """Return what is to be called after each step of a master that asks `pilot`."""
 
         def watch(
-            now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Tilt | Reading | None, master: Master
+            now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Reading | None, master: Master
         ) -> None:
             row, self._row = self._row, None
             cycle = cycle_of(master, pilot, now, received, tilt, sent)

@@ -10,34 +10,8 @@ from ._events import Event
 from ._settings import SensorSettings
 
 
-class Tilt(NamedTuple):
-    """One sample of the inclinometer as it came.
-
-    Attributes:
-        pitch, roll: [rad].
-        pitch_rate, roll_rate: [rad/s]; NaN without a gyro.
-        valid: False while the sensor itself says that it has nothing.
-    """
-
-    pitch: float
-    roll: float
-    pitch_rate: float = math.nan
-    roll_rate: float = math.nan
-    valid: bool = True
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """Both angles [rad]."""
-        return self.pitch, self.roll
-
-    @property
-    def rates(self) -> tuple[float, ...]:
-        """Both rates [rad/s]."""
-        return self.pitch_rate, self.roll_rate
-
-
 class Reading(NamedTuple):
-    """One sample of a robot whose outputs are not two angles.
+    """One sample of what measures a robot's outputs, as it came.
 
     Attributes:
         values: of the outputs [rad].
@@ -50,12 +24,21 @@ class Reading(NamedTuple):
     valid: bool = True
 
 
-def sample_of(values: Sequence[float], rates: Sequence[float] = (), *, valid: bool = True) -> Tilt | Reading:
+class Tilt(Reading):
+    """One sample of an inclinometer: pitch, roll [rad] and their rates [rad/s], NaN without a gyro."""
+
+    __slots__ = ()
+
+    def __new__(
+        cls, pitch: float, roll: float, pitch_rate: float = math.nan, roll_rate: float = math.nan, valid: bool = True
+    ) -> Tilt:
+        """Take both angles."""
+        return super().__new__(cls, (pitch, roll), (pitch_rate, roll_rate), valid)
+
+
+def sample_of(values: Sequence[float], rates: Sequence[float] = (), *, valid: bool = True) -> Reading:
     """Return the sample of so many outputs; `rates` are NaN where none are given."""
-    known = tuple(rates) or (math.nan,) * len(values)
-    if len(values) == 2:
-        return Tilt(*values, *known, valid=valid)
-    return Reading(tuple(values), known, valid)
+    return Reading(tuple(values), tuple(rates) or (math.nan,) * len(values), valid)
 
 
 class Gate:
@@ -68,13 +51,13 @@ class Gate:
     def __init__(self, settings: SensorSettings) -> None:
         """Believe nothing yet."""
         self._settings = settings
-        self.last: Tilt | Reading | None = None
+        self.last: Reading | None = None
         self._raw: tuple[float, ...] | None = None
         self._same = self._bad = 0
         self._good_at: float | None = None
         self._first: float | None = None
 
-    def step(self, now: float, sample: Tilt | Reading | None, events: list[Event]) -> bool:
+    def step(self, now: float, sample: Reading | None, events: list[Event]) -> bool:
         """Take the sample that is due, None if none came; return whether it is believed."""
         s = self._settings
         if self._first is None:
@@ -102,7 +85,7 @@ class Gate:
             events.append(Event(now, "sensor_lost", 0, f"no valid sample for {since * 1e3:.0f} ms"))
         return good
 
-    def _reason(self, now: float, sample: Tilt | Reading) -> str:
+    def _reason(self, now: float, sample: Reading) -> str:
         """Return why `sample` is not valid, "" if it may be."""
         s = self._settings
         values = sample.values

@@ -10,7 +10,7 @@ from ._cia301 import Frame
 from ._cia402 import OFF, POWERED, DriveState, Goal
 from ._events import IDLE_TOO, Event, Reaction
 from ._fieldbus import Fieldbus
-from ._gate import Gate, Reading, Tilt
+from ._gate import Gate, Reading
 from ._limiter import Limiter
 from ._measured import Measurement, Motors, Pilot, reference_of
 from ._settings import MasterSettings
@@ -104,7 +104,7 @@ class Master:
         self.requests.append(("stop", reason))
         self._told(Event(self._now or 0.0, "operator", 0, reason))
 
-    def step(self, now: float, frames: Sequence[Frame], tilt: Tilt | Reading | None = None) -> list[Frame]:
+    def step(self, now: float, frames: Sequence[Frame], tilt: Reading | None = None) -> list[Frame]:
         """Return the frames to send at `now` [s, monotonic].
 
         Args:
@@ -143,7 +143,7 @@ class Master:
         return self._index >= 0 and self._part == 1 and self.supervisor.phase is Phase.RUNNING
 
     @property
-    def tilt(self) -> Tilt | Reading | None:
+    def tilt(self) -> Reading | None:
         """The last believed sample of the inclinometer."""
         return self._gate.last
 

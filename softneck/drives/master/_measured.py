@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from ._gate import Reading, Tilt
+from ._gate import Reading
 
 # One number for each motor.
 Motors = tuple[float, ...]
@@ -23,7 +23,7 @@ class Measurement:
     """
 
     index: int
-    tilt: Tilt | Reading
+    tilt: Reading
     fresh: bool
     positions: Motors
 

@@ -11,7 +11,7 @@ from ..supervision._baseline import Baseline
 from ..supervision._plausibility import Plausibility
 from ._events import Event
 from ._fieldbus import BusSettings
-from ._gate import Reading, Tilt
+from ._gate import Reading
 from ._settings import LimitSettings, WatchSettings
 
 # Both watches speak after this time beyond their tolerance [s]; the fault table allows 200 ms, and what is told
@@ -150,7 +150,7 @@ class Watches:
 
     def plausible(self, now: float, nodes: Sequence[int], setpoints: Sequence[float], positions: Sequence[float],
                   tensions: Sequence[float], events: list[Event], *, due: bool,
-                  sample: Tilt | Reading | None, reference: Sequence[float]) -> None:  # fmt: skip
+                  sample: Reading | None, reference: Sequence[float]) -> None:  # fmt: skip
         """Ask the charts; each cycle while enabled, with the sample that came where one is due."""
         if self._plausible is None:
             return

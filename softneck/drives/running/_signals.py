@@ -15,7 +15,7 @@ from softneck.signals.recording._channels import NECK
 from ..bus._link import VirtualLink
 from ..logs._result import signal_units
 from ..logs._rows import Motion, columns_of, experiment_channels, truths
-from ..master import Frame, Master, Phase, Tilt
+from ..master import Frame, Master, Phase
 from ..master._gate import Reading
 from ..master._measured import Measurement, Motors
 from ._pilot import LoopPilot
@@ -130,7 +130,7 @@ class SignalLog:
         self.index = -1
 
     def __call__(
-        self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Tilt | Reading | None,
+        self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Reading | None,
         master: Master,
     ) -> None:  # fmt: skip
         """Take what this cycle measured and sent."""
@@ -149,7 +149,7 @@ class SignalLog:
             row = dict(zip(self._names, self._table[self.index].tolist(), strict=True))
             self._log.signals({**row, "run": 1.0 if self._run is None else float(self._run[self.index])})
 
-    def _measure(self, row: Vector, tilt: Tilt | Reading | None, master: Master) -> None:
+    def _measure(self, row: Vector, tilt: Reading | None, master: Master) -> None:
         known = self._motors + 2 * self._outputs
         if tilt is not None and master.tilt is tilt:
             row[self._motors : known] = (*tilt.values, *tilt.rates)

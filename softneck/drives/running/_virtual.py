@@ -13,7 +13,7 @@ from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
-from ..master import Frame, Master, Tilt
+from ..master import Frame, Master
 from ..master._gate import Reading
 from ..simulated import SimulatedNeck, SimulatedSettings
 from ..simulated._habits import WireHabits
@@ -23,7 +23,7 @@ from ..simulated._springs import SimulatedSprings, SpringSettings
 _PATIENCE = 120.0
 
 # Called after each cycle: (now, frames in, frames out, sample of the inclinometer or None, master).
-Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Tilt | Reading | None, Master], None]
+Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Reading | None, Master], None]
 # Noise of the stand-in's sensor where the robot gives none [rad]: none at all would look frozen.
 _LITTLE = 1e-5
 
@@ -151,7 +151,7 @@ class VirtualRun:
     host_stopped: bool = False
     watch: Callable[[VirtualRun], None] | None = None
     cycles: int = 0
-    newest: Tilt | Reading | None = None
+    newest: Reading | None = None
     watches: tuple[Watch, ...] = ()
 
     def step(self) -> None:

@@ -38,7 +38,7 @@ class PythonInclinometer:
         """Hand over frames of a cycle without a sample."""
         self._call("take", frames)
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
         """Return the newest sample; None if none came, or where it returned something else."""
         answer = self._call("read", now, frames)
         if answer is None:
@@ -49,14 +49,14 @@ class PythonInclinometer:
             self._end(f"`read` returned no sample: {error}")
             return None
 
-    def _sample(self, answer: Any) -> Tilt | Reading:
+    def _sample(self, answer: Any) -> Reading:
         """Return a `Tilt`, or one number for each output of another robot, as a sample."""
         if isinstance(answer, Tilt) and self._outputs == 2:
-            pitch, roll, pitch_rate, roll_rate = (float(value) for value in answer[:4])
-            return Tilt(pitch, roll, pitch_rate, roll_rate, bool(answer.valid))
+            values, rates = ([float(value) for value in told] for told in (answer.values, answer.rates))
+            return sample_of(values, rates, valid=bool(answer.valid))
         if self._outputs == 2:
             raise TypeError(f"{type(answer).__name__} {answer!r:.60} is not a softneck.drives.master.Tilt")
-        values = [float(value) for value in answer]
+        values = [float(value) for value in list[Any](answer)]
         if len(values) != self._outputs:
             raise TypeError(f"{len(values)} numbers for {self._outputs} outputs")
         return sample_of(values)

@@ -10,7 +10,7 @@ from typing import Protocol
 from softneck.core import SettingsError
 
 from ..bus._link import Link
-from ..master import Frame, Tilt
+from ..master import Frame
 from ..master._gate import Reading, sample_of
 
 # 6110h and 6120h, slope of one axis or both in 32 bits, at a resolution of 0.001 deg (6000h = 1; CiA 410, 6.1).
@@ -30,12 +30,12 @@ class Sensor(Protocol):
         """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
         ...
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
         """Return the newest sample, None if none came since the last call."""
         ...
 
 
-def look_at(sensor: Sensor, link: Link, timeout: float) -> Tilt | Reading | None:
+def look_at(sensor: Sensor, link: Link, timeout: float) -> Reading | None:
     """Return the first sample of `sensor` that comes within `timeout` [s], None if none does."""
     until = link.now + timeout
     while link.now < until:
@@ -59,9 +59,9 @@ class CanInclinometer:
                 f'[sensor] kind = "can" has one axis or two; the robot has {axes} outputs. Write kind = "python".'
             )
         self._identifier, self._slopes = 0x180 + node, _SLOPES[axes]
-        self._newest: Tilt | Reading | None = None
+        self._newest: Reading | None = None
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
         """Return the newest sample among `frames`, and those since the last call; None if none came."""
         del now
         self.take(frames)

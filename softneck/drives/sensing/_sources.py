@@ -12,7 +12,7 @@ from softneck.signals.recording._channels import NECK
 
 from ..bus._axes import Axes, axes_of, turned
 from ..bus._sensor_source import SENSORS, SensorSource
-from ..master import Frame, Tilt
+from ..master import Frame
 from ..master._gate import Reading, sample_of
 from ._python_sensor import make_python_sensor
 from ._sensor import CanInclinometer
@@ -32,7 +32,7 @@ class _FirstAngle:
     def take(self, frames: Sequence[Frame]) -> None:
         self._sensor.take(frames)
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
         tilt = self._sensor.read(now, frames)
         return None if tilt is None else sample_of(tilt.values[:1], tilt.rates[:1], valid=tilt.valid)
 
@@ -47,7 +47,7 @@ class _Turned:
         # What not every sensor has: name, problem, close.
         return getattr(self._sensor, name)
 
-    def read(self, now: float, frames: Sequence[Frame]) -> Tilt | Reading | None:
+    def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
         sample = self._sensor.read(now, frames)
         return None if sample is None else turned(sample, self._axes)
 

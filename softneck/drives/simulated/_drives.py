@@ -164,40 +164,10 @@ def sensed(
     return (values[0] + jump, *values[1:]), rates, True
 
 
-class TiltSample(NamedTuple):
-    """One sample of the inclinometer, NaN and `valid` False where it dropped out."""
-
-    time: float
-    pitch: float
-    roll: float
-    pitch_rate: float
-    roll_rate: float
-    valid: bool
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """Both angles [rad]."""
-        return self.pitch, self.roll
-
-    @property
-    def rates(self) -> tuple[float, ...]:
-        """Both rates [rad/s]."""
-        return self.pitch_rate, self.roll_rate
-
-
-class OutputSample(NamedTuple):
-    """One sample of the sensor: values [rad] and rates [rad/s] of all outputs; NaN and not `valid` where it drops."""
+class Sample(NamedTuple):
+    """One sample of the sensor: values [rad] and rates [rad/s] of all outputs; NaN, not `valid` where it drops."""
 
     time: float
     values: tuple[float, ...]
     rates: tuple[float, ...]
     valid: bool
-
-
-def sample_at(
-    now: float, values: tuple[float, ...], rates: tuple[float, ...], *, valid: bool
-) -> TiltSample | OutputSample:
-    """Return the sample at `now` [s]; two outputs are the angles of a tilt."""
-    if len(values) == 2:
-        return TiltSample(now, *values, *rates, valid=valid)
-    return OutputSample(now, values, rates, valid)

@@ -15,7 +15,7 @@ from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.runtime._bundle import sized
 
-from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
+from ._drives import Sample, SimulatedDrives, SimulatedSettings, sensed
 from ._frame import CanFrame
 from ._servo_runtime import SERVO_GEARING, SERVO_STUCK
 
@@ -56,7 +56,7 @@ class SimulatedNeck:
         )
         self._samples = 0
         self.sensor = "works"
-        self._last = self._newest = sample_at(0.0, *self._measured(), valid=True)
+        self._last = self._newest = Sample(0.0, *self._measured(), valid=True)
 
     def set(self, **disturbance: float) -> None:
         """Set payload [kg], push_x, push_y [N], base_tilt_pitch or base_tilt_roll [rad], as far as the neck has them.
@@ -86,7 +86,7 @@ class SimulatedNeck:
         bus = self._on_bus
         self._functions.servo_ticks(self._q, self._x, self.disturbance, bus.motion, bus.ring, bus.ticks, bus.h)
 
-    def sample(self, now: float) -> TiltSample | OutputSample:
+    def sample(self, now: float) -> Sample:
         """Take one sample of the inclinometer; to be called each `sample_time`."""
         self._newest = self._sampled(now)
         return self._newest
@@ -96,7 +96,7 @@ class SimulatedNeck:
         m = self._angles
         return tuple(self.outputs[m : 2 * m].tolist()), tuple(self.outputs[2 * m : 3 * m].tolist())
 
-    def _sampled(self, now: float) -> TiltSample | OutputSample:
+    def _sampled(self, now: float) -> Sample:
         if self._samples:
             self._functions.winch_sense(self._arrays, self._q, self._x, self.disturbance, self.outputs)
         self._samples += 1
@@ -104,13 +104,13 @@ class SimulatedNeck:
         if self.sensor == "freezes":
             return self._last._replace(time=now)
         values, rates, valid = sensed(self.sensor, *self._measured(), valid=valid)
-        taken = sample_at(now, values, rates, valid=valid)
+        taken = Sample(now, values, rates, valid=valid)
         if not math.isnan(values[0]):
             self._last = taken
         return taken
 
     @property
-    def newest(self) -> TiltSample | OutputSample:
+    def newest(self) -> Sample:
         """The last sample that was taken."""
         return self._newest
 

@@ -23,7 +23,7 @@ from softneck.plant._index_runtime import (
 from softneck.plant._mechanics_runtime import neck_drive
 from softneck.runtime import load_functions
 
-from ._drives import OutputSample, SimulatedDrives, SimulatedSettings, TiltSample, sample_at, sensed
+from ._drives import Sample, SimulatedDrives, SimulatedSettings, sensed
 from ._frame import CanFrame
 from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_STUCK, SERVO_ZERO
 from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRING_SIZE, SPRING_STIFFNESS
@@ -101,7 +101,7 @@ class SimulatedSprings:
         self._noise = np.random.default_rng(settings.seed)
         self.sensor = "works"
         nothing = (0.0,) * len(springs.outputs)
-        self.newest = self._last = sample_at(0.0, nothing, nothing, valid=True)
+        self.newest = self._last = Sample(0.0, nothing, nothing, valid=True)
 
     def set(self, **disturbance: float) -> None:
         """Take no disturbance: there is nothing here that a load could bend.
@@ -133,7 +133,7 @@ class SimulatedSprings:
             bus.ticks, bus.h,
         )  # fmt: skip
 
-    def sample(self, now: float) -> TiltSample | OutputSample:
+    def sample(self, now: float) -> Sample:
         """Take one sample of the sensor; to be called each `sample_time`."""
         noise: Vector = self._noise.normal(0.0, self._springs.noise_std, len(self._springs.outputs))
         if self.sensor == "freezes":
@@ -141,7 +141,7 @@ class SimulatedSprings:
             return self.newest
         values, rates = tuple((self.outputs[0] + noise).tolist()), tuple(self.outputs[1].tolist())
         values, rates, valid = sensed(self.sensor, values, rates, valid=True)
-        self.newest = sample_at(now, values, rates, valid=valid)
+        self.newest = Sample(now, values, rates, valid=valid)
         if not math.isnan(self.newest.values[0]):
             self._last = self.newest
         return self.newest

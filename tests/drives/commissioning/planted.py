@@ -12,7 +12,7 @@ from softneck.drives.bus._file import DrivesFile
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.running._virtual import simulated_plant
 from softneck.drives.simulated import SimulatedNeck
-from softneck.drives.simulated._drives import OutputSample, TiltSample, sample_at, twin
+from softneck.drives.simulated._drives import Sample, twin
 from softneck.drives.simulated._springs import SimulatedSprings
 from softneck.plant import NeckParameters
 
@@ -134,20 +134,20 @@ class MountedOtherwise:
             raise ValueError(f"`axes` must name each of the {count} outputs once.")
         self._neck, self._axes = neck, tuple(axes)
         samples = round(late / neck.settings.sample_time)
-        self._past: deque[TiltSample | OutputSample] = deque([neck.newest] * (samples + 1), samples + 1)
-        self.newest: TiltSample | OutputSample = self._turned(neck.newest)
+        self._past: deque[Sample] = deque([neck.newest] * (samples + 1), samples + 1)
+        self.newest: Sample = self._turned(neck.newest)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._neck, name)
 
-    def sample(self, now: float) -> TiltSample | OutputSample:
+    def sample(self, now: float) -> Sample:
         """Take one sample, and tell the one that is due."""
         self._past.append(self._neck.sample(now))
         self.newest = self._turned(self._past[0]._replace(time=now))
         return self.newest
 
-    def _turned(self, sample: TiltSample | OutputSample) -> TiltSample | OutputSample:
+    def _turned(self, sample: Sample) -> Sample:
         values, rates = (
             tuple(sign * given[number] for number, sign in self._axes) for given in (sample.values, sample.rates)
         )
-        return sample_at(sample.time, values, rates, valid=sample.valid)
+        return Sample(sample.time, values, rates, valid=sample.valid)

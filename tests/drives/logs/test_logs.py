@@ -24,7 +24,8 @@ from softneck.drives import default_drives, prepare, read_run_log, replay, run_s
 from softneck.drives.logs._cycle import Cycle, LoggedPilot, decode_cycle, encode_cycle
 from softneck.drives.logs._log_file import changed_files
 from softneck.drives.logs._run_log import RunLogger, run_facts
-from softneck.drives.master import Frame, Phase, Tilt
+from softneck.drives.master import Frame, Phase
+from softneck.drives.master._gate import Reading
 from softneck.drives.running._pilot import LoopPilot
 
 from ...data import slow_but
@@ -44,7 +45,7 @@ CYCLES = st.builds(
     Cycle,
     st.floats(0.0, 1e9),
     st.lists(FRAMES, max_size=4).map(tuple),
-    st.one_of(st.none(), st.builds(Tilt, NUMBERS, NUMBERS, NUMBERS, NUMBERS, st.booleans())),
+    st.one_of(st.none(), st.builds(Reading, st.tuples(NUMBERS, NUMBERS), st.tuples(NUMBERS, NUMBERS), st.booleans())),
     st.lists(st.tuples(st.sampled_from(["start", "finish", "leave", "stop"]), st.text()), max_size=2).map(tuple),
     st.lists(ANSWERS, max_size=2).map(tuple),
     st.lists(FRAMES, max_size=4).map(tuple),

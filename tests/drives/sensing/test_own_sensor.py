@@ -57,15 +57,15 @@ def test_packets_give_the_same_samples_however_they_are_torn(
     newest = [sample for sample in samples if sample is not None]
     # Of several in one piece the newest counts; the last one of all is always there.
     assert newest
-    assert newest[-1][:2] == rows[-1]
-    assert {tuple(sample[:2]) for sample in newest} <= set(rows)
+    assert newest[-1].values == rows[-1]
+    assert {sample.values for sample in newest} <= set(rows)
 
 
 def test_a_wrong_checksum_is_no_sample_and_costs_its_packet_only() -> None:
     bad = bytearray(packet(0.1, 0.2))
     bad[8] ^= 1
     assert EXAMPLE.Packets().feed(bytes(bad)) is None
-    assert EXAMPLE.Packets().feed(bytes(bad) + packet(0.5, 0.25))[:2] == (0.5, 0.25)
+    assert EXAMPLE.Packets().feed(bytes(bad) + packet(0.5, 0.25)).values == (0.5, 0.25)
 
 
 def test_the_drives_file_opens_it(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_the_drives_file_opens_it(tmp_path: Path) -> None:
             tilt = sensor.read(0.01, ())
             assert tilt is not None
             # 32-bit floats.
-            assert math.degrees(tilt.pitch) == pytest.approx(10.0, rel=1e-6)
+            assert math.degrees(tilt.values[0]) == pytest.approx(10.0, rel=1e-6)
             assert sensor.problem == ""
     finally:
         os.close(theirs)

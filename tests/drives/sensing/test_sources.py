@@ -52,7 +52,7 @@ def test_a_sensor_of_ones_own(tmp_path: Path) -> None:
     lines = 'kind = "python"\npython = "my_sensor_for_test:make"\noptions = { offset = 0.25 }'
     file = file_with(tmp_path, lines)
     with open_sensor(file.sensor_kind, file.sensor_node, file.sensor_source) as sensor:
-        assert sensor.read(2.0, ())[:2] == (0.25, 2.0)
+        assert sensor.read(2.0, ()).values == (0.25, 2.0)
 
 
 @pytest.mark.parametrize(
