@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 import traceback
@@ -93,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code; an error is one line on stderr."""
     try:
-        with _without_remarks():
+        with _without_remarks(), _saying_which_robot():
             code = group.main(args=arguments, prog_name="softneck", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message(), err=True)
@@ -128,6 +129,32 @@ def _without_remarks() -> Iterator[None]:
         if not os.environ.get("SOFTNECK_TRACEBACK"):
             warnings.showwarning = lambda *_, **__: None
         yield
+
+
+class _Once(logging.Handler):
+    """Prints each line of the library's log once on stderr."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said = set[str]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        line = record.getMessage()
+        if line not in self._said:
+            self._said.add(line)
+            click.echo(line, err=True)
+
+
+@contextlib.contextmanager
+def _saying_which_robot() -> Iterator[None]:
+    """Say which file of a robot was found and is applied, though no option named it."""
+    log, heard = logging.getLogger("softneck.robot"), _Once()
+    log.addHandler(heard)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.removeHandler(heard)
 
 
 def _missing(error: ModuleNotFoundError) -> int:

@@ -317,14 +317,14 @@ class KalmanSettings:
                 told = preset.noise_std if preset is not None else factor * float(robot.require("noise_std", _WHAT))
                 if not told > 0.0:
                     raise SettingsError(
-                        f"robot `{robot.name}` gives `sensor.noise_std` = 0, and {_WHAT} needs a positive one; raise "
+                        f"robot {robot.label()} gives `sensor.noise_std` = 0, and {_WHAT} needs a positive one; raise "
                         f"it, or give `{name}`."
                     )
                 levels.append(told)
             elif preset is not None:
                 levels.append(3.0 * preset.gyro_noise_std)
             else:
-                raise SettingsError(f"robot `{robot.name}` says nothing of its rates' noise; give `{name}` [{unit}].")
+                raise SettingsError(f"robot {robot.label()} says nothing of its rates' noise; give `{name}` [{unit}].")
         return (levels[0], levels[1], levels[2]), sensor
 
     def _form(self, plants: list[AxisPlant], period: float, reach: Reach) -> FilterMatrices:

@@ -182,7 +182,7 @@ def _plant_inputs(fault: MotorFault | NeckFault, plant: Part, robot: Robot) -> t
     if isinstance(fault, MotorFault):
         if fault.motor > len(robot.set_points):
             raise SettingsError(
-                f"the {with_kind(fault)} is of motor {fault.motor}; `{robot.name}` has {len(robot.set_points)}."
+                f"the {with_kind(fault)} is of motor {fault.motor}; {robot.label()} has {len(robot.set_points)}."
             )
         return (robot.set_points[fault.motor - 1],) if fault.motor else robot.set_points
     known = [port.name for port in plant.inputs]

@@ -104,7 +104,7 @@ def robot_reference(kind: str, values: Mapping[str, object], robot: Robot) -> Ro
     wanted = dict.fromkeys((*names, "cocontraction"), 0.0)
     if kind == "rotation":
         if len(names) != 2 or to_si(robot.outputs.unit)[1] != "rad":
-            raise SettingsError(f'kind = "rotation" is for two angles; `{robot.name}` has {", ".join(names)}.')
+            raise SettingsError(f'kind = "rotation" is for two angles; {robot.label()} has {", ".join(names)}.')
         wanted = {"inclination": 0.0, "cocontraction": 0.0}
     for key, value in values.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
@@ -164,6 +164,7 @@ def _within(key: str, name: str, value: float, robot: Robot) -> float:
         high = min(outputs.max or (np.inf,))
     if not low * factor <= value <= high * factor:
         raise SettingsError(
-            f"`{key}` is beyond what `{robot.name}` may do: {low:g} to {high:g} {outputs.unit}; got {value / factor:g}."
+            f"`{key}` is beyond what {robot.label()} may do: {low:g} to {high:g} {outputs.unit}; "
+            f"got {value / factor:g}."
         )
     return value

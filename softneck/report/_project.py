@@ -17,6 +17,7 @@ from softneck.cosim.loops._loop_values import read_toml
 from softneck.cosim.loops._trust import python_of
 from softneck.cosim.studies._store import read_description
 from softneck.identification.models._directions import bandwidth_of
+from softneck.robot._search import FILE
 from softneck.signals import assess_quality, import_log, read_layout, read_recording
 from softneck.signals.importing._layout_text import doubts_in
 
@@ -40,7 +41,7 @@ class Project:
         certificates: path -> content.
         loops: path -> result of its run.
         studies: path of the folder -> (description, runs).
-        doubts: path of a layout -> what its import was not sure of.
+        doubts: path of a layout or robot file -> what was taken there without being sure.
         problems: path -> why it could not be read or run.
     """
 
@@ -84,8 +85,9 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
         name = path.relative_to(root).as_posix()
         progress(number / len(files), name)
         try:
-            if path.name.endswith(_LAYOUT):
-                _layout(project, path, name)
+            if path.name.endswith(_LAYOUT) or path.name == FILE:
+                if found := doubts_in(path):
+                    project.doubts[name] = found
             elif run_loops or path.suffix.lower() != ".toml":
                 _READERS[path.suffix.lower()](project, path, name)
         except SoftneckError as error:
@@ -119,11 +121,6 @@ def _files(root: Path) -> Iterator[Path]:
             yield from _files(entry)
         elif entry.suffix.lower() in _READERS and not _is_front(entry):
             yield entry
-
-
-def _layout(project: Project, path: Path, name: str) -> None:
-    if found := doubts_in(path):
-        project.doubts[name] = found
 
 
 def _loop(project: Project, path: Path, name: str) -> None:

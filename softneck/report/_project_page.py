@@ -16,6 +16,7 @@ from softneck.identification import INFINITE
 from softneck.identification.validation._validation import Rules, judge, judged_parts
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import loop_chart, recording_chart, validation_chart
+from softneck.robot._search import FILE
 from softneck.signals import Recording
 
 from ._project import Project
@@ -57,12 +58,19 @@ def _sentence(project: Project) -> tuple[str, bool | None]:
         parts.append(f"{certified} of {len(project.certificates)} certificates hold")
     if project.problems:
         parts.append(f"{len(project.problems)} file(s) could not be read or run")
-    doubts = [one for found in project.doubts.values() for one in found]
-    unsure = f" Not sure of the log{'s' if len(project.doubts) > 1 else ''}: {_shortly(doubts)}." if doubts else ""
+    unsure = "".join(f" Not sure of {what}: {_shortly(doubts)}." for what, doubts in _doubts(project).items())
     if not parts:
         return f"Nothing in this project states a limit, so nothing was judged.{unsure}", None
     good = held == len(loops) and certified == len(project.certificates) and not project.problems
     return f"{'; '.join(parts)}.".capitalize() + unsure, good
+
+
+def _doubts(project: Project) -> dict[str, list[str]]:
+    """Return what is not sure: of the logs, and of the robots."""
+    found: dict[str, list[str]] = {}
+    for name, doubts in project.doubts.items():
+        found.setdefault("the robot" if Path(name).name == FILE else "the log", []).extend(doubts)
+    return found
 
 
 def _shortly(doubts: Sequence[str]) -> str:
@@ -130,7 +138,7 @@ def _data(project: Project) -> Section | None:
         tables.append(Table("What was found in them", ["recording", "finding"], findings, text=2))
     unsure = [[name, doubt] for name, found in project.doubts.items() for doubt in found]
     if unsure:
-        tables.insert(0, Table("What the import was not sure of", ["layout", "taken"], unsure, text=2))
+        tables.insert(0, Table("What is not sure", ["file", "taken"], unsure, text=2))
     return Section("Data", tables=tables, charts=charts)
 
 

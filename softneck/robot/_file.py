@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import tomllib
 from collections.abc import Iterator, Mapping
 from importlib.resources import files
@@ -120,6 +121,11 @@ def named(path: str | Path) -> Iterator[None]:
         yield
     except SoftneckError as error:
         raise SettingsError(f"{path}: {error}") from error
+
+
+def shown(path: Path) -> str:
+    """Return a path as people read it: from the working folder, or whole where that is shorter."""
+    return min(os.path.relpath(path), str(path.resolve()), key=len)
 
 
 def _check(table: Mapping[str, Any]) -> None:

@@ -36,7 +36,7 @@ class Robot(Shown):
         rate_hz: samples of the sensor per second [1/s].
         neck: the virtual plant that stands for the robot: "paper", "lab" or a neck file.
         drives: file of the drives.
-        folder: where the files that it names are; None for a preset.
+        file: from which it was read; None for a preset.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Robot(Shown):
     rate_hz: float | None = None
     neck: str | None = None
     drives: str | None = None
-    folder: Path | None = None
+    file: Path | None = None
 
     def __post_init__(self) -> None:
         if not self.name.strip() or not self.name.isprintable():
@@ -82,7 +82,7 @@ class Robot(Shown):
         """
         table = _file.read_table(Path(path))
         with _file.named(path):
-            return cls(**_file.fields(table), folder=Path(path).parent)
+            return cls(**_file.fields(table), file=Path(path))
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Robot:
@@ -96,6 +96,11 @@ class Robot(Shown):
     def as_dict(self) -> dict[str, Any]:
         """Return the tables of its `robot.toml`, without `extends`; what is not given is left out."""
         return _table(self)
+
+    @property
+    def folder(self) -> Path | None:
+        """Where the files that it names are; None for a preset."""
+        return None if self.file is None else self.file.parent
 
     @property
     def set_points(self) -> tuple[str, ...]:
@@ -138,7 +143,7 @@ class Robot(Shown):
         """
         value = getattr(self, key)
         if value is None:
-            raise SettingsError(f"robot `{self.name}` gives no `{_file.KEY_OF[key]}`, which {what} needs; add it.")
+            raise SettingsError(f"robot {self.label()} gives no `{_file.KEY_OF[key]}`, which {what} needs; add it.")
         return value
 
     def require_neck(self, what: str) -> None:
@@ -147,8 +152,8 @@ class Robot(Shown):
             raise SettingsError(f"{what} takes necks only so far, not robot {self.label()}.")
 
     def label(self) -> str:
-        """Return name and short hash, by which messages tell robots apart."""
-        return f"`{self.name}` ({self.hash[:8]})"
+        """Return name, short hash and file, by which messages tell robots apart."""
+        return f"`{self.name}` ({self.hash[:8]}{'' if self.file is None else f', from {_file.shown(self.file)}'})"
 
     def summary(self) -> str:
         """Return a few lines on the robot, for people."""

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from softneck.core import SettingsError
 
-from ._file import PRESETS
+from ._file import PRESETS, shown
 from ._robot import Robot
 
 FILE = "robot.toml"
+_LOG = logging.getLogger(__name__)
 
 
 def find_robot(given: str | Path | Robot | None = None, *, beside: str | Path | None = None) -> Robot:
     """Return the robot that is `given`, else that of `robot.toml` beside or above `beside`, else the neck.
+
+    A file that was found and not given is named in the log `softneck.robot`, at level INFO; the commands print it.
 
     Args:
         given: a robot, a preset's name or a robot file; None: look for it.
@@ -27,7 +31,11 @@ def find_robot(given: str | Path | Robot | None = None, *, beside: str | Path | 
     if given is not None:
         return _named(given)
     found = robot_file_of(beside) if beside is not None else None
-    return Robot.preset("neck") if found is None else Robot.read(found)
+    if found is None:
+        return Robot.preset("neck")
+    robot = Robot.read(found)
+    _LOG.info("robot: %s, from %s", robot.name, shown(found))
+    return robot
 
 
 def robot_file_of(beside: str | Path) -> Path | None:

@@ -178,7 +178,7 @@ def task_of(
     ends = zip(robot.outputs.min or (), robot.outputs.max or (), strict=True)
     if own and any(not low < 0.0 < high for low, high in ends):
         raise SettingsError(
-            f"loops over {next(iter(own))} would begin at zero, where `{robot.name}` cannot be; give linear plants "
+            f"loops over {next(iter(own))} would begin at zero, where {robot.label()} cannot be; give linear plants "
             "alone."
         )
     asked = _asked(requirements, robot, list(linear.values()), stepping=bool(own))

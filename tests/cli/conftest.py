@@ -24,8 +24,9 @@ class Said:
 
     @property
     def error(self) -> str:
-        """The one line on stderr, beside lines of progress, which end in dots."""
+        """The one line on stderr, beside lines of progress, which end in dots, and the robot that was found."""
         lines = [line for line in self.err.splitlines() if line.strip() and not line.endswith(" ...")]
+        lines = [line for line in lines if not line.startswith("robot: ")]
         assert len(lines) == 1, self.err
         return lines[0]
 

@@ -56,3 +56,26 @@ def test_bad_robots_are_one_line_and_exit_code_2(call: Call, tmp_path: Path) -> 
     (tmp_path / "robot.toml").write_text('extends = "neck"\n[motor]\nunit = "deg"\n')
     said = call("info", "robot.toml")
     assert (said.code, "unknown key `motor`; did you mean `motors`?" in said.error) == (2, True)
+
+
+def test_a_file_that_was_found_is_said_once_and_one_that_was_given_is_not(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert call("robot", "new", "--preset", "finger").code == 0
+    inside = tmp_path / "logs" / "monday"
+    inside.mkdir(parents=True)
+    monkeypatch.chdir(inside)
+    # Recording it reads the file for the plant, for the limits and for the recording.
+    said = call("record", "steps", "-o", "a.csv", "--duration", "2", "--json")
+    assert (said.code, said.err.count("robot: finger, from ../../robot.toml\n")) == (0, 1)
+    json.loads(said.out)
+    given = call("record", "steps", "-o", "b.csv", "--duration", "2", "--robot", "finger")
+    assert (given.code, "robot: " in given.err) == (0, False)
+    # An error about it names it as well; what its own file says is read from there.
+    (tmp_path / "robot.toml").write_text('extends = "antagonist"\nname = "mine"\n')
+    said = call("identify", "rls", "a.csv", "-o", "a.npz")
+    assert said.code == 2
+    here, there = (Robot.preset(name).hash[:8] for name in ("antagonist", "finger"))
+    assert f"of robot `finger` ({there}), not of `mine` ({here}, from ../../robot.toml)." in said.error
+    (tmp_path / "robot.toml").write_text("name = 1\n")
+    assert "robot.toml: `name` must be a text" in call("info", "a.csv").error

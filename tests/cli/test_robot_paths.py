@@ -160,7 +160,7 @@ def test_record_takes_the_robot_beside_the_recording_and_says_what_it_lacks(call
     assert call("robot", "new", "--preset", "arm").code == 0
     said = call("record", "steps", "-o", "rec.csv")
     assert (said.code, len(said.error.splitlines())) == (2, 1)
-    assert "robot `arm` gives no `plant.neck`, which the virtual plant needs; add it." in said.error
+    assert ", from robot.toml) gives no `plant.neck`, which the virtual plant needs; add it." in said.error
     (tmp_path / "robot.toml").write_text('extends = "antagonist"\nname = "muscles"\n[motors]\nunit = "bar"\n')
     said = call("record", "steps", "-o", "rec.csv")
     assert said.code == 2

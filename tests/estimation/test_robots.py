@@ -154,7 +154,7 @@ def test_levels_are_given_in_the_unit_of_the_outputs() -> None:
 def test_what_the_robot_does_not_say_of_its_sensor_is_asked_for(key: str) -> None:
     sensor = {name: value for name, value in SENSED.as_dict()["sensor"].items() if name != key}
     silent = Robot.from_dict({**SENSED.as_dict(), "sensor": sensor})
-    line = f"robot `bellows` gives no `sensor.{key}`, which an observer needs; add it"
+    line = rf"robot `bellows` \(\w{{8}}\) gives no `sensor.{key}`, which an observer needs; add it"
     with pytest.raises(SettingsError, match=line):
         KalmanSettings().design(plant(silent, gain=1e-7))
 

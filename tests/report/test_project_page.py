@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -9,8 +10,12 @@ import pytest
 
 from softneck.cosim import Result
 from softneck.loop import LoopResult, metrics
-from softneck.report._project_page import _metrics
+from softneck.report._project import read_project
+from softneck.report._project_page import _metrics, _sentence
 from softneck.robot import Robot
+from softneck.signals import write_recording
+
+from ..data import neck_recording
 
 
 class _Run:
@@ -37,3 +42,14 @@ def test_a_loop_of_any_robot_has_a_row(name: str) -> None:
     assert settling.split("/")[0] == "0.00"
     assert error.split("/")[0] == "0.00"
     assert float(largest) == 0.025
+
+
+def test_what_is_not_sure_of_log_and_robot_is_in_the_heading(tmp_path: Path) -> None:
+    write_recording(tmp_path / "log.csv", neck_recording(600))
+    (tmp_path / "log.layout.toml").write_text("# NOT SURE (80 %): the only column in rad\npitch = 'tilt'\n")
+    sensor = "".join(f"# NOT SURE ({sure} %): why\n{key} = 0.1\n" for key, sure in (("noise_std", 80), ("delay_s", 50)))
+    (tmp_path / "robot.toml").write_text(f'extends = "neck"\n[sensor]\n{sensor}')
+    sentence, _ = _sentence(read_project(tmp_path))
+    assert sentence.endswith(
+        " Not sure of the log: pitch (80 % sure). Not sure of the robot: noise_std (80 % sure) and 1 more."
+    )

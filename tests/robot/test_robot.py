@@ -76,7 +76,8 @@ def test_what_is_not_given_is_not_assumed_and_who_needs_it_says_so(tmp_path: Pat
     assert robot.motors.setpoint_max == (7.0, 7.0, 8.0)
     assert (robot.motors.rate_limit, robot.outputs.min, robot.weights()) == (None, None, None)
     with pytest.raises(
-        SettingsError, match=r"robot `pneumatic arm` gives no `sensor.noise_std`, which softneck x needs"
+        SettingsError,
+        match=r"robot `pneumatic arm` \(\w{8}, from .*robot.toml\) gives no `sensor.noise_std`, which softneck x needs",
     ):
         robot.require("noise_std", "softneck x")
     assert robot.require("sample_time_s", "softneck x") == 0.083

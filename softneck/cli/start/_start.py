@@ -119,13 +119,9 @@ def _robot_of(log: Path, robot: str | None) -> str | None:
     """Return the robot as commands in another folder name it, None where nothing says whose log it is."""
     from softneck.robot import find_robot
     from softneck.robot._file import PRESETS
-    from softneck.robot._search import robot_file_of
 
-    if robot is not None:
-        find_robot(robot)  # which says what is wrong with it
-        return robot if robot in PRESETS else str(Path(robot).absolute())
-    found = robot_file_of(log)
-    return None if found is None else str(found)
+    file = find_robot(robot, beside=log).file  # which says what is wrong with it
+    return robot if robot in PRESETS or file is None else str(file.absolute())
 
 
 def _asked(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: bool) -> Asked:
@@ -278,7 +274,8 @@ def _unsure(facts: dict[str, Any]) -> str:
         return ""
     said, file = min(doubts, key=lambda pair: not pair[0].startswith("outputs: "))
     more = f", {len(doubts) - 1} more" if doubts[1:] else ""
-    return f"not sure of the log: {said.partition(' sure): ')[0]} sure){more}; see NOT SURE in {file}"
+    what = "the robot" if file == "robot.toml" else "the log"
+    return f"not sure of {what}: {said.partition(' sure): ')[0]} sure){more}; see NOT SURE in {file}"
 
 
 def _model(file: str) -> dict[str, Any]:

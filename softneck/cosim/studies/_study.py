@@ -16,8 +16,7 @@ from softneck.core._shown import Shown, sparkline
 from softneck.loop import Loop, LoopRun
 from softneck.loop._result import metric_names, shown_unit
 from softneck.loop._robot_references import reference_key
-from softneck.robot import Robot
-from softneck.robot._search import robot_file_of
+from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 
 from ..loops._loop_file import LoopSetup, load_loop, make_loop, normal_table
@@ -236,9 +235,11 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
 
 def _with_robot(table: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return a loop file's table with the robot beside it where no part can say whose it is: runs know no file."""
-    file = robot_file_of(path)
     parts = [*(table.get(name) for name in SOURCES), *table.get("part", [])]
-    if file is None or "robot" in table or any({"model", "file"} & set(part or ()) for part in parts):
+    if "robot" in table or any({"model", "file"} & set(part or ()) for part in parts):
+        return table
+    file = find_robot(beside=path).file
+    if file is None:
         return table
     return {**table, "robot": os.path.relpath(file, path.resolve().parent / str(table.get("folder", ".")))}
 

@@ -81,7 +81,7 @@ class LoopSettings:
         if plant.robot.is_neck:
             return self
         if self.tendon_angles != tuple(TENDON_ANGLES.tolist()):
-            raise SettingsError(f"`tendon_angles` are of necks; those of `{plant.robot.name}` are in its robot file.")
+            raise SettingsError(f"`tendon_angles` are of necks; those of {plant.robot.label()} are in its robot file.")
         others = {
             name: value for name, value in self._others(plant).items() if isinstance(getattr(self, name), NeckDefault)
         }

@@ -228,7 +228,7 @@ def robot_limits(robot: Robot, given: Mapping[str, float]) -> ControllerLimits:
 
 def _not_given(robot: Robot, key: str, setting: str) -> SettingsError:
     return SettingsError(
-        f"robot `{robot.name}` gives no `{key}`, which a controller needs; add it, or give `{setting}` in "
+        f"robot {robot.label()} gives no `{key}`, which a controller needs; add it, or give `{setting}` in "
         f"{robot.motors.unit}."
     )
 

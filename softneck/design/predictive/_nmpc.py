@@ -149,9 +149,9 @@ class NmpcSettings(Shown):
             )
         robot = model.robot
         if not robot.is_neck and self.tendon_angles != NmpcSettings().tendon_angles:
-            raise SettingsError(f"`tendon_angles` are of necks; those of `{robot.name}` are in its robot file.")
+            raise SettingsError(f"`tendon_angles` are of necks; those of {robot.label()} are in its robot file.")
         if not robot.is_neck and self.minimum_tautness is not None:
-            raise SettingsError(f"`minimum_tautness` of `nmpc` is for necks; `{robot.name}` is none. Leave it out.")
+            raise SettingsError(f"`minimum_tautness` of `nmpc` is for necks; {robot.label()} is none. Leave it out.")
         limits = limits_of(self, robot)
         directions = None if robot.is_neck else weights_of(model)
         pulled = max(0.0, self.minimum_tautness or 0.0)

@@ -115,7 +115,7 @@ def limits_of(settings: Any, robot: Robot) -> ControllerLimits:
             require_between("angle_limit", angle, 0.01, MAX_REFERENCE, "rad")
         elif to_si(robot.outputs.unit)[1] != "rad":
             raise SettingsError(
-                f"`angle_limit` is for outputs that are angles; those of `{robot.name}` are in "
+                f"`angle_limit` is for outputs that are angles; those of {robot.label()} are in "
                 f"{robot.outputs.unit}. Leave it out."
             )
     taut, most = getattr(settings, "minimum_tautness", None), limits.position_limit / to_si(unit)[0]
@@ -189,11 +189,11 @@ def refuse_what_is_for_necks(settings: Any, robot: Robot) -> None:
     """Raise SettingsError for settings of `MpcSettings` that mean nothing for another robot than the neck."""
     usual = type(settings)()
     if settings.tendon_angles != usual.tendon_angles:
-        raise SettingsError(f"`tendon_angles` are of necks; those of `{robot.name}` are in its robot file.")
+        raise SettingsError(f"`tendon_angles` are of necks; those of {robot.label()} are in its robot file.")
     if settings.minimum_tautness is not None and (
         robot.directions.kind != "tendons" or isinstance(settings.tautness_lever, NeckDefault)
     ):
         raise SettingsError(
-            f"`minimum_tautness` of robot `{robot.name}` needs tendons at known angles (`angles_deg`), and "
+            f"`minimum_tautness` of robot {robot.label()} needs tendons at known angles (`angles_deg`), and "
             "`tautness_lever`, the motor that a tendon takes up for each unit of an output; give both or neither."
         )

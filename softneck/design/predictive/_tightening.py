@@ -90,7 +90,7 @@ def measurement_bound(given: float, robot: Robot) -> float:
     if isinstance(given, NeckDefault):
         if robot.noise_std is None:
             raise SettingsError(
-                f"robot `{robot.name}` gives no `sensor.noise_std`, which `tightening` needs; add it, or give "
+                f"robot {robot.label()} gives no `sensor.noise_std`, which `tightening` needs; add it, or give "
                 f"`measurement_bound` in {robot.outputs.unit}."
             )
         given = _OF_NOISE * robot.noise_std

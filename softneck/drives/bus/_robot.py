@@ -79,10 +79,9 @@ def require_signs(turned: Sequence[bool], robot: Robot) -> None:
         return
     for j, (other_way, sign) in enumerate(zip(turned, robot.motors.sign, strict=True), start=1):
         if other_way != (sign < 0.0):
-            where = "its robot file" if robot.folder is None else f"the robot file in {robot.folder}"
             raise SettingsError(
                 f"[[drive]] {j} has reversed = {str(other_way).lower()}, but `motors.sign` of motor {j} is "
-                f"{sign:g} in {where} ({robot.label()}); correct one, or leave `sign` out: `reversed` decides."
+                f"{sign:g} in the file of robot {robot.label()}; correct one, or leave `sign` out: `reversed` decides."
             )
 
 

@@ -214,7 +214,7 @@ def weights_of(model: Linear) -> Matrix:
         found = model.findings.get("directions")
         if found is None:
             raise SettingsError(
-                f"the model of kind `{model.kind}` says nothing of the directions of robot `{model.robot.name}`, "
+                f"the model of kind `{model.kind}` says nothing of the directions of robot {model.robot.label()}, "
                 'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
             )
         weights = np.array(found, dtype=np.float64)

@@ -66,7 +66,7 @@ def multisine_experiments(
     weights = robot.weights()
     if weights is None:
         raise SettingsError(
-            f"robot `{robot.name}` gives no directions to move; give `[directions]` as tendons or matrix."
+            f"robot {robot.label()} gives no directions to move; give `[directions]` as tendons or matrix."
         )
     rows = round(2.0 * np.pi / (low * sample_time))
     lines = np.arange(1, max(1, int(high / low + 1e-9)) + 1)
