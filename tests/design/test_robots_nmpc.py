@@ -132,7 +132,7 @@ def test_it_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
 
 
 def test_what_is_of_necks_is_refused() -> None:
-    with pytest.raises(SettingsError, match="`tendon_angles` are of necks; those of `antagonist` .* are in its robot"):
+    with pytest.raises(SettingsError, match=r"`tendon_angles` are of necks; those of `antagonist` .* are in its robot"):
         NmpcSettings(tendon_angles=(0.0, 2.0, 4.0)).design(lag(Robot.preset("antagonist")))
     with pytest.raises(
         SettingsError, match="`angle_limit` is for outputs that are angles; those of `pusher` are in mm"
