@@ -45,7 +45,7 @@ def test_record_is_a_recording_for_identify(call: Call) -> None:
     [
         (("commission", "--only", "jog", "--motor", "4", "--simulated"), "4 is not in the range"),
         (("commission", "--only", "jog", "--motor", "1"), "say which drives"),
-        (("commission", "--only", "jog", "--motor", "1", "--simulated", "--travel", "9"), "amplitude"),
+        (("commission", "--only", "jog", "--motor", "1", "--simulated", "--travel", "9"), "--travel"),
         (("commission", "--only", "jog", "--motor", "1", "--simulated", "--pace", "-1"), "--pace"),
         (
             ("commission", "--only", "jog", "--motor", "1", "--bus", "virtual:x", "--drives", EXAMPLE),

@@ -161,10 +161,17 @@ def cluster(place: Path) -> Iterator[tuple[str, list[subprocess.Popen[str]]]]:
         yield address, [a, b]
 
 
+def on_cluster(place: Path, address: str) -> None:
+    """Have the study of `place` run there."""
+    file = place / "study.toml"
+    file.write_text(f'dask = "{address}"\n{file.read_text()}')
+
+
 def test_dask_with_a_worker_that_dies(place: Path, cluster: tuple[str, list[subprocess.Popen[str]]]) -> None:
     """A scheduler and two workers on loopback; one is killed in the middle, no run is lost, no number changed."""
     address, workers = cluster
-    with running([*_COMMAND, "--dask", address, "--json"], place) as process:
+    on_cluster(place, address)
+    with running([*_COMMAND, "--json"], place) as process:
         wait_for_runs(place / "out", 5, process)
         os.killpg(workers[0].pid, signal.SIGKILL)
         out, said = process.communicate(timeout=_PATIENCE)
@@ -177,7 +184,8 @@ def test_no_scheduler_is_a_clear_line(place: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
-    done = subprocess.run([*_COMMAND, "--dask", address], cwd=place, capture_output=True, text=True)
+    on_cluster(place, address)
+    done = subprocess.run(_COMMAND, cwd=place, capture_output=True, text=True)
     assert done.returncode == 2
     line = [line for line in done.stderr.splitlines() if line.startswith("softneck:")]
     assert len(line) == 1

@@ -104,7 +104,7 @@ def run_study(
     study.check()
     if workers != 0:
         check_sendable((dict(study.loop), [item.values for item in study.vary.values()]))
-    with crew(workers, dask or study.dask) as members:
+    with crew(workers, study.dask if dask is None and workers is None else dask) as members:
         store = Store(study, folder, force=force)
         try:
             _Work(study, store, members, report).run()

@@ -45,7 +45,7 @@ class Study(Shown):
         folder: where relative paths of the loop start.
         name: for titles.
         parquet: whether the folder gets the runs as Parquet besides.
-        dask: address of a Dask scheduler that runs it, such as tcp://head:8786; None: processes here.
+        dask: address of a Dask scheduler that runs it, such as tcp://head:8786, unless `workers` are asked for.
     """
 
     loop: Mapping[str, Any]

@@ -122,16 +122,14 @@ def jog(
     robot = session.file.moves
     motors, outputs = len(robot.motors.names), robot.outputs.names
     require_whole("motor", motor, 1, motors)
-    require_between("--amplitude", amplitude, LEAST, MOST, "rad")
+    require_between("--travel", amplitude, LEAST, MOST, "rad")
     low, high, speed = session.file.ranges[motor - 1]
     whose = "drives file" if session.file.robot is None else "drives file or robot"
     if amplitude > high:
-        raise SettingsError(f"--amplitude {amplitude:g} is beyond the {high:g} rad of the {whose}.")
+        raise SettingsError(f"--travel {amplitude:g} is beyond the {high:g} rad of the {whose}.")
     fastest = 0.5 * math.pi * amplitude / _WAY
     if fastest > speed:
-        raise SettingsError(
-            f"--amplitude {amplitude:g} moves at up to {fastest:.2g} rad/s; the {whose} allows {speed:g}."
-        )
+        raise SettingsError(f"--travel {amplitude:g} moves at up to {fastest:.2g} rad/s; the {whose} allows {speed:g}.")
     lowest = max(-amplitude, low)
     path, stands = _path(amplitude, lowest)
     log = SignalLog(len(path), session=session)
@@ -257,7 +255,7 @@ def judge(
     if noise > _NOISE * max(size, wanted):
         return "unclear", (
             f"The inclinometer is noisier ({math.degrees(noise):.1f} deg) than what is to be seen "
-            f"({math.degrees(wanted):.1f} deg); look at it, or raise --amplitude."
+            f"({math.degrees(wanted):.1f} deg); look at it, or raise --travel."
         )
     if size < _MOVED * wanted:
         return (

@@ -163,8 +163,8 @@ def test_an_operator_stops_it() -> None:
 
 @pytest.mark.parametrize(
     ("motor", "amplitude", "message"),
-    [(4, 0.5, "`motor` must be a whole number between 1 and 3"), (1, 0.0, "--amplitude.*between 0.1 and 1.5"),
-     (1, math.nan, "--amplitude"), (1, 1.2, "beyond the 1 rad of the drives file")],
+    [(4, 0.5, "`motor` must be a whole number between 1 and 3"), (1, 0.0, "--travel.*between 0.1 and 1.5"),
+     (1, math.nan, "--travel"), (1, 1.2, "beyond the 1 rad of the drives file")],
 )  # fmt: skip
 def test_bad_input(motor: int, amplitude: float, message: str) -> None:
     file = default_drives(limits=replace(default_drives().limits, position=1.0))
