@@ -33,7 +33,6 @@ QUICK: dict[str, Any] = {**TAUT, "lead_limit": 0.8, "reference_time": 0.12}
 # Settings other than the defaults, by kind; a kind that is not named gets its defaults.
 SETTINGS: dict[str, dict[str, Any]] = {
     "pi": QUICK,
-    "scheduled": TAUT,
     "adaptive": {**TAUT, "lead_limit": 1.0},
     "hinf": {**TAUT, "lead_limit": 1.2, "reference_time": 0.08},
     "pid": {**TAUT, "lead_limit": 0.8, "reference_time": 0.25},

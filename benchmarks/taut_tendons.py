@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from softneck.design import AdaptiveSettings, PiSettings, ScheduledSettings
+from softneck.design import AdaptiveSettings, PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import FamilySettings
 from softneck.plant import VirtualNeck, record
@@ -26,7 +26,7 @@ def main() -> None:
     family = FamilySettings().fit(recordings)
     observer = KalmanSettings(sensor="3dm-gx5-10").design(family)
     kinds: dict[str, Any] = {
-        "pi": PiSettings(lead_limit=0.8, reference_time=0.12), "scheduled": ScheduledSettings(),
+        "pi": PiSettings(lead_limit=0.8, reference_time=0.12),
         "adaptive": AdaptiveSettings(lead_limit=1.0),
     }  # fmt: skip
     controllers = {name: settings.design(family) for name, settings in kinds.items()}

@@ -94,9 +94,6 @@ KINDS: dict[str, Kind] = {
         Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
              f"{_DESIGN}.linear._linear_controller_runtime",
              "PI with reference filter, anti-windup and tendon allocation"),
-        Kind("scheduled", "controller", "softneck.design:ScheduledSettings", "softneck.design:VaryingController",
-             f"{_DESIGN}.varying._scheduled_runtime",
-             "robust PI at every inclination of a family, gains interpolated without bumps"),
         Kind("adaptive", "controller", "softneck.design:AdaptiveSettings", "softneck.design:VaryingController",
              f"{_DESIGN}.varying._adaptive_runtime",
              "recursive least squares as the neck moves, gains redesigned in every sample, with safeguards"),
@@ -133,6 +130,7 @@ REMOVED: dict[str, str] = {
     "ncf": "hinf",
     "residual": "nlsm --set form=residual",
     "ensemble": "guarded",
+    "scheduled": "pi",
 }
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 

@@ -20,5 +20,4 @@ from .robust._synthesis import mixsyn as mixsyn
 from .robust._weights import makeweight as makeweight
 from .robust._weights import ucover as ucover
 from .varying._adaptive import AdaptiveSettings as AdaptiveSettings
-from .varying._scheduled import ScheduledSettings as ScheduledSettings
 from .varying._varying import VaryingController as VaryingController

@@ -30,7 +30,6 @@ from .uncertainty._family import Family as Family
 from .uncertainty._family_fit import FamilySettings as FamilySettings
 from .uncertainty._frf import FrequencyResponse as FrequencyResponse
 from .uncertainty._frf_fit import frequency_response as frequency_response
-from .uncertainty._lpv import Lpv as Lpv
 from .validation._compare import compare as compare
 from .validation._novelty import Novelty as Novelty
 from .validation._score_tables import INFINITE as INFINITE

@@ -14,9 +14,9 @@ from softneck.core import KINDS, SettingsError, Vector, resolve
 from softneck.core._kinds import kinds_of
 
 #: Kinds that are searched where nobody names any; `nmpc` needs a nonlinear model of its own and minutes.
-KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "lqg", "scheduled", "adaptive", "mpc")
+KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "lqg", "adaptive", "mpc")
 #: Of these nothing is certified beside recordings, since they have no linear form: named, they are searched there too.
-UNCERTIFIED = ("scheduled", "adaptive")
+UNCERTIFIED = ("adaptive",)
 #: A design of these takes ten times as long as one of the others.
 COSTLY = ("mpc", "nmpc")
 
@@ -55,7 +55,6 @@ _OWN: dict[str, tuple[Dimension, ...]] = {
     "hinf": (Dimension("max_sensitivity", 1.2, 3.0, 1.5), Dimension("control_weight", 0.05, 1.0, 0.3)),
     "lqg": (Dimension("max_sensitivity", 1.2, 3.0, 1.4), Dimension("control_weight", 0.01, 1.0, 0.06),
             Dimension("input_noise", 1.0, 100.0, 5.0)),
-    "scheduled": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
     "adaptive": (Dimension("max_sensitivity", 1.15, 2.0, 1.5), Dimension("phase_margin", 0.7, 1.4, 1.05)),
     "mpc": (Dimension("max_sensitivity", 1.2, 2.5, 1.5),),
     "nmpc": (),

@@ -21,7 +21,7 @@ from ._steps import Steps
 
 # Set by hand [rad]: pretension changes by some 3 % of itself.
 _SAME = 0.1
-# Of `scheduled` and `adaptive` on foreign necks such margins were up to four times the true ones.
+# Of `adaptive` on foreign necks such margins were up to four times the true ones.
 ALONE = (
     "not supported by the data: found by experiment on models alone; a controller without linear form (`ss()`) is not "
     "held against the weight over the recordings"

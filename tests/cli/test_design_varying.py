@@ -1,8 +1,7 @@
-"""softneck design scheduled and adaptive: files in, file out, FMU, and one clear line where it cannot be."""
+"""softneck design adaptive: files in, file out, FMU, and one clear line where it cannot be."""
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -23,17 +22,6 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_two_models_make_a_schedule(call: Call, files: Path) -> None:
-    said = call(
-        "design", "scheduled", "low.npz", "high.npz", "-o", "s.npz", "--set", "inclinations=[0.0, 0.35]", "--json"
-    )
-    assert said.code == 0, said.err
-    assert json.loads(said.out)["kind"] == "scheduled"
-    made = load(files / "s.npz", role="controller")
-    assert made.design["inclinations_deg"] == [0.0, pytest.approx(math.degrees(0.35))]
-    assert "scheduled" in call("info", "s.npz").out
-
-
 def test_one_model_makes_an_adaptive_controller_and_its_fmu(call: Call, files: Path) -> None:
     said = call("design", "adaptive", "low.npz", "-o", "a.npz", "--set", "dead_zone_deg=0.05")
     assert said.code == 0, said.err
@@ -47,8 +35,6 @@ def test_one_model_makes_an_adaptive_controller_and_its_fmu(call: Call, files: P
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("scheduled", "low.npz"), "at least two models with one of `inclinations` each"),
-        (("scheduled", "low.npz", "high.npz"), "got 2 model(s) and 0 inclination(s)"),
         (("adaptive", "low.npz", "high.npz"), "one model or a family; got 2 models"),
         (("adaptive", "low.npz", "--set", "forgetting=2"), "`forgetting` must be between 0.9 and 1"),
         (("adaptive", "low.npz", "--set", "least_position=7"), "`least_position` must be between -6 and 6 [rad]"),

@@ -25,7 +25,6 @@ from softneck.design import (
     NmpcSettings,
     PidSettings,
     PiSettings,
-    ScheduledSettings,
 )
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.estimation._axis import axis_plant
@@ -42,7 +41,7 @@ def _custom(**settings: Any) -> CustomSettings:
 
 KINDS: dict[str, Callable[..., Any]] = {
     "pi": PiSettings, "pid": PidSettings, "fopi": FopiSettings, "hinf": HinfSettings,
-    "lqg": LqgSettings, "custom": _custom, "scheduled": ScheduledSettings, "adaptive": AdaptiveSettings,
+    "lqg": LqgSettings, "custom": _custom, "adaptive": AdaptiveSettings,
 }  # fmt: skip
 LIMITS: dict[str, Any] = {
     "position_limit": 3.0, "slew_limit": 5.0, "lead_limit": 0.7, "least_position": -0.5, "least_cocontraction": 0.25
@@ -125,8 +124,8 @@ def test_files_of_a_neck_with_a_file_of_its_own_carry_it(settings: Any, tmp_path
 
 def test_limits_of_a_necks_own_file_hold_where_they_are_stricter() -> None:
     own = _OWN
-    settings = ScheduledSettings(inclinations=(0.05, 0.3))
-    limits = settings.design([OwnNeck(), OwnNeck()]).limits
+    settings = AdaptiveSettings()
+    limits = settings.design(OwnNeck()).limits
     assert (limits.position_limit, limits.slew_limit) == (4.0, 5.0)
     given = replace(settings, slew_limit=9.0).limits(own)
     assert (given.position_limit, given.slew_limit) == (4.0, 9.0)

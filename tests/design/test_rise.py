@@ -123,13 +123,13 @@ def test_what_the_loop_cannot_give_is_refused_in_a_line() -> None:
         resolve(KINDS["hinf"].settings)(rise_s=0.15, max_sensitivity=1.15).design(neck(*PLANTS["late"]))
 
 
-@pytest.mark.parametrize("kind", [*LINEAR, "scheduled", "adaptive"])
+@pytest.mark.parametrize("kind", [*LINEAR, "adaptive"])
 def test_two_settings_for_one_filter_are_refused(kind: str) -> None:
     with pytest.raises(SettingsError, match="not both"):
         resolve(KINDS[kind].settings)(rise_s=0.35, reference_time=0.1)
 
 
-@pytest.mark.parametrize("kind", ["pi", "scheduled", "adaptive"])
+@pytest.mark.parametrize("kind", ["pi", "adaptive"])
 def test_the_rise_of_another_robot_needs_no_filter_of_its_own(kind: str) -> None:
     robot = Robot.preset("antagonist")
     asked = resolve(KINDS[kind].settings)(rise_s=0.6).of_robot(uncertain_plant(lag(robot)))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from softneck import identify, load, record
-from softneck.core import DataError, SettingsError
+from softneck.core import SettingsError
 from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
 from softneck.design import MpcSettings, PiSettings, design_controller
@@ -202,15 +202,6 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
         check_key(table, "reference.roll_deg", {}, model.robot)
     with pytest.raises(SettingsError, match="`motor` must be a whole number between 0 and 2"):
         make_fault("motor_stuck", {"motor": 3}, model.robot)
-
-
-def test_scheduling_is_refused_where_nothing_inclines() -> None:
-    said = r"scheduling over the inclination is for robots with one or two angles; robot `bellows` .* has x, y, z in mm"
-    with pytest.raises(SettingsError, match=said):
-        design_controller("scheduled", [plant(BELLOWS), plant(BELLOWS, gain=0.05)], inclinations=(0.0, 0.3))
-    with pytest.raises(DataError, match="plants of two robots"):
-        design_controller("scheduled", [plant(Robot.preset(name)) for name in ("antagonist", "trunk4")],
-                          inclinations=(0.0, 0.3))  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ HERE = Path(__file__).parent
 GOLDEN = HERE.parent / "golden"
 KINDS = (
     "rls", "subspace", "nlsm", "residual", "nn", "nss", "play", "greybox", "guarded", "neck",
-    "kalman", "nonlinear", "pi", "fopi", "hinf", "scheduled", "adaptive", "mpc",
+    "kalman", "nonlinear", "pi", "fopi", "hinf", "adaptive", "mpc",
 )  # fmt: skip
 BACKENDS = ("python 2.0", "compiled 2.0", "compiled 3.0")
 ROWS = 40

@@ -19,7 +19,6 @@ from softneck.design import (
     NmpcSettings,
     PidSettings,
     PiSettings,
-    ScheduledSettings,
 )
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
@@ -159,10 +158,6 @@ def _pi() -> Block:
     return PiSettings().design(_linear()).block()
 
 
-def _scheduled() -> Block:
-    return ScheduledSettings(inclinations=(0.05, 0.3)).design([_linear(), _linear()]).block()
-
-
 def _adaptive() -> Block:
     return AdaptiveSettings().design(_linear()).block()
 
@@ -274,7 +269,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         MOTORS,
         (),
     ),
-    "scheduled": (_scheduled, _REFERENCES, MOTORS, ("lead_limit", "least_position", "least_cocontraction")),
     "adaptive": (_adaptive, _REFERENCES, MOTORS, ("lead_limit", "least_cocontraction", "adapt")),
     "hinf": (_hinf, _REFERENCES, MOTORS, ("slew_limit",)),
     "pid": (_pid, _REFERENCES, MOTORS, ("slew_limit",)),
@@ -294,7 +288,7 @@ HEAVY = ("guarded", "nmpc")
 # controller, the neck.
 SHORT = ("rls", "nlsm", "kalman", "pi", "neck")
 # One of each family of runtimes.
-FAMILIES = (*SHORT, "subspace", "nn", "play", "greybox", "mpc", "scheduled")
+FAMILIES = (*SHORT, "subspace", "nn", "play", "greybox", "mpc", "adaptive")
 
 
 @cache

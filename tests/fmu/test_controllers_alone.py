@@ -31,7 +31,7 @@ pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
 )
 # All that run as C; nonlinear predictive control is added below.
-CONTROLLERS = ("pi", "pid", "fopi", "hinf", "lqg", "custom", "scheduled", "adaptive", "mpc")
+CONTROLLERS = ("pi", "pid", "fopi", "hinf", "lqg", "custom", "adaptive", "mpc")
 POSITIONS = [f"motor_position_{j}" for j in (1, 2, 3)]
 STEP = math.radians(15.0)
 GOLDEN = ROOT / "tests" / "golden"
@@ -58,7 +58,7 @@ def neck(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module", params=slow_but([*CONTROLLERS, "nmpc"], ["pi", "hinf", "scheduled", "mpc"]))
+@pytest.fixture(scope="module", params=slow_but([*CONTROLLERS, "nmpc"], ["pi", "hinf", "mpc"]))
 def kind(request: pytest.FixtureRequest) -> str:
     return request.param
 

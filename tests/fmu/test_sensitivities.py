@@ -288,7 +288,6 @@ def test_controllers_and_observers_have_them_too(name: str, tmp_path: Path, runn
     ("name", "words"),
     [
         ("mpc", "quadratic program"), ("kalman", "covariance"), ("adaptive", "learns its plant"),
-        ("scheduled", "interpolates whole matrices"),
     ],
 )  # fmt: skip
 def test_kinds_without_are_refused(name: str, words: str, tmp_path: Path) -> None:

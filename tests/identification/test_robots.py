@@ -238,19 +238,9 @@ def test_a_family_holds_the_truth_of_each_axis(name: str, sample_time: float, tm
     np.testing.assert_array_equal(again.directions, family.directions)
 
 
-def test_what_of_a_family_is_a_neck_s_alone_is_refused() -> None:
-    recording = recorded(ROBOTS["antagonist"])
-    table = ROBOTS["antagonist"].as_dict()
-    lengths = Robot.from_dict({**table, "outputs": {"names": ["x"], "unit": "mm"}})
-    channels = {**recording.channels, "x": recording.channels["pitch"]}
-    del channels["pitch"]
-    shown = replace(recording, channels=channels, robot=lengths)
-    with pytest.raises(
-        SettingsError, match=r"`lpv_knots`.* is for robots with one or two angles; robot .* has x in mm"
-    ):
-        FamilySettings(lpv_knots=3).fit(shown)
+def test_a_family_of_two_robots_is_refused() -> None:
     with pytest.raises(DataError, match="recordings of two robots"):
-        FamilySettings().fit([recording, recorded(ROBOTS["finger"])])
+        FamilySettings().fit([recorded(ROBOTS["antagonist"]), recorded(ROBOTS["finger"])])
 
 
 def test_the_kinds_that_take_a_robot_are_tried_and_the_best_is_chosen() -> None:
@@ -334,7 +324,6 @@ def test_an_output_that_follows_no_motor_is_said() -> None:
 
 
 def test_a_file_whose_arrays_do_not_fit_its_robot_is_refused(tmp_path: Path) -> None:
-    from dataclasses import replace
 
     model = identify("oe", recorded(ROBOTS["finger"]), delay=0.06)
     replace(model, robot=ROBOTS["trunk4"]).save(tmp_path / "m.npz")

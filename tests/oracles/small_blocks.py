@@ -89,7 +89,6 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
         "kalman_steady": lambda: kalman(steady=True).design(linear),
         "kalman_jacobi": lambda: kalman(sensor="paper", order="jacobi").design(made["rls"]),
         "pi": lambda: design.PiSettings().design(linear),
-        "scheduled": lambda: design.ScheduledSettings(inclinations=(0.05, 0.3)).design([linear, linear]),
         "adaptive": lambda: design.AdaptiveSettings().design(linear),
         "hinf": lambda: design.HinfSettings(bandwidth=4.0, gain_spread=0.0).design(linear),
         "pid": lambda: design.PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(linear),

@@ -162,7 +162,6 @@ def test_controllers_and_observers_have_derivatives_too(name: str) -> None:
         ("mpc", "quadratic program"),
         ("kalman", "covariance"),
         ("adaptive", "learns its plant"),
-        ("scheduled", "matrices"),
     ],
 )
 def test_kinds_without_derivative_say_why(name: str, words: str) -> None:

@@ -6,18 +6,26 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import control
 import numpy as np
 import pytest
 
 from softneck.design import MpcSettings
-from softneck.estimation import KalmanSettings
+from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import GreyBox
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 from softneck.verification import make_requirements, verify
 
-from ..design.test_scheduled import neck
+TS, POLE, GAIN = 0.02, 5.3, math.radians(5.5)
+
+
+def neck() -> LinearNeck:
+    a = math.exp(-POLE * TS)
+    axis = control.TransferFunction([GAIN * (1.0 - a)], [1.0, -a, 0.0, 0.0, 0.0, 0.0], TS)
+    return LinearNeck(pitch=axis, roll=axis)
+
 
 PAPER = VirtualNeck(NeckParameters.paper())
 ASKED = {
@@ -37,8 +45,8 @@ def test_verify_has_the_estimate_of_an_observer_in_the_loops_of_an_mpc() -> None
     model = GreyBox(evaluations=2, sensor_delay=2).fit([log("eq22", 0.0), log("eq22", 1.0)])
     observer = KalmanSettings().design(model)
     settings = MpcSettings(bandwidth=6.0, minimum_tautness=0.5, payload_tautness=2.0)
-    controller, deaf = settings.design(neck(5.5)), replace(settings, payload_tautness=0.0).design(neck(5.5))
-    found = verify(controller, {"line": neck(5.5)}, make_requirements(ASKED), observer=observer)
+    controller, deaf = settings.design(neck()), replace(settings, payload_tautness=0.0).design(neck())
+    found = verify(controller, {"line": neck()}, make_requirements(ASKED), observer=observer)
     runs: list[Any] = found.evidence.necks
     assert [run.payload for run in runs] == [0.0, 1.0]
     size = math.radians(float(found.requirements.neck["size_deg"]))

@@ -23,7 +23,7 @@ AUTO, PI, OBSERVER, BEST = "models/auto.npz", "controllers/pi.npz", "observers/k
 FAMILY = "models/family.npz"
 PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu", "fmus/Controller.fmu"
 _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
-# Of `tune`: without `scheduled`, which needs several models, and `adaptive`, which was the best on none of the foreign
+# Of `tune`: without `adaptive`, which was the best on none of the foreign
 # necks `column`, `spring` and `chain`, and takes a fifth of a search with empty caches.
 _KINDS = "pi,pid,fopi,hinf,lqg"
 # Beside a family nothing is certified of it: its loops pull no tendons as the recordings do.
@@ -39,7 +39,7 @@ class Asked:
         logs: absolute paths, as the commands run in the project's folder.
         robot: a preset, or the absolute path of a robot file; None: the neck, or what the log shows.
         requirements: absolute path of the file for `tune`; None: the defaults.
-        kinds: of controllers to search; None: those of `tune` but `scheduled` and `adaptive`.
+        kinds: of controllers to search; None: those of `tune` but `adaptive`.
         sample_time: of logs without a clock [s].
         motors, positions, outputs: columns of the logs that were named; () for a guess.
         budget: of `tune`: by default half its own, so that a sitting ends within minutes.

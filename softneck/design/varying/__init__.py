@@ -1,4 +1,4 @@
-"""Controllers whose gains vary as they run: scheduled over the inclination, or adaptive.
+"""Adaptive control: gains that follow what recursive least squares learns in the loop.
 
 Each keeps the checks of the linear design it is made of.
 May import `design.linear` and `design.plants`.

@@ -1,4 +1,4 @@
-"""Controllers whose gains vary as they run - scheduled or adaptive - in loops, FMUs and files."""
+"""A controller whose gains vary as it runs, in loops, FMUs and files."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from ..linear._ports import ControllerLimits, controller_inputs, controller_outp
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class VaryingController(Shown):
-    """A designed controller of pitch and roll whose gains follow the inclination or what it learns.
+    """A designed controller of pitch and roll whose gains follow what it learns.
 
     Attributes:
-        kind: "scheduled" or "adaptive".
+        kind: "adaptive".
         runtime: dotted name of the runtime module, which declares `arrays`.
         sample_time: [s].
         arrays: by name, in the runtime's order.
@@ -123,6 +123,5 @@ def _ports(ports: tuple[Port, ...]) -> list[dict[str, Any]]:
 
 
 RUNTIMES = {
-    "scheduled": "softneck.design.varying._scheduled_runtime",
     "adaptive": "softneck.design.varying._adaptive_runtime",
 }

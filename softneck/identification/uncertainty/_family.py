@@ -18,7 +18,6 @@ from softneck.signals.recording._recording import require_same_robot
 from ..linear._srivc_fit import Continuous
 from ..models._directions import Directions
 from ._frf import SUPPORTED
-from ._lpv import Lpv
 from ._measured import (
     AxisMeasured,
     axis_points,
@@ -75,7 +74,6 @@ class Family(Shown):
             another robot (outputs, outputs), from the input of each output.
         cross_std: as `cross`.
         compression: (3,) static gain [m/rad], pole [1/s], dead time [s] of G_delta; NaN where not recorded.
-        lpv: gain and pole over the inclination, or None.
         settings, findings: what was asked and what was found.
         robot: whose plant it is; its outputs and motors in their SI units where a neck's are in rad.
         directions: (outputs, motors) weights of the motors in each axis's input; None for a neck, whose are Eq. 9, 10.
@@ -88,7 +86,6 @@ class Family(Shown):
     cross: Matrix
     cross_std: Matrix
     compression: Vector
-    lpv: Lpv | None = None
     settings: dict[str, Any] = field(default_factory=dict)
     findings: dict[str, Any] = field(default_factory=dict)
     robot: Robot = field(default_factory=Robot.preset)
@@ -198,7 +195,7 @@ class Family(Shown):
         else:
             lines.append("compression: not recorded or not excited, so there is no G_delta")
         lines += self._measured_lines()
-        for key in ("free_run_fit", "caution"):
+        for key in ("caution",):
             if key in self.findings:
                 lines.append(f"{key}: {self.findings[key]}")
         return "\n".join(lines)
@@ -255,14 +252,12 @@ class Family(Shown):
         }
         for name, axis in self.axes.items():
             arrays |= {f"{name}_{key}": getattr(axis, key) for key in AxisFamily.__dataclass_fields__}
-        if self.lpv is not None:
-            arrays |= {f"lpv_{key}": getattr(self.lpv, key) for key in ("knots", "gains", "poles", "delays")}
         header = {
             "kind": "family",
             "sample_time": self.sample_time,
             "settings": self.settings,
             "findings": self.findings,
-            "lpv_source": None if self.lpv is None else self.lpv.source,
+            "lpv_source": None,  # format 1 names an interpolation over the inclination here; there is none any more
             **self.robot.in_header(),
         }
         if self.directions is not None:
@@ -294,14 +289,6 @@ class Family(Shown):
             if parts:
                 names = header["findings"].get("tested", {}).get("names", [])
                 measured[name] = AxisMeasured.from_arrays(parts, len(names))
-        lpv = None
-        if header["lpv_source"] is not None:
-            parts = {key: arrays[f"lpv_{key}"] for key in ("knots", "gains", "poles", "delays")}
-            m = parts["knots"].size
-            n = len(axes)
-            if parts["gains"].shape != (n, m) or parts["poles"].shape != (n, m) or parts["delays"].shape != (n,):
-                raise FileFormatError("its interpolation has arrays that do not fit each other.")
-            lpv = Lpv(**parts, source=str(header["lpv_source"]), directions=weights)
         return cls(
             sample_time=float(header["sample_time"]),
             axes=axes,
@@ -309,7 +296,6 @@ class Family(Shown):
             cross=arrays["cross"],
             cross_std=arrays["cross_std"],
             compression=arrays["compression"],
-            lpv=lpv,
             settings=header["settings"],
             findings=header["findings"],
             robot=robot,

@@ -30,7 +30,6 @@ from ..models._fitting import check_training
 from ._envelope import envelope_weight
 from ._family import SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
-from ._lpv import Lpv, fit_lpv, require_inclination
 from ._measured import (
     AxisMeasured,
     axis_points,
@@ -118,8 +117,6 @@ class FamilySettings:
         weight_order: of W, 1 to 3.
         max_delay: bound on dead times [s].
         source: "set_points", or "positions" of the motors.
-        lpv_knots: fit an interpolation of gain and pole over so many inclinations, judged in free run on the last
-            30 % of each run; 0 for none.
         confidence: of each circle of the measured frequency responses that the weight of the data covers.
     """
 
@@ -131,7 +128,6 @@ class FamilySettings:
     weight_order: int = 2
     max_delay: float = 0.3
     source: str = "set_points"
-    lpv_knots: int = 0
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
@@ -142,7 +138,6 @@ class FamilySettings:
         require_whole("weight_order", self.weight_order, 1, 3)
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
-        require_whole("lpv_knots", self.lpv_knots, 0, 12)
         require_between("confidence", self.confidence, 0.5, 0.9999)
 
     @one_blas_thread
@@ -167,8 +162,6 @@ class FamilySettings:
         sample_time = _one_sample_time(parts)
         for part in parts:
             check_training(part)
-            if self.lpv_knots > 0:
-                require_inclination(part.robot, "`lpv_knots`: an interpolation over the inclination")
         robot, together = parts[0].robot, concatenate(parts)
         motors = [run.motor_positions if self.source == "positions" else run.set_points for run in together.runs()]
         directions = directions_of(together, motors)
@@ -197,7 +190,6 @@ class FamilySettings:
         if robot.is_neck:
             squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
         weights = None if robot.is_neck else directions.weights
-        lpv, fits = self._lpv(parts, axes, sample_time, weights) if self.lpv_knots > 0 else (None, {})
         progress(0.9, "frequency responses")
         measured, tested = self._measured(search, parts, directions, nominal, names)
         progress(1.0, "done")
@@ -208,7 +200,6 @@ class FamilySettings:
             cross=cross,
             cross_std=cross_std,
             compression=_numbers(squeezed),
-            lpv=lpv,
             settings=asdict(self),
             findings={
                 "recordings": len(parts),
@@ -217,7 +208,6 @@ class FamilySettings:
                 "caution": _CAUTION,
                 "tested": tested,
                 **({} if robot.is_neck else directions.findings()),
-                **fits,
             },
             robot=robot,
             directions=weights,
@@ -361,27 +351,6 @@ class FamilySettings:
         W = np.abs(np.polyval(above, 1j * w) / np.polyval(below, 1j * w))
         excess = float(np.max(relative_errors(plants, nominal, w, sample_time) / W))
         return above * max(1.0, excess), below
-
-    def _lpv(
-        self, parts: list[Recording], axes: dict[str, AxisFamily], sample_time: float, directions: Matrix | None
-    ) -> tuple[Lpv, dict]:
-        """Return the interpolation, and its free-run fits on the last 30 % of each run beside those of one model."""
-        halves = [part.split(0.7) for part in parts]
-        head, tail = [first for first, _ in halves], [second for _, second in halves]
-        nominal = np.array([axis.nominal for axis in axes.values()])
-        start = Lpv(
-            knots=np.zeros(1),
-            gains=nominal[:, :1],
-            poles=nominal[:, 1:2],
-            delays=np.round([np.median(axis.samples[axis.used > 0.5, 2]) / sample_time for axis in axes.values()]),
-            source=self.source,
-            directions=directions,
-        )
-        one = fit_lpv(head, start, 1)
-        many = fit_lpv(head, one, self.lpv_knots) if self.lpv_knots > 1 else one
-        models = {"invariant": one, "lpv": many}
-        fits: dict[str, Any] = {name: [model.fit(part) for part in tail] for name, model in models.items()}
-        return many, {"free_run_fit": {name: np.round(np.mean(f, axis=0), 2).tolist() for name, f in fits.items()}}
 
 
 def _one_sample_time(parts: list[Recording]) -> float:

@@ -184,27 +184,6 @@ def _lag(u: np.ndarray, pole: float, delay: int) -> np.ndarray:
 
 
 @pytest.mark.nightly
-def test_a_gain_that_falls_with_inclination_is_interpolated() -> None:
-    P = signal("aprbs", duration=80.0, seed=4).set_points.copy()
-    P[:15] = 0.0
-    r = recording_from(P)
-    U = P @ np.array([[1, -0.5, -0.5], [0, np.sqrt(0.75), -np.sqrt(0.75)]]).T
-    Y = np.zeros((len(P), 2))
-    for k in range(len(P) - 1):
-        tilt = np.arctan(np.hypot(*np.tan(Y[k])))
-        for i in range(2):
-            Y[k + 1, i] = 0.9 * Y[k, i] + 0.1 * (0.12 - 0.15 * tilt) * U[max(k - 3, 0), i]
-    r = r.with_channels(pitch=Y[:, 0], roll=Y[:, 1])
-    family = FamilySettings(directions=1, lpv_knots=4).fit(r)
-    fits = family.findings["free_run_fit"]
-    # It contains the truth but for the knots; one gain for all inclinations does not.
-    assert min(fits["lpv"]) > 97.0
-    assert max(fits["invariant"]) < min(fits["lpv"]) - 3.0
-    assert family.lpv is not None
-    assert (np.diff(family.lpv.gains, axis=1) < 0).all()
-
-
-@pytest.mark.nightly
 def test_the_virtual_neck_and_the_real_one(shared_data: Path) -> None:
     from softneck.signals import import_log, read_layout
 
