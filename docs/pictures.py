@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import control
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from scipy.signal import lfilter
 
-from softneck.estimation import KalmanSettings, LinearNeck, consistency
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.plots import consistency_figure, faults_figure, region_figure, spectrum_figure
-from softneck.signals import Excitation, Recording, SetPointLimits, assess_quality, prepare, redefine, signal
+from softneck.plots import faults_figure, region_figure, spectrum_figure
+from softneck.signals import Excitation, Recording, SetPointLimits, assess_quality, prepare, signal
 
 STATIC = Path(__file__).parent / "_static"
 
@@ -28,8 +25,6 @@ def main() -> None:
     bad = _faulty(eq22.rows(0, 3000))
     _save(faults_figure(bad, assess_quality(bad), "Eq. 22 with planted faults"), "quality_faults.png")
     _save(_limits_figure(), "excitation_limits.png")
-    for factor, name in ((1.0, "true"), (0.5, "too_sure")):
-        _save(_consistency_figure(factor), f"kalman_{name}.png")
 
 
 def _faulty(recording: Recording) -> Recording:
@@ -40,30 +35,6 @@ def _faulty(recording: Recording) -> Recording:
     roll[800:880] = roll[800]
     roll[2400] += np.radians(15.0)
     return recording.with_channels(pitch=pitch, roll=roll)
-
-
-def _consistency_figure(factor: float) -> Figure:
-    """Return NIS and NEES of a filter over the paper's pitch (Eq. 31), whose noise levels are `factor` of the true."""
-    rows, period, pole = 1500, 0.02, np.exp(-5.293 * 0.02)
-    b = np.radians(27.69) / 5.293 * (1.0 - pole)
-    axis = control.TransferFunction([b], [1.0, -pole, 0.0, 0.0, 0.0, 0.0], period)
-    P, rng = signal("eq22").set_points[:rows], np.random.default_rng(5)
-    degrees = {"measurement_noise_std": 0.1, "model_noise_std": 0.05, "disturbance_noise_std": 0.02}
-    levels = KalmanSettings(sensor_delay=0.0, **{name: np.radians(level) for name, level in degrees.items()})
-    channels = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)}
-    for name, u in zip(("pitch", "roll"), redefine(P)[:, :2].T, strict=True):
-        # What the filter takes the neck for: a model with noise of its own, and a disturbance that walks.
-        driven = lfilter([1.0], [1.0, -pole], levels.model_noise_std * rng.standard_normal(rows))
-        walk = np.cumsum(levels.disturbance_noise_std * rng.standard_normal(rows))
-        channels[name] = lfilter([0.0] * 5 + [b], [1.0, -pole], u) + driven + walk
-        channels[f"{name}_measured"] = channels[name] + np.radians(0.1) * rng.standard_normal(rows)
-    observer = levels.design(LinearNeck(pitch=axis, roll=axis))
-    told = consistency(
-        observer.with_noise([factor * level for level in observer.noise]),
-        Recording(np.arange(rows) * period, period, channels),
-    )
-    title = "noise levels as they are" if factor == 1.0 else f"noise levels taken for {factor:g} times what they are"
-    return consistency_figure(told.nis, told.nees, title=title)
 
 
 def _limits_figure() -> Figure:

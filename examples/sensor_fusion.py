@@ -90,10 +90,9 @@ def dark(time: Vector) -> np.ndarray:
 
 
 def settings() -> dict[str, KalmanSettings]:
-    """Return the three filters by name."""
+    """Return both filters by name."""
     common = KalmanSettings(sensor="3dm-gx5-10", sample_time=PERIOD, sensor_period=2 * PERIOD, sensor_delay=ANGLE_DELAY)
     return {
-        "kinematic": replace(common, form="kinematic"),
         "model + disturbance": replace(common, disturbance_noise_std=DISTURBANCE_STD),
         "gyro + bias": replace(common, form="gyro", gyro_delay=RATE_DELAY),
     }

@@ -53,8 +53,8 @@ def command(
     """Build a filter over the identified MODEL.
 
     The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; of a nonlinear
-    one the free run, with a disturbance. Others: --set form=gyro, driven by the gyro's rates with their bias as a
-    state, and --set form=kinematic.
+    one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
+    state.
     """
 
     kind = find_kind("kalman", "observer")

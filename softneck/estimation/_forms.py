@@ -1,4 +1,4 @@
-"""The forms of the filter: what its states are, what drives them, which noises it has; and its steady state."""
+"""The forms of the filter: what its states are, what drives them, which noises it has."""
 
 from __future__ import annotations
 
@@ -12,22 +12,17 @@ from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
 
 from ._axis import AxisPlant
-from ._kalman_parts_runtime import KALMAN_DIVIDER, KalmanArrays
+from ._kalman_parts_runtime import KalmanArrays
 
-FORMS = ("model", "kinematic", "gyro", "nonlinear")
+FORMS = ("model", "gyro", "nonlinear")
 # Name and unit of the noise levels (standard deviations): of the measurement, then of the two process noises;
 # a nonlinear model's second is a part of its motion.
 NOISES: dict[str, tuple[tuple[str, str], ...]] = {
     "model": (("measurement_noise_std", "rad"), ("model_noise_std", "rad"), ("disturbance_noise_std", "rad")),
-    "kinematic": (
-        ("measurement_noise_std", "rad"),
-        ("acceleration_noise_std", "rad/s^2"),
-        ("angle_noise_std", "rad"),
-    ),
     "gyro": (("measurement_noise_std", "rad"), ("gyro_noise_std", "rad/s"), ("bias_noise_std", "rad/s")),
     "nonlinear": (("measurement_noise_std", "rad"), ("rest_noise_std", "rad"), ("motion_noise_ratio", "")),
 }
-STATES = {"model": "model and disturbance", "kinematic": "angle and rate", "gyro": "angle and gyro bias"}
+STATES = {"model": "model and disturbance", "gyro": "angle and gyro bias"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,16 +108,6 @@ def model_form(plants: Sequence[AxisPlant], reach: Reach = _NECK) -> FilterMatri
     return _all(axes)
 
 
-def kinematic_form(sample_time: float, outputs: int = 2, reach: Reach = _NECK) -> FilterMatrices:
-    """Return angle and rate, driven by an acceleration constant over each sample (Bar-Shalom 2001, sec. 6.3.2)."""
-    T = sample_time
-    F = np.array([[1.0, T], [0.0, 1.0]])
-    g = np.array([0.5 * T * T, T])
-    P0 = np.diag([reach.start**2, reach.rate**2])
-    axis = (F, np.zeros((2, 1)), np.array([[1.0, 0.0]]), np.outer(g, g), np.diag([1.0, 0.0]), P0, P0)
-    return _all([axis] * outputs)
-
-
 def gyro_form(sample_time: float, outputs: int = 2, reach: Reach = _NECK) -> FilterMatrices:
     """Return angle and gyro bias: the angle rises by what the gyro says minus its bias (Lefferts 1982)."""
     T = sample_time
@@ -142,42 +127,6 @@ def _diagonal(*blocks: Matrix) -> Matrix:
     from scipy.linalg import block_diag
 
     return np.asarray(block_diag(*blocks), dtype=np.float64)
-
-
-def steady_covariance(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> Matrix:
-    """Return the covariance (n, n) before a measurement, when one came every sensor period for long.
-
-    Over the m samples of a period the state goes by F^m, with the noise of all m (Anderson and Moore 1979, sec. 4.4).
-    """
-    from scipy.linalg import solve_discrete_are
-
-    F, H, Q, R = system(arrays, noise)
-    Fm, Qm = np.eye(F.shape[0]), np.zeros_like(Q)
-    for _ in range(int(KalmanArrays(arrays).constants[KALMAN_DIVIDER])):
-        Fm, Qm = F @ Fm, F @ Qm @ F.T + Q
-    try:
-        P = np.asarray(solve_discrete_are(Fm.T, H.T, Qm, R))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise SettingsError(f"these noise levels have no steady filter ({error}); give each process noise.") from error
-    # The solver works to some 1e-10 of its largest number; what it left the recursion takes away.
-    for _ in range(50):
-        K, _ = gain(P, H, R)
-        J = np.eye(len(P)) - K @ H
-        P = Fm @ (J @ P @ J.T + K @ R @ K.T) @ Fm.T + Qm
-    return 0.5 * (P + P.T)
-
-
-def steady_gains(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tuple[Matrix, ...]:
-    """Return gain and inverse innovation covariance in steady state, at the start and by force: six matrices."""
-    P, p, R = steady_covariance(arrays, noise), KalmanArrays(arrays), system(arrays, noise)[3]
-    pairs = (gain(P, p.H, R), gain(P + p.P0, p.H, R), gain(P + p.PF, p.H, R))
-    return tuple(np.ascontiguousarray(matrix) for pair in pairs for matrix in pair)
-
-
-def gain(P: Matrix, H: Matrix, R: Matrix) -> tuple[Matrix, Matrix]:
-    """Return K = P H' S^-1 (n, outputs) and S^-1 (outputs, outputs)."""
-    SI = np.linalg.inv(H @ P @ H.T + R)
-    return P @ H.T @ SI, SI
 
 
 def system(arrays: tuple[Matrix, ...], noise: tuple[float, float, float]) -> tuple[Matrix, Matrix, Matrix, Matrix]:

@@ -19,7 +19,7 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
 from softneck.signals import Recording
 
-from ._forms import NOISES, STATES, noise_units, require_levels, steady_gains, system
+from ._forms import NOISES, STATES, noise_units, require_levels, system
 from ._kalman_parts_runtime import (
     KALMAN_DIVIDER,
     KALMAN_FROZEN,
@@ -31,15 +31,13 @@ from ._kalman_parts_runtime import (
     KalmanArrays,
     kalman_lag,
 )
-from ._offline import Estimates, filter_recording, smooth_recording
-from ._steady_kalman_runtime import SteadyKalmanArrays
+from ._offline import Estimates, filter_recording
 
 if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
 
 
 _RUNTIME = "softneck.estimation._kalman_runtime"
-_STEADY = "softneck.estimation._steady_kalman_runtime"
 _NECK = Robot.preset("neck")
 # Where the sensor's delay comes from, as the summary says it.
 _SOURCES = {"given": "as given", "sensor": "of the sensor", "robot": "of the robot's file; set-points and angles alone "
@@ -52,9 +50,9 @@ class KalmanObserver(Shown):
     """A designed Kalman filter; `KalmanSettings.design` makes it.
 
     Attributes:
-        form: "model", "gyro" or "kinematic".
+        form: "model" or "gyro".
         sample_time: [s].
-        arrays: those of `KalmanArrays`; with steady gains those of `SteadyKalmanArrays`.
+        arrays: those of `KalmanArrays`.
         noise: standard deviations, named as `noise_names`, in SI.
         sensor: name of the preset, "none" where the noise was given, "data" where it was estimated, "robot" where the
             robot's file says it.
@@ -94,11 +92,6 @@ class KalmanObserver(Shown):
         return tuple(name for name, _ in NOISES[self.form])
 
     @property
-    def is_steady(self) -> bool:
-        """Whether gains are constant."""
-        return len(self.arrays) > len(KalmanArrays.names())
-
-    @property
     def lead(self) -> float:
         """How far the estimate runs ahead of the measurement [s]: the sensor's delay."""
         return float(self._named.constants[KALMAN_LEAD]) * self.sample_time
@@ -120,15 +113,9 @@ class KalmanObserver(Shown):
         return dataclasses.replace(self, arrays=(*self.arrays[:place], constants, *self.arrays[place + 1 :]))
 
     def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
-        """Return the same filter with other noise levels, steady gains made anew."""
+        """Return the same filter with other noise levels."""
         levels = require_levels(self.form, self.robot, noise)
-        bare = dataclasses.replace(self, noise=levels, sensor=sensor, arrays=self.arrays[: len(KalmanArrays.names())])
-        return bare.steady() if self.is_steady else bare
-
-    def steady(self) -> KalmanObserver:
-        """Return the filter with the gains that it converges to while measurements come regularly."""
-        arrays = self.arrays[: len(KalmanArrays.names())]
-        return dataclasses.replace(self, arrays=(*arrays, *steady_gains(arrays, self.noise)))
+        return dataclasses.replace(self, noise=levels, sensor=sensor)
 
     def block(self) -> Block:
         """Return the filter as a block of role "observer"."""
@@ -138,18 +125,15 @@ class KalmanObserver(Shown):
         return Block(
             kind="kalman",
             role="observer",
-            runtime=sized(
-                _STEADY if self.is_steady else _RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)
-            ),
+            runtime=sized(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=self.arrays,
             inputs=inputs,
             outputs=outputs,
             parameters=tuple(
-                # Levels of process noise are part of constant gains and cannot be changed there.
                 Port(name=name, unit=unit, start=value, minimum=least, maximum=most if unit != "rad" else math.pi,
                      description="standard deviation")
-                for (name, unit), value in (levels[:1] if self.is_steady else levels)
+                for (name, unit), value in levels
             ),
         )  # fmt: skip
 
@@ -183,13 +167,6 @@ class KalmanObserver(Shown):
         """
         return filter_recording(self, recording)
 
-    def smooth(self, recording: Recording) -> Estimates:
-        """Return the best estimates from a whole run, what comes after each row included (Rauch, Tung, Striebel 1965).
-
-        For offline use: no online filter knows what comes. Raises as `estimate`.
-        """
-        return smooth_recording(self, recording)
-
     def summary(self) -> str:
         """Return some lines for people."""
         n, c = len(self._named.F), self._named.constants
@@ -202,7 +179,7 @@ class KalmanObserver(Shown):
         ]
         lines = [
             f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
-            f"  {self.form} form, {'constant gains' if self.is_steady else 'gains from the covariance'}",
+            f"  {self.form} form, gains from the covariance",
             f"  {n} states: {STATES[self.form]} of {_and(self.robot.outputs.names)}{acts}",
             f"  noise: {', '.join(levels)}",
             *filter_lines(self.gate_level, c, self.sample_time, self.delay_source),
@@ -226,14 +203,16 @@ class KalmanObserver(Shown):
             **({} if self.delay_source == "given" else {"delay_source": self.delay_source}),
             **self.robot.in_header(),
         }
-        names = SteadyKalmanArrays.names()  # of a filter without steady gains the first
-        write_archive(path, header, dict(zip(names, self.arrays, strict=False)), force=force)
+        write_archive(path, header, dict(zip(KalmanArrays.names(), self.arrays, strict=True)), force=force)
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> KalmanObserver:
         """Return the observer that `save` wrote; `softneck.core.load` calls this."""
         form = str(header["form"])
-        items = (SteadyKalmanArrays if "gain" in arrays else KalmanArrays).read(arrays)
+        gone = "form kinematic" if form == "kinematic" else "constant gains" if "gain" in arrays else ""
+        if gone:
+            raise FileFormatError(f"{gone} went after softneck 0.2.0, which still reads the file; design it again.")
+        items = KalmanArrays.read(arrays)
         robot = Robot.from_dict(header["robot"]) if "robot" in header else _NECK
         outputs, motors = len(robot.outputs.names), len(robot.motors.names)
         if items["sources"].shape != (outputs, outputs if form == "gyro" else motors):

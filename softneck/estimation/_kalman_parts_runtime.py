@@ -173,7 +173,7 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
             u[i] = kalman_row(T, i, x.rates)
     else:
         for i in range(p.outputs):
-            # Eq. 9 and 10; the kinematic form has zeros here.
+            # Eq. 9 and 10.
             u[i] = kalman_row(T, i, inputs)
     newest = int(x.samples) % p.length
     for axis in range(p.outputs):

@@ -103,11 +103,9 @@ class Estimates(Shown):
 
 @dataclass(slots=True)
 class _Pass:
-    """One run filtered forwards: what each row had before and after its measurement."""
+    """One run filtered: what each row had after its measurement."""
 
     sources: Matrix
-    prior: list[Vector] = field(default_factory=list)
-    prior_P: list[Matrix] = field(default_factory=list)
     x: list[Vector] = field(default_factory=list)
     P: list[Matrix] = field(default_factory=list)
     # innovation, accepted, healthy, judged, log det
@@ -116,12 +114,25 @@ class _Pass:
 
 def filter_recording(observer: LinearFilter, recording: Recording) -> Estimates:
     """Return what the filter makes of each run."""
-    return _over_runs(observer, recording, smooth=False)
-
-
-def smooth_recording(observer: LinearFilter, recording: Recording) -> Estimates:
-    """Return the fixed-interval smoothed estimates of each run; flags are those of the forward pass."""
-    return _over_runs(observer, recording, smooth=True)
+    check_recording(observer, recording)
+    columns: list[tuple[np.ndarray, ...]] = []
+    for run in recording.runs():
+        columns.append(_told(observer, _forward(observer, run)))
+    stacked = [np.concatenate(parts) for parts in zip(*columns, strict=True)]
+    angle, rate, flags, aligned, covariance = stacked
+    innovation, accepted, healthy, judged, log_det = flags.T.copy()
+    return Estimates(
+        time=recording.time,
+        outputs=angle,
+        rates=rate,
+        innovation=innovation,
+        accepted=accepted > 0.5,
+        healthy=healthy > 0.5,
+        judged=judged > 0.5,
+        aligned=aligned,
+        covariance=covariance,
+        log_det=log_det,
+    )
 
 
 def measured_angles(run: Recording) -> Matrix:
@@ -169,30 +180,6 @@ def _rate(run: Recording, axis: str) -> Vector:
     )
 
 
-def _over_runs(observer: LinearFilter, recording: Recording, *, smooth: bool) -> Estimates:
-    check_recording(observer, recording)
-    columns: list[tuple[np.ndarray, ...]] = []
-    for run in recording.runs():
-        passed = _forward(observer, run)
-        x, P = _backward(observer, passed) if smooth else (np.array(passed.x), np.array(passed.P))
-        columns.append(_told(observer, passed, x, P, smooth=smooth))
-    stacked = [np.concatenate(parts) for parts in zip(*columns, strict=True)]
-    angle, rate, flags, aligned, covariance = stacked
-    innovation, accepted, healthy, judged, log_det = flags.T.copy()
-    return Estimates(
-        time=recording.time,
-        outputs=angle,
-        rates=rate,
-        innovation=innovation,
-        accepted=accepted > 0.5,
-        healthy=healthy > 0.5,
-        judged=judged > 0.5,
-        aligned=aligned,
-        covariance=covariance,
-        log_det=log_det,
-    )
-
-
 def _forward(observer: LinearFilter, run: Recording) -> _Pass:
     """Filter one run with filterpy."""
     p = KalmanArrays(observer.arrays)
@@ -210,8 +197,6 @@ def _forward(observer: LinearFilter, run: Recording) -> _Pass:
         kf.predict(_input(observer, passed.sources, k)[:, None])
         forced = rejections >= c[KALMAN_REJECTIONS]
         kf.P = kf.P + (gap if lost[k] else 0.0) + (p.P0 if k < length else p.PF if forced else 0.0)
-        passed.prior.append(kf.x[:, 0].copy())
-        passed.prior_P.append(kf.P.copy())
         nis, log_det, accepted = 0.0, 0.0, False
         if usable[k]:
             e = z[k][:, None] - H @ kf.x
@@ -227,19 +212,9 @@ def _forward(observer: LinearFilter, run: Recording) -> _Pass:
     return passed
 
 
-def _backward(observer: LinearFilter, passed: _Pass) -> tuple[Matrix, np.ndarray]:
-    """Return the smoothed states (time, n) and covariances; filterpy's own smoother knows no inputs."""
-    F = KalmanArrays(observer.arrays).F
-    x, P = np.array(passed.x), np.array(passed.P)
-    for k in range(len(x) - 2, -1, -1):
-        G = np.linalg.solve(passed.prior_P[k + 1], F @ P[k]).T
-        x[k] += G @ (x[k + 1] - passed.prior[k + 1])
-        P[k] += G @ (P[k + 1] - passed.prior_P[k + 1]) @ G.T
-    return x, P
-
-
-def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, smooth: bool) -> tuple[np.ndarray, ...]:
+def _told(observer: LinearFilter, passed: _Pass) -> tuple[np.ndarray, ...]:
     """Return outputs and rates (time, outputs) ahead by the sensor's delay, flags, aligned outputs, covariances."""
+    x, P = np.array(passed.x), np.array(passed.P)
     p = KalmanArrays(observer.arrays)
     H, c = p.H, p.constants
     whole = int(c[KALMAN_LEAD])
@@ -248,14 +223,9 @@ def _told(observer: LinearFilter, passed: _Pass, x: Matrix, P: np.ndarray, *, sm
     # ahead[i, k]: the angles i samples after the filter's time of row k.
     ahead = np.empty((whole + 2, size, len(H)))
     for k in range(size):
-        if smooth:
-            kept = min(size - 1 - k, whole + 1)
-            ahead[: kept + 1, k] = x[k : k + kept + 1] @ H.T
-        else:
-            kept = 0
-            ahead[0, k] = H @ x[k]
-        state = x[k + kept]
-        for i in range(kept + 1, whole + 2):
+        state = x[k]
+        ahead[0, k] = H @ state
+        for i in range(1, whole + 2):
             state = p.F @ state + p.B @ _input(observer, passed.sources, k, i)
             ahead[i, k] = H @ state
     angle = ahead[whole] + part * (ahead[whole + 1] - ahead[whole])

@@ -31,10 +31,8 @@ from ._forms import (
     FilterMatrices,
     Reach,
     gyro_form,
-    kinematic_form,
     model_form,
     noise_units,
-    steady_gains,
 )
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_LAG, KALMAN_MORE_LAGS
@@ -53,26 +51,23 @@ _MISSED = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KalmanSettings:
-    """Kalman filter of pitch and roll, or of another robot's outputs, in one of four forms.
+    """Kalman filter of pitch and roll, or of another robot's outputs, in one of three forms.
 
     "model": the angle is what an identified linear model makes of the delayed set-points plus a disturbance that
-    walks. "gyro": the angle rises by what the gyro says minus a bias that walks. "kinematic": angle and rate under
-    a white acceleration. "nonlinear": the angle is what a nonlinear model makes of the set-points in free run plus a
-    disturbance that walks as far as the model moves; "model" is this form where the model is nonlinear. Measurement
-    noise is white.
+    walks. "gyro": the angle rises by what the gyro says minus a bias that walks. "nonlinear": the angle is what a
+    nonlinear model makes of the set-points in free run plus a disturbance that walks as far as the model moves; "model"
+    is this form where the model is nonlinear. Measurement noise is white.
 
     The defaults are the neck's. Of another robot noise, delay and rate of the sensor are those of its file, and the
     other levels follow from how far and how fast its outputs go; those given are in the unit of its outputs, angles in
     rad.
 
     Attributes:
-        form: "model", "gyro", "kinematic" or "nonlinear".
+        form: "model", "gyro" or "nonlinear".
         sensor: preset of the measurement noise: "mpu9250", "3dm-gx5-10", "paper".
         measurement_noise_std: [rad]; None for that of the sensor.
         model_noise_std: "model": of the model's angle, added each sample [rad].
         disturbance_noise_std: "model": step of the disturbance's walk, each sample [rad].
-        acceleration_noise_std: "kinematic": of the acceleration [rad/s^2].
-        angle_noise_std: "kinematic": what else the angle does, each sample [rad].
         gyro_noise_std: "gyro": of the rates, with what their alignment misses [rad/s]; None for thrice the sensor's.
         bias_noise_std: "gyro": step of the bias's walk, each sample [rad/s].
         rest_noise_std: "nonlinear": step of the disturbance's walk at rest, each sample [rad].
@@ -90,7 +85,6 @@ class KalmanSettings:
         max_rejections: after so many in a row the next measurement is taken in by force.
         healthy_timeout: [s] without an accepted measurement until `healthy` goes false.
         frozen_samples: so many identical samples are a frozen sensor: not used, not healthy. 0: never.
-        steady: constant gains instead of a covariance: for small targets.
         order: of the loop it will run in; in "jacobi" the observer sees set-points one sample younger.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
@@ -103,9 +97,6 @@ class KalmanSettings:
     # What a linear model misses of a neck in fast motion, in a sample: as much as the neck moves. Chosen by
     # `benchmarks/leave_one_neck_out.py observer.disturbance_noise_std`.
     disturbance_noise_std: float = NeckDefault(math.radians(1.5))
-    # 40 deg/s within 0.15 s, as the neck's pole of 5 1/s allows.
-    acceleration_noise_std: float = NeckDefault(5.0)
-    angle_noise_std: float = NeckDefault(1e-6)
     gyro_noise_std: float | None = None
     # A bias that wanders by 0.2 deg/s in some 10 s.
     bias_noise_std: float = NeckDefault(math.radians(0.01))
@@ -123,7 +114,6 @@ class KalmanSettings:
     max_rejections: int = 10
     healthy_timeout: float = NeckDefault(0.1)
     frozen_samples: int = 20
-    steady: bool = False
     order: str = "sequential"
     tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
@@ -181,8 +171,6 @@ class KalmanSettings:
     def _over_nonlinear(self, model: Any) -> NonlinearObserver:
         if not isinstance(model, Model):
             raise SettingsError(f"form nonlinear needs an identified model; got {type(model).__name__}.")
-        if self.steady:
-            raise SettingsError("constant gains have no meaning over a nonlinear model; leave `steady` out.")
         if self.sample_time is not None and not math.isclose(self.sample_time, model.sample_time, rel_tol=_ROUNDING):
             raise SettingsError(
                 f"`sample_time` {self.sample_time:g} s must be the model's, {model.sample_time:g} s: a nonlinear model "
@@ -194,7 +182,7 @@ class KalmanSettings:
             sensor = self.sensor if self.measurement_noise_std is None else "none"
         else:
             reach = simulated_reach(model)
-            noise, sensor = asked.robot_noise(robot, reach, 1.0, period)
+            noise, sensor = asked.robot_noise(robot, reach, period)
         return NonlinearObserver(
             model=model,
             noise=noise,
@@ -229,13 +217,13 @@ class KalmanSettings:
             sensor = self.sensor if self.measurement_noise_std is None else "none"
         else:
             asked, reach = self.robot_timing(robot, period), linear_reach(plants, robot, directions_of(model))
-            noise, sensor = self.robot_noise(robot, reach, max(plant.stretch for plant in plants), period)
+            noise, sensor = self.robot_noise(robot, reach, period)
         constants = asked.constants([plant.delay for plant in plants], period, reach)
         arrays = self._form(plants, period, reach).arrays(self._sources(robot, model), constants)
         return KalmanObserver(
             form=self.form,
             sample_time=period,
-            arrays=(*arrays, *steady_gains(arrays, noise)) if self.steady else arrays,
+            arrays=arrays,
             noise=noise,
             sensor=sensor,
             order=self.order,
@@ -284,9 +272,7 @@ class KalmanSettings:
             timeout = _MISSED * wait
         return replace(self, sensor_delay=float(delay), sensor_period=wait, healthy_timeout=float(timeout))
 
-    def robot_noise(
-        self, robot: Robot, reach: Reach, stretch: float, period: float
-    ) -> tuple[tuple[float, float, float], str]:
+    def robot_noise(self, robot: Robot, reach: Reach, period: float) -> tuple[tuple[float, float, float], str]:
         """Return the noise levels of the form in SI, and which sensor they are of.
 
         Levels that are given are in the unit of the robot's outputs (angles in rad), those that are not are the neck's,
@@ -299,7 +285,6 @@ class KalmanSettings:
         moved = reach.rate / Reach().rate
         scales = {
             "model_noise_std": moved * period / _NECK_PERIOD, "disturbance_noise_std": moved * period / _NECK_PERIOD,
-            "acceleration_noise_std": moved / stretch, "angle_noise_std": reach.start / Reach().start,
             "bias_noise_std": moved, "rest_noise_std": moved * period / _NECK_PERIOD,
         }  # fmt: skip
         preset = None if self.sensor == "paper" else find_sensor(self.sensor)
@@ -330,13 +315,12 @@ class KalmanSettings:
     def _form(self, plants: list[AxisPlant], period: float, reach: Reach) -> FilterMatrices:
         if self.form == "model":
             return model_form(plants, reach)
-        return (gyro_form if self.form == "gyro" else kinematic_form)(period, len(plants), reach)
+        return gyro_form(period, len(plants), reach)
 
     def _sources(self, robot: Robot, model: HasTransferFunctions) -> Matrix:
         if self.form == "gyro":
             return np.eye(len(robot.outputs.names))
-        T = redefinition_matrix(np.array(self.tendon_angles))[:2] if robot.is_neck else directions_of(model)
-        return T if self.form == "model" else np.zeros_like(T)
+        return redefinition_matrix(np.array(self.tendon_angles))[:2] if robot.is_neck else directions_of(model)
 
     def constants(self, delays: Sequence[int], period: float, reach: Reach | None = None) -> Vector:
         """Return the constants in the places that `_kalman_parts_runtime` names.

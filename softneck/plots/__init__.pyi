@@ -2,7 +2,6 @@ from ._chart import Chart as Chart
 from ._chart import Curve as Curve
 from ._chart import Level as Level
 from ._chart import Panel as Panel
-from ._estimation_charts import consistency_figure as consistency_figure
 from ._figures import chart_figure as chart_figure
 from ._figures import cost_figure as cost_figure
 from ._figures import delay_figure as delay_figure

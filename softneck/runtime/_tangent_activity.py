@@ -35,7 +35,7 @@ def member_step(arrays, member, parameters, state, inputs, outputs):
 _WITHOUT = {
     "qp_solve": "it solves a quadratic program by iterations that are not differentiated.",
     "adaptive_update": "it learns its plant while it runs, with a covariance that is not differentiated.",
-    "kalman_predict": "it carries a covariance, which is not differentiated; the steady filter has a derivative.",
+    "kalman_predict": "it carries a covariance, which is not differentiated.",
     "payload_start": "it carries several models and their spread, which are not differentiated.",
     "neck_substeps": "the virtual neck's integration is not differentiated; a model identified on it is.",
 }

@@ -108,7 +108,6 @@ _KINDS = {
     # 20 ms at 500 times real time.
     "virtual neck": _Kind(make=lambda: VirtualNeck(NeckParameters.paper()).block(), wanted=40.0),
     "observer (kalman)": _Kind(make=lambda: KalmanSettings().design(bake_off_neck()).block()),
-    "observer (kalman, steady)": _Kind(make=lambda: KalmanSettings(steady=True).design(bake_off_neck()).block()),
     "pi": _Kind(make=lambda: PiSettings().design(bake_off_neck()).block()),
     "fopi": _Kind(make=lambda: FopiSettings().design(bake_off_neck()).block()),
     "hinf": _Kind(make=lambda: HinfSettings(bandwidth=4.0, gain_spread=0.0).design(bake_off_neck()).block()),

@@ -73,10 +73,9 @@ def test_step_from_python(benchmark: BenchmarkFixture) -> None:
 
 
 @pytest.mark.benchmark(group="kalman, 10,000 samples compiled")
-@pytest.mark.parametrize("steady", [False, True], ids=["covariance", "constant gains"])
-def test_compiled_loop(benchmark: BenchmarkFixture, steady: bool) -> None:
+def test_compiled_loop(benchmark: BenchmarkFixture) -> None:
     """Issue 10: 1 us for a sample, so 10 ms here."""
-    block = (observer().steady() if steady else observer()).block()
+    block = observer().block()
     state, U = block.initial_state(), np.tile(INPUTS, (ROWS, 1))
     block.run(state, U[:2])
     _, Y = benchmark(block.run, state, U)

@@ -212,7 +212,6 @@ def test_a_file_gives_it_back_to_the_bit_and_a_broken_one_is_refused(
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (KalmanSettings(steady=True), "constant gains have no meaning"),
         (KalmanSettings(sample_time=0.01), "must be the model's, 0.02 s"),
         (KalmanSettings(sensor_period=0.03), "must be a multiple of the sample time"),
     ],
@@ -251,7 +250,7 @@ def test_another_robot_gives_its_sensor_and_units() -> None:
     assert estimates.outputs.shape == (500, 1)
     assert observer.lead == pytest.approx(robot.require("delay_s", "a test"))
     # The sensor's own noise is taken off, or at least not added to; the model's free run misses more than both.
-    assert consistency(observer, log.rows(0, 500)).nis.mean > 0.0
+    assert consistency(observer, log.rows(0, 500)).mean > 0.0
     missed = estimates.aligned[50:] - log.outputs[50:500]
     assert np.sqrt(np.mean(missed**2)) < 5.0 * observer.noise[0]
 

@@ -167,7 +167,7 @@ def test_its_file_says_the_payload(model: Model, run: Recording, tmp_path: Path)
     np.testing.assert_array_equal(again.estimate(run).outputs, observer.estimate(run).outputs)
     assert [port.name for port in again.block().outputs][-2:] == ["healthy", "payload"]
     assert "from 0 to 1 kg" in again.summary()
-    assert consistency(observer, run).nis.mean > 0.0
+    assert consistency(observer, run).mean > 0.0
 
 
 def test_levels_from_data_are_kept_only_where_they_are_better(model: Model) -> None:

@@ -67,7 +67,7 @@ def run_block(observer: KalmanObserver, record: Recording, *, compiled: bool) ->
     return Y
 
 
-@pytest.mark.parametrize("form", ["model", "gyro", "kinematic"])
+@pytest.mark.parametrize("form", ["model", "gyro"])
 @pytest.mark.parametrize("outputs", [1, 2, 3])
 def test_the_runtime_equals_filterpy(outputs: int, form: str) -> None:
     record = recording(model_of(outputs))
@@ -91,15 +91,12 @@ def test_the_runtime_equals_filterpy(outputs: int, form: str) -> None:
 
 
 @pytest.mark.slow
-def test_compiled_and_with_constant_gains_it_is_the_same_filter() -> None:
+def test_compiled_it_is_the_same_filter() -> None:
     record = recording(model_of(3), rows=1200)
-    full, steady = (KalmanSettings(steady=steady).design(model_of(3)) for steady in (False, True))
+    full = KalmanSettings().design(model_of(3))
     a, b = run_block(full, record, compiled=True), run_block(full, record, compiled=False)
     span = float(np.ptp(record.outputs))
     np.testing.assert_allclose(a[:, :3], b[:, :3], rtol=0, atol=1e-11 * span)
-    c = run_block(steady, record, compiled=False)
-    # What the start made different dies out with the disturbance's slow pole, some 0.99: 0.99^1000 = 4e-5.
-    np.testing.assert_allclose(c[1000:, :3], b[1000:, :3], rtol=0, atol=4e-5 * span)
 
 
 def test_it_filters_noise_and_its_innovations_are_as_large_as_it_says() -> None:
@@ -110,7 +107,7 @@ def test_it_filters_noise_and_its_innovations_are_as_large_as_it_says() -> None:
     record = recording(model, rows=1520)
     error = observer.estimate(record).outputs - record.outputs
     assert error[200:].std() < 0.35 * 1e-4
-    found = consistency(observer, record, settle=200).nis
+    found = consistency(observer, record, settle=200)
     low, high = found.mean_band
     assert low < found.mean < high
     assert math.isclose(0.5 * (low + high), 3.0, rel_tol=0.01)

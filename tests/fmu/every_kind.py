@@ -142,10 +142,6 @@ def _kalman_gyro() -> Block:
     return KalmanSettings(form="gyro", sensor_delay=0.03).design(_linear()).block()
 
 
-def _kalman_steady() -> Block:
-    return KalmanSettings(steady=True).design(_linear()).block()
-
-
 def _nonlinear() -> Block:
     return KalmanSettings().design(Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording())).block()
 
@@ -237,12 +233,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         [*MOTORS, "pitch_measured", "measurement_valid", "pitch_rate_measured", "roll_rate_measured"],
         ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
         ("measurement_noise_std", "gyro_noise_std", "bias_noise_std"),
-    ),
-    "kalman_steady": (
-        _kalman_steady,
-        [*MOTORS, "pitch_measured", "roll_measured", "measurement_valid"],
-        ["pitch", "roll", "pitch_rate", "roll_rate", "innovation", "healthy"],
-        ("measurement_noise_std",),
     ),
     "nonlinear": (
         _nonlinear,

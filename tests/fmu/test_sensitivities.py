@@ -31,7 +31,7 @@ KINDS = (
     "residual",
 )  # fmt: skip
 # Controllers and observers: their outputs follow the inputs of a sample at once.
-LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "kalman_steady", "nonlinear")
+LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "nonlinear")
 pytestmark = pytest.mark.skipif(
     shutil.which("cc") is None and not os.environ.get("CI"), reason="no C compiler here, and no library is built"
 )

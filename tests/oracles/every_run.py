@@ -170,9 +170,9 @@ def record_run(_: Path) -> np.ndarray:
 def estimate_run(folder: Path) -> np.ndarray:
     """Return what filters and smoothers make of a whole recording, that over a nonlinear model too."""
     load, few = find("core:load"), recording().rows(0, 150)
-    estimates = [load(folder / f"{name}.npz").estimate(few) for name in ("kalman", "kalman_steady")]
+    estimates = [load(folder / f"{name}.npz").estimate(few) for name in ("kalman",)]
     nonlinear = find("estimation:KalmanSettings")().design(load(folder / "play.npz"))
-    estimates += [load(folder / "kalman.npz").smooth(few), nonlinear.estimate(few)]
+    estimates += [nonlinear.estimate(few)]
     return np.vstack([np.column_stack([e.pitch, e.roll, e.pitch_rate, e.roll_rate]) for e in estimates])
 
 

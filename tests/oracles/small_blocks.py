@@ -86,7 +86,6 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
         "family": lambda: ident.FamilySettings(window=6.0).fit(whole),
         "kalman": lambda: kalman().design(linear),
         "kalman_gyro": lambda: kalman(form="gyro", sensor_delay=0.03).design(linear),
-        "kalman_steady": lambda: kalman(steady=True).design(linear),
         "kalman_jacobi": lambda: kalman(sensor="paper", order="jacobi").design(made["rls"]),
         "pi": lambda: design.PiSettings().design(linear),
         "adaptive": lambda: design.AdaptiveSettings().design(linear),

@@ -41,7 +41,7 @@ KINDS = (
     "nlsm",
     "nlsm_residual",
 )
-LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "kalman_steady", "nonlinear")
+LAWS = ("pi", "pid", "lqg", "fopi", "hinf", "custom", "nonlinear")
 
 
 def block_of(name: str) -> Block:
