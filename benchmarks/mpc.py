@@ -123,12 +123,6 @@ def own(c: MpcController) -> Callable[..., np.ndarray]:
     return solve
 
 
-def program(c: MpcController) -> Callable[..., np.ndarray]:
-    """Return `MpcProgram`, daqp kept warm, with f made of theta."""
-    made = c.program()
-    return lambda theta, low, high: made.solve(theta, low, high)[0]
-
-
 def bare(c: MpcController) -> Callable[..., np.ndarray]:
     """Return daqp's persistent model alone."""
     a, made = MpcArrays(c.arrays), daqp.Model()
@@ -168,7 +162,6 @@ def casadi_daqp(c: MpcController) -> Callable[..., np.ndarray]:
 
 SOLVERS: dict[str, Callable[[MpcController], Callable[..., np.ndarray]]] = {
     "own dual active set (numba), warm": own,
-    "MpcProgram (daqp), warm": program,
     "bare daqp Model, warm": bare,
     "OSQP, warm, 1e-5": osqp_solver,
     "casadi.conic daqp": casadi_daqp,

@@ -67,12 +67,6 @@ def mpc(part: str) -> Any:
     return settings.design(neck_table.family("paper"))
 
 
-def mpc_tight(part: str) -> Any:
-    """Return the same with limits that hold on samples of the family, tightened by what trials still passed."""
-    settings = MpcSettings(**SOFT, scenarios=3, tightening=True) if part != "rotation" else MpcSettings(**FOLLOWING)
-    return settings.design(neck_table.family("paper"))
-
-
 def nmpc(part: str) -> Any:
     """Return nonlinear predictive control over a network of the neck without payload; it knows no tautness."""
     following: dict[str, Any] = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}
@@ -81,7 +75,7 @@ def nmpc(part: str) -> Any:
     return settings.design(Network().fit(neck_table.recordings("paper")[0]))
 
 
-CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "mpc_tight": mpc_tight, "nmpc": nmpc}
+CONTROLLERS: dict[str, Callable[[str], Any]] = {"pi": pi, "mpc": mpc, "nmpc": nmpc}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from softneck.design import MeasuredDisturbance, MpcController, MpcSettings
 from softneck.design.predictive._mpc_state_runtime import MpcArrays
 from softneck.robot import Robot
 
-from .mpc_neck import SOLVED, Neck
+from .mpc_neck import Neck
 from .test_mpc_speed import identified
 
 PER_KG = 2.0
@@ -59,20 +59,6 @@ def test_what_comes_later_is_followed_slowly_and_what_is_lost_stays(told: MpcCon
     assert 0.0 <= jumped - before < 0.06 * (there - before)
     # A wish of light weight: co-contraction costs as well, and takes part of it away.
     assert 0.2 * PER_KG < there - before <= PER_KG
-
-
-@pytest.mark.slow
-def test_daqp_is_told_as_well(told: MpcController) -> None:
-    parts = [told.part(), told.part(solver="daqp")]
-    names = [port.name for port in told.block().inputs]
-    u = np.zeros(len(names))
-    u[names.index("healthy")] = u[names.index("enabled")] = u[names.index("payload")] = 1.0
-    for part in parts:
-        part.start(0.0, {})
-    for k in range(20):
-        u[0] = 0.2
-        own, other = (part.advance(0.02 * k, u) for part in parts)
-        np.testing.assert_allclose(own, other, atol=SOLVED)
 
 
 def test_files_say_it_only_where_it_is_asked(told: MpcController, untold: MpcController, tmp_path: Path) -> None:

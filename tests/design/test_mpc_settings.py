@@ -1,4 +1,4 @@
-"""Predictive control's scenarios, files, tuning and refusals."""
+"""Predictive control's files, tuning and refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.estimation import LinearNeck
 
 from ..oracles.bake_off import bake_off_neck, block_stepper, run_bake_off
-from .mpc_neck import SOLVED, TS, Neck, Samples
+from .mpc_neck import TS
 
 
 @pytest.fixture(scope="module")
@@ -27,40 +27,6 @@ def plain() -> MpcController:
 def soft() -> MpcController:
     settings = MpcSettings(bandwidth=8.0, angle_limit=0.3, minimum_tautness=-0.25, lead_limit=12.0)
     return settings.design(bake_off_neck())
-
-
-@pytest.mark.slow
-def test_equal_scenarios_are_one() -> None:
-    class Same(LinearNeck):
-        def samples(self, output: str) -> list[control.TransferFunction]:
-            return [self.tf(output)] * 3
-
-    nominal = bake_off_neck()
-    same = Same(pitch=nominal.pitch, roll=nominal.roll)
-    settings = {"bandwidth": 8.0, "angle_limit": 0.3}
-    one = MpcSettings(**settings).design(nominal)  # type: ignore[arg-type]
-    three = MpcSettings(**settings, scenarios=2).design(same)  # type: ignore[arg-type]
-    assert rt.MpcArrays(three.arrays).constants[rt.MPC_SCENARIOS] == 3
-    necks = [Neck(one), Neck(three)]
-    for k in range(60):
-        outs = [neck.step(0.4 if k < 30 else -0.1) for neck in necks]
-        np.testing.assert_allclose(outs[1], outs[0], atol=SOLVED)
-
-
-@pytest.mark.slow
-def test_scenarios_keep_the_limit_on_all_their_plants() -> None:
-    nominal = bake_off_neck()
-    family = Samples(pitch=nominal.pitch, roll=nominal.roll)
-    settings = {"bandwidth": 4.0, "angle_limit": 0.2, "worst_sensitivity": 9.0, "lead_limit": 12.0}
-    highest = []
-    for scenarios in (0, 3):
-        controller = MpcSettings(**settings, scenarios=scenarios).design(family)  # type: ignore[arg-type]
-        neck, peak = Neck(controller, gain=1.4), 0.0
-        for _ in range(150):
-            neck.step(0.2)
-            peak = max(peak, float(neck.y[0]))
-        highest.append(peak)
-    assert highest[1] < highest[0]
 
 
 def test_saved_and_loaded_it_is_the_same(soft: MpcController, tmp_path: Path) -> None:
@@ -137,8 +103,6 @@ def test_models_it_cannot_use_are_refused() -> None:
         MpcSettings().design(LinearNeck(pitch=good, roll=control.TransferFunction([0.01], [1.0, -1.1], TS)))
     with pytest.raises(SettingsError, match="a linear model is needed"):
         MpcSettings().design(object())  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="scenarios are samples of a family"):
-        MpcSettings(scenarios=2, bandwidth=8.0).design(bake_off_neck())
 
 
 @pytest.mark.slow

@@ -117,13 +117,6 @@ def with_gains(arrays: tuple[Matrix, ...], trust: float) -> tuple[Matrix, ...]:
     return _with(arrays, observer=observer_gains(poles, trust))
 
 
-def with_back_off(arrays: tuple[Matrix, ...], angle: float, tautness: float) -> tuple[Matrix, ...]:
-    """Return the arrays with soft limits that are tighter by so much [rad]."""
-    constants = rt.MpcArrays(arrays).constants.copy()
-    constants[[rt.MPC_ANGLE_BACK, rt.MPC_TAUT_BACK]] = angle, tautness
-    return _with(arrays, constants=constants)
-
-
 def with_filter(arrays: tuple[Matrix, ...], reference_time: float) -> tuple[Matrix, ...]:
     """Return the arrays with other reference filters."""
     constants = rt.MpcArrays(arrays).constants.copy()

@@ -23,7 +23,7 @@ from . import _mpc_state_runtime as rt
 from ._disturbance import MeasuredDisturbance
 from ._lti import lti
 from ._part import MpcPart
-from ._program import MpcInfo, MpcProgram, explain
+from ._program import MpcInfo, explain
 from ._scale import runtime_of
 
 if TYPE_CHECKING:
@@ -122,17 +122,9 @@ class MpcController(Shown):
         """Return what the sample that led to `state` decided: prediction, active limits, iterations."""
         return explain(self.arrays, state.values, self.robot.outputs.names)
 
-    def program(self) -> MpcProgram:
-        """Return the QP outside of the block: as CasADi functions, solved by daqp."""
-        return MpcProgram(self.arrays)
-
-    def part(self, *, solver: str = "own") -> MpcPart:
-        """Return the controller as a part of a loop that tells `info` after each sample.
-
-        Args:
-            solver: "own" for that of the block, "daqp" for daqp.
-        """
-        return MpcPart(self.block(), solver=solver)
+    def part(self) -> MpcPart:
+        """Return the controller as a part of a loop that tells `info` after each sample."""
+        return MpcPart(self.block())
 
     def review(self) -> list[str]:
         """Return what is wrong or doubtful with this set-up, one line each; empty if nothing is."""

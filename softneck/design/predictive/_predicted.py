@@ -1,4 +1,4 @@
-"""The plant that is predicted, its samples as scenarios, and the defaults that it has: of a neck, or another robot."""
+"""The plant that is predicted, its samples, and the defaults that it has: of a neck, or another robot."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from ..plants._coupled import CoupledPlant, coupled_plant
 from ..plants._coupled_axis import AnyAxis, CoupledAxis, times
 from ..plants._uncertain import UncertainPlant, uncertain_plant
 from ._disturbance import with_payload
-from ._prediction import Scenario
 from ._scale import SizedPlant, refuse_what_is_for_necks
 from ._tuning import Pair, samples_ahead
 
@@ -31,8 +30,6 @@ _BELIEVED: dict[str, Any] = {
 # Of another robot than the neck, stretched by its slowest pole: the neck's 30 samples of 20 ms [s].
 _HORIZON = 0.6
 _LONGEST = 200
-# The nominal plant counts as much as all other scenarios together.
-_NOMINAL_WEIGHT = 0.5
 # That many samples of a family judge robustness; they are spread evenly over all.
 _JUDGES = 12
 
@@ -67,9 +64,6 @@ def settings_for(settings: S, model: HasTransferFunctions) -> S:
     settings = replace(settings, disturbances=with_payload(settings.disturbances, settings.payload_tautness))
     if not (robot_of(model).is_neck and identified(model)):
         settings = _with(settings, _BELIEVED)
-    elif settings.tightening:
-        # What is tightened until it holds is a limit; a wish is none.
-        settings = _with(settings, {"minimum_tautness": None})
     if settings.minimum_tautness is None and any(item.tautness for item in settings.disturbances):
         raise SettingsError("`payload_tautness` adds to `minimum_tautness`, which is not set; give it, such as 0.5.")
     return settings
@@ -180,26 +174,6 @@ def sample_pairs(model: Any, timing: _Settings) -> list[Pair]:
     count = min(_JUDGES, *(len(plants) for plants in axes))
     picks = [np.linspace(0, len(plants) - 1, count).round().astype(int) for plants in axes]
     return [tuple(plants[i] for plants, i in zip(axes, chosen, strict=True)) for chosen in zip(*picks, strict=True)]
-
-
-def chosen_scenarios(model: Any, nominal: Pair, count: int, timing: _Settings) -> list[Scenario]:
-    """Return the nominal plant and `count` samples, from the lowest to the highest gain.
-
-    Raises:
-        SettingsError: scenarios of a model that has no samples.
-    """
-    if count == 0:
-        return [Scenario(nominal, 1.0)]
-    pairs = sample_pairs(model, timing)
-    if not pairs:
-        raise SettingsError("scenarios are samples of a family; give a FAMILY (`softneck family`), or `scenarios=0`.")
-    picks = np.unique(np.linspace(0, len(pairs) - 1, min(count, len(pairs))).round().astype(int))
-    weight = (1.0 - _NOMINAL_WEIGHT) / picks.size
-    others = []
-    for pair in (pairs[i] for i in picks):
-        delayed = tuple(replace(plant, delay=plant.delay + timing.extra_delay) for plant in pair)
-        others.append(Scenario(delayed, weight))
-    return [Scenario(nominal, _NOMINAL_WEIGHT), *others]
 
 
 def samples_of(model: Any, axis: str) -> list[AxisPlant]:

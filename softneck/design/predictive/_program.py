@@ -1,21 +1,18 @@
-"""The QP of a predictive controller outside of its block: as CasADi functions, solved by daqp, explained."""
+"""What a sample of a predictive controller decided, read from its state."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector
+from softneck.core import Matrix, Vector
 from softneck.estimation._axis import AXES
 from softneck.runtime import load_functions
 
 from . import _mpc_state_runtime as rt
 from ._scale import runtime_of, units_of
 
-# daqp's own default is 1e-6; the block's solver ends at 1e-10.
-_TOLERANCE = 1e-10
 ROW_NAMES = ("slew", "position", "slack", "angle", "angle", "tautness")
 STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 _OF_MOTORS = (rt.MPC_ROW_MOVE, rt.MPC_ROW_POSITION, rt.MPC_ROW_TAUT)
@@ -49,106 +46,6 @@ class MpcInfo:
     angles: Matrix
     reference: Matrix
     time: float = float("nan")
-
-
-class MpcProgram:
-    """`min 1/2 z'Hz + (F theta)'z, lower <= A z <= upper` of a controller's arrays, kept warm in a daqp model."""
-
-    def __init__(self, arrays: tuple[Matrix, ...], *, budget: int | None = None) -> None:
-        """Set daqp up.
-
-        Args:
-            arrays: of an `MpcController`.
-            budget: iterations of daqp; None for the controller's own.
-        """
-        import daqp
-
-        self.iterations = 0
-        self.arrays, a = arrays, rt.MpcArrays(arrays)
-        self.constants, self.kinds, self.H, self.F, self.A, self.E = a.constants, a.kinds, a.H, a.F, a.A, a.E
-        m = self.A.shape[0]
-        self._functions = load_functions(runtime_of(arrays))
-        self._rest, self._order = self._rows()
-        self._model: Any = daqp.Model()
-        wide = np.full(m, 1e30)
-        flag, _ = self._model.setup(
-            self.H, np.zeros(self.H.shape[0]), self.A[self._rest], wide[self._order], -wide, np.zeros(m, dtype=np.int32)
-        )
-        if flag < 0:
-            raise SettingsError(f"daqp refuses the controller's QP (flag {flag}); review its weights.")
-        limit = int(self.constants[rt.MPC_BUDGET]) if budget is None else budget
-        self._model.settings = {"primal_tol": _TOLERANCE, "dual_tol": _TOLERANCE, "iter_limit": max(limit, 1)}
-
-    def _rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows without the bounds, and the order in which daqp sees all: those on one variable first."""
-        nz, m = self.A.shape[1], self.A.shape[0]
-        eye = np.eye(nz)
-        place = {tuple(row): i for i, row in reversed(list(enumerate(self.A.tolist())))}
-        found = [place.get(tuple(row)) for row in eye.tolist()]
-        simple = all(i is not None for i in found)
-        first = [i for i in found if i is not None] if simple else []
-        taken = set(first)
-        rest = np.array([i for i in range(m) if i not in taken], dtype=np.int64)
-        return rest, np.concatenate([np.array(first, dtype=np.int64), rest])
-
-    def bounds(self, theta: Vector, parameters: Vector, motors: Vector) -> tuple[Vector, Vector]:
-        """Return the bounds (m,) of all rows under those limits, motors (motors,) being where they are [rad]."""
-        m = self.A.shape[0]
-        lower, upper = np.empty(m), np.empty(m)
-        self._functions.mpc_bounds(self.arrays, parameters, np.asarray(motors, float), theta, lower, upper)
-        return lower, upper
-
-    def solve(self, theta: Vector, lower: Vector, upper: Vector) -> tuple[Vector, int, Vector]:
-        """Return z (nz,), daqp's exit flag (1 or 2 when solved) and the multipliers (m,), positive at upper bounds."""
-        self._model.update(f=self.F @ theta, bupper=upper[self._order], blower=lower[self._order])
-        z, _, flag, found = self._model.solve()
-        self.iterations = int(found["iterations"])
-        multipliers = np.zeros(upper.size)
-        multipliers[self._order] = found["lam"]
-        return z, int(flag), multipliers
-
-    def function(self) -> Any:
-        """Return `casadi.Function` theta, limits -> H, f, A, lower, upper: the QP as any solver takes it.
-
-        Limits are position [rad], move per sample [rad], angle [rad] and tautness [rad], of another robot in SI; the
-        lead limit, which is the block's own matter, is left out.
-        """
-        import casadi as ca
-
-        theta, limits = ca.SX.sym("theta", self.F.shape[1]), ca.SX.sym("limits", 4)
-        q, inf = self.constants, rt.MPC_NO_BOUND
-        unit, outputs, _ = units_of(self.arrays)
-        position, move, taut = limits[0] / unit, limits[1] / unit, limits[3] / unit + float(q[rt.MPC_TAUT_BACK])
-
-        def ends(kind: float, which: int) -> tuple[Any, Any]:
-            angle = limits[2] / outputs[which % outputs.size] - float(q[rt.MPC_ANGLE_BACK])
-            low, high = -position, position
-            if q.size > rt.MPC_NUMBERS:  # the motors' own ranges
-                motors = rt.MpcArrays(self.arrays).T.shape[1]
-                low = ca.fmax(low, q[rt.MPC_NUMBERS + which % motors])
-                high = ca.fmin(high, q[rt.MPC_NUMBERS + motors + which % motors])
-            return {
-                rt.MPC_ROW_MOVE: (-move, move), rt.MPC_ROW_POSITION: (low, high), rt.MPC_ROW_SLACK: (0.0, inf),
-                rt.MPC_ROW_ANGLE_HIGH: (-inf, angle), rt.MPC_ROW_ANGLE_LOW: (-angle, inf), rt.MPC_ROW_TAUT: (taut, inf),
-            }[kind]  # fmt: skip
-
-        free = ca.mtimes(ca.DM(self.E), theta)
-        rows = [ends(kind, int(which)) for kind, which in self.kinds]
-        lower = ca.vertcat(*(row[0] for row in rows)) - free
-        upper = ca.vertcat(*(row[1] for row in rows)) - free
-        return ca.Function(
-            "mpc_qp", [theta, limits],
-            [ca.DM(self.H), ca.mtimes(ca.DM(self.F), theta), ca.DM(self.A), lower, upper],
-            ["theta", "limits"], ["H", "f", "A", "lower", "upper"],
-        )  # fmt: skip
-
-
-def residual(
-    program: MpcProgram, theta: Vector, z: Vector, multipliers: Vector, bounds: tuple[Vector, Vector]
-) -> float:
-    """Return the largest residual of the KKT conditions of any answer, by the block's own function."""
-    functions = load_functions(runtime_of(program.arrays))
-    return float(functions.mpc_residual(program.arrays, theta, z, multipliers, *bounds))
 
 
 def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = AXES) -> MpcInfo:

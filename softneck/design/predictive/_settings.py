@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -37,7 +36,6 @@ from ._lti import system
 from ._mpc_state_runtime import MpcArrays
 from ._observed import over
 from ._predicted import (
-    chosen_scenarios,
     families,
     plant_of,
     predicted_plants,
@@ -47,9 +45,8 @@ from ._predicted import (
     weighed,
     with_taken,
 )  # fmt: skip
-from ._prediction import Problem, matrices
+from ._prediction import Problem, Scenario, matrices
 from ._scale import SizedPlant, limits_of, sized_plant
-from ._tightening import tightened, trial_of
 from ._tuning import (
     FULL_TRUST,
     Pair,
@@ -103,8 +100,6 @@ class MpcSettings(Shown):
         gain_spread: relative spread of the plant's gain that the filter allows for.
         horizon: N, samples predicted behind the dead time.
         moves: times at which the motors move within the horizon; in between they are held.
-        scenarios: with a family, that many of its samples are predicted beside the nominal plant, and all must keep
-            the limits; 0 for the nominal plant alone.
         preview: how far ahead the reference is known [s]; the controller then has the inputs
             `pitch_reference_ahead` and `roll_reference_ahead`.
         disturbances: measured ones, each an input more.
@@ -123,10 +118,6 @@ class MpcSettings(Shown):
         tautness_weight: on a lack of tautness [rad of motor], against errors of the angles, squared; None for
             `slack_weight` where `minimum_tautness` is given, a limit, and 0.3 where it is the default, a wish: a limit
             turns the noise of the angles into pulls of one sign, and tilts the neck by 0.2 deg.
-        tightening: whether soft limits are tightened until they hold in trials with the identified plant and with every
-            judged sample of a family.
-        measurement_bound: by how much a measured angle may be wrong in these trials [rad], of another robot in the unit
-            of its outputs; by default seven times the `noise_std` of its sensor, as the neck's.
         disturbance_time: time constant of the output disturbance's rate [s]; None for the plant's own, as a load at its
             input makes it. A longer one follows what keeps changing, such as a payload carried round, less robustly.
         budget: iterations of the solver for each sample; beyond them the previous plan goes on.
@@ -153,7 +144,6 @@ class MpcSettings(Shown):
     gain_spread: float = 0.2
     horizon: int = NeckCount(30)
     moves: int = NeckCount(10)
-    scenarios: int = 0
     preview: float = 0.0
     disturbances: tuple[MeasuredDisturbance, ...] = ()
     position_limit: float = NeckDefault(6.0)
@@ -170,9 +160,6 @@ class MpcSettings(Shown):
     cocontraction_weight: float = 0.05
     slack_weight: float = 1e3
     tautness_weight: float | None = None
-    tightening: bool = False
-    # The observer of the 3DM-GX5-10 on the virtual neck is wrong by up to 0.34 deg near a limit, by 0.1 deg at rest.
-    measurement_bound: float = NeckDefault(math.radians(0.35))
     disturbance_time: float | None = None
     budget: int = 100
     # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
@@ -197,14 +184,12 @@ class MpcSettings(Shown):
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
         require_whole("horizon", self.horizon, 1, 200)
         require_whole("moves", self.moves, 1, self.horizon)
-        require_whole("scenarios", self.scenarios, 0, 8)
         require_between("preview", self.preview, 0.0, 4.0, "s")
         require_limits({name: getattr(self, name) for name in LIMITS[:4]})
         require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
         require_between("payload_tautness", self.payload_tautness, 0.0, 12.0, "rad/kg")
         if self.minimum_tautness is not None:
             require_finite("minimum_tautness", self.minimum_tautness)
-        require_between("measurement_bound", self.measurement_bound, 0.0, 1e12)
         require_whole("budget", self.budget, 1, 10_000)
         require_between("least_delay", self.least_delay, 0.0, 1.0, "s")
         require_between("look_ahead", self.look_ahead, 0.0, 1.0, "s")
@@ -253,14 +238,6 @@ class MpcSettings(Shown):
         arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
         unit, taut = to_si(limits.robot.motors.unit)[0], self.minimum_tautness
-        if self.tightening:
-            # A dead time is known to a sample, and `least_delay` makes those of all samples one.
-            plants = [
-                self._delayed(pair, late)
-                for pair in [*families(nominal, self.small_move_pole), *samples]
-                for late in (0, 1)
-            ]
-            arrays, found["back_off_rad"] = tightened(arrays, plants, trial_of(self, limits, self._lever(model)))
         return MpcController(
             sample_time=nominal[0].sample_time,
             arrays=arrays,
@@ -324,7 +301,6 @@ class MpcSettings(Shown):
 
     def _problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
         nominal = predicted_plants(self, model)
-        scenarios = chosen_scenarios(model, self._delayed(nominal), self.scenarios, self)
         if isinstance(model, SizedPlant):
             T, inverse = model.redefinition
         else:
@@ -335,7 +311,7 @@ class MpcSettings(Shown):
         # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
         on_input = max(move_weight(plant, bandwidth) for plant in nominal)
         return Problem(
-            scenarios=tuple(scenarios),
+            scenarios=(Scenario(self._delayed(nominal), 1.0),),
             horizon=self.horizon,
             starts=self.starts,
             T=T,
