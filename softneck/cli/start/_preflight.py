@@ -13,7 +13,7 @@ from ..shared._console import note
 # A project of 140 s of recording takes 7 MB; what is written anew beside what it replaces takes as much again.
 _LEAST_BYTES = 50_000_000
 #: Kind of controller -> the package that its design needs.
-_NEEDS = {"mpc": "daqp", "nmpc": "casadi"}
+_NEEDS = {"nmpc": "casadi"}
 
 
 def require_disk(folder: Path) -> None:

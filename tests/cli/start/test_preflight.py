@@ -96,9 +96,9 @@ def test_without_a_compiler_and_without_pytest_it_goes_on_and_says_so(
 def test_kinds_whose_package_is_absent_are_not_searched(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(_preflight, "find_spec", lambda name: None if name == "daqp" else object())
-    assert _preflight.kinds_here("pi,lqg,mpc") == "pi,lqg"
-    assert "not searched: mpc: daqp is not installed" in capsys.readouterr().err
+    monkeypatch.setattr(_preflight, "find_spec", lambda name: None if name == "casadi" else object())
+    assert _preflight.kinds_here("pi,mpc,nmpc") == "pi,mpc"
+    assert "not searched: nmpc: casadi is not installed" in capsys.readouterr().err
 
 
 def test_a_disk_that_is_nearly_full_is_said_before_anything_is_made(
