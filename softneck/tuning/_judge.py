@@ -14,7 +14,6 @@ import numpy as np
 from softneck.core import KINDS, SoftneckError, Vector, resolve
 from softneck.core._kinds import make_settings
 from softneck.design.linear._axis_settings import AxisSettings
-from softneck.design.linear._pi import PiSettings
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.identification.models._ports import payloads
 from softneck.runtime import Block
@@ -130,7 +129,7 @@ def _plant_for(task: Task, ready: Ready, kind: str, made: Any) -> Any:
 
     Of several nonlinear models the first that knows payloads.
     """
-    if isinstance(made, AxisSettings | PiSettings):
+    if isinstance(made, AxisSettings):
         return ready.uncertain
     if kind == "nmpc":
         models = sorted(task.models, key=lambda model: payloads(model.arrays) is None)

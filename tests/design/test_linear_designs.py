@@ -1,4 +1,4 @@
-"""Each synthesis against the law that defines it, reduction and conditioning against theorems."""
+"""Each synthesis against the law that defines it, conditioning against theorems."""
 
 from __future__ import annotations
 
@@ -15,18 +15,15 @@ from softneck.design import HinfSettings, LqgSettings, PidSettings, PiSettings, 
 from softneck.design.linear._assembly import AxisController
 from softneck.design.linear._axis_loop import (
     axis_margins,
-    closed_radius,
     conditioning_gain,
     delayed_form,
     feedback_response,
 )
 from softneck.design.linear._fractional import FractionalPid
 from softneck.design.linear._pid import PidGains
-from softneck.design.linear._reduction import reduce_controller
 from softneck.design.linear._sweep import make_sweep
 from softneck.design.plants._step_and_load import StepAndLoad
 
-from ..data import slow_but
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, run_bake_off
 
 TS = 0.02
@@ -203,37 +200,3 @@ def test_conditioning_exists_where_hanus_has_none(direct: float) -> None:
 def test_a_hidden_integrator_has_no_conditioning() -> None:
     with pytest.raises(SettingsError, match="no conditioning keeps the controller stable"):
         conditioning_gain(np.diag([1.0, 0.5]), np.ones((2, 1)), np.array([[0.0, 1.0]]), 0.0)
-
-
-@pytest.mark.parametrize("order", slow_but([2, 3, 4, 5, 6], [2, 5]))
-def test_reduction_keeps_its_bound_and_its_integrator(order: int) -> None:
-    K: Any = HinfSettings(gain_spread=0.0, conditioning="hanus").design(bake_off_neck())
-    axis = axis_of(K)
-    full = control.StateSpace(axis.A, np.hstack([axis.Br, axis.By]), axis.C, [[axis.Dr, axis.Dy]], TS)
-    found = reduce_controller(full, order)
-    assert found.system.nstates == order
-    assert np.min(np.abs(found.system.poles() - 1.0)) < 1e-9
-    z = np.exp(1j * np.geomspace(1e-3, math.pi / TS, 400) * TS)
-    error = np.moveaxis(np.asarray(full(z)) - np.asarray(found.system(z)), -1, 0)
-    # The bound is a theorem; at low frequencies integrators of 1e6 times the gain are subtracted from each other.
-    assert np.linalg.norm(error, 2, axis=(1, 2)).max() <= found.bound + 1e-5
-    assert np.all(np.diff(found.singular_values) <= 0.0)
-
-
-@pytest.mark.slow
-def test_a_reduced_design_says_what_it_lost() -> None:
-    full = HinfSettings().design(bake_off_neck())
-    small = HinfSettings(controller_order=4).design(bake_off_neck())
-    loss = small.design["pitch"]["reduction"]
-    assert loss["states_before"] == full.design["pitch"]["states"]
-    assert small.design["pitch"]["states"] == 4
-    assert loss["sensitivity_before"] == pytest.approx(full.design["pitch"]["margins"]["sensitivity"], rel=1e-9)
-    assert closed_radius(axis_of(small), PLANT, 0) < 1.0
-    assert "4 of 6 states" in small.summary()
-    with pytest.raises(SettingsError, match="less than the 2 integrators"):
-        reduce_controller(full.ss()[0, 2], 0)
-
-
-def test_reduction_takes_discrete_systems() -> None:
-    with pytest.raises(SettingsError, match="takes a discrete system"):
-        reduce_controller(control.TransferFunction([1.0], [1.0, 1.0]), 1)

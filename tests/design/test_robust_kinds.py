@@ -228,7 +228,7 @@ def test_no_solution_is_said_with_the_remedy(settings: Any, plant: Any, message:
         (HinfSettings, "bandwidth", -1.0), (HinfSettings, "peak", 0.9), (HinfSettings, "method", "lmi"),
         (LqgSettings, "control_weight", 0.0), (FopiSettings, "derivative_order", 2.0),
         (PidSettings, "tuning", "luck"), (PidSettings, "noise_gain", 0.0), (PiSettings, "tuning", "luck"),
-        (HinfSettings, "max_sensitivity", 1.0), (HinfSettings, "controller_order", -1), (LqgSettings, "order", "x"),
+        (HinfSettings, "max_sensitivity", 1.0), (LqgSettings, "order", "x"),
     ],
 )  # fmt: skip
 def test_settings_are_checked(kind: Any, field: str, value: Any) -> None:

@@ -65,7 +65,7 @@ def innovations_gain(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
     except (np.linalg.LinAlgError, ValueError) as error:
         raise SettingsError(
             "no conditioning keeps the controller stable at its limits: a mode that is not stable does not show in "
-            "its output. Ask for less, or reduce it (`controller_order`)."
+            "its output. Ask for less."
         ) from error
     return np.asarray(np.linalg.solve((C @ P @ C.T + R).T, (A @ P @ C.T + S).T).T)
 

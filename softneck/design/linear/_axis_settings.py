@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of, require_positive, require_whole
+from softneck.core import Matrix, SettingsError, require_between, require_positive
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
 
@@ -23,13 +23,11 @@ from ._controller import LinearController
 from ._loop_settings import LoopSettings, check_reference
 from ._margins import Margins
 from ._ports import ControllerLimits
-from ._reduction import reduce_axis
 from ._rise import check_rise, filter_for, leading_filter
 from ._sweep import Sweep, make_sweep
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
 _SLOWEST = 100
-CONDITIONINGS = ("hanus", "tuned")
 # Another conditioning than Hanus' must overshoot less by this [%].
 _WORTH_IT = 0.5
 
@@ -63,10 +61,6 @@ class AxisSettings(LoopSettings, ABC):
             loop's own lag (its rise over ln 9): what moves is followed the closer, and a step overshoots rather.
         overshoot_pct: of a step of 10 deg, within the limits.
         gain_spread: relative; a plant without samples of its own is taken at both ends of it as well.
-        controller_order: states that balanced reduction leaves to the axis' controller; 0 for all.
-        conditioning: "hanus" (what a limit took away is taken from the reference), or "tuned": of that and of
-            predictors that follow the limited output faster, the one that overshoots least on the worst sample in a
-            step of 20 deg and in one with half the slew.
         sample_time: [s] at which a continuous `control` system is held (exact); None for 20 ms. Other plants have their
             own.
     """
@@ -78,8 +72,6 @@ class AxisSettings(LoopSettings, ABC):
     reference_lead: float = 0.0
     overshoot_pct: float = DESIGN_OVERSHOOT_IN_LIMITS_PCT
     gain_spread: float = 0.2
-    controller_order: int = 0
-    conditioning: str = "tuned"
     sample_time: float | None = None
 
     def __post_init__(self) -> None:
@@ -88,8 +80,6 @@ class AxisSettings(LoopSettings, ABC):
         check_reference(self.reference_time, self.reference_lead)
         require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
         require_between("gain_spread", self.gain_spread, 0.0, 0.9)
-        require_whole("controller_order", self.controller_order, 0, 100)
-        require_one_of("conditioning", self.conditioning, CONDITIONINGS)
         if self.sample_time is not None:
             require_positive("sample_time", self.sample_time, "s")
 
@@ -171,14 +161,11 @@ class AxisSettings(LoopSettings, ABC):
 
     def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, ReferenceFilter, dict[str, Any]]:
         found = self._synthesise(axis, name)
-        controller, reduction = found.controller, {}
-        if 0 < self.controller_order < controller.A.shape[0]:
-            controller, reduction = reduce_axis(controller, axis.nominal, self.extra_delay, self.controller_order)
+        controller = found.controller
         margins = axis_margins(controller, axis.nominal, self.extra_delay)
         self._hold(controller, axis)
         led = self._reference(controller, axis)
-        if self.conditioning == "tuned":
-            controller = self._conditioned(controller, led, axis)
+        controller = self._conditioned(controller, led, axis)
         worst = float(sensitivities(controller, axis.samples, self.extra_delay).max())
         findings = {
             "gains": {**found.gains, **filter_numbers(led)},
@@ -188,7 +175,6 @@ class AxisSettings(LoopSettings, ABC):
             "samples": len(axis.samples),
             "worst_sensitivity": worst,
             **found.notes,
-            **reduction,
         }
         return controller, led, findings
 
@@ -232,7 +218,11 @@ class AxisSettings(LoopSettings, ABC):
         return high * axis.sample_time
 
     def _conditioned(self, controller: AxisController, led: ReferenceFilter, axis: UncertainAxis) -> AxisController:
-        """Return the controller with the conditioning that overshoots least where limits matter."""
+        """Return the controller with the conditioning that overshoots least where limits matter.
+
+        Of Hanus' (what a limit took away is taken from the reference) and of predictors that follow the limited output
+        faster, on the worst sample in a step of 20 deg and in one with half the slew.
+        """
         usual = self._sweep(axis)
         large = replace(usual, test=replace(usual.test, reference=2.0 * usual.test.reference))
         slow = replace(usual, test=replace(usual.test, slew_limit=0.5 * usual.test.slew_limit))

@@ -188,7 +188,7 @@ def assumed_lines(values: Mapping[str, float]) -> list[str]:
 
 
 def _findings(item: Mapping[str, Any]) -> list[str]:
-    """Return a line on the samples that a design was verified on, and one on its reduction."""
+    """Return a line on the samples that a design was verified on."""
     lines = []
     if item.get("samples", 1) > 1:
         worst, lost = item.get("worst_sensitivity"), item.get("samples_unstable", 0)
@@ -196,13 +196,6 @@ def _findings(item: Mapping[str, Any]) -> list[str]:
         lines.append(f"    {held}" + (f", worst Ms {worst:.3g}" if worst is not None else ""))
     if "gamma" in item:
         lines.append(f"    gamma {item['gamma']:.4g}")
-    if "reduction" in item:
-        loss = item["reduction"]
-        lines.append(
-            f"    reduced to {item['states']} of {loss['states_before']} states: error at most "
-            f"{loss['error_bound']:.3g} at any frequency, Ms {loss['sensitivity_before']:.4g} before, "
-            f"{loss['sensitivity_after']:.4g} after"
-        )
     return lines
 
 

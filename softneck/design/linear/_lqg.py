@@ -58,8 +58,6 @@ class LqgSettings(AxisSettings):
 
     def _whole(self, plant: CoupledPlant) -> LinearController:
         """Return the controller of a coupled plant."""
-        if self.controller_order:
-            raise SettingsError("a controller of a coupled plant is not reduced; leave `controller_order` out.")
         nominal: AnyAxes = tuple(row.delayed(self.least_delay) for row in plant.rows)
         spread = {1.0, 1.0 - self.gain_spread, 1.0 + self.gain_spread}
         own = tuple(row.delayed(self.least_delay) for row in plant.own_rows)
