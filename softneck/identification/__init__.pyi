@@ -16,8 +16,6 @@ from .networks._state_space_network import NeuralStateSpace as NeuralStateSpace
 from .selection._auto import Choice as Choice
 from .selection._auto import choose as choose
 from .selection._auto import refit as refit
-from .selection._search import Search as Search
-from .selection._search import search as search
 from .set_membership._cone_set import ConeSet as ConeSet
 from .set_membership._cones import Cones as Cones
 from .set_membership._gamma import gamma_curve as gamma_curve

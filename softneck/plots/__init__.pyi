@@ -3,7 +3,6 @@ from ._chart import Curve as Curve
 from ._chart import Level as Level
 from ._chart import Panel as Panel
 from ._figures import chart_figure as chart_figure
-from ._figures import cost_figure as cost_figure
 from ._figures import delay_figure as delay_figure
 from ._figures import histogram_figure as histogram_figure
 from ._figures import loop_figure as loop_figure
@@ -14,7 +13,6 @@ from ._identification_figures import convergence_figure as convergence_figure
 from ._identification_figures import cover_figure as cover_figure
 from ._identification_figures import frequency_response_figure as frequency_response_figure
 from ._identification_figures import local_map_figure as local_map_figure
-from ._identification_figures import search_figure as search_figure
 from ._neck3d import neck_view as neck_view
 from ._page import Section as Section
 from ._page import Table as Table

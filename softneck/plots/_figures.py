@@ -13,7 +13,7 @@ from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Panel, bar_width
 from ._charts import delay_chart, loop_chart, recording_chart, validation_chart
-from ._judgement_charts import cost_chart, histogram_chart, residual_chart
+from ._judgement_charts import histogram_chart, residual_chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,10 +130,3 @@ def residual_figure(
 def histogram_figure(errors: Matrix, title: str) -> Figure:
     """Draw `histogram_chart`: how errors (time, 2) [rad] are spread, in degrees, beside a normal curve."""
     return chart_figure(histogram_chart(errors, title))
-
-
-def cost_figure(
-    values: Vector, costs: Mapping[str, Vector], labels: tuple[str, str], title: str, *, chosen: float | None = None
-) -> Figure:
-    """Draw `cost_chart`: the cost curve of a search."""
-    return chart_figure(cost_chart(values, costs, labels, title, chosen=chosen))

@@ -1,9 +1,9 @@
-"""Figures of identification: convergence, maps of local models, cover of an uncertain plant, cost of a search."""
+"""Figures of identification: convergence, maps of local models, cover of an uncertain plant."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -160,54 +160,3 @@ def _unwrapped(response: np.ndarray, known: np.ndarray) -> np.ndarray:
     phase = np.full(response.shape, np.nan)
     phase[known] = np.unwrap(np.angle(response[known]))
     return phase
-
-
-# Fits further below the best are no candidates and would flatten the curve.
-_DEPTH = 25.0
-
-
-def search_figure(
-    curves: Mapping[str, Sequence[Sequence[Any]]],
-    title: str,
-    *,
-    best: Mapping[str, Any],
-    names: Sequence[str] = ("pitch", "roll"),
-) -> Figure:
-    """Draw for each varied setting its best free-run fit at each value, beside the one-step fit.
-
-    Args:
-        curves: setting -> rows (value, free-run fit of each output, one-step fit of each) [%], None: no fit.
-        title: of the figure.
-        best: setting -> the chosen value.
-        names: of the outputs.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 2.6 * len(curves) + 0.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(len(curves), 1, squeeze=False)[:, 0]
-    fits = [fit for rows in curves.values() for row in rows for fit in row[1 : 1 + len(names)] if fit is not None]
-    for ax, (name, rows) in zip(axes, curves.items(), strict=True):
-        ax.grid(alpha=0.3)
-        ax.spines[["top", "right"]].set_visible(False)
-        # Values may be lags or names: they stand side by side in the order given.
-        places = range(len(rows))
-        drawn = zip(names, (BLUE, ORANGE, GREEN, RED), strict=False)
-        lines = [(axis, name, colour) for axis, (name, colour) in enumerate(drawn, start=1)]
-        for column, colour, style, text in [
-            *((axis, colour, "o-", f"{name}, free run") for axis, name, colour in lines),
-            *((axis + len(names), colour, ":", f"{name}, one step") for axis, name, colour in lines),
-        ]:
-            heights = [float("nan") if row[column] is None else row[column] for row in rows]
-            ax.plot(places, heights, style, ms=4, lw=1.2, color=colour, label=text)
-        values = [str(row[0]) for row in rows]
-        ax.set_xticks(list(places), values)
-        if str(best.get(name)) in values:
-            ax.axvline(values.index(str(best[name])), color=GREY, lw=0.8, ls="--", label="chosen")
-        if fits:
-            ax.set_ylim(max(max(fits) - _DEPTH, min(fits) - 1.0), 101.0)
-        ax.set_xlabel(name)
-        label(ax, "fit on the hold-out [%]")
-    figure.suptitle(title)
-    return figure

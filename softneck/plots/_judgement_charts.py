@@ -1,4 +1,4 @@
-"""The charts of what a validation finds: residual tests, histograms of errors, and the cost curves of a search."""
+"""The charts of what a validation finds: residual tests, histograms of errors, reliability."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel
-from ._style import BLUE, GREY, RED, looks, shown
+from ._style import BLUE, GREY, RED, shown
 
 _BOUND = "99 % bounds"
 # Bins of a histogram at most; more are thinner than what a screen shows.
@@ -112,33 +112,6 @@ def _histogram(axis: str, errors: Vector, unit: str) -> Panel:
         curves.append(Curve(x, normal, "normal", RED, width=1.2))
     title = f"{axis}: mean {mean:.3g} {unit}, standard deviation {spread:.3g} {unit}"
     return Panel(curves, f"density [1/{unit}]", title=title)
-
-
-def cost_chart(
-    values: Vector,
-    costs: Mapping[str, Vector],
-    labels: tuple[str, str],
-    title: str,
-    *,
-    chosen: float | None = None,
-    caption: str = "",
-) -> Chart:
-    """Describe the cost curve of a search: a score against one parameter, one line for each value of another.
-
-    Args:
-        values: (n,) of the parameter.
-        costs: name of a line -> (n,) scores; NaN where none could be found.
-        labels: of the x and of the y axis, with their units.
-        title: of the chart.
-        chosen: the parameter that was taken.
-        caption: for under the chart.
-    """
-    curves = [
-        Curve(values, np.asarray(cost), name, colour, "marked")
-        for (name, cost), (colour, _) in zip(costs.items(), looks(), strict=False)
-    ]
-    levels = () if chosen is None else (Level(chosen, "chosen", GREY, vertical=True),)
-    return Chart(title, [Panel(curves, labels[1], levels=levels)], labels[0], caption=caption, row_height=3.0)
 
 
 def reliability_chart(rows: Sequence[Mapping[str, float]], title: str) -> Chart:

@@ -1,4 +1,4 @@
-"""Charts of residual tests, histograms and searches show the numbers that they were given."""
+"""Charts of residual tests and histograms show the numbers that they were given."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError
-from softneck.plots import cost_figure, histogram_figure, residual_figure
-from softneck.plots._judgement_charts import cost_chart, histogram_chart, residual_chart
+from softneck.plots import histogram_figure, residual_figure
+from softneck.plots._judgement_charts import histogram_chart, residual_chart
 
 LAGS, CROSS_LAGS = np.arange(26), np.arange(-25, 26)
 
@@ -66,15 +66,3 @@ def test_equal_errors_make_a_histogram_and_none_do_not(value: float) -> None:
     assert np.isfinite(chart.panels[0].curves[0].y).all()
     with pytest.raises(DataError, match="no error of pitch"):
         histogram_chart(np.full((50, 2), np.nan), "h")
-
-
-def test_a_search_keeps_its_whole_cost_curve() -> None:
-    lags = np.arange(1.0, 6.0)
-    costs = {f"order {n}": 80.0 + n * lags for n in (1, 2)}
-    chart = cost_chart(lags, costs, ("lag [samples]", "free-run fit [%]"), "search", chosen=3.0)
-    (panel,) = chart.panels
-    assert [curve.label for curve in panel.curves] == list(costs)
-    for curve, cost in zip(panel.curves, costs.values(), strict=True):
-        np.testing.assert_array_equal(curve.y, cost)
-    assert [level.value for level in panel.levels] == [3.0]
-    assert len(cost_figure(lags, costs, ("lag [samples]", "free-run fit [%]"), "search").axes) == 1

@@ -17,7 +17,6 @@ from softneck.plots import (
     loop_figure,
     page,
     recording_figure,
-    search_figure,
     validation_figure,
 )
 from softneck.plots import write_page as write
@@ -37,7 +36,6 @@ def test_a_page_needs_nothing_from_outside_and_holds_its_pictures() -> None:
         ("experiment", recording_figure(t, _wave(3), _wave(2), "experiment")),
         ("validation", validation_figure(t, _wave(2), {"model": 0.9 * _wave(2)}, "validation")),
         ("delay", delay_figure({"pitch": [[0.0, 80.0, 0.01], [0.02, 81.0, 0.009]]}, "delay")),
-        ("search", search_figure({"na": [[1, 80.0, 81.0, 97.0, 97.0], [2, None, None, None, None]]}, "s", best={})),
     ]
     html = page("Title", [Section("First", figures=figures)])
     assert not re.search(r"(src|href)=\"(?!data:|#)", html)

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import Vector
+from softneck.core import Matrix, Vector
 from softneck.signals import Recording, concatenate
 
 from ..models._fitting import MIN_ROWS
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
-from ._trials import standard_error
 
 # Kinds are compared on so many rows (40 s of Eq. 22); the chosen one is trained on all.
 SCREENED_ROWS = 2000
@@ -29,6 +28,10 @@ _REGION, _WIDEN = 0.12, 0.2
 _MOVED_OVER = 0.5
 # Runs are left out in so many groups at most; a group of fewer rows says nothing of a free run.
 _MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
+# Errors within 2 s of each other belong together: that is ten time constants of the neck.
+_BLOCK = 100
+# The standard error itself is then known to 5 %.
+_RESAMPLES = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,3 +170,18 @@ def _scaled(recording: Recording) -> np.ndarray:
     U = recording.set_points - recording.set_points.mean(axis=0)
     spread = U.std(axis=0)
     return U / np.where(spread > 0.0, spread, 1.0)
+
+
+def standard_error(y: Matrix, outputs: Matrix) -> float:
+    """Return the standard error of the mean of all fits [%], by resampling blocks of the hold-out."""
+    wrong, spread = _block_sums((y - outputs) ** 2), _block_sums((y - np.nanmean(y, axis=0)) ** 2)
+    # Any generator will do, but the same choice must give the same answer.
+    drawn = np.random.default_rng(0).integers(len(wrong), size=(_RESAMPLES, len(wrong)))
+    ratio = wrong[drawn].sum(axis=1) / np.maximum(spread[drawn].sum(axis=1), 1e-300)
+    return float((100.0 * (1.0 - np.sqrt(ratio))).mean(axis=1).std())
+
+
+def _block_sums(squares: Matrix) -> Matrix:
+    """Return the sums (blocks, outputs) over consecutive rows (time, outputs), samples that are NaN left out."""
+    borders = np.arange(0, len(squares), _BLOCK)
+    return np.add.reduceat(np.nan_to_num(squares), borders, axis=0)
