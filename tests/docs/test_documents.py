@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 
+from softneck.cli._main import group
 from tests.docs import run_documents
-from tests.docs.run_documents import Block, PageError, name_of, pages, read, require_few_fragments, wanted
+from tests.docs.run_documents import Block, PageError, commands, name_of, pages, read, require_few_fragments, wanted
 
 SOUND = """# A page
 
@@ -122,6 +126,27 @@ def test_a_page_starts_with_nothing_of_the_tests(tmp_path: Path, monkeypatch: py
 
 def test_the_pages_can_be_run() -> None:
     require_few_fragments({name_of(page): read(page) for page in wanted(None)})
+
+
+@pytest.mark.parametrize("page", pages(), ids=name_of)
+def test_commands_and_options_of_a_page_exist(page: Path) -> None:
+    """What `make documents` tells in minutes, and fragments and nightly pages too. Other programs are not looked at."""
+    for block in read(page):
+        for number, text in commands(block, page.name) if block.language == "console" else ():
+            typed = re.sub(r"\s#\s.*", "", text.replace("\\\n", " "))
+            for words in map(shlex.split, re.split("&&|[;|]", typed)):
+                if words[:1] != ["softneck"]:
+                    continue
+                command: click.Command = group
+                rest = words[1:]
+                while isinstance(command, click.Group) and rest:
+                    # `robot` takes what names no command for the argument of FILE.
+                    found = command.get_command(click.Context(command), rest[0]) or command.commands.get("FILE")
+                    assert found is not None, f"{page.name}:{number}: no command {rest[0]}"
+                    command, rest = found, rest[1:]
+                known = {option for parameter in command.params for option in parameter.opts} | {"-h", "--help"}
+                unknown = {word for word in rest if re.match("--?[a-z]", word)} - known
+                assert not unknown, f"{page.name}:{number}: {text}"
 
 
 def test_what_is_not_run_yet_is_a_page() -> None:
