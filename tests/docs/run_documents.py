@@ -39,11 +39,6 @@ MAX_FRAGMENTS = 5
 TIME_LIMIT_S = 1200.0
 SHOWN_LINES = 40
 
-# Pages whose blocks are not run yet, and why. It shall become empty.
-NOT_YET: dict[str, str] = {
-    "README.md": "runs but for `start`, which was repaired last and is to be tried",
-}
-
 _BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>[\w-]+)\n(?P<text>.*?)^ *```$", flags=re.MULTILINE | re.DOTALL)
 _FRAGMENT = re.compile(r"<!-- fragment: (.+?) -->\s*\Z", flags=re.DOTALL)
 _NIGHTLY = "<!-- documents: nightly -->"
@@ -336,13 +331,11 @@ def main(arguments: list[str] | None = None) -> int:
     python = options.python.absolute()  # not resolved: a link in an environment is how Python finds its packages
 
     try:
-        found = {page: read(page) for page in wanted(options.page)}
+        found = {page: read(page) for page in map(Path.resolve, options.page or pages())}
         require_few_fragments({name_of(page): blocks for page, blocks in found.items()})
     except PageError as problem:
         print(problem)
         return 1
-    if not options.page:
-        print(*(f"not yet {name}: {why}" for name, why in NOT_YET.items()), sep="\n")
     chosen = [
         page
         for page, blocks in found.items()
@@ -366,11 +359,6 @@ def main(arguments: list[str] | None = None) -> int:
             sys.stdout.flush()
     print(f"{len(chosen)} pages, {broken} broken")
     return bool(broken)
-
-
-def wanted(named: list[Path] | None) -> list[Path]:
-    """Return the pages that are named, or all that can be run yet."""
-    return [page.resolve() for page in named] if named else [page for page in pages() if name_of(page) not in NOT_YET]
 
 
 def runs(block: Block) -> bool:

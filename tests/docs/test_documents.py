@@ -14,7 +14,7 @@ import pytest
 
 from softneck.cli._main import group
 from tests.docs import run_documents
-from tests.docs.run_documents import Block, PageError, commands, name_of, pages, read, require_few_fragments, wanted
+from tests.docs.run_documents import Block, PageError, commands, name_of, pages, read, require_few_fragments
 
 SOUND = """# A page
 
@@ -125,7 +125,7 @@ def test_a_page_starts_with_nothing_of_the_tests(tmp_path: Path, monkeypatch: py
 
 
 def test_the_pages_can_be_run() -> None:
-    require_few_fragments({name_of(page): read(page) for page in wanted(None)})
+    require_few_fragments({name_of(page): read(page) for page in pages()})
 
 
 @pytest.mark.parametrize("page", pages(), ids=name_of)
@@ -147,10 +147,6 @@ def test_commands_and_options_of_a_page_exist(page: Path) -> None:
                 known = {option for parameter in command.params for option in parameter.opts} | {"-h", "--help"}
                 unknown = {word for word in rest if re.match("--?[a-z]", word)} - known
                 assert not unknown, f"{page.name}:{number}: {text}"
-
-
-def test_what_is_not_run_yet_is_a_page() -> None:
-    assert set(run_documents.NOT_YET) <= {name_of(page) for page in pages()}
 
 
 def test_the_runner_needs_no_package() -> None:
