@@ -17,7 +17,6 @@ from ..master._gate import Reading
 from ..simulated import SimulatedNeck
 from ..simulated._frame import CanFrame
 from ..simulated._springs import SimulatedSprings
-from ._axes import Axes, turned
 from ._why import reason
 
 # Interfaces whose far end is a program on this machine: no drive can be behind them.
@@ -59,7 +58,6 @@ class VirtualLink:
         tap: called with (time, from_master, frame) for each frame that is on the wire.
         lose: returns whether a frame is lost: (from_master, frame).
         inject: frames of somebody else, delivered to both sides with the next exchange.
-        axes: which of the sensor's own axes each output is; None: as they come.
         sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
     """
 
@@ -74,7 +72,6 @@ class VirtualLink:
         self.tap: Callable[[float, bool, Frame], None] | None = None
         self.lose: Callable[[bool, Frame], bool] | None = None
         self.inject: list[Frame] = []
-        self.axes: Axes | None = None
         self.sampling = True
         self._samples = max(1, round(neck.settings.sample_time / self.cycle))
 
@@ -100,8 +97,7 @@ class VirtualLink:
     @property
     def newest(self) -> Reading:
         """The sensor's newest sample, as the master takes it."""
-        told = Reading(*self.neck.newest[1:])
-        return told if self.axes is None else turned(told, self.axes)
+        return Reading(*self.neck.newest[1:])
 
     def pass_time(self) -> None:
         """Let one cycle pass: drives, neck, and what the drives say by themselves."""

@@ -12,7 +12,7 @@ from softneck.signals.detection._threshold import Budget, thresholds
 from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Baseline, Row, Rows, Tracking
-from ._motor_charts import EDGES, MotorCharts, MotorRules, motor_names
+from ._motor_charts import EDGES, MotorCharts, motor_names
 from ._motor_models import Features, Flags, Motion, features_of, level_rows, motor_rows, row_of, variance_of
 from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
 from ._tracking import LoopRun, fit_tracking, tracking_scores
@@ -41,7 +41,6 @@ def calibrate(
     budget: Budget | None = None,
     seed: int = 0,
     known_bias: float = _KNOWN_BIAS,
-    rules: MotorRules | None = None,
 ) -> Baseline:
     """Return what the supervisor compares with.
 
@@ -55,7 +54,6 @@ def calibrate(
         budget: of false alarms; `charts` and `step` are set here.
         seed: of the bootstrap.
         known_bias: part of the largest slow error that the tilt's charts take for no fault; the bootstrap has the rest.
-        rules: of the motors' charts; None: as the charts have them.
 
     Raises:
         DataError: too little motion, or motors that did not move.
@@ -73,14 +71,14 @@ def calibrate(
     motor, tilt, slow, fitted = [], [], [], []
     for number in range(len(parts)):
         others = [other for k, other in enumerate(known) if k != number]
-        fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack, rules=rules))
+        fitted.append(fit(others, cycle=cycle, sample_cycles=sample_cycles, slack=slack))
         slow.append(_slow(fitted[-1], parts[number]))
     bias = row_of(known_bias * np.max(slow, axis=0))
     for part, model in zip(parts, fitted, strict=True):
-        found = scores_of(replace(model, tilt_bias=bias), part, rules)
+        found = scores_of(replace(model, tilt_bias=bias), part)
         motor.append(found[0])
         tilt.append(found[1])
-    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack, rules=rules)
+    whole = fit(known, cycle=cycle, sample_cycles=sample_cycles, slack=slack)
     runs = _loops(loops, replace(whole, tilt_bias=bias))
     charts = motor[0].shape[1] + tilt[0].shape[1] + 1 + (2 * runs[0].values.shape[1] if runs else 0)
     shared = replace(budget or Budget(), charts=charts)
@@ -125,9 +123,9 @@ def _tracking(runs: Sequence[LoopRun], budget: Budget, rng: np.random.Generator)
     return fit_tracking(runs)._replace(bias=bias, thresholds=row_of(thresholds(scores, budget, rng)))
 
 
-def scores_of(baseline: Baseline, motion: Motion, rules: MotorRules | None = None) -> tuple[Matrix, Matrix]:
+def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
     """Return the scores of all charts on one stretch: of motors (cycles, charts), of the tilt (samples, charts)."""
-    walk = _Walk(baseline, rules)
+    walk = _Walk(baseline)
     ours, theirs = [], []
     for k in range(len(motion.due)):
         if walk.step(motion, k):
@@ -139,9 +137,9 @@ def scores_of(baseline: Baseline, motion: Motion, rules: MotorRules | None = Non
 class _Walk:
     """The charts over a stretch of motion, none of which ever says anything."""
 
-    def __init__(self, baseline: Baseline, rules: MotorRules | None = None) -> None:
+    def __init__(self, baseline: Baseline) -> None:
         self._gains = np.array(baseline.current)
-        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf), rules)
+        self.motors = MotorCharts(baseline, np.full(len(motor_names(baseline.motors)), np.inf))
         names = tilt_names(baseline.motors, baseline.outputs, gyro=bool(baseline.gyro_spread))
         self.tilt = TiltCharts(baseline, np.full(len(names), np.inf))
         self.tilt.begin()
@@ -162,7 +160,6 @@ def fit(
     cycle: float,
     sample_cycles: int,
     slack: float,
-    rules: MotorRules | None = None,
 ) -> Baseline:
     """Return the models of drives, tendons and tilt, without thresholds."""
     motions, features = [motion for motion, _ in known], [f for _, f in known]
@@ -179,7 +176,7 @@ def fit(
     lags = _lags(step)
     # At rest nobody knows which way friction holds: a tendon is taut for certain above that much only.
     least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
-    load, (least_load, most_load), level, level_spread = level_rows(known, least, top, reach, rules or MotorRules())
+    load, (least_load, most_load), level, level_spread = level_rows(known, least, top, reach)
     samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
     tilt = _tilt_gains(samples, lags)
     residuals = [s.values - _predicted(s, tilt, lags, n) for s in samples]

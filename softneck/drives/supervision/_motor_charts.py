@@ -58,6 +58,10 @@ class MotorRules(NamedTuple):
     carries: float = 500.0
 
 
+RULES = MotorRules()
+_RULES = tuple(RULES)
+
+
 class MotorFeatures:
     """What the models of drive and tendon are linear in.
 
@@ -133,7 +137,7 @@ class MotorCharts:
         charts: their sums.
     """
 
-    def __init__(self, baseline: Baseline, thresholds: Vector | None = None, rules: MotorRules | None = None) -> None:
+    def __init__(self, baseline: Baseline, thresholds: Vector | None = None) -> None:
         """Begin; `thresholds` other than the baseline's are for calibrating."""
         b = self._b = baseline
         n = b.motors
@@ -152,7 +156,6 @@ class MotorCharts:
         self._model = tuple(np.array(row) for row in rows)
         self._levels = tuple(np.array(row) for row in (b.level, b.level_spread, b.load, *rows[-3:]))
         self._load = (np.zeros(n), np.zeros(n), np.zeros(1))
-        self._rules = tuple(rules or MotorRules())
         filter_ = Filter([Whitening(row) for row in b.current_whitening], 1 + len(SCALES))
         self._white = (filter_.coefficients, filter_.past, np.zeros((1 + len(SCALES), n)))
         self._rest = np.zeros(n)
@@ -182,11 +185,11 @@ class MotorCharts:
         if self._jump is not None:
             return self._judged(self._jumped)
         self._functions.supervised_motors(
-            self._model, self._rules, f.past, f.x, self._white, self._rest, self._scales, self._b.cycle, self.scores
+            self._model, _RULES, f.past, f.x, self._white, self._rest, self._scales, self._b.cycle, self.scores
         )
         at = (2 + len(SCALES)) * n
         self._functions.supervised_levels(
-            self._levels, self._rules, f.past, f.x, self._rest, self._scales, self._load, self.scores[at:]
+            self._levels, _RULES, f.past, f.x, self._rest, self._scales, self._load, self.scores[at:]
         )
         if not self.known_load:
             # As for the tilt: nobody saw how such a load is shared.

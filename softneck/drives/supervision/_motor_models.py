@@ -13,7 +13,7 @@ from softneck.runtime import load_functions
 from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Row, Rows
-from ._motor_charts import RUNTIME, MotorFeatures, MotorRules
+from ._motor_charts import RULES, RUNTIME, MotorFeatures
 
 Flags = NDArray[np.bool_]
 
@@ -98,7 +98,7 @@ def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most:
 
 
 def level_rows(
-    known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector, rules: MotorRules
+    known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector
 ) -> tuple[Rows, tuple[float, float], Rows, Row]:
     """Fit each tension by the motors' places and what all carry, where all may be believed; not for one motor.
 
@@ -109,7 +109,7 @@ def level_rows(
     n = len(slack)
     if n < 2:
         return ((0.0, 0.0),), (0.0, 0.0), (row_of(np.zeros(known[0][1].place.shape[2] + 2)),), (1.0,)
-    good = [_believed(motion, f, slack, top, reach, rules) for motion, f in known]
+    good = [_believed(motion, f, slack, top, reach) for motion, f in known]
     places = [np.column_stack([motion.positions, np.ones(len(motion.due))])[kept]
               for (motion, _), kept in zip(known, good, strict=True)]  # fmt: skip
     others = [
@@ -118,7 +118,7 @@ def level_rows(
     told = sum(map(len, others)) > 10 * (n + 1)
     load = np.array([_robust(np.concatenate(places), column) if told else np.zeros(n + 1)
                      for column in np.concatenate(others).T])  # fmt: skip
-    carried = [_carried(y - X @ load.T, rules.carries) for X, y in zip(places, others, strict=True)]
+    carried = [_carried(y - X @ load.T, RULES.carries) for X, y in zip(places, others, strict=True)]
     rows, spread = [], []
     for i in range(n):
         X = np.concatenate([np.column_stack([f.place[kept, i], loads[:, i], np.ones(len(loads))])
@@ -128,14 +128,14 @@ def level_rows(
         rows.append(row_of(theta))
         spread.append(float(np.var(y - X @ theta)) if theta.any() else 1.0)
     # Of the first cycles friction has not averaged out.
-    seen = np.concatenate([[0.0], *(loads.max(axis=1)[round(0.1 * rules.carries) :] for loads in carried)])
+    seen = np.concatenate([[0.0], *(loads.max(axis=1)[round(0.1 * RULES.carries) :] for loads in carried)])
     return tuple(row_of(row) for row in load), (float(seen.min()), float(seen.max())), tuple(rows), tuple(spread)
 
 
-def _believed(motion: Motion, f: Features, slack: Vector, top: Vector, reach: Vector, rules: MotorRules) -> Flags:
+def _believed(motion: Motion, f: Features, slack: Vector, top: Vector, reach: Vector) -> Flags:
     """Return the cycles in which no tendon may hang, no motor is near its limit, and none far behind."""
     T = motion.tensions
-    good = ((slack <= T) & ((1.0 - rules.near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
+    good = ((slack <= T) & ((1.0 - RULES.near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
     return np.asarray(good & np.isfinite(f.place).all(axis=(1, 2)))
 
 

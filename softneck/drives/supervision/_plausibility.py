@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ._baseline import Baseline
-from ._motor_charts import MotorCharts, MotorRules
+from ._motor_charts import MotorCharts
 from ._tilt_charts import TiltCharts
 from ._tracking import TrackingCharts
 
@@ -47,11 +47,11 @@ class Plausibility:
         rests: why the tilt is not compared, in the sample in which that is to be said; else "".
     """
 
-    def __init__(self, baseline: Baseline, rules: MotorRules | None = None) -> None:
-        """Know nothing yet; `rules` other than those of the motors' charts are for choosing them."""
+    def __init__(self, baseline: Baseline) -> None:
+        """Know nothing yet."""
         self._b = baseline
         self._gains = np.array(baseline.current)
-        self.motors = MotorCharts(baseline, rules=rules)
+        self.motors = MotorCharts(baseline)
         self.tilt = TiltCharts(baseline)
         step, known = baseline.cycle * baseline.sample_cycles, baseline.tracking
         self.tracking = TrackingCharts(known, baseline.outputs, step) if known.weights else None

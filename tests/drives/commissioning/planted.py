@@ -112,9 +112,11 @@ def planted_link(
     """Return simulated drives that are set up as `planted` says, on a bus that is read as `believed` says."""
     turns = simulated_plant(planted.file, neck, sample_time=sample_time, homed=False, seed=seed)
     outputs = believed.moves.outputs.names
-    mounted = MountedOtherwise(turns, inverse(axes_of(planted.file.sensor_axes, outputs)), late=planted.late)
+    # As it is mounted, and read as it is believed to be.
+    true = inverse(axes_of(planted.file.sensor_axes, outputs))
+    axes = [(true[n][0], sign * true[n][1]) for n, sign in axes_of(believed.sensor_axes, outputs)]
+    mounted = MountedOtherwise(turns, axes, late=planted.late)
     link = VirtualLink(mounted)  # pyright: ignore[reportArgumentType]  # it stands for what it is around
-    link.axes = axes_of(believed.sensor_axes, outputs)
     turns.drives = (*turns.drives, *(twin(node, turns.settings) for node in planted.twins))
     return link
 
