@@ -54,8 +54,9 @@ class Certificate(Shown):
         return required_rows(self.contents)
 
     def failed(self) -> list[str]:
-        """Return the names of the requirements or limits that did not hold."""
-        return [str(row.get("metric")) for row in self.rows if not row.get("holds")]
+        """Return the names of the requirements or limits that did not hold; one that is None was not computed."""
+        judged = (row for row in self.rows if row.get("holds", False) is not None)
+        return [str(row.get("metric")) for row in judged if not row.get("holds")]
 
 
 def required_rows(contents: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -9,16 +9,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from softneck.core import KINDS, FileFormatError, Progress, SettingsError, SoftneckError, load, read_archive, silent
 from softneck.core._budget import MOST_JSON, open_zip, settings_text
-from softneck.cosim import load_loop, read_runs, simulate
+from softneck.cosim import Result, load_loop, read_runs, simulate
 from softneck.cosim.loops._loop_file import is_loop_file
 from softneck.cosim.loops._loop_values import read_toml
 from softneck.cosim.loops._trust import python_of
 from softneck.cosim.studies._store import read_description
 from softneck.identification.models._directions import bandwidth_of
 from softneck.robot._search import FILE
-from softneck.signals import assess_quality, import_log, read_layout, read_recording
+from softneck.signals import Recording, assess_quality, import_log, read_layout, read_recording
 from softneck.signals.importing._layout_text import doubts_in
 
 # Folders that are no part of a project, beside those whose name begins with a dot.
@@ -92,9 +94,24 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
                 _READERS[path.suffix.lower()](project, path, name)
         except SoftneckError as error:
             project.problems[name] = str(error).removeprefix(f"{path}: ")
+    # What a loop of the project did in a simulation is no data: models would be judged on what they said themselves.
+    for name, (recording, _) in list(project.recordings.items()):
+        if any(_is_run_of(result, recording) for result in project.loops.values()):
+            del project.recordings[name]
     if project.is_empty:
         raise FileFormatError(f"{root}: holds no softneck files; `softneck new {root}` begins a project.")
     return project
+
+
+def _is_run_of(result: Result, recording: Recording) -> bool:
+    """Return whether a recording is what `softneck simulate -o` wrote of a loop's run."""
+    signals = result.signals.signals
+    return all(
+        name in signals
+        and len(signals[name]) == len(recording)
+        and np.allclose(signals[name], recording.channels[name], rtol=0.0, atol=1e-6)
+        for name in recording.robot.set_points
+    )
 
 
 def _is_worst(entry: Path) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from softneck.core import Progress, SoftneckError, file_hash, silent
@@ -91,7 +92,14 @@ def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, 
         for name, thing in list(things.items())[:_MOST_CARDS]:
             lines = _lines(thing)
             said = lines[1] if title == "Loops" and len(lines) > 1 else lines[0]
-            cards.append((name, places[title], thing._picture() if isinstance(thing, Shown) else "", said[:90]))
+            cards.append(
+                (
+                    name,
+                    places[title],
+                    thing._picture() if isinstance(thing, Shown) else "",
+                    shorten(said, 90, placeholder=" ..."),
+                )
+            )
     return cards
 
 
@@ -246,7 +254,8 @@ def _certifies(content: Mapping[str, Any]) -> bool:
 
 
 def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:
-    verdict = "holds" if row.get("holds") else "fails"
+    held = row.get("holds", False)
+    verdict = "holds" if held else "not computed" if held is None else "fails"
     return [name, str(row.get("metric", "")), _cell(row.get("value")), _cell(row.get("limit")), verdict]
 
 

@@ -200,6 +200,18 @@ def test_a_report_takes_a_raw_log_whose_layout_lies_beside_it_for_what_it_is(cal
     assert (told["recordings"], told["problems"]) == (1, {})
 
 
+def test_a_run_of_the_project_s_own_loop_is_no_data_of_it(call: Call, recording: Path, rls_file: Path) -> None:
+    Path("project").mkdir()
+    assert call("design", "pi", rls_file, "-o", "project/pi.npz", "--any-fit").code == 0
+    parts = '[plant]\nneck = "paper"\n[controller]\nfile = "pi.npz"\n[reference]\nkind = "step"\npitch_deg = 3\n'
+    Path("project/loop.toml").write_text(f"duration_s = 1.0\n{parts}")
+    assert call("simulate", "project/loop.toml", "-o", "project/run.csv").code == 0
+    told = one_object(call("report", "project", "--json", "-o", "a.html"))
+    assert (told["recordings"], told["loops"], told["problems"]) == (0, 1, {})
+    Path("project/log.csv").write_text(recording.read_text())
+    assert one_object(call("report", "project", "--json", "-o", "b.html"))["recordings"] == 1
+
+
 def test_info_says_what_the_columns_of_a_log_seem_to_be(call: Call, recording: Path) -> None:
     rows = [line.split(",") for line in recording.read_text().splitlines()]
     titles = [

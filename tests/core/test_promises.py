@@ -154,7 +154,13 @@ def test_only_true_holds(tmp_path: Path, controller: Path, holds: object) -> Non
 
 
 def test_the_rows_that_failed_are_named_in_their_order(tmp_path: Path) -> None:
-    rows = [{"metric": "a", "holds": True}, {"metric": "b", "holds": False}, {"metric": "c"}, "no row"]
+    rows = [
+        {"metric": "a", "holds": True},
+        {"metric": "b", "holds": False},
+        {"metric": "c"},
+        {"metric": "open", "holds": None},
+        "no row",
+    ]
     for key in ("requirements", "limits"):
         changed = certificate(holds=False)
         del changed["requirements"]
