@@ -125,7 +125,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     if any(plant.payload and plant.name == name for plant in found.own):
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}
     if taut and "least_cocontraction" not in found.best.settings:
-        table["reference"]["cocontraction"] = task.cocontraction
+        table["reference"]["cocontraction"] = task.said_cocontraction
     asked = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
              if b.metric.startswith("neck.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
     known = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_")

@@ -117,7 +117,7 @@ def spaces(
     Args:
         kinds: of controllers.
         rise: the longest that is allowed [s].
-        cocontraction: at which the robot was recorded [rad]; None: no rule is set.
+        cocontraction: at which the robot was recorded, in the unit of its motors; None: no rule is set.
         neck: whether it is a neck: of another robot limits are those of its file.
         least: the rise that the motors can give at best [s].
 
@@ -143,7 +143,7 @@ def spaces(
         fixed: dict[str, Any] = {"lead_limit": _LEAD} if neck and kind not in _PLANNED else {}
         if cocontraction is not None and "least_cocontraction" in names:
             fixed["least_cocontraction"] = cocontraction
-        if cocontraction is not None and kind == "nmpc":
+        if cocontraction is not None and neck and kind == "nmpc":
             # Its plan begins where the recordings were: elsewhere the tendons hang, and it is refused.
             fixed["minimum_tautness"] = cocontraction
         found.append(Space(kind, tuple(item for item in wanted if item.name in names), fixed))

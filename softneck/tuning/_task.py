@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from softneck.core import KINDS, resolve
+from softneck.core import KINDS, resolve, to_si
 from softneck.identification import Model
 from softneck.robot import Robot
 
@@ -28,7 +28,7 @@ class Task:
         own: by name, plants that step.
         asked: the requirements.
         robot: whose controller is tuned.
-        cocontraction: at which the loops are held [rad]; None: by the controller's own rule.
+        cocontraction: at which the loops are held [rad, else SI]; None: by the controller's own rule.
         seed: of the noise.
         observer: of the loops of kinds that have one (`mpc`, `nmpc`); None: these have none either.
     """
@@ -41,6 +41,12 @@ class Task:
     cocontraction: float | None = None
     seed: int = 0
     observer: Any = None
+
+    @property
+    def said_cocontraction(self) -> float | None:
+        """As settings and loop files say it: in the unit of the robot's motors."""
+        factor = to_si(self.robot.motors.unit)[0]
+        return None if self.cocontraction is None else float(f"{self.cocontraction / factor:.4g}")
 
     @property
     def tested(self) -> bool:

@@ -145,7 +145,7 @@ def tune(
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
     each = spaces(
-        chosen, rise=_aimed(task), cocontraction=task.cocontraction, neck=task.robot.is_neck,
+        chosen, rise=_aimed(task), cocontraction=task.said_cocontraction, neck=task.robot.is_neck,
         least=quickest(task.plant),
     )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from softneck.core import DataError, SettingsError
+from softneck.core import KINDS, DataError, SettingsError, resolve
 from softneck.cosim import FmuPart
 from softneck.design import PiSettings
 from softneck.fmu import build_fmu
@@ -21,6 +22,7 @@ from softneck.tuning import tune
 from softneck.tuning._beforehand import refuse_impossible
 from softneck.tuning._cases import loop_of, quietly
 from softneck.tuning._judge import made_ready
+from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
 from softneck.verification import read_requirements
 from softneck.verification._neck_loops import direction
@@ -55,6 +57,18 @@ def test_a_default_that_is_quieter_than_the_noise_of_a_neck_refuses_no_other_rob
     asked = task_of({"model": model}, {"track": {"noise_deg": 5.0}}, 0).asked
     assert 0.0 < (asked.limit("neck.steady_rms_deg") or 0.0) < 5.0
     refuse_impossible(asked, model)
+
+
+def test_the_recordings_cocontraction_is_told_to_controllers_in_the_unit_of_the_motors() -> None:
+    model = plant(BELLOWS)
+    recorded = {"tested": {"conditions": [{"payload_kg": [0.0, 0.0], "cocontraction": [1.4e5, 1.8e5]}]}}
+    task = task_of({"model": replace(model, findings={**model.findings, **recorded})}, QUICK, 0)
+    assert (task.cocontraction, task.said_cocontraction) == (1.6e5, 1.6)  # Pa and bar
+    for space in spaces(("pi", "lqg"), rise=0.4, cocontraction=task.said_cocontraction, neck=False):
+        limits = resolve(KINDS[space.kind].settings)(**space.settings(space.start)).design(model).limits
+        assert limits.least_cocontraction == 1.6e5
+    (planned,) = spaces(("nmpc",), rise=0.4, cocontraction=1.6, neck=False)
+    assert "minimum_tautness" not in planned.fixed  # which only necks have
 
 
 def test_verify_judges_by_what_tune_stretched_and_not_by_more() -> None:
