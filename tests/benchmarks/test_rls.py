@@ -17,7 +17,7 @@ from softneck.identification import Recursion
 from softneck.runtime import load_functions
 
 ROWS = 2_000_000
-UD, STANDARD = "softneck.identification.linear._ud_runtime", "softneck.identification.linear._recursion_runtime"
+UD, STANDARD = "softneck.identification.linear._ud_runtime", "tests.oracles.recursion_runtime"
 
 
 @pytest.fixture(scope="module")

@@ -118,7 +118,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("speed=3", "unknown setting `speed`; this kind has covariance_bound, dead_zone, delay"),
+        ("speed=3", "unknown setting `speed`; this kind has covariance_bound, delay"),
         ("na", "--set takes KEY=VALUE; got `na`"),
         ("na=0", "`na` must be a whole number between 1 and 100; got 0"),
         ("na=1.5", "`na` must be a whole number between 1 and 100; got 1.5"),
@@ -127,7 +127,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
         ("forgetting=nan", "`forgetting` must be a finite number; got nan"),
         ("delay=5", "`delay` must be between 0 and 2 [s]; got 5"),
         ("delay=late", "a setting has a value of the wrong type"),
-        ("delay_by=luck", "`delay_by` must be one of free_run, one_step; got 'luck'"),
+        ("structure=luck", "`structure` must be one of siso, miso, mimo; got 'luck'"),
     ],
 )
 def test_a_wrong_setting(call: Call, tmp_path: Path, recording: Path, setting: str, message: str) -> None:

@@ -64,7 +64,7 @@ class OnlineRls:
     """`Rls` sample by sample: after as many calls it has learnt what `Rls.fit` would have.
 
     Attributes:
-        settings: with a dead time given; form `ud`.
+        settings: with a dead time given.
         sample_time: [s].
     """
 
@@ -77,8 +77,6 @@ class OnlineRls:
             raise SettingsError(
                 "a dead time cannot be searched for sample by sample; give `delay`, from a model identified before."
             )
-        if self.settings.form != "ud":
-            raise SettingsError("estimation sample by sample needs form `ud`.")
 
     @property
     def delay(self) -> int:

@@ -32,9 +32,7 @@ from ._operating_point import about, operating_point, with_offset
 from ._recursion import EXACT_START, Recursion, require_forgetting
 from ._regression import arx_rows, require_excitation
 
-_STANDARD, _UD = "softneck.identification.linear._recursion_runtime", "softneck.identification.linear._ud_runtime"
-# F(0) of the standard form; a weaker start would cost it more digits than the start's pull does.
-_STANDARD_START = 1e8
+_UD = "softneck.identification.linear._ud_runtime"
 STRUCTURES = ("siso", "miso", "mimo")
 Curve = list[list[float]]
 
@@ -45,28 +43,22 @@ class Rls:
 
     Attributes:
         na, nb: orders of Eq. 23.
-        delay: dead time [s]; None searches it.
-        delay_by: the search's criterion on the training rows: "free_run" (simulation) or "one_step" (prediction).
+        delay: dead time [s]; None takes that of the best simulation of the training rows.
         max_delay: end of the search [s], of another robot by its time constant over the neck's 0.2 s.
         forgetting: lambda in (0, 1]; 1 for Eq. 29, below for a constant forgetting factor (CFF-RLS).
         structure: "siso" over theta_i and phi_i, "miso" (each output from the three motors and its own past) or
             "mimo" (from the three motors and both pasts).
-        form: "ud" (Bierman's factors) or "standard" (Eq. 29 as printed).
         covariance_bound: on the trace of F where `forgetting` is below 1; 0 for none.
-        dead_zone: prediction errors up to this size [rad] change nothing.
         stable: halve a step that would make a pole unstable (not for "mimo").
     """
 
     na: int = 1
     nb: int = 1
     delay: float | None = None
-    delay_by: str = "free_run"
     max_delay: float = 0.3
     forgetting: float = 1.0
     structure: str = "siso"
-    form: str = "ud"
     covariance_bound: float = 1e8
-    dead_zone: float = 0.0
     stable: bool = False
 
     def __post_init__(self) -> None:
@@ -75,15 +67,10 @@ class Rls:
         require_whole("nb", self.nb, 1, 100)
         if self.delay is not None:
             require_between("delay", self.delay, 0.0, 2.0, "s")
-        require_one_of("delay_by", self.delay_by, ("free_run", "one_step"))
         require_positive("max_delay", self.max_delay, "s")
         require_forgetting(self.forgetting)
         require_one_of("structure", self.structure, STRUCTURES)
-        require_one_of("form", self.form, ("ud", "standard"))
         require_between("covariance_bound", self.covariance_bound, 0.0, 1e15)
-        require_between("dead_zone", self.dead_zone, 0.0, np.pi, "rad")
-        if self.form == "standard" and (self.dead_zone > 0.0 or self.stable):
-            raise SettingsError("form `standard` is Eq. 28-30 alone; `dead_zone` and `stable` need form `ud`.")
         if self.stable and self.structure == "mimo":
             raise SettingsError("`stable` watches the poles of one output; use structure `siso` or `miso` with it.")
 
@@ -98,7 +85,6 @@ class Rls:
             parameters=parameters,
             forgetting=self.forgetting,
             covariance_bound=self.covariance_bound if self.forgetting < 1.0 else 0.0,
-            dead_zone=self.dead_zone,
             poles=self.na if self.stable else 0,
             start_covariance=EXACT_START,
         )
@@ -127,9 +113,7 @@ class Rls:
             findings |= directions.findings()
         arrays = with_offset("rls", arrays, recording, point)
         progress(1.0, "done")
-        return fitted_model(
-            "rls", self, recording, arrays=arrays, findings={"delay_criterion": self.delay_by, **findings}
-        )
+        return fitted_model("rls", self, recording, arrays=arrays, findings={"delay_criterion": "free_run", **findings})
 
     def _fit_siso(
         self, recording: Recording, directions: Directions, progress: Progress
@@ -179,9 +163,8 @@ class Rls:
             theta, std, one_step, number = self._least_squares(runs, d, name)
             free = free_run_fit(runs, theta[: self.na], theta[self.na :].reshape(-1, self.nb), d)
             curve.append([d * sample_time, free, one_step])
-            cost = -free if self.delay_by == "free_run" else one_step
-            if best is None or cost < best[0]:
-                best = (cost, d, theta, std, number)
+            if best is None or -free < best[0]:
+                best = (-free, d, theta, std, number)
         if best is None or not np.isfinite(best[0]):
             raise DataError(
                 f"no dead time gives a stable one-step model of {name}; record with more excitation or set `delay`."
@@ -203,13 +186,9 @@ class Rls:
 
     def _recurse(self, Phi: Matrix, y: Vector) -> tuple[Vector, Matrix]:
         n = Phi.shape[1]
-        if self.form == "standard":
-            theta, F = np.zeros(n), _STANDARD_START * np.eye(n)
-            load_functions(_STANDARD).rls_recursion(Phi, y, theta, F, self.forgetting)
-            return theta, F
         recursion = self._recursion(n)
         state = recursion.initial_state()
-        if self.forgetting < 1.0 or self.dead_zone > 0.0 or self.stable:
+        if self.forgetting < 1.0 or self.stable:
             state, _ = recursion.run(state, Phi, y)
         else:
             load_functions(_UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
@@ -239,7 +218,7 @@ class Rls:
             fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays, robot=recording.robot), recording)
             for name, fit, (_, _, rms, _) in zip(names, fits, both, strict=True):
                 curves[name].append([d * Ts, fit, rms])
-            cost = -sum(fits) if self.delay_by == "free_run" else sum(rms for _, _, rms, _ in both)
+            cost = -sum(fits)
             if best is None or cost < best[0]:
                 best = (cost, arrays, [number for *_, number in both])
         if best is None or not np.isfinite(best[0]):

@@ -89,7 +89,6 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
 
 
 FORMS = ("paper_eq21", "lags", "residual")
-_MOTORS = ("measured", "simulated")
 # Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
 _BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
 # Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3) at the neck's 20 ms; of another robot u and M so far apart by its time.
@@ -132,8 +131,6 @@ class SetMembership:
         output_weight: weight of the outputs, all others having 1: the scale without a choice.
         epsilon: noise bound of Eq. 15 [rad, or the SI unit of the outputs]; None chooses it by the same free run
             (form "residual": so that the bounds are narrowest among equal fits).
-        motors: whose positions M the set is made of: "measured", logged ones where there are any, or "simulated",
-            the drive model's, as in every free run. None: "simulated" for form "residual", else "measured".
         base: linear kind of one pole that form "residual" stands on.
     """
 
@@ -144,7 +141,6 @@ class SetMembership:
     scale: str | tuple[float, ...] = "auto"
     output_weight: float | None = None
     epsilon: float | None = None
-    motors: str | None = None
     base: str = "oe"
 
     def __post_init__(self) -> None:
@@ -161,8 +157,6 @@ class SetMembership:
             require_positive("output_weight", self.output_weight)
             if self.scale != "auto":
                 raise SettingsError("`output_weight` is a scale of its own; leave `scale` at auto beside it.")
-        if self.motors is not None:
-            require_one_of("motors", self.motors, _MOTORS)
         require_one_of("base", self.base, _BASES)
 
     @one_blas_thread
@@ -230,7 +224,8 @@ class SetMembership:
             table=table,
             drive=drive,
             base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
-            measured=(self.motors or ("simulated" if residual else "measured")) == "measured",
+            # What the set sees when it is used: the drive model's positions in simulation, which `residual` always is.
+            measured=not residual,
             units=regressor_units(recording, table),
         )
 

@@ -53,8 +53,6 @@ def test_a_controller_can_be_designed_anew_while_it_runs() -> None:
 def test_what_is_wrong_is_named() -> None:
     with pytest.raises(SettingsError, match="a dead time cannot be searched for sample by sample; give `delay`"):
         OnlineRls(settings=Rls(), sample_time=TS)
-    with pytest.raises(SettingsError, match="sample by sample needs form `ud`"):
-        OnlineRls(settings=Rls(delay=0.0, form="standard"), sample_time=TS)
     online = OnlineRls(settings=Rls(delay=0.0), sample_time=TS)
     with pytest.raises(DataError, match="`set_points` must have 3 entries"):
         online.step(online.initial_state(), [0.0], [0.0, 0.0])

@@ -16,7 +16,7 @@ from softneck.plots import convergence_figure
 from softneck.runtime import load_functions
 
 UD = "softneck.identification.linear._ud_runtime"
-STANDARD = "softneck.identification.linear._recursion_runtime"
+STANDARD = "tests.oracles.recursion_runtime"
 
 
 def rows(n: int, count: int, seed: int = 0) -> tuple[Matrix, Vector]:

@@ -67,18 +67,17 @@ def test_without_outputs_in_the_regressor_a_free_run_forgets_its_start() -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", ["lags", "residual"])
-def test_the_drive_model_supplies_motors_where_that_is_asked_for(form: str) -> None:
-    """Made of simulated motors, a set does not look at logged ones beyond the drive model they give."""
+def test_a_residual_set_is_made_of_the_motors_that_every_simulation_has() -> None:
+    """Form `residual` does not look at logged motors beyond the drive model they give."""
     recording = neck_recording(700)
     drive = fit_drive(recording)
     simulated = drive.simulate(recording.set_points, recording.set_points[0])
     spoilt = recording.with_channels(**{f"motor_position_{j + 1}": simulated[:, j] for j in range(3)})
-    settings = {"form": form, "epsilon": 0.02, "output_weight": 5.0}
-    once = SetMembership(**settings, motors="simulated").fit(recording)
-    again = SetMembership(**settings, motors="measured").fit(spoilt)
+    estimator = SetMembership(form="residual", epsilon=0.02, output_weight=5.0)
     # The drives identified from their own simulation are the same to rounding.
-    np.testing.assert_allclose(once.simulate(recording), again.simulate(recording), atol=1e-6)
+    np.testing.assert_allclose(
+        estimator.fit(recording).simulate(recording), estimator.fit(spoilt).simulate(recording), atol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
@@ -91,7 +90,6 @@ def test_the_drive_model_supplies_motors_where_that_is_asked_for(form: str) -> N
         ({"scale": "magic"}, "`scale` must be one of auto, none, std"),
         ({"scale": (1.0, -1.0)}, "or a list of positive numbers"),
         ({"scale": "none", "output_weight": 3.0}, "`output_weight` is a scale of its own"),
-        ({"motors": "magic"}, "`motors` must be one of measured, simulated"),
     ],
 )
 def test_wrong_lags_and_scales_are_refused(settings: dict, message: str) -> None:
