@@ -311,7 +311,7 @@ class Search:
 
     def _run(self, job: Job) -> Future:
         item = self.candidates[(job.kind, job.settings)]
-        return self.crew.submit(judge_candidate, self.task, job.kind, item.settings, job.level)
+        return self.crew.pool.submit(judge_candidate, self.task, job.kind, item.settings, job.level)
 
     def _took(self, job: Job, judgement: Judgement) -> None:
         self.log.add(job, judgement)

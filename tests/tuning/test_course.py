@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from softneck.cosim.studies._executors import Here
+from softneck.cosim.studies._executors import Crew, Here
 from softneck.tuning import _search
 from softneck.tuning._judge import Judgement
 from softneck.tuning._log import Log
@@ -42,7 +42,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) 
         asked=SimpleNamespace(bounds=BOUNDS), own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, neck=True)
-    found = Search(task, each, Here(), Log(None, ""), budget, lambda *_: None)
+    found = Search(task, each, Crew(1, Here()), Log(None, ""), budget, lambda *_: None)
     found.run()
     return found
 

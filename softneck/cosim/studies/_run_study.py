@@ -158,7 +158,7 @@ class _Work:
         points = [self._study.points[run] for run in runs]
         chunk = Chunk(self._digest, self._study.loop, self._study.folder, points, self._study.metrics)
         try:
-            self._out[self._crew.submit(run_chunk, chunk)] = runs
+            self._out[self._crew.pool.submit(run_chunk, chunk)] = runs
         except BrokenExecutor:
             # The pool broke since the last look; its other work comes back as suspect.
             self._suspects.extend(runs)
