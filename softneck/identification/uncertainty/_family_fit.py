@@ -112,8 +112,6 @@ class FamilySettings:
         window: length of a window [s]; shorter runs are one window.
         inclination_step: width of the operating points [rad].
         directions: sectors of direction; 1 takes all together.
-        include_windows: put single windows into the plant as well, not points and recordings alone.
-        widen: standard deviations by which each sample widens the box and the plant.
         weight_order: of W, 1 to 3.
         max_delay: bound on dead times [s].
         source: "set_points", or "positions" of the motors.
@@ -123,8 +121,6 @@ class FamilySettings:
     window: float = 8.0
     inclination_step: float = float(np.radians(7.5))
     directions: int = 4
-    include_windows: bool = False
-    widen: float = 0.0
     weight_order: int = 2
     max_delay: float = 0.3
     source: str = "set_points"
@@ -134,7 +130,6 @@ class FamilySettings:
         require_between("window", self.window, 1.0, 1000.0, "s")
         require_between("inclination_step", self.inclination_step, 0.001, np.pi, "rad")
         require_whole("directions", self.directions, 1, 72)
-        require_between("widen", self.widen, 0.0, 5.0)
         require_whole("weight_order", self.weight_order, 1, 3)
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
@@ -293,7 +288,7 @@ class FamilySettings:
         return [local for local in found if local is not None], len(cut) - len(there)
 
     def _axis(self, name: str, found: list[Local], frequency: Vector, sample_time: float, lost: int) -> AxisFamily:
-        used = np.array([local.scope != "window" or self.include_windows for local in found], dtype=float)
+        used = np.array([local.scope != "window" for local in found], dtype=float)
         if used.sum() < 2:
             raise DataError(
                 f"{name}: only {int(used.sum())} local models say enough ({lost} windows do not) where a family needs "
@@ -301,7 +296,7 @@ class FamilySettings:
             )
         samples = np.array([local.numbers for local in found])
         std = np.array([local.std for local in found])
-        plants = self._plants(samples[used > 0.5], std[used > 0.5])
+        plants = samples[used > 0.5]
         box = np.array([plants.min(axis=0), plants.max(axis=0)])
         nominal = 0.5 * (box[0] + box[1])
         # Whole samples: a dead time between two puts a zero beside z = -1, where no relative error is finite.
@@ -325,22 +320,6 @@ class FamilySettings:
             weight=weight,
             envelope=envelope,
         )
-
-    def _plants(self, samples: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """Return the samples, and where asked each moved by its own uncertainty to all sides."""
-        if self.widen == 0.0:
-            return samples
-        moved = [samples]
-        for column in range(3):
-            for sign in (-1.0, 1.0):
-                other = samples.copy()
-                other[:, column] += sign * self.widen * std[:, column]
-                moved.append(other)
-        plants = np.concatenate(moved)
-        plants[:, 0] = np.maximum(plants[:, 0], 0.1 * samples[:, 0].min())
-        plants[:, 1] = np.maximum(plants[:, 1], 0.1 * samples[:, 1].min())
-        plants[:, 2] = np.maximum(plants[:, 2], 0.0)
-        return plants
 
     def _weight(
         self, frequency: Vector, envelope: Vector, plants: np.ndarray, nominal: Vector, sample_time: float

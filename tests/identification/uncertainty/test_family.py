@@ -145,15 +145,6 @@ def test_a_design_reads_it(family: Family) -> None:
 
 
 @pytest.mark.nightly
-def test_windows_and_their_uncertainty_widen_the_plant(recordings: list[Recording], family: Family) -> None:
-    wide = FamilySettings(directions=1, include_windows=True, widen=2.0).fit(recordings)
-    for name in ("pitch", "roll"):
-        assert (wide.axes[name].box[0] <= family.axes[name].box[0] + 1e-12).all()
-        assert (wide.axes[name].box[1] >= family.axes[name].box[1] - 1e-12).all()
-        assert wide.covered(name) <= 1.0 + 1e-9
-
-
-@pytest.mark.nightly
 def test_gains_across_the_axes_are_told() -> None:
     P = signal("mixed", duration=60.0, seed=3).set_points.copy()
     P[:15] = 0.0
