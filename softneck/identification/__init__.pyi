@@ -29,7 +29,6 @@ from .uncertainty._family_fit import FamilySettings as FamilySettings
 from .uncertainty._frf import FrequencyResponse as FrequencyResponse
 from .uncertainty._frf_fit import frequency_response as frequency_response
 from .validation._compare import compare as compare
-from .validation._novelty import Novelty as Novelty
 from .validation._score_tables import INFINITE as INFINITE
 from .validation._validation import Rules as Rules
 from .validation._validation import Validation as Validation

@@ -194,12 +194,6 @@ def _remarks(r: Validation) -> list[str]:
             f"{v['brier_base_rate']:.3f}."
         )
     words += [f"{said[0].upper()}{said[1:]}." for said in r.bounds_remarks]
-    if r.novelty is not None and r.novelty.larger is not None:
-        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
-        words.append(
-            f"Novelty: the judged rows lie {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times as far "
-            "from the training rows as these from each other."
-        )
     return words
 
 

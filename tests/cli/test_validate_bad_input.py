@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from softneck.identification import Novelty
 from softneck.signals import Recording, concatenate, write_recording
 
 from ..data import neck_recording
@@ -106,9 +104,3 @@ def test_what_too_few_rows_cannot_tell_is_not_told(call: Call, rls_file: Path) -
     assert "nan" not in said.out
     page = Path("page.html").read_text(encoding="utf-8")
     assert "There are too few one-step errors to test whether they are white." in page
-
-
-def test_novelty_has_no_measure_where_training_rows_coincide() -> None:
-    steady = Novelty(distance=np.ones((2, 4)), spacing=np.array([[0.0, 1.0, 1.0, 1.0], [0.5, 0.5, 0.5, 0.5]]))
-    assert steady.larger == [2.0, 2.0, 2.0, 2.0]  # roll's alone
-    assert Novelty(np.ones((2, 4)), np.zeros((2, 4))).larger is None

@@ -34,7 +34,7 @@ _NOW = {
     "record --max-speed": "[motors] rate_limit of the robot file",
     "record --max-slack": "[motors] setpoint_min of the robot file",
     "validate --initial": 'cold_fits of --json; Rules(initial="cold") in Python',
-    "validate --training": "softneck.validate(model, recording, training=RECORDING) in Python",
+    "validate --training": "leave it out: `validity` says how far a model is beyond its training",
     "observer --sensor": "--set sensor=NAME",
     "observer --gyro": "--set form=gyro",
     "identify --search": "a loop over `identify KIND --set` and `validate`",

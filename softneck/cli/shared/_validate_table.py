@@ -94,11 +94,6 @@ def remarks(r: Validation) -> list[str]:
     lines += [f"{who}: {said}" for said in r.bounds_remarks if not lost]
     if not lost:
         lines += _calibrated(who, r)
-    if r.novelty is not None and r.novelty.larger is not None:
-        p50, p90, p99, most = (f"{value:.1f}" for value in r.novelty.larger)
-        lines.append(
-            f"{who}: novelty {p50} (median), {p90} (90 %), {p99} (99 %), {most} (largest) times the training's spacing"
-        )
     return lines
 
 

@@ -1,5 +1,5 @@
 """Honest validation: free run beside persistence and the best linear model, on rows not trained on.
 
-Residual tests, noise ceiling, novelty, confidence of scores.
+Residual tests, noise ceiling, confidence of scores.
 May import the kinds; no kind imports it.
 """

@@ -12,7 +12,7 @@ from softneck.signals import Recording
 
 from ..models._model import Model
 from ._baselines import Baselines
-from ._validation import Rules, Validation, check_training_data, judge, judged_parts
+from ._validation import Rules, Validation, judge, judged_parts
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -55,7 +55,6 @@ def compare(
     recordings: Mapping[str, Recording] | Sequence[Recording],
     *,
     rules: Rules | None = None,
-    training: Recording | None = None,
     progress: Progress = silent,
 ) -> Comparison:
     """Judge every model on every recording, each on the rows it was not trained on.
@@ -64,7 +63,6 @@ def compare(
         models: by name; without names they are called by their kind.
         recordings: by name; without names "data 1", "data 2", ...
         rules: horizons, motors, include_training, tolerance (see `validate`).
-        training: what the models were trained on, for `Validation.novelty`.
         progress: called with the part done and a word on it.
 
     Raises:
@@ -76,8 +74,6 @@ def compare(
     named_data = _named(recordings, [f"data {i + 1}" for i in range(len(recordings))])
     if not named_models or not named_data:
         raise SettingsError("`compare` needs at least one model and one recording.")
-    for _, model in named_models:
-        check_training_data(model, training)
     known: dict[str, dict[bytes, Baselines]] = {name: {} for name, _ in named_data}
     results: list[Validation] = []
     for model_name, model in named_models:
@@ -85,7 +81,7 @@ def compare(
             progress(len(results) / (len(named_models) * len(named_data)), f"{model_name} on {data_name}")
             try:
                 parts = judged_parts(model, recording, rules, known[data_name])
-                results.append(judge(model, parts, rules, names=(model_name, data_name), training=training))
+                results.append(judge(model, parts, rules, names=(model_name, data_name)))
             except DataError as error:
                 raise DataError(f"{model_name} on {data_name}: {error}") from error
     return Comparison(tuple(results))

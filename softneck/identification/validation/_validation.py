@@ -22,7 +22,6 @@ from ..models._validity import with_tolerance
 from ._baselines import Baselines, baselines
 from ._bounds import calibrated_bounds, judged_bounds, useful_parts
 from ._horizons import predict
-from ._novelty import Novelty, novelty
 from ._residual_tests import ResidualTests, residual_tests
 from ._score_tables import (
     INFINITE,
@@ -70,7 +69,6 @@ class Validation(Shown):
             over up to eight blocks of equal length; None where there is one alone.
         diverged: time [s] at which the first free run left the data's range, or None.
         residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
-        novelty: how far the judged rows lie from the training rows, where these are known.
         coverage_pct, mean_width_deg: of kinds with bounds in free run: axis -> measured samples within them [%], and
             their mean distance [deg], None where that is more than the range of the data; None for other kinds.
         bounds_remarks: where these bounds are of no use or do not hold what they promise.
@@ -105,7 +103,6 @@ class Validation(Shown):
     spread: dict[str, dict[str, list[float] | None]]
     diverged: float | None
     residual_tests: ResidualTests
-    novelty: Novelty | None
     coverage_pct: dict[str, float] | None
     mean_width_deg: dict[str, float | None] | None
     bounds_remarks: tuple[str, ...]
@@ -175,7 +172,6 @@ class Validation(Shown):
                 "uncorrelated_with_inputs": self.uncorrelated,
                 **self.residual_tests.as_dict(self.robot.outputs.names),
             },
-            "novelty": None if self.novelty is None else self.novelty.as_dict(),
             "coverage_pct": self.coverage_pct,
             "mean_width_deg": self.mean_width_deg,
             "bounds_remarks": list(self.bounds_remarks),
@@ -219,7 +215,6 @@ def validate(
     include_training: bool = False,
     initial: str = "warm",
     tolerance: float | None = None,
-    training: Recording | str | Path | None = None,
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
 
@@ -236,7 +231,6 @@ def validate(
         include_training: whether rows that the model was trained on are judged too.
         initial: "warm", or "cold": then the free run itself has the first row only.
         tolerance: error that `validity` is to allow, in the unit in which people see the outputs; None: the model's.
-        training: what the model was trained on, for `novelty`.
 
     Raises:
         FileFormatError: no such file, or not one of ours.
@@ -259,16 +253,8 @@ def validate(
         model_name, data_name = (str(of) if isinstance(of, str | Path) else None for of in (model, recording))
         names = (model_name or "model", data_name or "data")
     judged: Model = opened(model, "model")
-    known = None if training is None else opened_recording(training)
-    check_training_data(judged, known)
     parts = judged_parts(judged, opened_recording(recording), rules)
-    return judge(judged, parts, rules, names=names, training=known)
-
-
-def check_training_data(model: Model, training: Recording | None) -> None:
-    """Raise DataError where the training data is at another sample time than the model."""
-    if training is not None:
-        model.check(training)
+    return judge(judged, parts, rules, names=names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -310,9 +296,7 @@ def judged_parts(
     return Parts(stretches, left_out, rows, known[key])
 
 
-def judge(
-    model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str], training: Recording | None = None
-) -> Validation:
+def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -> Validation:
     """Return the validation of a model on its parts of a recording."""
     if rules.tolerance is not None:
         model = with_tolerance(model, rules.tolerance)
@@ -353,7 +337,6 @@ def judge(
         spread=spread_tables(rows, free[:, :axes], per_run) if INFINITE in outputs else {},
         diverged=first,
         residual_tests=tests,
-        novelty=novelty(model, parts.stretches, training) if rows.robot.is_neck else None,
         coverage_pct=coverage,
         mean_width_deg=useful_width,
         bounds_remarks=tuple(said),

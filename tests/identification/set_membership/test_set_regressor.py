@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.identification import INFINITE, PAPER_EQ21, SetMembership, fit_drive, validate
+from softneck.identification import PAPER_EQ21, SetMembership, fit_drive
 from softneck.identification.models._regressors import lag_table
 
 from ...data import neck_recording
@@ -103,17 +103,3 @@ def test_a_regressor_of_nothing_and_a_scale_of_another_length_are_refused() -> N
         SetMembership(form="lags", output_lags=(), setpoint_lags=(), motor_lags=()).fit(recording)
     with pytest.raises(SettingsError, match="`scale` has 3 entries; the regressor has 10 components"):
         SetMembership(epsilon=0.01, scale=(1.0, 2.0, 3.0)).fit(recording)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("form", ["lags", "residual"])
-def test_novelty_is_measured_in_a_sets_own_regressor(form: str) -> None:
-    settings = SetMembership(form=form, epsilon=0.02, output_weight=5.0, output_lags=(1, 2), motor_lags=(1, 5))
-    model = settings.fit(neck_recording(700))
-    alike, stronger = neck_recording(400, seed=7), neck_recording(400, seed=7)
-    stronger = stronger.with_channels(**{n: 3.0 * c for n, c in stronger.channels.items()})
-    near, far = (validate(model, r, horizons=(1, INFINITE)).novelty for r in (alike, stronger))
-    assert near is not None
-    assert far is not None
-    # The neck of the tests is linear: three times the motion lies further out, in every regressor.
-    assert (far.distance[:, -1] > near.distance[:, -1]).all()
