@@ -24,5 +24,3 @@ from .recording._redefinition import motors_from as motors_from
 from .recording._redefinition import redefine as redefine
 from .recording._redefinition import redefinition_matrix as redefinition_matrix
 from .recording._resampling import resampled as resampled
-from .recording._scaling import Scaling as Scaling
-from .recording._trend import Trend as Trend
