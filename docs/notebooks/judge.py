@@ -8,7 +8,6 @@ import numpy as np
 
 import softneck
 from softneck.plant import NeckParameters
-from softneck.plots import validation_figure
 from softneck.signals import signal
 
 neck = softneck.VirtualNeck(NeckParameters.paper())
@@ -23,7 +22,7 @@ print("one step   ", {name: round(fit, 1) for name, fit in found.fits["1"].items
 print("free run   ", {name: round(fit, 1) for name, fit in found.fits["inf"].items()})
 
 # %%
-validation_figure(found.time, found.measured, {"rls": found.free_run}, "Free run on a sine of rising frequency")
+found.plot("Free run on a sine of rising frequency")
 
 # %% [markdown]
 # The largest error, and when it is.

@@ -9,10 +9,10 @@ from pathlib import Path
 import click
 
 from softneck.core import SettingsError, refuse_existing, require_positive
+from softneck.robot._opened import opened
 
 from .shared._console import percent, print_json
 from .shared._options import apply_settings, read_together, target
-from .shared._robot import load_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ def adapt(
     """Refit MODEL to the latest data, starting from what it is; write the model, and say what became of it."""
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    old = load_of(model, robot, role="model")
+    old = opened(model, "model", robot)
     if kind not in (old.kind, "auto"):
         raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; what is refitted stays what it is.")
     window = float(apply_settings(_Adaptation, settings).window)

@@ -13,7 +13,7 @@ from softneck.core import CheckFailedError, DataError, SettingsError, refuse_exi
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
-from .shared._validate_table import left_out, useless, with_fit
+from .shared._validate_table import left_out, useless
 
 if TYPE_CHECKING:
     from softneck.identification import Choice, Model, Validation
@@ -46,6 +46,7 @@ def identify_auto(
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
     from softneck.identification import choose, refit
+    from softneck.identification._identify import with_fit
     from softneck.identification.models._fitting import check_training
     from softneck.identification.models._validity import with_tolerance
     from softneck.identification.selection._auto import REFITTED

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
-from softneck.core import KINDS, SettingsError, find_kind, load, refuse_existing, resolve
-from softneck.core._kinds import fitting, kinds_of
+from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve
+from softneck.core._kinds import kinds_of
+from softneck.robot._opened import opened
 
-from .shared._console import note, percent, print_json, progress
+from .shared._console import note, print_json, progress
 from .shared._groups import kinds_complete
 from .shared._kind_help import kind_command
 from .shared._options import apply_settings, common_options, output_option, set_option, target
-from .shared._robot import load_of
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
-
-# [%] Free run over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
-_LEAST_FIT = 30.0
 
 
 @click.command(
@@ -33,7 +29,7 @@ _LEAST_FIT = 30.0
 @click.argument("kind", shell_complete=kinds_complete("controller"))
 @click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
 @output_option("controller", "CONTROLLER")
-@click.option("--any-fit", is_flag=True, help=f"Also on a model whose free run has a fit below {_LEAST_FIT:g} %.")
+@click.option("--any-fit", is_flag=True, help="Also on a model whose free run has a fit below 30 %.")
 @click.option(
     "--observer", type=click.Path(path_type=Path), metavar="OBSERVER",
     help="Of the loop: `mpc` and `nmpc` plan without the delay that it makes up for, and `mpc` with tendons as taut as "
@@ -53,15 +49,17 @@ def command(
     as_json: bool,
 ) -> None:
     """Design a controller of KIND on identified linear models or a family."""
+    from softneck.design._design import linear_plant
+
     entry = find_kind(kind, "controller")
     path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    plants = [_linear(model, robot, any_fit=any_fit) for model in models]
+    plants = [linear_plant(model, any_fit=any_fit, robot=robot) for model in models]
     asked = apply_settings(resolve(entry.settings), settings)
     if observer is not None:
         if not hasattr(asked, "over"):
             raise SettingsError(f"`--observer` is for mpc and nmpc, and {kind} does not ask for it; leave it out.")
-        asked = asked.over(load_of(observer, robot, role="observer"))
+        asked = asked.over(opened(observer, "observer", robot))
     with progress(f"design {kind}", quiet=as_json):
         controller = asked.design(plants[0] if len(plants) == 1 else plants)
     controller.save(path, force=replace)
@@ -72,22 +70,3 @@ def command(
         print_json({"controller": str(path), "kind": kind, "summary": controller.summary()})
         return
     click.echo(f"{path}\n{controller.summary()}")
-
-
-def _linear(path: Path, robot: str | None, *, any_fit: bool) -> Any:
-    """Open a model or a family."""
-    thing = load_of(path, robot)
-    if not hasattr(thing, "tf"):
-        return load(path, role="model")  # which says what it is
-    with fitting(path):
-        held_out = getattr(thing, "findings", {}).get("hold_out", {})
-        diverged = held_out.get("diverged") is not None
-        least = min((fit for fit in held_out.get("fit", {}).values() if fit is not None), default=100.0)
-        poor = diverged or least < _LEAST_FIT
-    if poor and not any_fit:
-        what = "diverges" if diverged else f"fits {percent(least)} %"
-        raise SettingsError(
-            f"{path}: its free run over the rows held out {what}; {_LEAST_FIT:g} % is the least to design on. Identify "
-            "a better model, or go on by --any-fit."
-        )
-    return thing

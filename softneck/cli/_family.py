@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 
-from softneck.core import CheckFailedError, file_hash, refuse_existing
+from softneck.core import CheckFailedError, refuse_existing
 
 from .shared._console import print_json, progress
 from .shared._kind_help import kind_command
@@ -55,6 +56,7 @@ def command(
     payload among them, in the band that they excite. Exit code 1 if a recording of --test needs more than the weight.
     """
     from softneck.identification import FamilySettings
+    from softneck.identification import family as made_family
     from softneck.plots import write_page
     from softneck.signals import read_recording
 
@@ -63,11 +65,9 @@ def command(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    parts = [read_recording(source, robot=robot) for source in recordings]
     judges = [read_recording(source) for source in tests]
     with progress("family", quiet=as_json) as report:
-        family = chosen.fit(parts, names=[str(source) for source in recordings], progress=report)
-    family.findings["files"] = {str(source): file_hash(source) for source in recordings}
+        family = made_family(list(recordings), robot=robot, progress=report, **asdict(chosen))
     lines, needed = family.invalidated_by(judges, [str(source) for source in tests]) if judges else ([], {})
     family.save(path, force=replace)
     if html is not None:

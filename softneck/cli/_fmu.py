@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import FileFormatError, SettingsError, file_hash, load
-from softneck.core._budget import settings_text
 from softneck.fmu.compiled._platforms import PLATFORMS
 
 from .shared._console import note, print_json, progress
-from .shared._neck import load_neck
 from .shared._options import common_options, output_option, read_together, target
-from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.fmu.describe._describe import Buildable
@@ -137,27 +133,9 @@ def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bo
 def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
     """Return what `source` names: a softneck file of the robot, a neck or a robot by its file or preset."""
     from softneck.cosim.loops._loop_file import is_loop_file, reference_of
-    from softneck.plant import VirtualNeck
-    from softneck.robot import Robot
-    from softneck.robot._file import PRESETS
+    from softneck.fmu.describe._describe import buildable
 
-    if Path(source).suffix == ".npz":
-        thing = load_of(Path(source), robot)
-        if not hasattr(thing, "block"):
-            raise FileFormatError(f"{source}: is not a model, observer or controller, so no FMU can be built from it.")
-        return thing
-    if Path(source).suffix not in ("", ".toml"):
-        raise FileFormatError(
-            f"{source}: no FMU can be built from a `{Path(source).suffix}` file; give a model, controller or observer "
-            "(.npz), a neck, robot or loop file (.toml), or a preset (paper, lab, rough, trunk)."
-        )
-    if str(source) in PRESETS:
-        return VirtualNeck.of(Robot.preset(str(source)))
-    if _has_keys(Path(source), {"motors", "outputs", "directions", "extends"}):
-        return VirtualNeck.of(Robot.read(source))
-    if is_loop_file(Path(source)):
-        return reference_of(Path(source), robot=robot)
-    return VirtualNeck(load_neck(str(source)))
+    return reference_of(Path(source), robot=robot) if is_loop_file(Path(source)) else buildable(source, robot)
 
 
 def _can_be_fmu(source: str | Path) -> bool:
@@ -215,19 +193,10 @@ def _inside(folder: Path) -> list[Path]:
 
 def _is_neck(path: Path) -> bool:
     """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
+    from softneck.fmu.describe._describe import has_keys
     from softneck.plant import NeckParameters
 
-    return _has_keys(path, {"preset", *NeckParameters.names()})
-
-
-def _has_keys(path: Path, keys: set[str]) -> bool:
-    """Return whether a TOML file has one of these keys."""
-    if path.suffix != ".toml" or not path.is_file():
-        return False
-    try:
-        return not keys.isdisjoint(tomllib.loads(settings_text(path)))
-    except (ValueError, RecursionError):
-        return False
+    return has_keys(path, {"preset", *NeckParameters.names()})
 
 
 def _stem(file: str) -> str:

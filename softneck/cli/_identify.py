@@ -13,7 +13,7 @@ from softneck.core._kinds import kinds_of
 
 from ._adapt import adapt
 from ._auto import identify_auto
-from .shared._console import percent, print_json, progress
+from .shared._console import print_json, progress
 from .shared._groups import kinds_complete
 from .shared._kind_help import kind_command
 from .shared._options import (
@@ -25,11 +25,10 @@ from .shared._options import (
     target,
     tolerance_option,
 )
-from .shared._validate_table import left_out, useless, with_fit
+from .shared._validate_table import left_out, useless
 
 if TYPE_CHECKING:
     from softneck.identification import Model, Validation
-    from softneck.signals import Recording
 
 
 _ANOTHER = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
@@ -79,7 +78,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
-    from softneck.identification.models._validity import with_tolerance
+    from softneck.identification._identify import identified
     from softneck.signals.quality._poor_excitation import poor_excitation, stands_still
 
     if tolerance is not None:
@@ -100,27 +99,21 @@ def command(
     _refuse_options_of_auto(kind, html=html is not None, refit=refit)
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
-    if not 0.0 < train <= 1.0:
-        raise SettingsError(f"--train: the part to train on must be in (0, 1]; got {train:g}.")
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     whole = read_together(recordings, robot)
-    # All of it to train on leaves nothing to hold out.
-    head, tail = (whole, None) if train == 1.0 else whole.split(train)
     with progress(f"identify {kind}", quiet=as_json) as report:
-        model = estimator.fit(head, progress=report)
-    if tolerance is not None:
-        model = with_tolerance(model, tolerance)
-    with progress("hold-out", quiet=as_json):
-        held_out = _hold_out(model, tail)
-    model = with_fit(model, held_out)
+        model, held_out = identified(estimator, whole, train=train, tolerance=tolerance, progress=report)
     model.save(path, force=replace)
+    head, tail = (whole, None) if train == 1.0 else whole.split(train)
     poor = poor_excitation(head)
     if as_json:
         facts = {"excitation": poor, "guarded_form": _guarded_form(kind, recordings)}
         print_json(_facts(path, model, held_out) | facts)
     else:
-        _print(path, model, held_out)
+        click.echo(f"{path}\n{model.summary()}")
+        if held_out is None:
+            click.echo("nothing was held out: judge it with `softneck validate` on another recording")
         click.echo("\n".join(poor), nl=bool(poor))
     why = None if held_out is None else useless(held_out)
     if why is not None:
@@ -146,34 +139,6 @@ def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:
         )
     if refit:
         raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
-
-
-def _print(path: Path, model: Model, held_out: Validation | None) -> None:
-    from softneck.identification import INFINITE
-
-    click.echo(f"{path}\n{model.summary()}")
-    if held_out is None:
-        click.echo("nothing was held out: judge it with `softneck validate` on another recording")
-        return
-    one, free = held_out.fits["1"], held_out.fits[INFINITE]
-    held = held_out.persistence["1"]
-    click.echo(f"hold-out of {held_out.rows_scored} rows, fit [%] {'/'.join(model.robot.outputs.names)}:")
-    click.echo(f"  persistence {_fits(held)}")
-    click.echo(f"  one step    {_fits(one)}")
-    click.echo(f"  free run    {_fits(free)}")
-
-
-def _fits(table: dict[str, float | None]) -> str:
-    return "/".join(percent(fit) for fit in table.values())
-
-
-def _hold_out(model: Model, tail: Recording | None) -> Validation | None:
-    # A hold-out of a second or less says nothing.
-    from softneck.identification import INFINITE, validate
-
-    if tail is None or all(len(run) < 75 for run in tail.runs()):
-        return None
-    return validate(model, tail, horizons=(1, INFINITE))
 
 
 def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:

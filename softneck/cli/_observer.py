@@ -18,7 +18,6 @@ from .shared._options import (
     set_option,
     target,
 )
-from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.estimation._fitted import FittedObserver
@@ -56,18 +55,18 @@ def command(
     one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
     state.
     """
+    from softneck.estimation._observer import designed
 
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     chosen = apply_settings(resolve(kind.settings), settings)
-    observer = chosen.design(load_of(model, robot, role="model"))
+    observer = designed(chosen, model, robot)
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
         named = {setting.partition("=")[0].strip() for setting in settings}
-        fixed = (observer.noise_names[0],) if "sensor" in named else ()
-        found, lines = _fitted(observer, data, robot, fixed=fixed, delay="sensor_delay" not in named)
+        found, lines = _fitted(observer, data, robot, named)
         observer, fit = found.observer, found.fit
         told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
                         "at_bound": list(fit.at_bound), "not_told": list(found.untold), "held_out": found.checks,
@@ -82,16 +81,16 @@ def command(
 
 
 def _fitted(
-    observer: Any, data: tuple[Path, ...], robot: str | None, *, fixed: tuple[str, ...], delay: bool
+    observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
 ) -> tuple[FittedObserver, list[str]]:
     """Return what the recordings make of the observer, and what to say of it."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency
-    from softneck.estimation._fitted import fitted_observer
+    from softneck.estimation._observer import fitted
     from softneck.signals import read_recording
 
     recordings = [read_recording(path, robot=robot) for path in data]
-    found = fitted_observer(observer, recordings, fixed=fixed, delay=delay)
+    found = fitted(observer, recordings, named)
     unit = observer.robot.outputs.display_unit
     before, after = found.fit.log_likelihood
     lines = [

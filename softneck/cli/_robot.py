@@ -107,15 +107,13 @@ def _moved(source: Path, folder: Path) -> str:
 
 
 def _check_files(robot: Robot) -> None:
-    from softneck.plant import VirtualNeck
+    from softneck.plant import NeckParameters, VirtualNeck
     from softneck.plant._presets import PRESETS
-
-    from .shared._neck import load_neck
 
     folder = robot.folder or Path()
     if robot.neck is not None:
         # The file is there and holds a neck, and the robot is one that tendons on winches bend.
-        VirtualNeck.of(robot, load_neck(robot.neck if robot.neck in PRESETS else str(folder / robot.neck)))
+        VirtualNeck.of(robot, NeckParameters.preset(robot.neck if robot.neck in PRESETS else str(folder / robot.neck)))
     if robot.drives is not None:
         from softneck.drives import load_drives
 

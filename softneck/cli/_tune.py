@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import CheckFailedError, file_hash
+from softneck.robot._opened import opened
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options
-from .shared._plants import opened_plants
-from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.tuning._tune import Tuned
@@ -83,15 +82,15 @@ def command(
     from softneck.report._tune_page import said_of
     from softneck.tuning import tune
     from softneck.tuning._tune import task_of
-    from softneck.verification._own_plants import is_own_plant
+    from softneck.verification._own_plants import is_own_plant, named_plants
 
     if output.exists() and not output.is_dir():
         raise SettingsError(f"{output}: is a file; name a folder.")
-    things = opened_plants(plants, robot)
+    things = named_plants(list(plants), robot)
     asked = task_of(things, requirements, seed).asked
     if not as_json:
         note("requirements: " + "; ".join(asked.lines()))
-    eyes = None if observer is None else load_of(observer, robot, role="observer")
+    eyes = None if observer is None else opened(observer, "observer", robot)
     files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}
     with progress("tune", quiet=as_json) as report:
         found = tune(

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
+from softneck.robot._opened import opened
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import common_options, tolerance_option
-from .shared._robot import load_of
 from .shared._validate_table import fit_table, remarks, useless
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def command(
     models = tuple(path for path in models if path not in data)
     if not models:
         raise SettingsError("recordings only; expected a model before them: softneck validate MODEL --data REC...")
-    loaded = {str(path): load_of(path, robot, role="model") for path in models}
+    loaded = {str(path): opened(path, "model", robot) for path in models}
     recordings = {str(path): read_recording(path, robot=robot) for path in data}
     rules = Rules(horizons, motors, include_training, tolerance=tolerance)
     with progress("validate", quiet=as_json) as report:

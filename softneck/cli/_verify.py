@@ -10,11 +10,10 @@ import click
 from softneck.core import CheckFailedError, file_hash, refuse_existing, write_certificate
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
+from softneck.robot._opened import opened
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, output_option, target
-from .shared._plants import opened_plants
-from .shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.verification import Verification
@@ -74,18 +73,19 @@ def command(
     from softneck.estimation._axis import robot_of
     from softneck.verification import read_requirements, verify
     from softneck.verification._neck_loops import neck_file_of
+    from softneck.verification._own_plants import named_plants
     from softneck.verification._reserve import left_to_tune
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    judged = load_of(controller, robot, role="controller")
+    judged = opened(controller, "controller", robot)
     whose = robot_of(judged)
     asked = read_requirements(requirements, robot=whose)
     if left := left_to_tune(asked.own):
         note(f"{requirements}: {', '.join(left)} not looked at; `softneck tune` alone closes those loops.")
-    things, eyes = opened_plants(plants, robot), None if observer is None else load_of(observer, robot, role="observer")
+    things, eyes = named_plants(list(plants), robot), None if observer is None else opened(observer, "observer", robot)
     files = {
         "controller": controller,
         **{f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()},

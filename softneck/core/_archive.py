@@ -12,7 +12,7 @@ import numpy as np
 
 from ._budget import MOST_JSON, open_zip
 from ._errors import FileFormatError
-from ._files import atomic_write, require_file
+from ._files import as_path, atomic_write, require_file
 
 FORMAT_VERSION = 1
 _HEADER = "header"
@@ -40,7 +40,7 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
     Raises:
         FileFormatError: no such file, not a softneck file, another version, damaged.
     """
-    source = Path(path)
+    source = as_path(path)
     require_file(source)
     if not zipfile.is_zipfile(source):
         raise FileFormatError(

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ._errors import DataError, SettingsError
-from ._types import Vector
+from ._types import Matrix, Vector
 
 
 def require_finite(name: str, value: float, unit: str = "") -> None:
     """Raise SettingsError unless `value` is a finite number."""
-    if not math.isfinite(value):
+    if not isinstance(value, int | float | np.number) or not math.isfinite(value):
         raise SettingsError(f"`{name}` must be a finite number{_in(unit)}; got {value}.")
 
 
@@ -43,9 +44,32 @@ def require_one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
         raise SettingsError(f"`{name}` must be one of {', '.join(allowed)}; got {value!r}.")
 
 
+def finite_matrix(name: str, value: object, columns: int, *, missing: bool = False) -> Matrix:
+    """Return `value` as a float matrix (time, `columns`); raise DataError if it is none, or not finite.
+
+    A vector is one column. With `missing` an entry may be NaN.
+    """
+    array = _numbers(name, value)
+    array = array[:, None] if array.ndim == 1 and columns == 1 else array
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise DataError(f"`{name}` must have the shape (time, {columns}); got {array.shape}.")
+    if not (np.isfinite(array) | (missing & np.isnan(array))).all():
+        raise DataError(f"`{name}` must be finite; row {int(np.argmin(np.isfinite(array).all(axis=1)))} is not.")
+    return array
+
+
+def _numbers(name: str, value: Any) -> np.ndarray:
+    try:
+        if np.iscomplexobj(value):
+            raise TypeError
+        return np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"`{name}` must be an array of numbers; got a {type(value).__name__}.") from error
+
+
 def finite_vector(name: str, value: ArrayLike, size: int) -> Vector:
     """Return `value` as a float vector of `size` entries; raise DataError if it is not, or not finite."""
-    array = np.ascontiguousarray(value, dtype=np.float64).ravel()
+    array = _numbers(name, value).ravel()
     if array.size != size:
         raise DataError(f"`{name}` must have {size} entries; got {array.size}.")
     if not np.isfinite(array).all():

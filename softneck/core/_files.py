@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
-from ._errors import FileFormatError, OutputFileError
+from ._errors import FileFormatError, OutputFileError, SettingsError
 
 # Beside every target: `.NAME-softneck-RANDOM.SUFFIX`; readers and listings of `*.SUFFIX` pass over hidden files.
 _MARK = "-softneck-"
@@ -101,6 +101,13 @@ def refuse_existing(path: str | Path, *, force: bool) -> None:
         raise OutputFileError(f"{target}: is a folder; name a file.")
     if target.exists() and not force:
         raise OutputFileError(f"{target}: exists already; use --force to replace it or choose another name.")
+
+
+def as_path(thing: object) -> Path:
+    """Return a path; raise SettingsError for what names no file."""
+    if not isinstance(thing, str | Path):
+        raise SettingsError(f"the name of a file is needed; got a {type(thing).__name__}.")
+    return Path(thing)
 
 
 def require_file(path: str | Path) -> None:

@@ -151,13 +151,13 @@ def kinds_of(role: str) -> tuple[str, ...]:
 
 def find_kind(name: str, role: str) -> Kind:
     """Return the kind of that name; raise SettingsError with the known ones if there is none."""
-    kind = KINDS.get(name)
+    kind = KINDS.get(name) if isinstance(name, str) else None
     if kind is None or kind.role != role:
-        if gone := removed_kind(name):
+        if gone := removed_kind(str(name)):
             raise SettingsError(gone)
         known = kinds_of(role)
         raise SettingsError(
-            f"unknown kind of {role} `{name}`; {did_you_mean(name, known)}use one of {', '.join(known)}."
+            f"unknown kind of {role} `{name}`; {did_you_mean(str(name), known)}use one of {', '.join(known)}."
         )
     return kind
 
@@ -218,11 +218,6 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
         raise FileFormatError(f"{path}: is {is_a} ({kind.name}), not {wanted}.")
     with fitting(path):
         return resolve(kind.result).from_archive(header, arrays)
-
-
-def opened(thing: Any, role: str | None = None) -> Any:
-    """Return `thing`, or what its file holds where it is a path; as `load` otherwise."""
-    return load(thing, role=role) if isinstance(thing, str | Path) else thing
 
 
 @contextmanager

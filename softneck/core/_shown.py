@@ -133,3 +133,10 @@ def _short(value: Any) -> str:
 
 def _plain(text: Any) -> str:
     return _ODD.sub("\ufffd", " ".join(str(text).split()))
+
+
+def percent(value: float | None) -> str:
+    """Return a fit for a table cell; `-` where there is none: it diverged, or nothing was measured or moved."""
+    if value is not None and value < -1000.0:
+        return "<-1000"
+    return "-" if value is None else f"{value:.1f}"

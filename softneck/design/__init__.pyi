@@ -4,6 +4,7 @@ from .linear._custom import CustomSettings as CustomSettings
 from .linear._fopi import FopiSettings as FopiSettings
 from .linear._fractional import fopi as fopi
 from .linear._lqg import LqgSettings as LqgSettings
+from .linear._own import OwnController as OwnController
 from .linear._pi import PiSettings as PiSettings
 from .linear._pid import PidSettings as PidSettings
 from .linear._ports import ControllerLimits as ControllerLimits

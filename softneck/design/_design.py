@@ -2,18 +2,45 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
 
-from softneck.core import find_kind, resolve
-from softneck.core._kinds import make_settings, opened
+from softneck.core import SettingsError, find_kind, resolve
+from softneck.core._kinds import fitting, make_settings
+from softneck.core._shown import percent
+from softneck.robot._opened import opened
+
+if TYPE_CHECKING:
+    from .linear._controller import LinearController
+    from .predictive._controller import MpcController
+    from .predictive._nmpc import NmpcController
+    from .varying._varying import VaryingController
+
+# [%] Free run over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
+_LEAST_FIT = 30.0
 
 
-def design_controller(kind: str, plant: Any, **settings: Any) -> Any:
+@overload
+def design_controller(kind: Literal["mpc"], plant: Any, *, any_fit: bool = ..., **settings: Any) -> MpcController: ...
+@overload
+def design_controller(kind: Literal["nmpc"], plant: Any, *, any_fit: bool = ..., **settings: Any) -> NmpcController: ...
+@overload
+def design_controller(
+    kind: Literal["adaptive"], plant: Any, *, any_fit: bool = ..., **settings: Any
+) -> VaryingController: ...
+@overload
+def design_controller(
+    kind: Literal["pi", "pid", "fopi", "hinf", "lqg", "custom"], plant: Any, *, any_fit: bool = ..., **settings: Any
+) -> LinearController: ...
+@overload
+def design_controller(kind: str, plant: Any, *, any_fit: bool = ..., **settings: Any) -> Any: ...
+def design_controller(kind: str, plant: Any, *, any_fit: bool = False, **settings: Any) -> Any:
     """Return the controller of `kind` designed on `plant`; `settings` are those of the kind's settings class.
 
     Args:
         kind: name in the table of kinds: "pi", "pid", "hinf", "mpc", ...
         plant: an identified linear model, a family, the file of one, or a list whose first entry is the nominal plant.
+        any_fit: design on models too whose free run on the rows held out fits less than 30 %.
         **settings: for instance `phase_margin=1.05`; angles in rad.
 
     Raises:
@@ -33,4 +60,28 @@ def design_controller(kind: str, plant: Any, **settings: Any) -> Any:
         'pi'
     """
     made = make_settings(resolve(find_kind(kind, "controller").settings), settings)
-    return made.design([opened(one) for one in plant] if isinstance(plant, list | tuple) else opened(plant))
+    plants = [linear_plant(one, any_fit=any_fit) for one in (plant if isinstance(plant, list | tuple) else [plant])]
+    return made.design(plants[0] if len(plants) == 1 else plants)
+
+
+def linear_plant(thing: Any, *, any_fit: bool, robot: str | None = None) -> Any:
+    """Return what is designed on: a model or family, or that of a file.
+
+    Raises:
+        SettingsError: neither, or a model that does not fit the rows held out (and not `any_fit`).
+    """
+    plant = opened(thing, robot=robot)
+    path = str(thing) if isinstance(thing, str | Path) else ""
+    if not hasattr(plant, "tf") and not hasattr(plant, "axes"):
+        plant = opened(thing, "model")  # which says what it is
+    with fitting(path or "the model"):
+        held_out = getattr(plant, "findings", {}).get("hold_out", {})
+        diverged = held_out.get("diverged") is not None
+        least = min((fit for fit in held_out.get("fit", {}).values() if fit is not None), default=100.0)
+    if (diverged or least < _LEAST_FIT) and not any_fit:
+        what = "diverges" if diverged else f"fits {percent(least)} %"
+        raise SettingsError(
+            f"{path and path + ': '}its free run over the rows held out {what}; {_LEAST_FIT:g} % is the least to "
+            "design on. Identify a better model, or go on by --any-fit (`any_fit=True`)."
+        )
+    return plant

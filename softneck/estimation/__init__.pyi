@@ -5,5 +5,6 @@ from ._consistency import consistency as consistency
 from ._kalman import KalmanObserver as KalmanObserver
 from ._noise import fit_noise as fit_noise
 from ._nonlinear import NonlinearObserver as NonlinearObserver
+from ._observer import observer as observer
 from ._offline import Estimates as Estimates
 from ._settings import KalmanSettings as KalmanSettings

@@ -1,3 +1,4 @@
+from ._identify import family as family
 from ._identify import identify as identify
 from .linear._oe import OutputError as OutputError
 from .linear._online_rls import OnlineRls as OnlineRls

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,27 +14,28 @@ from softneck.plant._calibration import Calibration
 from softneck.plant._calibration import calibrate as calibrated
 from softneck.signals import Recording, signal
 from softneck.signals.recording._conditions import conditions
-from softneck.signals.recording._files import opened_recording
+from softneck.signals.recording._files import RecordingLike, opened_recording
 
 from .models._model import Model
 
 # What a model of the equations is asked to play [s].
 _PLAYED = 60.0
 
-Source = Recording | Model | str | Path
-
 
 def calibrate(
-    sources: Source | Sequence[Source], *, payloads: Sequence[float] | None = None, evaluations: int = 30,
+    sources: RecordingLike | Model | Sequence[RecordingLike | Model],
+    *,
+    payloads: Sequence[float] | None = None,
+    evaluations: int = 30,
     progress: Progress | None = None,
-) -> Calibration:  # fmt: skip
+) -> Calibration:
     """Return the virtual neck whose free run is nearest to recordings, by least squares.
 
     Payload and geometry that the robot file gives stay as they are. The last 30 % of each run are not fitted to: they
     judge. `save` writes the neck file.
 
     Args:
-        sources: recordings or models of kind `greybox`, or their files.
+        sources: recordings, as `identify` takes them, or models of kind `greybox`, or their files.
         payloads: of each in turn [kg]; what their column `payload` says, else 0, if not given.
         evaluations: steps of the search.
         progress: called with the part done and a word; a bar in a terminal if not given.
@@ -50,7 +52,7 @@ def calibrate(
         >>> softneck.calibrate(recording, evaluations=1).worst > 85.0
         True
     """
-    listed = [sources] if isinstance(sources, Recording | Model | str | Path) else list(sources)
+    listed: Sequence[Any] = sources if isinstance(sources, list | tuple) else [sources]
     parts = [_recording(source) for source in listed]
     given = [max(conditions(part)["payload_kg"]) for part in parts] if payloads is None else list(payloads)
     radius = parts[0].robot.winch_radius_m if parts else None
@@ -59,7 +61,7 @@ def calibrate(
         return calibrated(parts, given, known=known, evaluations=evaluations, progress=tell)
 
 
-def _recording(source: Source) -> Recording:
+def _recording(source: Any) -> Recording:
     if isinstance(source, Model):
         return _played(source, "the model")
     if isinstance(source, str | Path) and Path(source).suffix == ".npz":

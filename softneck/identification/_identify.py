@@ -1,37 +1,53 @@
-"""A model of any kind by its name, as `softneck identify KIND` makes it."""
+"""A model of any kind by its name, and a family, as `softneck identify KIND` and `softneck family` make them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from softneck.core import Progress, find_kind, resolve
+from softneck.core import Progress, SettingsError, file_hash, find_kind, require_positive, resolve
 from softneck.core._kinds import make_settings
 from softneck.core._progress import shown_progress
+from softneck.robot import Robot
 from softneck.signals import Recording
-from softneck.signals.recording._files import opened_recording
+from softneck.signals.recording._files import RecordingLike, opened_recording
 
 from .models._model import Model
 from .models._validity import with_tolerance
+from .uncertainty._family import Family
+from .uncertainty._family_fit import FamilySettings
+from .validation._score_tables import INFINITE
+from .validation._validation import Validation, validate
+
+# A hold-out of a second or less says nothing.
+_LEAST_HELD_OUT = 75
 
 
 def identify(
     kind: str,
-    recording: Recording | str | Path,
+    recording: RecordingLike,
     *,
+    train: float = 0.7,
+    robot: Robot | str | Path | None = None,
     tolerance: float | None = None,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Model:
-    """Return the model of `kind` fitted on all of `recording`; `settings` are those of the kind's settings class.
+    """Return the model of `kind` fitted on the first part of each run, judged on the rest.
+
+    It does what `softneck identify KIND` does; `summary()` and `findings["hold_out"]` tell the fit on the rest.
 
     Args:
         kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...
-        recording: what to identify from, or its file; join several with `softneck.signals.concatenate`.
+        recording: what to identify from, or its file; a DataFrame; an array of a `robot`; or a list of several.
+        train: part of each run, from its start, to train on; 1 holds nothing out.
+        robot: whose recording it is; None: `robot.toml` beside a file or above it, else what the recording says.
         tolerance: error that `validity` allows, in the unit in which people see the outputs (a neck's 2 deg).
         progress: called with the part done and a word; a bar in a terminal if not given.
-        **settings: for instance `delay=0.08`; angles in rad.
+        **settings: those of the kind's settings class, for instance `delay=0.08`; angles in rad.
 
     Raises:
         SettingsError: an unknown kind or setting, or a value out of range.
@@ -45,12 +61,84 @@ def identify(
         >>> neck = softneck.VirtualNeck(NeckParameters.paper())
         >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
         >>> model = softneck.identify("rls", recording)
-        >>> model.simulate(recording).channels[:2]
-        ('pitch', 'roll')
+        >>> model.findings["hold_out"]["rows"], model.findings["hold_out"]["fit"]["pitch"] > 50.0
+        (275, True)
     """
     estimator = make_settings(resolve(find_kind(kind, "model").settings), settings)
+    whole = opened_recording(recording, robot)
     with shown_progress(f"identify {kind}", progress) as tell:
-        # A kind of one's own need not tell how far it is.
-        told = {"progress": tell} if "progress" in signature(estimator.fit).parameters else {}
-        model = estimator.fit(opened_recording(recording), **told)
-    return model if tolerance is None else with_tolerance(model, tolerance)
+        return identified(estimator, whole, train=train, tolerance=tolerance, progress=tell)[0]
+
+
+def identified(
+    estimator: Any, whole: Recording, *, train: float, tolerance: float | None, progress: Progress
+) -> tuple[Model, Validation | None]:
+    """Return what `estimator` makes of the first part of each run, and how it does on the rest; None: nothing is."""
+    if isinstance(train, bool) or not isinstance(train, int | float) or not 0.0 < train <= 1.0:
+        raise SettingsError(f"`train`: the part to train on must be in (0, 1]; got {train!r}.")
+    if tolerance is not None:
+        require_positive("tolerance", tolerance)
+    # All of it to train on leaves nothing to hold out.
+    head, tail = (whole, None) if train == 1.0 else whole.split(train)
+    # A kind of one's own need not tell how far it is.
+    told = {"progress": progress} if "progress" in signature(estimator.fit).parameters else {}
+    model: Model = estimator.fit(head, **told)
+    model = model if tolerance is None else with_tolerance(model, tolerance)
+    if tail is None or all(len(run) < _LEAST_HELD_OUT for run in tail.runs()):
+        return model, None
+    held_out = validate(model, tail, horizons=(1, INFINITE))
+    return with_fit(model, held_out), held_out
+
+
+def with_fit(model: Model, held_out: Validation | None) -> Model:
+    """Return the model with what it was worth on the rows held out, which `softneck design` asks for."""
+    if held_out is None:
+        return model
+    said = {
+        "fit": held_out.fits[INFINITE],
+        "one_step": held_out.fits.get("1", {}),
+        "persistence": held_out.persistence.get("1", {}),
+        "diverged": held_out.diverged,
+        "rows": held_out.rows_scored,
+    }
+    return replace(model, findings={**model.findings, "hold_out": said})
+
+
+def family(
+    recordings: RecordingLike,
+    *,
+    robot: Robot | str | Path | None = None,
+    progress: Progress | None = None,
+    **settings: Any,
+) -> Family:
+    """Return the uncertain linear plant of one or several recordings, tested against them, as `softneck family` does.
+
+    Args:
+        recordings: as `identify` takes them; of a list each is a recording of its own, of its payload for instance.
+        robot: whose they are, as of `identify`.
+        progress: called with the part done and a word; a bar in a terminal if not given.
+        **settings: those of `FamilySettings`.
+
+    Raises:
+        SettingsError: an unknown setting, or a value out of range.
+        FileFormatError: no such file, or no recording.
+        DataError: too short, other sample times, or too few local models that say enough.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> from softneck.signals import signal
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> found = softneck.family(softneck.record(signal("eq22", duration=60.0), neck, seed=1))
+        >>> list(found.axes)
+        ['pitch', 'roll']
+    """
+    chosen: FamilySettings = make_settings(FamilySettings, settings)
+    listed: Sequence[Any] = recordings if isinstance(recordings, list | tuple) else [recordings]
+    parts = [opened_recording(part, robot) for part in listed]
+    files = [part for part in listed if isinstance(part, str | Path)]
+    names = [str(part) if isinstance(part, str | Path) else f"recording {k}" for k, part in enumerate(listed, start=1)]
+    with shown_progress("family", progress) as tell:
+        found = chosen.fit(parts, names=names, progress=tell)
+    found.findings["files"] = {str(source): file_hash(source) for source in files}
+    return found

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, require_between
+from softneck.core import DataError, Matrix, SettingsError, require_between
 from softneck.robot import Robot
 from softneck.runtime import Block, State
-from softneck.signals import Excitation, Recording
+from softneck.signals import Excitation, Recording, signal
 
 from ._neck import INTERNAL_STEP, VirtualNeck
+from ._parameters import NeckParameters
 
 # Before a recording starts the set-points rise from rest to their first row and are held [s]; on the
 # hardware every signal is ramped in as well. 3 s is 15 time constants of the neck.
@@ -19,8 +21,8 @@ _RAMP, _HOLD = 1.0, 3.0
 
 
 def record(
-    excitation: Excitation,
-    neck: VirtualNeck,
+    excitation: Excitation | str,
+    neck: VirtualNeck | NeckParameters | str | Path,
     *,
     seed: int = 0,
     payload: float = 0.0,
@@ -33,8 +35,8 @@ def record(
     inclinometer dropped is NaN.
 
     Args:
-        excitation: set-points (time, motors) [rad] at its sample time.
-        neck: the virtual neck.
+        excitation: set-points (time, motors) [rad] at its sample time, or the name of a signal.
+        neck: the virtual neck, its parameters, a preset or a neck file.
         seed: of the sensor's noise.
         payload: mass on the platform [kg], 0 to 5.
         noise: False gives a perfect sensor that keeps its lag and delay.
@@ -54,6 +56,15 @@ def record(
         (1000, ('pitch', 'roll'))
     """
     require_between("payload", payload, 0.0, 5.0, "kg")
+    if isinstance(neck, str | Path):
+        neck = NeckParameters.preset(str(neck))
+    neck = VirtualNeck(neck) if isinstance(neck, NeckParameters) else neck
+    if not isinstance(neck, VirtualNeck):
+        raise SettingsError(f"a virtual neck, its parameters or a preset is needed; got a {type(neck).__name__}.")
+    if isinstance(excitation, str):
+        excitation = signal(excitation, robot=neck.robot)
+    if not isinstance(excitation, Excitation):
+        raise SettingsError(f"an excitation or the name of a signal is needed; got a {type(excitation).__name__}.")
     P = np.asarray(excitation.set_points, dtype=np.float64)
     _check_set_points(P, excitation, neck)
     parameters = neck.parameters if noise else neck.parameters.without_noise()

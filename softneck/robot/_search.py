@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 
 from softneck.core import SettingsError
+from softneck.core._files import as_path
 
 from ._file import PRESETS, shown
 from ._robot import Robot
@@ -45,6 +46,7 @@ def robot_file_of(beside: str | Path) -> Path | None:
 
 
 def _named(given: str | Path) -> Robot:
+    as_path(given)
     if str(given) in PRESETS:
         return Robot.preset(str(given))
     if not Path(given).is_file():

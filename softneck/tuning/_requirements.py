@@ -14,7 +14,7 @@ from softneck.core._budget import settings_text
 from softneck.loop import default_limits
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
-from softneck.verification._requirements import VERSION, Requirement
+from softneck.verification._requirements import VERSION, Requirement, with_groups
 from softneck.verification._reserve import TRACK_METRICS, kept_back
 
 _RISE = "neck.rise_s"
@@ -84,6 +84,8 @@ def read_tune_requirements(
     """
     if path is None:
         return make_tune_requirements({}, robot=robot, stepping=stepping, rise=rise)
+    if not isinstance(path, str | Path):
+        raise SettingsError(f"requirements are a file or a table; got a {type(path).__name__}.")
     try:
         table = tomllib.loads(settings_text(path))
     except (ValueError, RecursionError) as error:
@@ -105,6 +107,7 @@ def make_tune_requirements(
 ) -> TuneRequirements:
     """Return the defaults with what a table like a requirements file says instead."""
     whose = Robot.preset() if robot is None else robot
+    table = with_groups(table, whose, stepping=stepping, more=TRACK_METRICS)
     defaults = tomllib.loads(default_text())
     if rise is not None:
         defaults["require"][_RISE] = {"max": rise}

@@ -10,14 +10,16 @@ from typing import Any
 
 from softneck.core import CheckFailedError, Progress, SettingsError, require_whole, silent
 from softneck.core._blas_threads import one_blas_thread
+from softneck.core._progress import shown_progress
 from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import robot_of
 from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
+from softneck.robot._opened import opened
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
-from softneck.verification._own_plants import OwnPlant, is_own_plant
+from softneck.verification._own_plants import OwnPlant, is_own_plant, named_plants
 from softneck.verification._scale import scaled
 from softneck.verification._verify import sources_of, standing_for
 
@@ -99,28 +101,30 @@ class Tuned:
 
 @one_blas_thread
 def tune(
-    plants: Mapping[str, Any],
+    plants: Any,
     requirements: TuneRequirements | Mapping[str, Any] | str | Path | None = None,
     *,
-    kinds: Sequence[str] = (),
+    kinds: str | Sequence[str] = (),
     budget: int = BUDGET,
     observer: Any = None,
     seed: int = 0,
     workers: int | None = None,
-    folder: Path | None = None,
+    folder: str | Path | None = None,
     force: bool = False,
     files: Mapping[str, tuple[str, str]] | None = None,
-    progress: Progress = silent,
+    progress: Progress | None = None,
 ) -> Tuned:
     """Return the best controller of some kinds for plants, by what is required of it.
 
     The same plants, requirements, kinds, budget and seed give the same result, whatever the number of workers.
 
     Args:
-        plants: by name: families and linear models, of which at least one, the first the nominal plant; and plants
-            that step (nonlinear models, neck parameters, functions that return a part), which loops are closed over.
-        requirements: what is asked, also as a file or a table like one; the defaults if not given.
-        kinds: of controllers; `KINDS_SEARCHED` if none is named, beside recordings without `UNCERTIFIED`.
+        plants: families and linear models, of which at least one, the first the nominal plant; and plants that step
+            (nonlinear models, neck parameters, FMUs, functions that return a part), which loops are closed over: one,
+            a list, or name -> one, each itself or its file.
+        requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`.
+        kinds: of controllers, also as "pi,mpc"; `KINDS_SEARCHED` if none is named, beside recordings without
+            `UNCERTIFIED`.
         budget: judgements of candidates.
         observer: that the loop shall have, if the requirements are kept with it; else a Kalman filter over the nominal
             plant.
@@ -129,7 +133,7 @@ def tune(
         folder: where judgements are kept as they come; the same call goes on with what is there.
         force: replace another search that `folder` holds.
         files: role -> (path, SHA-256) of what was read, for the certificate.
-        progress: called with the part done and the best so far.
+        progress: called with the part done and the best so far; a bar in a terminal if not given.
 
     Raises:
         SettingsError: no linear plant, an unknown kind, or requirements that contradict each other or the motors.
@@ -138,9 +142,12 @@ def tune(
     """
     require_whole("budget", budget, _LEAST_BUDGET, 1_000_000)
     require_whole("seed", seed, 0, 2**31 - 2)
+    kinds = tuple(kinds.split(",") if isinstance(kinds, str) else kinds)
+    folder = None if folder is None else Path(folder)
     task = task_of(plants, requirements, seed)
     dropped = {} if kinds or not task.tested else dict.fromkeys(UNCERTIFIED, _UNCERTIFIED)
     chosen = tuple(kind for kind in dict.fromkeys(kinds or KINDS_SEARCHED) if kind not in dropped)
+    observer = None if observer is None else opened(observer, "observer")
     if observer is not None:
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
@@ -152,17 +159,17 @@ def tune(
     task = replace(task, digest=digest_of(task, chosen, files))
     made_ready(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, force=force)
-    with crew(workers, None) as members:
-        search = Search(task, each, members, log, budget, lambda done, text: progress(0.9 * done, text))
-        search.dropped |= dropped
-        search.run()
-    return _finished(search, files, lambda done, text: progress(0.9 + 0.1 * done, text))
+    with shown_progress("tune", progress) as tell:
+        with crew(workers, None) as members:
+            search = Search(task, each, members, log, budget, lambda done, text: tell(0.9 * done, text))
+            search.dropped |= dropped
+            search.run()
+        return _finished(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))
 
 
-def task_of(
-    plants: Mapping[str, Any], requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int
-) -> Task:
+def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int) -> Task:
     """Return what is tuned, for which plants must be one robot's."""
+    plants = named_plants(plants)
     own = {name: thing for name, thing in plants.items() if is_own_plant(thing)}
     linear = {name: thing for name, thing in plants.items() if name not in own}
     if not linear:

@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from softneck.core import SettingsError, SoftneckError
+from softneck.cosim import FmuPart
 from softneck.estimation._axis import robot_of
 from softneck.loop import BlockPart, Part
 from softneck.plant import NeckParameters, VirtualNeck
+from softneck.plant._presets import PRESETS
 from softneck.robot import Robot
+from softneck.robot._opened import opened
 from softneck.runtime import Block
 
 from ._requirements import Requirements
@@ -60,6 +64,39 @@ class OwnPlant:
         return {f"plant_{self.payload}": {"payload": payload}} if self.payload else {}
 
 
+def named_plants(plants: Any, robot: str | Path | Robot | None = None) -> dict[str, Any]:
+    """Return name -> plant of one, several or named plants.
+
+    Args:
+        plants: linear models, families, plants that step, or the files of any, FMUs and presets of necks among them.
+        robot: whose plants they are; None: what the files say.
+
+    Raises:
+        SettingsError: what is no plant.
+    """
+    if isinstance(plants, Mapping):
+        named = {str(name): plant for name, plant in plants.items()}
+    else:
+        named, items = {}, list(plants) if isinstance(plants, list | tuple) else [plants]
+        for number, item in enumerate(items, start=1):
+            own = Path(item).name if isinstance(item, str | Path) else f"plant {number}" if len(items) > 1 else "plant"
+            named[str(item) if own in named else own] = item
+    return {name: _opened_plant(item, robot) for name, item in named.items()}
+
+
+def _opened_plant(item: Any, robot: str | Path | Robot | None) -> Any:
+    if isinstance(item, str | Path) and Path(item).suffix == ".fmu":
+        # FMUs are loaded in several threads, each of which works in the FMU's own folder for a moment.
+        return partial(FmuPart, Path(item).absolute(), role="plant")
+    path = Path(item) if isinstance(item, str | Path) else None
+    if path is not None and (path.suffix == ".toml" or (str(item) in PRESETS and not path.exists())):
+        return NeckParameters.preset(str(item))
+    thing = opened(item, robot=robot)
+    if not hasattr(thing, "tf") and (path is not None or not is_own_plant(thing)):
+        raise SettingsError(f"{item}: a MODEL, FAMILY, NECK or FMU is needed; this is a {type(thing).__name__}.")
+    return thing
+
+
 def is_own_plant(thing: Any) -> bool:
     """Return whether a thing steps as a plant and has no linear form that a model or a family is judged by."""
     if isinstance(thing, NeckParameters | VirtualNeck | Block):
@@ -94,6 +131,8 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
         block: Block = thing if isinstance(thing, Block) else cast("Any", thing).block()
         make = partial(BlockPart, block)
     part = make()
+    if not hasattr(part, "outputs"):
+        raise SettingsError(f"{name}: a function that is a plant returns a part; this one a {type(part).__name__}.")
     names = [port.name for port in part.outputs]
     part.close()
     outputs = (robot or Robot.preset()).outputs.names

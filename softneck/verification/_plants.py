@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.core._kinds import opened
 from softneck.estimation import AxisPlant, axis_plant
 from softneck.estimation._axis import directions_of, robot_of
 from softneck.robot import Robot
@@ -321,12 +320,3 @@ def join(parts: list[Plants]) -> Plants:
         np.concatenate([part.delay for part in parts]),
         parts[0].axes,
     )
-
-
-def named_plants(plants: Any) -> dict[str, Any]:
-    """Return name -> plant of one, several or named plants, each of them itself or its file."""
-    if isinstance(plants, Mapping):
-        return {name: opened(plant) for name, plant in plants.items()}
-    one = isinstance(plants, str) or not isinstance(plants, Sequence)
-    items = [opened(item) for item in ([plants] if one else plants)]
-    return {f"plant {k}" if len(items) > 1 else "plant": item for k, item in enumerate(items, start=1)}

@@ -11,6 +11,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
 from softneck.core._budget import settings_text
+from softneck.core._errors import did_you_mean
 from softneck.core._shown import Shown
 from softneck.loop import default_limits
 from softneck.loop._result import shown_unit
@@ -28,6 +29,8 @@ _NECK_METRICS = (
     "slack_s",
 )  # fmt: skip
 _NECK = Robot.preset("neck")
+# Of requirements files, `tune`'s included.
+_TABLES = ("version", "uncertainty", "sampling", "step", "neck", "require", "track", "reserve")
 
 
 def metric_names(robot: Robot) -> tuple[str, ...]:
@@ -43,6 +46,36 @@ def metric_names(robot: Robot) -> tuple[str, ...]:
         *(f"step.{shown.of(name)}" for name in METRICS),
         *(f"neck.{shown.of(name)}" for name in _NECK_METRICS),
     )
+
+
+def with_groups(
+    table: Mapping[str, Any], robot: Robot, *, stepping: bool, more: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return a table like a requirements file of one that may be flat: `{"overshoot_pct": 5}`.
+
+    A metric without its group is one of the plants that step if there are any, else of the linear ones, or of the only
+    group that has it; a number is the least that margins may be, and the most that all else may.
+    """
+    order = ("neck", "step", "track") if stepping else ("step", "track")
+    known = (*metric_names(robot), *more)
+    nested: dict[str, Any] = {key: value for key, value in table.items() if key in _TABLES}
+    for key, value in table.items():
+        full = [key, *(f"{group}.{key}" for group in (*order, "axes", "robust", "mimo", "stability"))]
+        metric = next((name for name in full if name in known), None)
+        if metric is None:
+            if isinstance(value, Mapping) or key in _TABLES:
+                nested[key] = value  # a table, which is refused below where nobody knows it
+                continue
+            ends = sorted({name.partition(".")[2] for name in known})
+            hint = did_you_mean(str(key), ends)
+            raise SettingsError(f"unknown requirement `{key}`; {hint}use one of {', '.join(ends)}.")
+        bound = "min" if metric.rpartition(".")[2] in LARGE else "max"
+        entry = value if value is False or isinstance(value, Mapping) else {bound: value}
+        require = nested.get("require", {})
+        if not isinstance(require, Mapping):
+            raise SettingsError("`require` must be a table: [require].")
+        nested["require"] = {**require, metric: entry}
+    return nested
 
 
 def metric_ends(robot: Robot) -> Callable[[str], str]:
@@ -207,6 +240,8 @@ def read_requirements(path: str | Path | None = None, *, robot: Robot = _NECK) -
     defaults = _defaults()
     if path is None:
         return _requirements(defaults, {}, robot)
+    if not isinstance(path, str | Path):
+        raise SettingsError(f"requirements are a file or a table; got a {type(path).__name__}.")
     table = _read(Path(path))
     try:
         return _requirements(defaults, table, robot)

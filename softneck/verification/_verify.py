@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,12 @@ import numpy as np
 from softneck.core import DataError, Progress, SettingsError
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._certificate import certificate_contents
-from softneck.core._kinds import opened
 from softneck.core._progress import shown_progress
 from softneck.core._shown import Shown, marks
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
+from softneck.robot._opened import opened
 from softneck.signals.recording._recording import require_same_robot
 
 from ._agreement import Agreement, agreements
@@ -27,9 +27,9 @@ from ._evidence import Evidence, gather, worst_row
 from ._experiments import crossing_values
 from ._laws import ControllerUnderTest, judge
 from ._neck_loops import check_blocks
-from ._own_plants import ALONE, is_own_plant, not_recorded, own_plant
-from ._plants import UncertainNeck, named_plants, neck_of_family, neck_of_model
-from ._requirements import Requirement, Requirements, read_requirements
+from ._own_plants import ALONE, is_own_plant, named_plants, not_recorded, own_plant
+from ._plants import UncertainNeck, neck_of_family, neck_of_model
+from ._requirements import Requirement, Requirements, make_requirements, read_requirements, with_groups
 from ._scale import scaled
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
@@ -224,8 +224,8 @@ def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[Un
 @one_blas_thread
 def verify(
     controller: Any,
-    plants: Mapping[str, Any] | Sequence[Any] | Any,
-    requirements: Requirements | str | Path | None = None,
+    plants: Any,
+    requirements: Requirements | Mapping[str, Any] | str | Path | None = None,
     *,
     order: str | None = None,
     observer: Any = None,
@@ -236,8 +236,9 @@ def verify(
 
     Args:
         controller: anything with `block()`, or its file; with `ss()` linear checks too.
-        plants: a linear model or a family, or the file of one; several, or name -> one.
-        requirements: what is asked, or its file; the defaults if not given.
+        plants: linear models, families, plants that step, or the files of any: one, a list, or name -> one.
+        requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`,
+            which is asked of the plants that step if there are any, else of the linear ones.
         order: of the loop; the one that the controller was designed for if not given.
         observer: for the loops over the virtual neck; none if not given.
         files: role -> (path, SHA-256) of all that was read for it, for the certificate.
@@ -252,22 +253,26 @@ def verify(
         >>> from softneck.plant import NeckParameters
         >>> from softneck.signals import signal
         >>> neck = softneck.VirtualNeck(NeckParameters.paper())
-        >>> from softneck.verification import make_requirements
         >>> model = softneck.identify("rls", softneck.record(signal("eq22", duration=20.0), neck, seed=1))
-        >>> asked = make_requirements({"sampling": {"plants": 20, "search_generations": 0}, "neck": {"necks": 1}})
+        >>> asked = {"sampling": {"plants": 20, "search_generations": 0}, "neck": {"necks": 1}, "overshoot_pct": 20}
         >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
         True
     """
-    begin, controller, observer = time.perf_counter(), opened(controller, "controller"), opened(observer, "observer")
+    begin, controller = time.perf_counter(), opened(controller, "controller")
+    observer = None if observer is None else opened(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
         # Physics and functions of one's own say nothing of a robot: their ports have to be its own.
         if robot.is_neck or hasattr(thing, "robot") or not is_own_plant(thing):
             require_same_robot(robot_of(thing), robot, f"the controller and {what}")
-    own_words = isinstance(requirements, Requirements)
-    asked = requirements.of_robot(robot) if own_words else read_requirements(requirements, robot=robot)
     own = {name: standing_for(thing, robot) for name, thing in named.items() if is_own_plant(thing)}
     linear = {name: thing for name, thing in named.items() if name not in own}
+    if isinstance(requirements, Requirements):
+        asked = requirements.of_robot(robot)
+    elif isinstance(requirements, Mapping):
+        asked = make_requirements(with_groups(requirements, robot, stepping=bool(own)), robot=robot)
+    else:
+        asked = read_requirements(requirements, robot=robot)
     if not robot.is_neck:
         asked = scaled(asked, sources_of(linear, asked))
     necks = sources_of(linear, asked)

@@ -126,7 +126,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
         ("na=true", "`na` must be a whole number"),
         ("forgetting=nan", "`forgetting` must be a finite number; got nan"),
         ("delay=5", "`delay` must be between 0 and 2 [s]; got 5"),
-        ("delay=late", "a setting has a value of the wrong type"),
+        ("delay=late", "`delay` must be a finite number [s]; got late"),
         ("structure=luck", "`structure` must be one of siso, miso, mimo; got 'luck'"),
     ],
 )
@@ -161,7 +161,7 @@ def test_a_wrong_setting_of_a_network(call: Call, tmp_path: Path, recording: Pat
         (("import", "REC", "--layout", "none.toml"), "none.toml: no such file"),
         (("info", "neck.xyz"), "neck.xyz: no such file"),
         (("record", "song", "-o", "r.csv"), "`signal` must be one of eq22"),
-        (("record", "steps", "-o", "r.csv", "--neck", "giraffe"), "`giraffe` is neither a neck preset"),
+        (("record", "steps", "-o", "r.csv", "--neck", "giraffe"), "giraffe: cannot be read"),
         (("record", "steps", "-o", "r.csv", "--payload", "-1"), "`--payload` must be between 0 and 1 [kg]"),
         (("record", "steps", "-o", "r.csv", "--duration", "0"), "`duration` must be between 0.02 and 86400 [s]"),
         (("record", "eq22", "-o", "r.csv", "--duration", "0.001"), "r"),

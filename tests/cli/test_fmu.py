@@ -124,8 +124,8 @@ def test_a_model_of_another_version_is_refused(call: Call, rls_file: Path) -> No
 
 
 def test_what_has_no_block_is_no_fmu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.cli._fmu.load_of", lambda _path, _robot: object())
-    with pytest.raises(FileFormatError, match="no FMU can be built from it"):
+    monkeypatch.setattr("softneck.fmu.describe._describe.opened", lambda _path, **_: object())
+    with pytest.raises(FileFormatError, match="nothing in it can be stepped"):
         open_buildable(tmp_path / "family.npz")
 
 

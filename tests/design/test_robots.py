@@ -168,7 +168,7 @@ def test_the_whole_way_over_the_virtual_plant(name: str) -> None:
     """Recorded, identified, designed and closed over the physics that stands for the robot."""
     robot = Robot.preset(name)
     recording = record(signal("aprbs", duration=40.0, robot=robot), VirtualNeck.of(robot), seed=1)
-    controller = design_controller("pi", identify("oe", recording))
+    controller = design_controller("pi", identify("oe", recording, train=1.0))
     result = simulate({"duration_s": 6.0, "plant": "paper", "controller": controller,
                        "reference": {"kind": "step", "at_s": 1.0, "pitch_deg": 8.0}})  # fmt: skip
     assert result.robot.hash == robot.hash
@@ -281,7 +281,7 @@ def test_a_predictive_controller_over_the_virtual_plant(name: str) -> None:
     """Recorded, identified, designed and closed over the physics that stands for the robot."""
     robot = Robot.preset(name)
     recording = record(signal("aprbs", duration=40.0, robot=robot), VirtualNeck.of(robot), seed=1)
-    controller = design_controller("mpc", identify("oe", recording), bandwidth=5.0)
+    controller = design_controller("mpc", identify("oe", recording, train=1.0), bandwidth=5.0)
     result: Any = simulate({"duration_s": 6.0, "plant": "paper", "controller": controller,
                             "reference": {"kind": "step", "at_s": 1.0, "pitch_deg": 8.0}})  # fmt: skip
     found = result.metrics["pitch"]

@@ -42,7 +42,7 @@ def recorded(name: str, seed: int) -> Recording:
 @pytest.mark.parametrize("kind", ANY_ROBOT)
 def test_every_kind_takes_every_robot(kind: str, name: str, tmp_path: Path) -> None:
     train, test = recorded(name, 1), recorded(name, 2)
-    model = identify(kind, train, **SETTINGS[kind])
+    model = identify(kind, train, train=1.0, **SETTINGS[kind])
     Y, t = test.outputs, test.time
     free = model.simulate(test)[:, : Y.shape[1]]
     line = np.column_stack([np.polyval(np.polyfit(t, y, 1), t) for y in Y.T])

@@ -24,7 +24,7 @@ def imported(folder: Path, name: str) -> Recording:
 def test_a_pneumatic_arm_of_three_chambers_runs_free(shared_data: Path) -> None:
     head, tail = imported(shared_data, "pneumatic_arm_two_trials.csv").split(0.7)
     # Fixed directions and seconds reached -78/3 %, a ridge on learned directions 64/86 %.
-    model = identify("play", head, degree=2, widths=())
+    model = identify("play", head, train=1.0, degree=2, widths=())
     fits = validate(model, tail, horizons=(1, "inf")).fits["inf"]
     assert fits["x"] is not None
     assert fits["y"] is not None
@@ -35,7 +35,7 @@ def test_a_pneumatic_arm_of_three_chambers_runs_free(shared_data: Path) -> None:
 def test_cascaded_tanks_at_their_own_4_s(shared_data: Path) -> None:
     recording = imported(shared_data, "cascaded_tanks_estimation.csv")
     assert recording.sample_time == 4.0
-    model = identify("oe", recording)
+    model = identify("oe", recording, train=1.0)
     free: Matrix = model.simulate(recording)
     error = recording.outputs[25:, 0] - free[25:, 0]
     # On its own rows; two copies of the level and fixed seconds gave 0.78 V. The tanks are far from linear.

@@ -65,7 +65,7 @@ def recorded(
 def test_the_truth_behind_a_record_is_recovered(kind: str, name: str, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], noise=1e-5, rest=0.3)
     order: dict[str, Any] = {"order": len(recording.robot.outputs.names) + 1} if kind == "subspace" else {}
-    model = identify(kind, recording, **KINDS_AND_SETTINGS[kind], **order)
+    model = identify(kind, recording, train=1.0, **KINDS_AND_SETTINGS[kind], **order)
     free = model.simulate(recording)[25:, : recording.outputs.shape[1]]
     # Noise of 1e-5 in a motion of 0.1: what is left is a few times that, also for the many numbers of `subspace`.
     assert np.abs(free - recording.outputs[25:]).max() < 2e-3
@@ -95,7 +95,7 @@ def test_the_same_rows_at_another_sample_time_give_the_same_model(kind: str) -> 
     # Seconds of the two: a search over dead times is in seconds by itself, and shorter where it is told.
     settings: dict[str, Any] = {"resamples": 0} if kind == "srivc" else {}
     fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
-    model, other = identify(kind, fast, **settings), identify(kind, slow, **settings)
+    model, other = identify(kind, fast, train=1.0, **settings), identify(kind, slow, train=1.0, **settings)
     assert other.findings["time_constants_s"] == pytest.approx(200.0 * np.array(model.findings["time_constants_s"]))
     # The searches take the same steps but for rounding.
     np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-6)
@@ -105,7 +105,7 @@ def test_the_same_rows_at_another_sample_time_give_the_same_model(kind: str) -> 
 def test_rls_over_the_motors_takes_any_robot() -> None:
     recording = recorded(ROBOTS["bellows"], noise=1e-5)
     for structure in ("miso", "mimo"):
-        model = identify("rls", recording, structure=structure, delay=0.06)
+        model = identify("rls", recording, train=1.0, structure=structure, delay=0.06)
         np.testing.assert_allclose(model.ss().dcgain(), GAIN * WEIGHTS, atol=2e-3)
 
 
@@ -113,7 +113,7 @@ def test_rls_over_the_motors_takes_any_robot() -> None:
 def test_play_takes_any_robot(name: str, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], noise=1e-4, rest=0.3)
     # A lag of 0.2 s behind a chain of five filters of 0.02 s: what such a chain cannot follow is a few per cent.
-    model = identify("play", recording, rate=20.0, order=6, widths=(), degree=2, ridge=1e-6)
+    model = identify("play", recording, train=1.0, rate=20.0, order=6, widths=(), degree=2, ridge=1e-6)
     fits = validate(model, recording, include_training=True).fits["inf"].values()
     assert min(fit or 0.0 for fit in fits) > 93.0
     model.save(tmp_path / "m.npz")
@@ -132,7 +132,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
 def test_networks_take_any_robot(kind: str, name: str, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], noise=1e-4, rest=0.3)
     train, test = recording.split(0.7)
-    model = identify(kind, train, **NETWORKS[kind])
+    model = identify(kind, train, train=1.0, **NETWORKS[kind])
     # A dead time that lies between the samples of the regressor costs a network a tenth or two.
     assert min(fit or 0.0 for fit in validate(model, test).fits["inf"].values()) > (75.0 if kind == "nn" else 95.0)
     model.save(tmp_path / "m.npz")
@@ -153,7 +153,7 @@ def test_set_membership_takes_any_robot(form: str, name: str, tmp_path: Path) ->
     kind, settings, least = SETS[form]
     recording = recorded(ROBOTS[name], noise=1e-3, rest=0.3)
     train, test = recording.split(0.7)
-    model = identify(kind, train, **settings)
+    model = identify(kind, train, train=1.0, **settings)
     judged = validate(model, test)
     assert min(fit or 0.0 for fit in judged.fits["inf"].values()) > least
     assert judged.coverage_pct is not None
@@ -177,7 +177,7 @@ def test_set_membership_takes_any_robot(form: str, name: str, tmp_path: Path) ->
 def test_a_set_of_the_same_rows_at_another_sample_time_is_the_same(form: str) -> None:
     kind, settings, _ = SETS[form]
     fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
-    model, other = (identify(kind, one, **settings) for one in (fast, slow))
+    model, other = (identify(kind, one, train=1.0, **settings) for one in (fast, slow))
     np.testing.assert_array_equal(other.arrays["table"], model.arrays["table"])
     # The bases' searches take the same steps but for rounding.
     np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-5)
@@ -186,7 +186,7 @@ def test_a_set_of_the_same_rows_at_another_sample_time_is_the_same(form: str) ->
 @pytest.mark.parametrize("kind", NETWORKS)
 def test_networks_of_the_same_rows_at_another_sample_time_are_the_same(kind: str) -> None:
     fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
-    model, other = (identify(kind, one, **{**NETWORKS[kind], "starts": 1}) for one in (fast, slow))
+    model, other = (identify(kind, one, train=1.0, **{**NETWORKS[kind], "starts": 1}) for one in (fast, slow))
     # The searches take the same steps but for rounding, which training makes grow.
     np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-4)
 
@@ -194,7 +194,7 @@ def test_networks_of_the_same_rows_at_another_sample_time_are_the_same(kind: str
 def test_a_map_that_starts_in_motion_finds_its_state_from_what_is_measured() -> None:
     """As in slow tanks: without the observer the first time constants of a free run would be lost."""
     fast, slow_rows = recorded(ROBOTS["finger"], noise=1e-5), 400
-    model = identify("nss", fast, **NETWORKS["nss"])
+    model = identify("nss", fast, train=1.0, **NETWORKS["nss"])
     tail = fast.rows(slow_rows + 7, len(fast))
     error = model.simulate(tail, warm_up=5)[5:10, 0] - tail.outputs[5:10, 0]
     assert np.abs(error).max() < 0.05 * np.ptp(fast.outputs)
@@ -206,7 +206,7 @@ def test_a_sensor_that_stands_at_its_end_is_seen() -> None:
     top = float(np.quantile(y, 0.9))
     limits = sensor_limits(recording.with_channels(pitch=np.minimum(y, top)))
     assert limits.tolist() == [[-np.inf, top]]
-    model = identify("nss", recording.with_channels(pitch=np.minimum(y, top)), **NETWORKS["nss"])
+    model = identify("nss", recording.with_channels(pitch=np.minimum(y, top)), train=1.0, **NETWORKS["nss"])
     assert model.simulate(recording)[30:, 0].max() <= top + 1e-12
 
 
@@ -257,22 +257,24 @@ def test_the_kinds_that_take_a_robot_are_tried_and_the_best_is_chosen() -> None:
 def test_scores_are_by_the_outputs_names_and_in_their_unit() -> None:
     recording = recorded(ROBOTS["bellows"], noise=1e-3)
     head, tail = recording.split(0.6)
-    said = validate(identify("oe", head, delay=0.06), tail).as_dict()
+    said = validate(identify("oe", head, train=1.0, delay=0.06), tail).as_dict()
     assert list(said["fits"]["model"]["inf"]) == ["x", "y", "z"]
     assert said["unit"] == "mm"
     # Noise of 1e-3 m.
     assert all(0.7 < value < 1.5 for value in said["rmse"]["inf"].values())
     assert "rmse_deg" not in said
     finger = recorded(ROBOTS["finger"], noise=1e-3)
-    assert "rmse_deg" in validate(identify("oe", finger, delay=0.06), finger, include_training=True).as_dict()
+    assert (
+        "rmse_deg" in validate(identify("oe", finger, train=1.0, delay=0.06), finger, include_training=True).as_dict()
+    )
 
 
 def test_the_equations_of_tendons_are_of_no_robot_without_them() -> None:
     with pytest.raises(SettingsError, match=r"kind `greybox` has motors in rad or deg, and `motors.unit` of robot"):
-        identify("greybox", recorded(ROBOTS["bellows"]))
+        identify("greybox", recorded(ROBOTS["bellows"]), train=1.0)
     angles = {"motors": {**BELLOWS["motors"], "unit": "rad"}, "outputs": {**BELLOWS["outputs"], "unit": "rad"}}
     with pytest.raises(SettingsError, match="kind `greybox` must know where tendons stand"):
-        identify("greybox", recorded(Robot.from_dict({**BELLOWS, **angles})))
+        identify("greybox", recorded(Robot.from_dict({**BELLOWS, **angles})), train=1.0)
 
 
 # Of each kind what is quick.
@@ -294,14 +296,14 @@ def test_a_model_of_a_robot_that_goes_on_and_on_is_read_as_it_was_written(kind: 
     recording = recording.with_channels(**dict(zip(recording.robot.outputs.names, drift.T, strict=True)))
     if kind == "greybox" and recording.robot.directions.kind != "tendons":
         pytest.skip("its equations are of tendons")
-    model = identify(kind, recording, **EVERY_KIND[kind])
+    model = identify(kind, recording, train=1.0, **EVERY_KIND[kind])
     assert model.findings.get("time_constants_s", [10.0])[0] > 5.0
     model.save(tmp_path / "m.npz")
     np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(recording), model.simulate(recording))
 
 
 def test_models_and_recordings_of_two_robots_are_not_mixed() -> None:
-    model = identify("oe", recorded(ROBOTS["finger"]), delay=0.06)
+    model = identify("oe", recorded(ROBOTS["finger"]), train=1.0, delay=0.06)
     with pytest.raises(DataError, match=r"of two robots cannot be used together: `finger` \(\w+\) and `antagonist` \("):
         model.simulate(recorded(ROBOTS["antagonist"]))
     with pytest.raises(DataError, match="of two robots"):
@@ -309,7 +311,7 @@ def test_models_and_recordings_of_two_robots_are_not_mixed() -> None:
 
 
 def test_a_transfer_function_is_of_the_direction_or_of_a_motor() -> None:
-    model = identify("oe", recorded(ROBOTS["trunk4"]), delay=0.06)
+    model = identify("oe", recorded(ROBOTS["trunk4"]), train=1.0, delay=0.06)
     # The direction of tendons at 0 and 180 deg is the difference of their motors.
     for G in (model.tf("pitch"), model.tf("pitch", input="motor_setpoint_1")):
         assert float(G.dcgain()) == pytest.approx(GAIN, abs=2e-3)
@@ -325,7 +327,7 @@ def test_an_output_that_follows_no_motor_is_said() -> None:
 
 def test_a_file_whose_arrays_do_not_fit_its_robot_is_refused(tmp_path: Path) -> None:
 
-    model = identify("oe", recorded(ROBOTS["finger"]), delay=0.06)
+    model = identify("oe", recorded(ROBOTS["finger"]), train=1.0, delay=0.06)
     replace(model, robot=ROBOTS["trunk4"]).save(tmp_path / "m.npz")
     with pytest.raises(FileFormatError):
         load(tmp_path / "m.npz")

@@ -11,7 +11,6 @@ import control
 import numpy as np
 import pytest
 
-from softneck.cli.shared._plants import opened_plants
 from softneck.core import SettingsError
 from softneck.design import PiSettings
 from softneck.fmu import build_fmu
@@ -29,6 +28,7 @@ from softneck.verification._own_plants import (
     ALONE,
     OwnPlant,
     is_own_plant,
+    named_plants,
     not_recorded,
     own_plant,
 )
@@ -348,7 +348,7 @@ def test_an_fmu_stands_as_much_as_the_plant_that_it_is_made_of(tmp_path: Path, m
     block = VirtualNeck(NeckParameters.paper().without_noise()).block()
     build_fmu(block, tmp_path / "neck.fmu")
     monkeypatch.chdir(tmp_path)
-    own = own_plant(opened_plants((Path("neck.fmu"),), None)["neck.fmu"], "neck.fmu")
+    own = own_plant(named_plants("neck.fmu")["neck.fmu"], "neck.fmu")
     # Loading an FMU changes the folder for a moment: another thread's relative path was "no such file".
     monkeypatch.chdir(Path("/"))
     swings = [

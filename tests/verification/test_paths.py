@@ -24,7 +24,7 @@ def rec(tmp_path: Path, neck: Recording) -> Path:
 
 def test_a_recording_s_path_is_identified_and_judged_as_the_recording(rec: Path, models: dict[str, Model]) -> None:
     read = softneck.read_recording(rec)
-    ours, theirs = (softneck.identify("rls", given, delay=0.06) for given in (read, str(rec)))
+    ours, theirs = (softneck.identify("rls", given, train=1.0, delay=0.06) for given in (read, str(rec)))
     assert all(np.array_equal(ours.arrays[name], theirs.arrays[name]) for name in ours.arrays)
     models["rls"].save(rec.with_suffix(".npz"))
     found = softneck.validate(rec.with_suffix(".npz"), rec)
@@ -57,4 +57,4 @@ def test_a_path_to_another_thing_says_what_it_is(tmp_path: Path, rec: Path) -> N
     with pytest.raises(FileFormatError, match=r"family\.npz: is a family \(family\), not a controller"):
         softneck.verify(tmp_path / "family.npz", family())
     with pytest.raises(FileFormatError, match=r"absent\.csv"):
-        softneck.identify("rls", tmp_path / "absent.csv")
+        softneck.identify("rls", tmp_path / "absent.csv", train=1.0)

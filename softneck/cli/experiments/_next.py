@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import SettingsError
+from softneck.robot._opened import opened
 
 from ..shared._console import print_json, print_table, progress
-from ..shared._robot import load_of
 
 if TYPE_CHECKING:
     from softneck.identification.selection._experiment_design import Known
@@ -59,7 +59,7 @@ def _known(source: Path, robot: str | None) -> Known:
     from softneck.identification import Model
     from softneck.identification.selection._experiment_design import Known
 
-    model = load_of(source, robot)
+    model = opened(source, robot=robot)
     if not isinstance(model, Model):
         raise SettingsError(f"{source}: is no model; give one of kind `guarded`.")
     return Known.of_model(model)

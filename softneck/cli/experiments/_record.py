@@ -23,7 +23,6 @@ from softneck.signals import (
 from softneck.signals.recording._recording import require_same_robot
 
 from ..shared._console import print_json, progress
-from ..shared._neck import load_neck
 from ..shared._options import common_options, output_option
 from ._next import record_next
 
@@ -75,7 +74,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Record SIGNAL on the virtual neck or robot."""
-    from softneck.plant import VirtualNeck, record
+    from softneck.plant import NeckParameters, VirtualNeck, record
     from softneck.signals.recording._files import recording_suffix
 
     recording_suffix(output)
@@ -90,7 +89,7 @@ def command(
         return
     require_between("--payload", payload, 0.0, 1.0, "kg")
     whose = find_robot(robot, beside=output)
-    virtual = VirtualNeck.of(whose, None if neck is None else load_neck(neck))
+    virtual = VirtualNeck.of(whose, None if neck is None else NeckParameters.preset(neck))
     limits = SetPointLimits(**_allowed(whose) | {name: value for name, value in bounds.items() if value is not None})
     experiment = {"amplitude": amplitude, "band": _band(band)}
     asked = {name: value for name, value in experiment.items() if value is not None}

@@ -14,6 +14,7 @@ import click
 
 from softneck.core import Progress, silent
 from softneck.core import Progress as ProgressCallback
+from softneck.core._shown import percent as percent
 
 
 def print_json(value: Any) -> None:
@@ -69,13 +70,6 @@ def progress(what: str, *, quiet: bool = False) -> Iterator[ProgressCallback]:
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda done, word: bar.update(task, completed=done, description=f"{what}: {word}")
-
-
-def percent(value: float | None) -> str:
-    """Return a fit for a table cell; `-` where there is none: it diverged, or nothing was measured or moved."""
-    if value is not None and value < -1000.0:
-        return "<-1000"
-    return "-" if value is None else f"{value:.1f}"
 
 
 def _plain(value: Any) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +13,7 @@ from softneck.core import to_si
 from ._console import percent
 
 if TYPE_CHECKING:
-    from softneck.identification import Model, Validation
+    from softneck.identification import Validation
 
 
 Head = list[str]
@@ -117,14 +116,6 @@ def _calibrated(who: str, r: Validation) -> list[str]:
     if found["reason"] is not None:
         lines.append(f"{who}: no calibrated bounds, {found['reason']}" if not lines else f"{who}: {found['reason']}")
     return lines
-
-
-def with_fit(model: Model, held_out: Validation | None) -> Model:
-    """Return the model with what it was worth on the rows held out, which `softneck design` asks for."""
-    if held_out is None:
-        return model
-    said = {"fit": held_out.fits["inf"], "diverged": held_out.diverged, "rows": held_out.rows_scored}
-    return replace(model, findings={**model.findings, "hold_out": said})
 
 
 def useless(r: Validation) -> str | None:

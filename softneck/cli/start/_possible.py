@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import tomli_w
 
@@ -52,10 +51,9 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
     """Return metric -> why no controller keeps what the defaults of `tune` ask of it."""
     from softneck.tuning._beforehand import refuse_impossible
     from softneck.tuning._tune import task_of
+    from softneck.verification._own_plants import named_plants
 
-    from ..shared._plants import opened_plants
-
-    things, refused = opened_plants(tuple(map(Path, plants)), None), dict[str, str]()
+    things, refused = named_plants(list(plants)), dict[str, str]()
     while True:
         task = task_of(things, {"require": dict.fromkeys(refused, False)}, 0)
         try:

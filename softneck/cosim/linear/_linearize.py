@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix, SettingsError, Vector, atomic_write, load, require_between
+from softneck.core import Matrix, SettingsError, Vector, atomic_write, require_between
+from softneck.fmu.describe._describe import Buildable, buildable
 from softneck.identification.models._linearisation import moved_through
-from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, Port, State
 from softneck.runtime._compile import load_tangent
 from softneck.runtime._tangent_activity import TangentError
@@ -29,8 +29,6 @@ from ._pulses import BlockSteps, FmuSteps, realised
 
 if TYPE_CHECKING:
     import control
-
-    from softneck.fmu.describe._describe import Buildable
 
 # What an FMU of ours and its block may differ by: the library adds in another order (1e-12 of a signal's size).
 _SAME = 1e-9
@@ -147,15 +145,10 @@ def linearize(
 
 def _opened(source: str | Path | Block | Buildable) -> Block:
     """Return the block of what is ours."""
-    if isinstance(source, str | Path):
-        path = Path(source)
-        if path.suffix == ".ssp":
-            raise SettingsError(f"{path}: is several FMUs; unzip it and linearize one of those in `resources`.")
-        thing: Any = load(path) if path.suffix == ".npz" else VirtualNeck(NeckParameters.preset(str(path)))
-        if not hasattr(thing, "block"):
-            raise FileFormatError(f"{path}: is not a model, observer or controller, so it has no states.")
-        return thing.block()
-    return source if isinstance(source, Block) else source.block()
+    if isinstance(source, str | Path) and Path(source).suffix == ".ssp":
+        raise SettingsError(f"{source}: is several FMUs; unzip it and linearize one of those in `resources`.")
+    found = buildable(source)
+    return found if isinstance(found, Block) else found.block()
 
 
 def _says_role(path: str | Path) -> bool:

@@ -12,10 +12,12 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck import __version__
 from softneck.core import SettingsError, atomic_write, refuse_existing
+from softneck.core._files import as_path
 from softneck.runtime import Block, Port, bundle
 from softneck.runtime._tangent import with_tangent
 from softneck.runtime._tangent_activity import TangentError
 
+from ..describe._describe import Buildable, block_and_info
 from ..describe._description import Identity, described_block, model_description
 from ..describe._documentation import FmuInfo, documentation_page
 from ..describe._terminals_and_icons import icon_png, terminals_file
@@ -45,15 +47,15 @@ and put it into binaries/ under the folder of your platform. `sn_kinds.h` was ge
 
 
 def build_compiled_fmu(
-    block: Block, path: str | Path, *, info: FmuInfo | None = None, force: bool = False, fmi: int = 2,
-    platforms: Sequence[str] = (), sensitivities: bool = False,
+    thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False,
+    fmi: int = 2, platforms: Sequence[str] = (), sensitivities: bool = False,
 ) -> str:  # fmt: skip
-    """Write `block` as a Co-Simulation FMU that needs no Python, and return one line on where its libraries come from.
+    """Write `thing` as a Co-Simulation FMU that needs no Python, and return one line on where its libraries come from.
 
     Variables, timing and state are those of `build_fmu`. The same block, info and libraries give the same bytes.
 
     Args:
-        block: what to package.
+        thing: what to package, as `build_fmu` takes it.
         path: `NAME.fmu`; NAME becomes the model name.
         info: what the FMU says about itself.
         force: replace an existing file.
@@ -67,9 +69,10 @@ def build_compiled_fmu(
         FileFormatError: a library is damaged.
         OutputFileError: the file exists or cannot be written.
     """
-    target = Path(path)
+    target = as_path(path)
     name = model_name(target)
     refuse_existing(target, force=force)
+    block, said = block_and_info(thing, info)
     check_block(block)
     if fmi not in FMI_VERSIONS:
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
@@ -80,7 +83,7 @@ def build_compiled_fmu(
     _check_kinds(modules, library.sources)
     folders = _folders(library, platforms, fmi)
     block = replace(block, outputs=(*block.outputs, *ahead))
-    members = _members(block, info or FmuInfo(), name, fmi, library.sources, len(ahead))
+    members = _members(block, said, name, fmi, library.sources, len(ahead))
     members |= {f"binaries/{folder}/{name}{suffix}": data for folder, suffix, data in folders}
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members, library.streams)

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict
 from html import escape
+from pathlib import Path
 from typing import Any, Protocol
 
-from softneck.core import to_si
+from softneck.core import FileFormatError, SettingsError, to_si
+from softneck.core._budget import settings_text
 from softneck.identification import Validation
+from softneck.plant import NeckParameters, VirtualNeck
+from softneck.robot import Robot
+from softneck.robot._file import PRESETS
+from softneck.robot._opened import opened
 from softneck.runtime import Block
 
 from ._documentation import FmuInfo
@@ -49,6 +56,56 @@ class Buildable(Protocol):
     def summary(self) -> str:
         """Return a few lines for people."""
         ...
+
+
+def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot | None = None) -> Any:
+    """Return what has a block, or what its file or preset stands for: a softneck file, a neck or a robot.
+
+    Raises:
+        FileFormatError: a file of which nothing is stepped.
+        SettingsError: no file, no preset and nothing with a block.
+    """
+    if not isinstance(thing, str | Path):
+        if isinstance(thing, Block) or (hasattr(thing, "block") and not isinstance(thing, type)):
+            return thing
+        if isinstance(thing, NeckParameters):
+            return VirtualNeck(thing)
+        raise SettingsError(f"a model, observer, controller, neck or its file is needed; got a {type(thing).__name__}.")
+    name, path = str(thing), Path(thing)
+    if path.suffix == ".npz":
+        found = opened(path, robot=robot)
+        if not hasattr(found, "block"):
+            raise FileFormatError(f"{path}: is not a model, observer or controller: nothing in it can be stepped.")
+        return found
+    if path.suffix not in ("", ".toml"):
+        raise FileFormatError(
+            f"{path}: no FMU can be built from a `{path.suffix}` file; give a model, controller or observer "
+            "(.npz), a neck, robot or loop file (.toml), or a preset (paper, lab, rough, trunk)."
+        )
+    if name in PRESETS:
+        return VirtualNeck.of(Robot.preset(name))
+    if has_keys(path, {"motors", "outputs", "directions", "extends"}):
+        return VirtualNeck.of(Robot.read(path))
+    return VirtualNeck(NeckParameters.preset(name))
+
+
+def has_keys(path: Path, keys: set[str]) -> bool:
+    """Return whether a TOML file has one of these keys."""
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        return not keys.isdisjoint(tomllib.loads(settings_text(path)))
+    except (ValueError, RecursionError):
+        return False
+
+
+def block_and_info(thing: Buildable | Block | str | Path, info: FmuInfo | None) -> tuple[Block, FmuInfo]:
+    """Return what is packaged, and what its FMU says of it where nobody says otherwise."""
+    found = buildable(thing)
+    if isinstance(found, Block):
+        return found, info or FmuInfo()
+    # A block alone has no summary, and says nothing.
+    return found.block(), info or (fmu_info(found) if hasattr(found, "summary") else FmuInfo())
 
 
 def fmu_info(

@@ -21,9 +21,11 @@ from typing import Any
 import numpy as np
 
 from softneck.core import SettingsError, atomic_write, refuse_existing
+from softneck.core._files import as_path
 from softneck.runtime import Block, Port
 
 from ..describe._cost import plain_cost
+from ..describe._describe import Buildable, block_and_info
 from ..describe._description import Identity, described_block, generation_tool, model_description
 from ..describe._documentation import HOST_NEEDS, FmuInfo, documentation_page
 from ..describe._terminals_and_icons import icon_png, terminals_file
@@ -34,16 +36,18 @@ _BINARIES = ("binaries/linux64/", "binaries/win64/")
 _ROLES = ("plant", "observer", "controller", "reference")
 
 
-def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, force: bool = False) -> Path:
-    """Write `block` as an FMI 2.0 Co-Simulation FMU and return its path.
+def build_fmu(
+    thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False
+) -> Path:
+    """Write a model, observer, controller or neck as an FMI 2.0 Co-Simulation FMU and return its path.
 
     The FMU carries the runtime of the block's kind, its arrays and pythonfmu's binaries; it needs Python
     and numpy on the host, not softneck. The same block and info give the same bytes.
 
     Args:
-        block: what to package.
+        thing: what to package: itself, its block, its file, or a preset of a neck or robot.
         path: `NAME.fmu`; NAME becomes the model name.
-        info: what the FMU says about itself.
+        info: what the FMU says about itself; what `fmu_info` makes of `thing` if not given.
         force: replace an existing file.
 
     Raises:
@@ -57,14 +61,15 @@ def build_fmu(block: Block, path: str | Path, *, info: FmuInfo | None = None, fo
         >>> neck = softneck.VirtualNeck(NeckParameters.paper())
         >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
         >>> model = softneck.identify("rls", recording)
-        >>> softneck.build_fmu(model.block(), "Neck.fmu").name
+        >>> softneck.build_fmu(model, "Neck.fmu").name
         'Neck.fmu'
     """
-    target = Path(path)
+    target = as_path(path)
     name = model_name(target)
     refuse_existing(target, force=force)
+    block, said = block_and_info(thing, info)
     check_block(block)
-    members = _members(described_block(block), info or FmuInfo(), name)
+    members = _members(described_block(block), said, name)
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members)
     return target

@@ -18,26 +18,30 @@ from softneck.core import (
     SettingsError,
     Vector,
     require_one_of,
+    require_whole,
     resolve,
     to_si,
     write_archive,
 )
 from softneck.core import load as load_file
-from softneck.core._checks import finite_vector
-from softneck.core._shown import Shown, bars
+from softneck.core._checks import finite_matrix, finite_vector
+from softneck.core._shown import Shown, bars, percent
 from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Recording
+from softneck.signals.recording._files import RecordingLike, opened_recording
 from softneck.signals.recording._labelled import Labelled
 from softneck.signals.recording._recording import require_same_robot
 
 from . import _linear_systems as _linear
 from . import _linearisation, _ports
 from ._arrays import check_arrays, members, memory_of, runtime_arrays, runtime_of, set_now
+from ._scores import r_squared
 
 if TYPE_CHECKING:
     import casadi
     import control
+    from matplotlib.figure import Figure
 
 
 #: A free run starts from this many measured samples, for every kind; they are not scored.
@@ -168,31 +172,31 @@ class Model(Shown):
         """
         return _linearisation.linearised(self, at)
 
-    def simulate(self, recording: Recording, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
+    def simulate(self, recording: RecordingLike, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
         """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.
 
         The result is an array that knows its channels: `["pitch"]`, `.to_pandas()`, `.to_xarray()`, `.plot()`.
 
         Args:
-            recording: whose set-points drive the model; its first `warm_up` samples align each run.
+            recording: whose set-points drive the model, or what stands for one (see `identify`), or set-points alone
+                (time, motors) in SI, from rest; its first `warm_up` samples align each run.
             motors: "measured" feeds logged motor positions throughout, as the paper does.
             warm_up: samples at the start of each run in which the measured outputs are fed.
         """
-        self.check(recording)
+        recording = self._opened(recording)
         require_one_of("motors", motors, _MOTORS)
         return self._labelled(recording, [self._free_run(run, motors, warm_up) for run in recording.runs()])
 
-    def predict(self, recording: Recording, horizon: int = 1, *, motors: str = "simulated") -> Labelled:
+    def predict(self, recording: RecordingLike, horizon: int = 1, *, motors: str = "simulated") -> Labelled:
         """Return the outputs (time, n_out) [rad] predicted `horizon` samples ahead from measured ones.
 
         The result is labelled as that of `simulate`.
 
         The first rows of each run, with no such past, are predicted from its first row.
         """
-        self.check(recording)
+        recording = self._opened(recording)
         require_one_of("motors", motors, _MOTORS)
-        if horizon < 1:
-            raise DataError(f"`horizon` must be at least 1 sample; got {horizon}.")
+        require_whole("horizon", horizon, 1, 1_000_000)
         parts: list[Matrix] = []
         for run in recording.runs():
             start = self.initial_state(run)
@@ -204,6 +208,36 @@ class Model(Shown):
                 predicted = self.block().run_horizon(start, rows, free, horizon)
             parts.append(np.vstack([start.outputs, predicted[:-1]]))
         return self._labelled(recording, parts)
+
+    def score(self, recording: RecordingLike) -> float:
+        """Return R2 of the simulation, the mean over the outputs, as scikit-learn's `score` does.
+
+        1 is perfect, 0 is as good as the mean, below it is worse. Of the paper's fit in % it is `1 - (1 - fit/100)^2`.
+        All rows count but those that align each run; `softneck.validate` leaves out rows that were trained on.
+        """
+        recording = self._opened(recording)
+        judged = np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
+        Y, free = recording.outputs[judged], np.asarray(self.simulate(recording))[judged]
+        return float(np.mean([r_squared(y, free[:, k]) for k, y in enumerate(Y.T)]))
+
+    def plot(self, recording: RecordingLike, title: str = "") -> Figure:
+        """Return a matplotlib figure of the measured outputs and the simulation, each with its error below."""
+        recording = self._opened(recording)
+        free = np.asarray(self.simulate(recording))[:, : self._sizes[1]]
+        draw = resolve("softneck.plots:validation_figure")
+        return draw(
+            recording.time, recording.outputs, {"free run": free}, title, run=recording.run, robot=recording.robot
+        )
+
+    def _opened(self, recording: RecordingLike) -> Recording:
+        """Return the recording that this model is to run along; an array is of its robot and sample time."""
+        if isinstance(recording, np.ndarray):
+            U = finite_matrix("set_points", recording, self._sizes[0])
+            recording = Recording.from_arrays(U, sample_time=self.sample_time, robot=self.robot)
+        else:
+            recording = opened_recording(recording)
+        self.check(recording)
+        return recording
 
     def _labelled(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
         return Labelled(np.concatenate(parts), recording.time, {port.name: port.unit for port in self.block().outputs})
@@ -287,6 +321,7 @@ class Model(Shown):
                 "kind alone can be far off"
             )
         lines.append(f"trained on {self.training_rows.size} rows")
+        lines += _held_out_lines(self.findings.get("hold_out", {}), self.robot.outputs.names)
         return "\n".join(lines)
 
     def _picture(self) -> str:
@@ -336,7 +371,9 @@ class Model(Shown):
         return {f"{name}_start": float(y) for name, y in zip(self.robot.outputs.names, y0, strict=True)}
 
     def check(self, recording: Recording) -> None:
-        """Raise DataError for a recording that this model cannot run along: another robot or sample time."""
+        """Raise DataError for what this model cannot run along: no recording, another robot or sample time."""
+        if not isinstance(recording, Recording):
+            raise DataError(f"a recording is needed; got a {type(recording).__name__}.")
         require_same_robot(recording.robot, self.robot, "a model and a recording")
         if not np.isclose(recording.sample_time, self.sample_time, rtol=1e-3):
             raise DataError(
@@ -388,6 +425,18 @@ def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
     if source == "measured" and run.has_motor_positions:
         rows[:, both:] = run.motor_positions
     return rows
+
+
+def _held_out_lines(found: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    """Return the fits [%] on the rows held out, for people."""
+    if not found:
+        return []
+    tables = {"persistence": "persistence", "one_step": "one step", "fit": "free run"}
+    lines = [f"hold-out of {found.get('rows', '-')} rows, fit [%] {'/'.join(names)}:"]
+    for key, what in tables.items():
+        if table := found.get(key):
+            lines.append(f"  {what:11} {'/'.join(map(percent, table.values()))}")
+    return lines
 
 
 def _is_plain(value: Any) -> bool:

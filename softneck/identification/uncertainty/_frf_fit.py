@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector, require_one_of
 from softneck.robot import Robot
 from softneck.signals import Recording, redefine
-from softneck.signals.recording._files import opened_recording
+from softneck.signals.recording._files import RecordingLike, opened_recording
 
 from ..linear._oe import SOURCES
 from ._frf import FrequencyResponse
@@ -42,9 +41,7 @@ class _Run:
     missed: int
 
 
-def frequency_response(
-    recordings: Recording | str | Path | Sequence[Recording | str | Path], *, source: str = "set_points"
-) -> FrequencyResponse:
+def frequency_response(recordings: RecordingLike, *, source: str = "set_points") -> FrequencyResponse:
     """Return the nonparametric response from inputs to outputs, with covariance and coherence.
 
     Runs of periodic multisines (at least two realisations, each of as many orthogonal experiments as inputs move) are
@@ -53,7 +50,7 @@ def frequency_response(
     `S_yr S_ur^-1`. Every result is of inputs of this size: a nonlinear robot has another one for others.
 
     Args:
-        recordings: or their files; of one robot and one sample time; runs are never joined.
+        recordings: as `identify` takes them; of one robot and one sample time; runs are never joined.
         source: "set_points", or "positions" of the motors.
 
     Returns:
@@ -72,8 +69,7 @@ def frequency_response(
         >>> found.outputs, found.own_input("pitch")
         (('pitch', 'roll'), 'theta_i')
     """
-    listed = [recordings] if isinstance(recordings, Recording | str | Path) else list(recordings)
-    parts = [opened_recording(item) for item in listed]
+    parts = [opened_recording(item) for item in (recordings if isinstance(recordings, list | tuple) else [recordings])]
     require_one_of("source", source, SOURCES)
     robot, sample_time = _one(parts)
     names, transform = input_names(robot)

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector, require_one_of
+from softneck.core import DataError, Matrix, Vector, require_one_of, resolve
 from softneck.core._blas_threads import one_blas_thread
-from softneck.core._kinds import opened
 from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot
+from softneck.robot._opened import opened
 from softneck.signals import Recording
-from softneck.signals.recording._files import opened_recording
+from softneck.signals.recording._files import RecordingLike, opened_recording
 
 from ..models._model import WARM_UP, Model
 from ..models._validity import with_tolerance
@@ -36,6 +36,9 @@ from ._score_tables import (
 )
 from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
 from ._validity import judged_validity
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _HORIZONS = (1, 5, 25, INFINITE)
 # Kinds whose bounds are guaranteed under an assumption.
@@ -127,6 +130,15 @@ class Validation(Shown):
     def _picture(self) -> str:
         return sparkline([self.measured[:, 0], self.free_run[:, 0]])
 
+    def plot(self, title: str = "") -> Figure:
+        """Return a matplotlib figure of what was measured, the free run and one step ahead, with bounds and errors."""
+        bounds = (self.lower, self.upper) if np.isfinite(self.lower).any() else None
+        draw = resolve("softneck.plots:validation_figure")
+        return draw(
+            self.time, self.measured, {"free run": self.free_run, "one step": self.one_step},
+            title or f"{self.model} on {self.data}", bounds=bounds, run=self.run, robot=self.robot,
+        )  # fmt: skip
+
     @property
     def white(self) -> bool:
         """Whether the one-step errors are white noise, as far as 25 lags tell (99 %)."""
@@ -207,7 +219,7 @@ class Rules:
 @one_blas_thread
 def validate(
     model: Model | str | Path,
-    recording: Recording | str | Path,
+    recording: RecordingLike,
     *,
     names: tuple[str, str] | None = None,
     horizons: Sequence[int | str] = _HORIZONS,
@@ -224,7 +236,7 @@ def validate(
 
     Args:
         model: of any kind, or its file.
-        recording: at the model's sample time, or its file; its runs are never joined.
+        recording: at the model's sample time, its file, or what else `identify` takes; its runs are never joined.
         names: of model and data, for reports; the files' where files are given.
         horizons: samples ahead; "inf" is the free run.
         motors: "simulated" or "measured".

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, SoftneckError, Vector, to_si
+from softneck.core import DataError, SettingsError, SoftneckError, Vector, to_si
+from softneck.core._files import as_path
 
 from ..recording._channels import may_miss
 from ..recording._files import integers, numbers
@@ -51,7 +52,9 @@ def import_log(path: str | Path, layout: Layout) -> ImportResult:
         FileFormatError: no such file or no table.
         DataError: a column is missing, holds no numbers, or the times do not fit.
     """
-    source = Path(path)
+    source = as_path(path)
+    if not isinstance(layout, Layout):
+        raise SettingsError(f"a layout is needed (`read_layout`, `guess_layout`); got a {type(layout).__name__}.")
     frame = read_log(source, layout)
     if layout.rows is not None:
         frame = frame.iloc[layout.rows[0] : layout.rows[1]].reset_index(drop=True)

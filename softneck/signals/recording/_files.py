@@ -6,23 +6,25 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
 from softneck.core._budget import MOST_TOML, require_numbers, require_size, require_table
+from softneck.core._checks import finite_matrix
 from softneck.core._errors import require_package
-from softneck.core._files import require_file
+from softneck.core._files import as_path, require_file
 from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
 
 from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
-from ._recording import Recording
+from ._recording import Recording, concatenate, require_same_robot
 from ._times import median_step
 
 if TYPE_CHECKING:
@@ -156,7 +158,7 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
         >>> len(softneck.read_recording("neck.csv"))
         1000
     """
-    source = Path(path)
+    source = as_path(path)
     if source.is_dir():
         require_file(source)
     suffix = recording_suffix(source)
@@ -172,9 +174,55 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
         raise DataError(f"{source}: {error}") from error
 
 
-def opened_recording(thing: Recording | str | Path) -> Recording:
-    """Return `thing`, or what `read_recording` makes of it where it is a path."""
-    return read_recording(thing) if isinstance(thing, str | Path) else thing
+#: What stands for a recording: itself, its file, a table with units in its titles, an array in SI, or several.
+RecordingLike: TypeAlias = (
+    "Recording | str | Path | pd.DataFrame | Mapping[str, ArrayLike] | np.ndarray | Sequence[RecordingLike]"
+)
+
+
+def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> Recording:
+    """Return the recording that `thing` is or stands for, several as runs of one.
+
+    Args:
+        thing: a recording, its file, a DataFrame or a dict of columns with units in their titles, an array (time,
+            motors and outputs, or motors alone) in SI at the robot's sample time, or a list of them.
+        robot: whose it is, as `read_recording` takes it; an array needs one.
+
+    Raises:
+        DataError: anything else, or recordings that do not go together.
+    """
+    if isinstance(thing, str | Path):
+        return read_recording(thing, robot=robot)
+    if isinstance(thing, Recording):
+        if robot is not None:
+            require_same_robot(thing.robot, find_robot(robot), "the robot and a recording")
+        return thing
+    if isinstance(thing, Mapping) or hasattr(thing, "columns"):
+        return from_frame(thing, robot)
+    if isinstance(thing, list | tuple):
+        return concatenate([opened_recording(item, robot) for item in thing])
+    if isinstance(thing, np.ndarray) and robot is not None:
+        whose = find_robot(robot)
+        motors = len(whose.set_points)
+        alone = thing.ndim == 2 and thing.shape[1] == motors
+        whole = finite_matrix("recording", thing, motors + (0 if alone else len(whose.outputs.names)), missing=True)
+        return Recording.from_arrays(whole[:, :motors], None if alone else whole[:, motors:], robot=whose)
+    hint = "an array needs `robot=`" if isinstance(thing, np.ndarray) else f"got a {type(thing).__name__}"
+    raise DataError(f"a recording, its file, a DataFrame, a dict of columns or a list of them is needed; {hint}.")
+
+
+def from_frame(frame: object, robot: Robot | str | Path | None = None) -> Recording:
+    """Return the recording of a table or of a mapping, title with unit -> column."""
+    import pandas as pd
+
+    try:
+        table = frame if isinstance(frame, pd.DataFrame) else pd.DataFrame(frame)  # pyright: ignore[reportArgumentType]
+    except (TypeError, ValueError) as error:
+        raise DataError(f"the columns do not make a table ({error}).") from error
+    if table.index.name == column_name("time"):
+        table = table.reset_index()
+    said = table.attrs.get("robot")
+    return _from_columns(_columns(table), find_robot(Robot.from_dict(said) if robot is None and said else robot))
 
 
 def said_robot(source: Path, suffix: str) -> Robot | None:

@@ -5,15 +5,27 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, Vector, require_positive, to_si
+from softneck.core import DataError, Matrix, Vector, require_positive, resolve, to_si
+from softneck.core._checks import finite_matrix
 from softneck.core._shown import Shown, sparkline
-from softneck.robot import Robot
+from softneck.robot import Robot, find_robot
 
 from ._channels import NECK, known_channels, may_miss
 from ._times import check_times
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+# [s] Where neither the caller nor the robot says.
+_SAMPLE_TIME = 0.02
+_FILES = "softneck.signals.recording._files"  # which reads recordings: by its name, as no two files import each other
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -44,6 +56,67 @@ class Recording(Shown):
         object.__setattr__(self, "channels", channels)
         self._check_channels()
         check_times(time, self.sample_time, run)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        set_points: ArrayLike,
+        outputs: ArrayLike | None = None,
+        *,
+        motor_positions: ArrayLike | None = None,
+        sample_time: float | None = None,
+        run: ArrayLike | None = None,
+        robot: Robot | str | Path | None = None,
+    ) -> Recording:
+        """Return the recording of arrays in SI, whose rows are equidistant; each run begins at 0 s.
+
+        Args:
+            set_points: (time, motors).
+            outputs: (time, outputs), NaN where a sample was missed; None: nothing was measured.
+            motor_positions: (time, motors), if they were logged.
+            sample_time: [s]; the robot's, or 0.02, if not given.
+            run: (time,) numbers of the runs; one run if not given.
+            robot: a robot, its file or a preset; the paper's neck if not given.
+
+        Raises:
+            DataError: shapes that do not fit each other or the robot.
+        """
+        whose = find_robot(robot)
+        names = (whose.set_points, whose.outputs.names, whose.motor_positions)
+        U = finite_matrix("set_points", set_points, len(names[0]))
+        given = (U, np.full((len(U), len(names[1])), np.nan) if outputs is None else outputs, motor_positions)
+        channels = {
+            name: column
+            for what, known, values in zip(("set_points", "outputs", "motor_positions"), names, given, strict=True)
+            if values is not None
+            for name, column in zip(known, finite_matrix(what, values, len(known), missing=True).T, strict=True)
+        }
+        numbers = np.zeros(len(U), dtype=np.int64) if run is None else np.asarray(run)
+        if numbers.shape != (len(U),) or numbers.dtype.kind not in "iu":
+            raise DataError(f"`run` must be integers of shape {(len(U),)}; got {numbers.dtype} {numbers.shape}.")
+        step = (whose.sample_time_s or _SAMPLE_TIME) if sample_time is None else sample_time
+        begins = np.maximum.accumulate(np.where(np.diff(numbers, prepend=numbers[:1] - 1) != 0, np.arange(len(U)), 0))
+        return cls((np.arange(len(U)) - begins) * step, step, channels, numbers, whose)
+
+    @classmethod
+    def from_pandas(cls, frame: pd.DataFrame, *, robot: Robot | str | Path | None = None) -> Recording:
+        """Return the recording of a table whose columns say their unit, as in a file: `time [s]`, `pitch [deg]`, ...
+
+        Raises:
+            DataError: columns, units, numbers or times are not those of a recording of the robot.
+        """
+        return resolve(f"{_FILES}:from_frame")(frame, robot)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table whose columns say their unit, as in its file; `from_pandas` reads it."""
+        return resolve(f"{_FILES}:recording_frame")(self)
+
+    def plot(self, title: str = "") -> Figure:
+        """Return a matplotlib figure of set-points and outputs, in the units that people see."""
+        chart, figure = (
+            resolve(f"softneck.plots.{name}") for name in ("_charts:recording_chart", "_figures:chart_figure")
+        )
+        return figure(chart(self.time, self.set_points, self.outputs, title, run=self.run, robot=self.robot))
 
     def __len__(self) -> int:
         return self.time.size

@@ -200,7 +200,9 @@ def test_points_that_stand_for_all_reach_all() -> None:
 
 
 def test_play_is_guarded_by_name_and_a_robot_may_have_it() -> None:
-    model = softneck.identification.identify("guarded", neck_recording(1200), of="play", members=2, base="rls")
+    model = softneck.identification.identify(
+        "guarded", neck_recording(1200), train=1.0, of="play", members=2, base="rls"
+    )
     assert (model.kind, model.findings["members"], model.findings["base"]) == ("guarded", "2 of play", "rls")
     assert model.training_rows.size == 1200
     assert model.settings["of"] == "play"
