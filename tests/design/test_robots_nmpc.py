@@ -135,7 +135,7 @@ def test_what_is_of_necks_is_refused() -> None:
     with pytest.raises(SettingsError, match=r"`tendon_angles` are of necks; those of `antagonist` .* are in its robot"):
         NmpcSettings(tendon_angles=(0.0, 2.0, 4.0)).design(lag(Robot.preset("antagonist")))
     with pytest.raises(
-        SettingsError, match="`angle_limit` is for outputs that are angles; those of `pusher` are in mm"
+        SettingsError, match=r"`angle_limit` is for outputs that are angles; those of `pusher` .* are in mm"
     ):
         NmpcSettings(angle_limit=0.1).design(lag(PUSHER))
 
