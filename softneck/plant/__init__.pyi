@@ -1,4 +1,3 @@
-from ._batch import simulate_batch as simulate_batch
 from ._neck import VirtualNeck as VirtualNeck
 from ._parameters import NeckParameters as NeckParameters
 from ._record import record as record

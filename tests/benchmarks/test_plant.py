@@ -12,7 +12,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from scipy.integrate import solve_ivp
 
-from softneck.plant import NeckParameters, VirtualNeck, simulate_batch
+from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._neck import RUNTIME
 from softneck.runtime import load_functions, load_runtime
 from softneck.signals import signal
@@ -75,12 +75,3 @@ def test_solve_ivp_2_s(benchmark: BenchmarkFixture) -> None:
     x = benchmark.pedantic(run, rounds=2)
     # solve_ivp's tolerance, and ours across the tendons' going slack.
     np.testing.assert_allclose(block.run(start, U)[0].values[:2], x[:2], atol=1e-4)
-
-
-@pytest.mark.benchmark(group="batch of 16 necks, 20 s")
-@pytest.mark.parametrize("workers", [1, None], ids=["one thread", "all cores"])
-def test_batch(benchmark: BenchmarkFixture, workers: int | None) -> None:
-    necks = [NeckParameters.paper().sample(np.random.default_rng(seed)) for seed in range(16)]
-    U = eq22_inputs(20.0)
-    outputs = benchmark.pedantic(simulate_batch, args=(necks, U), kwargs={"workers": workers}, rounds=3)
-    assert np.isfinite(outputs).all()

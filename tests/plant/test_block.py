@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.core import DataError, SettingsError
-from softneck.plant import NeckParameters, VirtualNeck, record, simulate_batch
+from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_runtime
 from softneck.signals import Excitation, signal
 
@@ -122,23 +121,3 @@ def test_a_sample_time_estimated_from_a_log_simulates_as_finely_as_any_other() -
     # rad: set-points arrive at a whole internal step, up to 1 ms late, while the neck moves at 1 rad/s.
     np.testing.assert_allclose(Y, fine, atol=1e-3)
     assert np.abs(fine).max() > 0.1
-
-
-def test_a_batch_is_each_neck_by_itself() -> None:
-    necks = [NeckParameters.paper().sample(np.random.default_rng(seed)) for seed in range(4)]
-    U = np.zeros((60, 8))
-    U[:, 0] = 1.5
-    together = simulate_batch(necks, U, seeds=[7, 8, 9, 10])
-    for neck, seed, outputs in zip(necks, (7, 8, 9, 10), together, strict=True):
-        block = VirtualNeck(neck).block(noise_seed=seed)
-        np.testing.assert_array_equal(block.run(block.initial_state(), U)[1], outputs)
-
-
-def test_a_batch_that_does_not_fit_is_refused() -> None:
-    necks = [NeckParameters.paper()] * 2
-    with pytest.raises(DataError, match=r"`inputs` must have shape \(time, 8\) or \(2, time, 8\); got \(3, 5, 8\)"):
-        simulate_batch(necks, np.zeros((3, 5, 8)))
-    with pytest.raises(SettingsError, match="one entry per neck"):
-        simulate_batch(necks, np.zeros((5, 8)), seeds=[1])
-    with pytest.raises(SettingsError, match="`necks` is empty"):
-        simulate_batch([], np.zeros((5, 8)))

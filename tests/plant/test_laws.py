@@ -8,10 +8,11 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plant._energy import body, free_lengths, neck_energy, potential_energy
 from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_load, neck_rates, neck_substeps
 from softneck.plant._neck_runtime import VirtualNeckArrays
 from softneck.runtime import Block, State
+
+from ..oracles.neck_energy import body, free_lengths, neck_energy, potential_energy
 
 # Where the plant's outputs are in its port order.
 TENSIONS = slice(10, 13)

@@ -10,10 +10,11 @@ import pytest
 
 from softneck.core import DataError, Matrix, SettingsError
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.plant._energy import body, neck_energy
 from softneck.robot import Robot
 from softneck.runtime import Block, State, load_runtime
 from softneck.signals import Excitation, signal, signal_names
+
+from ..oracles.neck_energy import body, neck_energy
 
 SIZES = [(1, 1), (2, 1), (4, 2), (8, 2)]
 

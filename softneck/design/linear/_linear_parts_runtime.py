@@ -60,24 +60,6 @@ class LinearArrays(FilterArrays):
     motors = value("T_inverse", function=linear_motors, written=True)
 
 
-class SeveralArrays(FilterArrays):
-    """The arrays of several linear controllers; those that differ between them stand one below the other."""
-
-    A = array("k * n, n", "as of the linear controller, of every one")
-    Br = array("k * n, outputs", "")
-    By = array("k * n, outputs", "")
-    C = array("k * outputs, n", "")
-    Dr = array("k * outputs, outputs", "")
-    Dy = array("k * outputs, outputs", "")
-    L = array("k * n, outputs", "")
-    align = array("k * n, 2 * outputs", "from angles and theta, phi to the state at rest")
-    rest = array("m, references", "from r to the filter's state at rest")
-    T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
-    T_inverse = array("motors, references", "redefined inputs to motors")
-    constants = array("numbers", "as of the linear controller: the sample time [s], of other robots also their ranges")
-    motors = value("T_inverse", function=linear_motors, written=True)
-
-
 class LinearState(StateVector):
     """What every linear controller remembers; kinds add what else they do."""
 
@@ -99,20 +81,6 @@ def linear_align(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
     rest[p.outputs] = v[p.outputs]
     x.xf[:] = np.dot(p.rest, rest)
     x.x[:] = np.dot(p.align, known)
-
-
-def linear_exactly(p: LinearArrays, x: LinearState, y: np.ndarray) -> None:
-    """Correct the aligned state until it asks for exactly the held set-points: a blend of alignments does not."""
-    v = np.dot(p.T, x.held)
-    inside = x.x
-    # With r at the angle, as `linear_align` has it.
-    asked = np.dot(p.C, inside) + np.dot(p.Dr, y) + np.dot(p.Dy, y)
-    for i in range(p.outputs):
-        row = p.C[i]
-        size = np.dot(row, row)
-        if size > 0.0:
-            # Rows of C belong to one axis each, so the other axis' answer stays.
-            inside += row * ((v[i] - asked[i]) / size)
 
 
 def linear_finite(inputs: np.ndarray) -> bool:

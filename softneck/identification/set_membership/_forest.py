@@ -105,11 +105,6 @@ class PointTree:
         columns = [*range(2 * n), 2 * (n + output), 2 * (n + output) + 1]
         return self.nodes if len(self.values) == 1 else np.ascontiguousarray(self.nodes[:, columns])
 
-    def in_time_order(self) -> tuple[Matrix, Matrix, Vector]:
-        """Return points, values and ages, oldest first."""
-        order = np.argsort(self.ages)
-        return self.points[:, order], self.values[:, order], self.ages[order]
-
 
 def plant(points: Matrix, values: Matrix, ages: Vector) -> PointTree:
     """Return the tree over points (n, N), values (m, N) and ages (N,), which are put in its order where they lie.

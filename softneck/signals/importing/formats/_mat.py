@@ -1,4 +1,7 @@
-"""MATLAB files as arrays: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no other files."""
+"""MATLAB files as arrays: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no other files.
+
+`scipy.io.loadmat` follows cells within cells without a bound: 10 MB of them end the process (segmentation fault).
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The neck's energy, written from the potentials themselves and not from the forces of the runtime.
 
-It is what the tests hold the forces against: at rest the potential is least, and without actuation the
+The tests hold the forces against it: at rest the potential is least, and without actuation the
 sum never rises.
 """
 
@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Vector
+from softneck.plant._mechanics_runtime import NeckBody
+from softneck.plant._neck_runtime import VirtualNeckArrays
+from softneck.plant._parameters import NeckParameters
 from softneck.runtime import State
-
-from ._mechanics_runtime import NeckBody
-from ._neck_runtime import VirtualNeckArrays
-from ._parameters import NeckParameters
 
 _GRAVITY = 9.80665
 # As in the link's runtime: the compressed link rests on itself.
