@@ -12,7 +12,7 @@ from softneck.core import SettingsError, refuse_existing, require_positive
 from softneck.robot._opened import opened
 
 from .shared._console import percent, print_json
-from .shared._options import apply_settings, read_together, target
+from .shared._options import apply_settings, target
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,8 @@ def adapt(
     robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Refit MODEL to the latest data, starting from what it is; write the model, and say what became of it."""
+    from softneck.signals.recording._files import opened_recording
+
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     old = opened(model, "model", robot)
@@ -34,7 +36,7 @@ def adapt(
         raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; what is refitted stays what it is.")
     window = float(apply_settings(_Adaptation, settings).window)
     require_positive("window", window, "s")
-    new = old.adapted(read_together(recordings, robot), window=window)
+    new = old.adapted(opened_recording(recordings, robot), window=window)
     new.save(path, force=replace)
     said = new.findings["adaptation"]
     if as_json:

@@ -201,7 +201,7 @@ def _finite(fit: float) -> float | None:
 
 
 def _page(choice: Choice) -> str:
-    from softneck.plots import Section, Table, page, validation_figure
+    from softneck.plots import Section, Table, page
 
     table = Table(_title(_model(choice).robot), _HEAD, _rows(choice))
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
@@ -211,9 +211,7 @@ def _page(choice: Choice) -> str:
     for one in choice.ranking:
         if one.judged is None or one is not choice.chosen:
             continue
-        curves = {"free run": one.judged.free_run}
-        figure = validation_figure(one.judged.time, one.judged.measured, curves, one.kind, robot=one.judged.robot)
-        figures.append((f"{one.kind}: free run beside what was measured", figure))
+        figures.append((f"{one.kind}: free run beside what was measured", one.judged.plot(one.kind)))
         found += one.model.summary().splitlines() if one.model else []
     sections = [
         Section("Which kind of model", figures=figures, tables=[table, all_scores], text=choice.remarks, method=found)

@@ -11,7 +11,7 @@ from softneck.core import FileFormatError, SettingsError, file_hash, load
 from softneck.fmu.compiled._platforms import PLATFORMS
 
 from .shared._console import note, print_json, progress
-from .shared._options import common_options, output_option, read_together, target
+from .shared._options import common_options, output_option, target
 
 if TYPE_CHECKING:
     from softneck.fmu.describe._describe import Buildable
@@ -156,11 +156,12 @@ def _has_sensitivities(block: Block) -> bool:
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:
     """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
     from softneck.identification import Model, validate
+    from softneck.signals.recording._files import opened_recording
 
     if not isinstance(thing, Model):
         return None
     names = (Path(source).name, ", ".join(path.name for path in data))
-    return validate(thing, read_together(data, robot), names=names)
+    return validate(thing, opened_recording(data, robot), names=names)
 
 
 def _what(files: tuple[str, ...], output: Path | None, *, force: bool) -> tuple[list[tuple[str | Path, Path]], bool]:

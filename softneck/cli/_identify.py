@@ -20,7 +20,6 @@ from .shared._options import (
     apply_settings,
     common_options,
     output_option,
-    read_together,
     set_option,
     target,
     tolerance_option,
@@ -80,6 +79,7 @@ def command(
     """Identify a model of KIND from one or more recordings."""
     from softneck.identification._identify import identified
     from softneck.signals.quality._poor_excitation import poor_excitation, stands_still
+    from softneck.signals.recording._files import opened_recording
 
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
@@ -101,7 +101,7 @@ def command(
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    whole = read_together(recordings, robot)
+    whole = opened_recording(recordings, robot)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model, held_out = identified(estimator, whole, train=train, tolerance=tolerance, progress=report)
     model.save(path, force=replace)

@@ -13,7 +13,7 @@ from softneck.core._kinds import make_settings
 from softneck.core._progress import shown_progress
 from softneck.robot import Robot
 from softneck.signals import Recording
-from softneck.signals.recording._files import RecordingLike, opened_recording
+from softneck.signals.recording._files import RecordingLike, names_of, opened_recording
 
 from .models._model import Model
 from .models._validity import with_tolerance
@@ -137,8 +137,7 @@ def family(
     listed: Sequence[Any] = recordings if isinstance(recordings, list | tuple) else [recordings]
     parts = [opened_recording(part, robot) for part in listed]
     files = [part for part in listed if isinstance(part, str | Path)]
-    names = [str(part) if isinstance(part, str | Path) else f"recording {k}" for k, part in enumerate(listed, start=1)]
     with shown_progress("family", progress) as tell:
-        found = chosen.fit(parts, names=names, progress=tell)
+        found = chosen.fit(parts, names=names_of(listed), progress=tell)
     found.findings["files"] = {str(source): file_hash(source) for source in files}
     return found

@@ -6,7 +6,6 @@ from ._figures import chart_figure as chart_figure
 from ._figures import delay_figure as delay_figure
 from ._figures import histogram_figure as histogram_figure
 from ._figures import loop_figure as loop_figure
-from ._figures import recording_figure as recording_figure
 from ._figures import residual_figure as residual_figure
 from ._figures import validation_figure as validation_figure
 from ._identification_figures import convergence_figure as convergence_figure

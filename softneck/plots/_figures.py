@@ -12,7 +12,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Panel, bar_width
-from ._charts import delay_chart, loop_chart, recording_chart, validation_chart
+from ._charts import delay_chart, loop_chart, validation_chart
 from ._judgement_charts import histogram_chart, residual_chart
 
 if TYPE_CHECKING:
@@ -87,13 +87,6 @@ def _draw_curve(ax: Axes, curve: Curve) -> None:
             ax.step(x, y, where="post", color=colour, lw=curve.width, label=name)
         case _:
             ax.plot(x, y, ls=_DASHES.get(curve.style, "-"), color=colour, lw=curve.width, label=name)
-
-
-def recording_figure(
-    time: Vector, set_points: Matrix, outputs: Matrix, title: str, *, run: np.ndarray | None = None
-) -> Figure:
-    """Draw `recording_chart`: motor set-points (time, 3) [rad], pitch and roll (time, 2) [rad] in degrees."""
-    return chart_figure(recording_chart(time, set_points, outputs, title, run=run))
 
 
 def validation_figure(

@@ -69,7 +69,7 @@ def test_recordings_of_two_sample_times_are_named(call: Call, tmp_path: Path) ->
     (tmp_path / "a.csv").write_text("\n".join(csv_lines(neck_recording(300), 300)))
     slow = neck_recording(300)
     write_recording("b.csv", Recording(2 * slow.time, 2 * slow.sample_time, slow.channels))
-    message = "b.csv: is at 40 ms and a.csv at 20 ms; recordings are used together at one sample time only"
+    message = "different sample times cannot be used together: 0.02 s and 0.04 s (a.csv and b.csv)"
     left = {"a.csv", "b.csv"}
     refused(call("identify", "rls", "a.csv", "b.csv", "-o", "m.npz", "--json"), message, tmp_path, left)
 

@@ -16,12 +16,12 @@ from softneck.plots import (
     delay_figure,
     loop_figure,
     page,
-    recording_figure,
     validation_figure,
 )
 from softneck.plots import write_page as write
 from softneck.plots._charts import loop_chart
 from softneck.robot import Robot
+from softneck.signals import Recording
 
 
 def _wave(columns: int) -> np.ndarray:
@@ -33,7 +33,7 @@ def _wave(columns: int) -> np.ndarray:
 def test_a_page_needs_nothing_from_outside_and_holds_its_pictures() -> None:
     t = np.arange(100) * 0.02
     figures = [
-        ("experiment", recording_figure(t, _wave(3), _wave(2), "experiment")),
+        ("experiment", Recording.from_arrays(_wave(3), _wave(2)).plot("experiment")),
         ("validation", validation_figure(t, _wave(2), {"model": 0.9 * _wave(2)}, "validation")),
         ("delay", delay_figure({"pitch": [[0.0, 80.0, 0.01], [0.02, 81.0, 0.009]]}, "delay")),
     ]

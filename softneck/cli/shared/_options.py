@@ -7,38 +7,12 @@ import math
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from softneck.core import DataError, SettingsError
+from softneck.core import SettingsError
 from softneck.core._kinds import make_settings
-
-if TYPE_CHECKING:
-    from softneck.signals import Recording
-
-
-def read_together(paths: Sequence[Path], robot: str | None = None) -> Recording:
-    """Read recordings as runs of one; `robot` is as `read_recording` takes it.
-
-    Raises:
-        DataError: their sample times or robots differ; the line names two that do.
-    """
-    from softneck.signals import concatenate, read_recording
-    from softneck.signals.recording._recording import require_same_robot
-
-    recordings = [read_recording(path, robot=robot) for path in paths]
-    for path, recording in zip(paths, recordings, strict=True):
-        if not math.isclose(recording.sample_time, recordings[0].sample_time, rel_tol=1e-6):
-            raise DataError(
-                f"{path}: is at {1e3 * recording.sample_time:g} ms and {paths[0]} at "
-                f"{1e3 * recordings[0].sample_time:g} ms; recordings are used together at one sample time only. Take "
-                f"each by itself, or bring one to the other's: `softneck import {path} --resample "
-                f"{recordings[0].sample_time:g} -o OTHER.csv`."
-            )
-        require_same_robot(recording.robot, recordings[0].robot, f"{paths[0]} and {path}: recordings")
-    return concatenate(recordings)
-
 
 COMMON = {
     "robot": click.option(

@@ -200,7 +200,7 @@ def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> 
     if isinstance(thing, Mapping) or hasattr(thing, "columns"):
         return from_frame(thing, robot)
     if isinstance(thing, list | tuple):
-        return concatenate([opened_recording(item, robot) for item in thing])
+        return concatenate([opened_recording(item, robot) for item in thing], names=names_of(thing))
     if isinstance(thing, np.ndarray) and robot is not None:
         whose = find_robot(robot)
         motors = len(whose.set_points)
@@ -209,6 +209,11 @@ def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> 
         return Recording.from_arrays(whole[:, :motors], None if alone else whole[:, motors:], robot=whose)
     hint = "an array needs `robot=`" if isinstance(thing, np.ndarray) else f"got a {type(thing).__name__}"
     raise DataError(f"a recording, its file, a DataFrame, a dict of columns or a list of them is needed; {hint}.")
+
+
+def names_of(things: Sequence[object]) -> list[str]:
+    """Return what recordings are called: their files, else their number."""
+    return [str(item) if isinstance(item, str | Path) else f"recording {k}" for k, item in enumerate(things, start=1)]
 
 
 def from_frame(frame: object, robot: Robot | str | Path | None = None) -> Recording:

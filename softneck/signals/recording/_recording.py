@@ -294,10 +294,10 @@ def _dealt(rows: Sequence[int], count: int) -> list[list[int]]:
     return [sorted(fold) for fold in folds]
 
 
-def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recording:
+def concatenate(recordings: Sequence[Recording], *, names: Sequence[str] = ()) -> Recording:
     """Put recordings of one sample time behind each other as separate runs; channels that all have are kept.
 
-    One without the channel `payload` bore none where another has it.
+    One without the channel `payload` bore none where another has it. Errors call the recordings by their `names`.
 
     Raises:
         DataError: none given, or sample times or robots differ.
@@ -306,13 +306,15 @@ def concatenate(recordings: list[Recording] | tuple[Recording, ...]) -> Recordin
         raise DataError("there is no recording to work on; the part to train on is empty.")
     first = recordings[0]
     parts: list[Recording] = []
-    for recording in recordings:
+    called = names or [f"recording {number}" for number in range(1, len(recordings) + 1)]
+    for name, recording in zip(called, recordings, strict=True):
         if not np.isclose(recording.sample_time, first.sample_time, rtol=1e-6):
             raise DataError(
                 f"recordings of different sample times cannot be used together: {first.sample_time:g} s and "
-                f"{recording.sample_time:g} s. Work on each by itself, or bring one to the other's by `resampled`."
+                f"{recording.sample_time:g} s ({called[0]} and {name}). Work on each by itself, or bring one to the "
+                "other's (`softneck import REC --resample S`, `softneck.signals.resampled`)."
             )
-        require_same_robot(recording.robot, first.robot, "recordings")
+        require_same_robot(recording.robot, first.robot, f"{called[0]} and {name}: recordings")
         parts.extend(recording.runs())
     if any("payload" in part.channels for part in parts):
         parts = [
