@@ -110,7 +110,6 @@ def frequency_response_figure(
     *,
     unit: str,
     models: Mapping[str, np.ndarray] | None = None,
-    sines: Sequence[tuple[float, complex, str]] = (),
 ) -> Figure:
     """Draw gain, phase and coherence of one entry of a frequency response, models beside it.
 
@@ -122,7 +121,6 @@ def frequency_response_figure(
         title: of the figure.
         unit: of `response`.
         models: name -> (n,) complex.
-        sines: (frequency [rad/s], describing function, label) of sines that were played.
     """
     figure, (gain, phase, explained) = new_figure(3, row_height=2.3)
     size = np.abs(response)
@@ -139,9 +137,6 @@ def frequency_response_figure(
         colour = _COLOURS[1 + number % (len(_COLOURS) - 1)]
         gain.loglog(frequency, np.abs(values), color=colour, lw=1.2, label=name)
         phase.semilogx(frequency, np.degrees(np.unwrap(np.angle(values))), color=colour, lw=1.2)
-    for w, value, name in sines:
-        gain.loglog(w, abs(value), color=RED, marker="x", ls="", label=name)
-        phase.semilogx(w, np.degrees(np.angle(value)), color=RED, marker="x", ls="")
     if known.any():
         # Frequencies at which nothing is known would flatten what is.
         gain.set_ylim(0.3 * size[known].min(), 3.0 * size[known].max())

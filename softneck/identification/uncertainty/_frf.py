@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,6 @@ from softneck.core import DataError, FileFormatError, SettingsError, Vector, req
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 
-from ._periodic import Sine
 from ._spectra import ComplexArray
 
 if TYPE_CHECKING:
@@ -25,7 +24,6 @@ SUPPORTED = 0.3
 METHODS = {
     "robust": "periodic multisines: the best linear approximation for this class of input",
     "local polynomials": "any excitation: local polynomials, nonlinear distortion counted as noise",
-    "sines": "one sine at a time: the describing function, no linear approximation",
 }
 
 
@@ -44,8 +42,7 @@ class FrequencyResponse(Shown):
         coherence: (k, m) what part of each output the inputs explain, 0 to 1.
         noise: (k, m, q) variance by noise alone; NaN where it was not told apart.
         amplitude: (q,) of the inputs, root mean square times sqrt 2 [rad].
-        method: one of "robust", "local polynomials", "sines".
-        sines: describing functions, where sines were played.
+        method: "robust" or "local polynomials".
         findings: what was found on the way.
     """
 
@@ -60,7 +57,6 @@ class FrequencyResponse(Shown):
     noise: Vector
     amplitude: Vector
     method: str
-    sines: tuple[Sine, ...] = ()
     findings: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -147,9 +143,8 @@ class FrequencyResponse(Shown):
         lines.append(
             f"amplitude (rms times sqrt 2) [{self.robot.motors.unit}]: {sizes}; it holds for inputs of this size"
         )
-        for output in () if self.method == "sines" else self.outputs:
+        for output in self.outputs:
             lines += self._axis_lines(output, scale, unit)
-        lines += [_sine_line(sine, self) for sine in self.sines]
         lines += [
             f"{key}: {value}" for key, value in self.findings.items() if key in ("closed_loop", "missing", "caution")
         ]
@@ -170,15 +165,10 @@ class FrequencyResponse(Shown):
         output = self.outputs[0] if output is None else output
         source = self.own_input(output)
         i, a = self._entry(output, source)
-        scale, per_input, unit = self.shown()
-        sines = [
-            (item.frequency, scale * item.response[i], f"sine of {per_input * item.amplitude[a]:.2g}")
-            for item in self.sines
-            if int(np.argmax(item.amplitude)) == a
-        ]
+        scale, _, unit = self.shown()
         return frequency_response_figure(
             self.frequency, scale * self.response[:, i, a], scale * np.nan_to_num(self.radius()[:, i, a]),
-            self.coherence[:, i], f"{source} to {output}", unit=unit, sines=sines,
+            self.coherence[:, i], f"{source} to {output}", unit=unit,
             models={name: scale * self._curve(model, name, output) for name, model in (models or {}).items()},
         )  # fmt: skip
 
@@ -191,7 +181,7 @@ class FrequencyResponse(Shown):
         return np.squeeze(model.tf(output)(np.exp(1j * self.frequency * self.sample_time)))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return method, inputs, bands and sines as plain values."""
+        """Return method, inputs and bands as plain values."""
         bands = {output: self.band(output, self.own_input(output)) for output in self.outputs}
         return {
             "method": self.method,
@@ -200,7 +190,6 @@ class FrequencyResponse(Shown):
             "own_inputs": {output: self.own_input(output) for output in self.outputs},
             f"amplitude_{to_si(self.robot.motors.unit)[1]}": self.amplitude.tolist(),
             "band_rad_s": {output: None if band is None else list(band) for output, band in bands.items()},
-            "sines": [_sine_dict(item) for item in self.sines],
             "findings": self.findings,
         }
 
@@ -215,7 +204,6 @@ class FrequencyResponse(Shown):
             "robot": self.robot.as_dict(),
             "inputs": self.inputs,
             "method": self.method,
-            "sines": [_sine_dict(item) for item in self.sines],
             "findings": self.findings,
         }
         write_archive(path, header, arrays, force=force)
@@ -244,7 +232,7 @@ class FrequencyResponse(Shown):
         values |= {name: arrays[f"{name}_re"] + 1j * arrays[f"{name}_im"] for name in _COMPLEX}
         return cls(
             sample_time=float(header["sample_time"]), robot=robot, inputs=inputs, method=str(header["method"]),
-            sines=tuple(_sine_from(item) for item in header["sines"]), findings=dict(header["findings"]), **values,
+            findings=dict(header["findings"]), **values,
         )  # fmt: skip
 
     def _entry(self, output: str, source: str) -> tuple[int, int]:
@@ -282,33 +270,3 @@ class FrequencyResponse(Shown):
 
 _REAL = ("frequency", "freedom", "coherence", "noise", "amplitude")
 _COMPLEX = ("response", "covariance")
-
-
-# Outputs that answer a sine less than this part of the one that answers most are left out of the summary.
-_HEARD = 0.1
-
-
-def _sine_line(item: Sine, of: FrequencyResponse) -> str:
-    scale, per_input, unit = of.shown()
-    main = int(np.argmax(item.amplitude))
-    answers = ", ".join(
-        f"{name} {scale * abs(G):.3g} {unit} at {np.degrees(np.angle(G)):.0f} deg, harmonics {100 * d:.0f} %"
-        for name, G, d in zip(of.outputs, item.response, item.distortion, strict=True)
-        if abs(G) >= _HEARD * max(map(abs, item.response))
-    )
-    return (
-        f"sine of {per_input * item.amplitude[main]:.2g} on {of.inputs[main]} at {item.frequency:.3g} rad/s: {answers}"
-    )
-
-
-def _sine_dict(item: Sine) -> dict[str, Any]:
-    return {**asdict(item), "response": [[G.real, G.imag] for G in item.response]}
-
-
-def _sine_from(table: dict[str, Any]) -> Sine:
-    return Sine(
-        float(table["frequency"]),
-        tuple(float(value) for value in table["amplitude"]),
-        tuple(complex(float(a), float(b)) for a, b in table["response"]),
-        tuple(float(value) for value in table["distortion"]),
-    )

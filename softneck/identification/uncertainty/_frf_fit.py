@@ -16,7 +16,7 @@ from softneck.signals.recording._files import RecordingLike, opened_recording
 from ..linear._oe import SOURCES
 from ._frf import FrequencyResponse
 from ._local_polynomial import Spectrum, local_polynomial, spectrum
-from ._periodic import Periods, Sine, period_of, periods, robust, sine
+from ._periodic import Periods, period_of, periods, robust
 from ._spectra import Response
 
 # Runs shorter than this have too few frequencies for a window of the local polynomials.
@@ -45,8 +45,8 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
     """Return the nonparametric response from inputs to outputs, with covariance and coherence.
 
     Runs of periodic multisines (at least two realisations, each of as many orthogonal experiments as inputs move) are
-    taken by the robust method, which tells noise and nonlinear distortion apart; runs of one sine give the describing
-    function; anything else is taken by local polynomials. Recordings with a reference were in a closed loop:
+    taken by the robust method, which tells noise and nonlinear distortion apart; anything else by local polynomials.
+    Recordings with a reference were in a closed loop:
     `S_yr S_ur^-1`. Every result is of inputs of this size: a nonlinear robot has another one for others.
 
     Args:
@@ -77,7 +77,7 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
     moving = _moving(runs, names)
     runs = [_Run(run.inputs[:, moving], run.outputs, run.references, run.missed) for run in runs]
     inputs = tuple(name for name, moves in zip(names, moving, strict=True) if moves)
-    found, method, sines = _estimate(runs, sample_time)
+    found, method = _estimate(runs, sample_time)
     missed = sum(run.missed for run in runs)
     findings: dict[str, Any] = {"runs": len(runs), "rows": sum(run.inputs.shape[0] for run in runs)}
     if missed:
@@ -89,7 +89,7 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
         sample_time=sample_time, robot=robot, inputs=inputs, frequency=found.frequency, response=found.response,
         covariance=found.covariance, freedom=found.freedom, coherence=np.clip(found.coherence, 0.0, 1.0), noise=noise,
         amplitude=np.sqrt(2.0 * np.mean([run.inputs.var(axis=0) for run in runs], axis=0)), method=method,
-        sines=tuple(sines), findings=findings,
+        findings=findings,
     )  # fmt: skip
 
 
@@ -176,31 +176,27 @@ def _moving(runs: Sequence[_Run], names: Sequence[str]) -> np.ndarray:
     return size > _MOVES * size.max()
 
 
-def _estimate(runs: Sequence[_Run], sample_time: float) -> tuple[Response, str, list[Sine]]:
-    """Return the response, how it was found, and the describing functions of runs with one sine."""
+def _estimate(runs: Sequence[_Run], sample_time: float) -> tuple[Response, str]:
+    """Return the response and how it was found."""
     if any(run.references is not None for run in runs):
-        return _behind_references(runs, sample_time), "local polynomials", []
+        return _behind_references(runs, sample_time), "local polynomials"
     lengths = [period_of(run.inputs) for run in runs]
     cut = [
         periods(run.inputs, run.outputs, length, sample_time)
         for run, length in zip(runs, lengths, strict=True)
         if length is not None
     ]
-    sines = [sine(item) for item in cut if item.is_sine]
-    rich = [item for item in cut if not item.is_sine]
+    if any(item.is_sine for item in cut):
+        raise DataError("a run of one sine shows no linear response; record `multisine` with a band of two ends.")
     others = [run for run, length in zip(runs, lengths, strict=True) if length is None]
-    if rich and not others:
-        _check_alike(rich)
-        found = robust(rich)
+    if not others:
+        _check_alike(cut)
+        found = robust(cut)
         if found is not None:
-            return found, "robust", sines
-    if not rich and not others:
-        return _of_sines(sines, runs[0].inputs.shape[1]), "sines", sines
+            return found, "robust"
     _check_length(others)
-    taken = [run for run, length in zip(runs, lengths, strict=True) if length is None or not _is_sine(run, length)]
-    spectra = [spectrum(run.inputs, run.outputs, sample_time) for run in taken]
-    found = local_polynomial(spectra, _grid(taken, sample_time), taken[0].outputs.shape[1])
-    return found, "local polynomials", sines
+    spectra = [spectrum(run.inputs, run.outputs, sample_time) for run in runs]
+    return local_polynomial(spectra, _grid(runs, sample_time), runs[0].outputs.shape[1]), "local polynomials"
 
 
 def _behind_references(runs: Sequence[_Run], sample_time: float) -> Response:
@@ -238,10 +234,6 @@ def _check_length(runs: Sequence[_Run]) -> None:
             )
 
 
-def _is_sine(run: _Run, length: int) -> bool:
-    return periods(run.inputs, run.outputs, length, 1.0).is_sine
-
-
 def _check_alike(runs: Sequence[Periods]) -> None:
     sizes = [float(np.sqrt((np.abs(run.inputs) ** 2).sum())) for run in runs]
     if max(sizes) > _ALIKE * min(sizes):
@@ -249,17 +241,3 @@ def _check_alike(runs: Sequence[Periods]) -> None:
             f"the multisines' sizes differ by a factor of {max(sizes) / min(sizes):.2g}: a nonlinear robot answers "
             "small and large ones differently; make one response of each size."
         )
-
-
-def _of_sines(sines: Sequence[Sine], q: int) -> Response:
-    """Return the describing functions as a response: a column is known where its input alone was moved."""
-    m = len(sines[0].response)
-    frequency = np.unique([item.frequency for item in sines])
-    G = np.full((frequency.size, m, q), np.nan + 0j)
-    harmonics = np.full((frequency.size, m), np.nan)
-    for item in sines:
-        k, a = int(np.searchsorted(frequency, item.frequency)), int(np.argmax(item.amplitude))
-        G[k, :, a] = item.response
-        harmonics[k] = item.distortion
-    nothing = np.full((frequency.size, m * q, m * q), np.nan + 0j)
-    return Response(frequency, G, nothing, np.zeros(frequency.size), 1.0 / (1.0 + harmonics**2), None)

@@ -131,35 +131,3 @@ def _realisation(
     noise = None if count < 2 else each.var(axis=0, ddof=1) / count
     G = each.mean(axis=0)
     return G, noise, ((np.abs(G @ U) ** 2).mean(axis=2), (np.abs(U) ** 2).mean(axis=2))
-
-
-@dataclass(frozen=True, slots=True)
-class Sine:
-    """What a neck answers to one sine: the sine-input describing function (Gelb and Vander Velde 1968, ch. 2).
-
-    Attributes:
-        frequency: [rad/s].
-        amplitude: of each input (q,) [rad].
-        response: (m,) of the outputs' fundamental, relative to the input that moves most.
-        distortion: (m,) rms of the harmonics over that of the fundamental.
-    """
-
-    frequency: float
-    amplitude: tuple[float, ...]
-    response: tuple[complex, ...]
-    distortion: tuple[float, ...]
-
-
-def sine(run: Periods) -> Sine:
-    """Return the describing function that a run of one sine shows."""
-    k = int(np.argmax(np.abs(run.inputs).max(axis=1)))
-    u = run.inputs[k]
-    Y = run.outputs.mean(axis=0)
-    rest = np.sqrt(np.maximum((np.abs(Y) ** 2).sum(axis=0) - np.abs(Y[k]) ** 2, 0.0))
-    main = int(np.argmax(np.abs(u)))
-    return Sine(
-        float(run.frequency[k]),
-        tuple(float(value) for value in np.abs(u)),
-        tuple(complex(value) for value in Y[k] / u[main]),
-        tuple(float(value) for value in rest / np.maximum(np.abs(Y[k]), 1e-300)),
-    )

@@ -1,4 +1,4 @@
-"""Frequency responses: circles that hold the truth, noise and distortion told apart, loops, describing functions."""
+"""Frequency responses: circles that hold the truth, noise and distortion told apart, loops."""
 
 from __future__ import annotations
 
@@ -169,19 +169,13 @@ def test_a_closed_loop_with_its_reference_gives_the_plant_where_the_inputs_alone
     assert held[1] < 0.5
 
 
-def test_a_sine_on_a_relay_gives_its_describing_function() -> None:
+def test_one_sine_is_refused_with_what_to_record() -> None:
     parts = []
     for item in multisine_experiments(amplitude=0.5, band=(1.0, 1.0), realisations=1):
         u = redefine(item.set_points)[:, :2]
         parts.append(recording(u, 0.1 * np.sign(np.round(u, 12))))
-    found = frequency_response(parts)
-    assert found.method == "sines"
-    first = found.sines[0]
-    # 4 M / (pi A) (Gelb and Vander Velde 1968, 2.3); 314 samples a cycle.
-    assert abs(first.response[0]) == pytest.approx(4.0 * 0.1 / (np.pi * 0.5), rel=1e-3)
-    # The harmonics 1/3, 1/5, ...: sqrt(pi^2/8 - 1).
-    assert first.distortion[0] == pytest.approx(np.sqrt(np.pi**2 / 8.0 - 1.0), rel=0.02)
-    assert "sine of 0.5 on theta_i at 1 rad/s" in found.summary()
+    with pytest.raises(DataError, match="one sine shows no linear response; record `multisine` with a band"):
+        frequency_response(parts)
 
 
 def test_what_is_called_supported_is_right_and_it_says_where_that_ends() -> None:
