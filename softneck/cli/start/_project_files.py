@@ -9,7 +9,7 @@ from typing import Any
 
 import tomli_w
 
-from softneck.core import FileFormatError, SettingsError
+from softneck.core import FileFormatError, SettingsError, to_si
 from softneck.core._budget import settings_text
 from softneck.robot import Robot, find_robot
 
@@ -61,8 +61,11 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _over_fmus(table: dict[str, Any], robot: Robot) -> dict[str, Any]:
     noise = robot.noise_std
-    # Seeds of runs are drawn by the study.
-    parameters = {} if noise is None else {"parameters": {"noise_std": noise, "noise_seed": 1}}
+    # The FMU's parameter is in SI. Seeds of runs are drawn by the study.
+    parameters = (
+        {} if noise is None
+        else {"parameters": {"noise_std": noise * to_si(robot.outputs.unit)[0], "noise_seed": 1}}
+    )  # fmt: skip
     eyes = {"observer": {"fmu": OBSERVER_FMU}} if "observer" in table else {}
     reference = dict(table["reference"])
     if "pitch_deg" in reference and "roll" in robot.outputs.names and _sizes(table):
