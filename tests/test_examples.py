@@ -26,11 +26,11 @@ def test_the_first_script_leaves_an_fmu(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.slow
 def test_the_pictures_of_set_membership_are_those_of_the_docs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All four are drawn; what they say is tested in tests/identification."""
+    """All three are drawn; what they say is tested in tests/identification."""
     monkeypatch.setattr("sys.argv", ["set_membership.py", str(tmp_path)])
     runpy.run_path(str(ROOT / "examples" / "set_membership.py"), run_name="__main__")
     names = {path.name for path in tmp_path.glob("*.svg")}
-    assert len(names) == 4
+    assert len(names) == 3
     assert names == {path.name for path in (ROOT / "docs" / "_static").glob("set_membership_*.svg")}
 
 

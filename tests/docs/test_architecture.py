@@ -116,8 +116,8 @@ def test_the_walk_through_runs(tmp_path: Path) -> None:
         else:
             assert language == "python"
             script.append(text)
-    # Three walk-throughs: kind (table, use), sensor (check), profile (EDS, tables, check).
-    assert len(script) == 6
+    # Three walk-throughs: kind (table, use), sensor (check), profile (tables, check).
+    assert len(script) == 5
     (tmp_path / "walk.py").write_text("\n".join(script), encoding="utf-8")
     path = os.pathsep.join(filter(None, (str(tmp_path), str(ROOT), os.environ.get("PYTHONPATH", ""))))
     done = subprocess.run(

@@ -166,6 +166,6 @@ def sampled(bench: Bench, spoil: Spoil) -> None:
     def taken(now: float):
         sample = take(now)
         values, rates = spoil(now, sample.values, sample.rates)
-        return sample._replace(pitch=values[0], roll=values[1], pitch_rate=rates[0], roll_rate=rates[1])
+        return sample._replace(values=values, rates=rates)
 
     neck._sampled = taken

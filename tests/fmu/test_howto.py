@@ -47,12 +47,12 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_fmpy_s_commands_run(folder: Path) -> None:
-    commands = [line.removeprefix("$ ") for part in _parts("fmu_fmpy.md", "console") for line in part.splitlines()]
+    lines = [line.removeprefix("$ ") for part in _parts("fmu_fmpy.md", "console") for line in part.splitlines()]
+    # Those before make the FMU; `make documents` runs them.
+    commands = [line for line in lines if line.startswith("python -m fmpy")]
     assert len(commands) == 3
     for command in commands:
-        words = shlex.split(command)
-        assert words[0] == "python"
-        _run([sys.executable, *words[1:]], folder)
+        _run([sys.executable, *shlex.split(command)[1:]], folder)
     assert (folder / "neck.csv").read_text().startswith('"time"')
 
 

@@ -372,7 +372,7 @@ def test_a_payload_counts_in_full_for_each_tension_whatever_friction_does() -> N
     rng = np.random.default_rng(0)
     motions = [carrying(payload, rng) for payload in (0.0, 1.5)]
     known = [(motion, features_of(motion, 0.01)) for motion in motions]
-    load, seen, level, spread = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0), MotorRules())
+    load, seen, level, spread = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0))
     # A mean of 25 blocks of friction, and at first of fewer, is good to 0.1 N of 0.75.
     np.testing.assert_allclose([row[-2] for row in level], 1.0, atol=0.1)
     np.testing.assert_allclose([row[:-1] for row in load], 0.2 + 0.25 * (1.0 - np.eye(N)), atol=0.1)
@@ -387,7 +387,7 @@ def test_the_load_of_the_experiments_is_what_no_tension_alone_says() -> None:
     motions = [carrying(0.0, rng), carrying(0.0, rng)]
     motions[1].tensions[:, 0] -= 2.0
     known = [(motion, features_of(motion, 0.01)) for motion in motions]
-    _, seen, _, _ = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0), MotorRules())
+    _, seen, _, _ = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0))
     # Half of 2 N each, half of it to either side; motor 1 says that nothing changed. The mean's own error as above.
     np.testing.assert_allclose(seen, (0.0, 0.5), atol=0.2)
 
@@ -396,14 +396,14 @@ def test_the_load_is_that_of_the_last_seconds() -> None:
     motion = carrying(0.0, np.random.default_rng(0))
     motion.tensions[2000:] -= 1.5
     known = [(motion, features_of(motion, 0.01))]
-    _, seen, _, _ = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0), MotorRules())
+    _, seen, _, _ = level_rows(known, np.full(N, 0.5), np.full(N, 20.0), np.full(N, 9.0))
     # A mean over all would end where it began to fall, at nothing.
     np.testing.assert_allclose(seen, (-0.75, 0.75), atol=0.25)
 
 
 def test_tendons_that_hang_all_the_time_have_no_level() -> None:
     known, limits = carrying(0.0, np.random.default_rng(4), rows=400), (np.full(N, 9.0), np.full(N, 99.0))
-    load, _, rows, spread = level_rows([(known, features_of(known, 0.01))], *limits, np.full(N, 9.0), MotorRules())
+    load, _, rows, spread = level_rows([(known, features_of(known, 0.01))], *limits, np.full(N, 9.0))
     assert not np.any(load)
     assert not np.any(rows)
     assert spread == (1.0,) * N
@@ -424,7 +424,7 @@ def test_a_single_tension_is_compared_with_nothing() -> None:
     one = {name: getattr(motion, name)[:, :1] for name in ("setpoints", "positions", "tensions")}
     alone = Motion(**one, values=motion.values, rates=motion.rates, due=motion.due)
     known = [(alone, features_of(alone, 0.01))]
-    _, seen, level, _ = level_rows(known, np.full(1, 0.5), np.full(1, 20.0), np.full(1, 9.0), MotorRules())
+    _, seen, level, _ = level_rows(known, np.full(1, 0.5), np.full(1, 20.0), np.full(1, 9.0))
     assert seen == (0.0, 0.0)
     assert not np.any(level)
 
