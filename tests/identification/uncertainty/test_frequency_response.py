@@ -319,7 +319,7 @@ def test_a_response_of_files_is_saved_drawn_and_described(tmp_path: Path) -> Non
     assert 1.0 <= low < high <= 12.1
     figure = found.plot(models={"oe": OutputError().fit(concatenate(parts))})
     assert figure.get_suptitle() == "theta_i to pitch"
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["data, 95 %", "oe"]
+    assert figure.axes[0].get_legend_handles_labels()[1] == ["data, 95 %", "oe"]
     found.save(tmp_path / "f.npz")
     assert "supported from" in load(tmp_path / "f.npz").summary()
     with pytest.raises(DataError, match="f: only a linear model or a family has a response to draw"):
