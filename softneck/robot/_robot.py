@@ -37,6 +37,16 @@ class Robot(Shown):
         neck: the virtual plant that stands for the robot: "paper", "lab" or a neck file.
         drives: file of the drives.
         file: from which it was read; None for a preset.
+
+    Example:
+        >>> import softneck
+        >>> finger = softneck.Robot.preset("finger")
+        >>> finger.set_points, finger.outputs.names
+        (('motor_setpoint_1',), ('pitch',))
+        >>> finger.motors.unit
+        'rad'
+        >>> softneck.Robot.from_dict(finger.as_dict()) == finger
+        True
     """
 
     name: str

@@ -139,6 +139,14 @@ def tune(
         SettingsError: no linear plant, an unknown kind, or requirements that contradict each other or the motors.
         OutputFileError: `folder` holds another search.
         CheckFailedError: the budget ended before any candidate was judged.
+
+    Example:
+        >>> import softneck
+        >>> from softneck.plant import NeckParameters
+        >>> neck = softneck.VirtualNeck(NeckParameters.paper())
+        >>> model = softneck.identify("rls", softneck.record("eq22", neck, seed=1))
+        >>> softneck.tune(model, {"overshoot_pct": 20}, kinds="pi", budget=12, workers=0).best.kind
+        'pi'
     """
     require_whole("budget", budget, _LEAST_BUDGET, 1_000_000)
     require_whole("seed", seed, 0, 2**31 - 2)

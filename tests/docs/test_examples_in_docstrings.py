@@ -9,8 +9,9 @@ import pytest
 
 import softneck
 
-NAMES = ("VirtualNeck", "build_fmu", "calibrate", "design_controller", "frequency_response", "identify", "linearize",
-         "load", "read_recording", "record", "simulate", "study", "validate", "verify")  # fmt: skip
+NAMES = ("Recording", "Robot", "VirtualNeck", "build_fmu", "calibrate", "design_controller", "family",
+         "frequency_response", "identify", "import_log", "linearize", "load", "observer", "read_recording", "record",
+         "simulate", "study", "tune", "validate", "verify")  # fmt: skip
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.core import DataError, FileFormatError, load
+from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import WARM_UP, Model, load_model
 from softneck.signals import Recording, concatenate
 
@@ -160,7 +160,7 @@ def test_wrong_sizes_and_horizons_are_refused(models: dict[str, Model]) -> None:
         model.step(state, [0, 0])
     with pytest.raises(DataError, match="`measured` must have 2 or 5 entries"):
         model.step(state, [0, 0, 0], measured=[0, 0, 0])
-    with pytest.raises(DataError, match="`horizon` must be at least 1 sample; got 0"):
+    with pytest.raises(SettingsError, match="`horizon` must be a whole number between 1 and"):
         model.predict(UNSEEN, 0)
     with pytest.raises(DataError, match="a run needs at least 2 rows; got 1"):
         model.simulate(UNSEEN.rows(0, 1))

@@ -47,7 +47,8 @@ def test_outputs_are_those_of_the_version_that_wrote_the_file(name: str) -> None
 def test_a_file_is_saved_as_it_was(path: Path, tmp_path: Path) -> None:
     load(path).save(tmp_path / path.name)
     (header, arrays), (new_header, new_arrays) = read_archive(path), read_archive(tmp_path / path.name)
-    assert new_header == header
+    # Of single sines there were none in a file; the entry went with them.
+    assert new_header == {key: value for key, value in header.items() if key != "sines"}
     assert list(new_arrays) == list(arrays)
     for name, array in arrays.items():
         assert new_arrays[name].dtype == array.dtype

@@ -250,7 +250,7 @@ def test_bad_input_is_told_in_words(files: dict[str, Path]) -> None:
     empty.axes["pitch"].used[:] = 0.0
     with pytest.raises(SettingsError, match="no samples of pitch"):
         verify(controller, empty, make_requirements(QUICK))
-    with pytest.raises(SettingsError, match="a controller is needed"):
+    with pytest.raises(SettingsError, match="a controller or its file is needed"):
         verify(linear_neck(), linear_neck(), make_requirements(QUICK))
     renamed = pi()
     system: Any = renamed.ss()

@@ -51,6 +51,17 @@ def import_log(path: str | Path, layout: Layout) -> ImportResult:
     Raises:
         FileFormatError: no such file or no table.
         DataError: a column is missing, holds no numbers, or the times do not fit.
+
+    Example:
+        >>> import softneck
+        >>> from pathlib import Path
+        >>> from softneck.signals import guess_layout
+        >>> rows = [f"{k * 20},{k},0,0,{k / 9:.2f},{-k / 9:.2f}" for k in range(200)]
+        >>> text = "\\n".join(["time [ms],target_1,target_2,target_3,pitch [deg],roll [deg]", *rows])
+        >>> _ = Path("log.csv").write_text(text, encoding="utf-8")
+        >>> result = softneck.import_log("log.csv", guess_layout("log.csv").layout)
+        >>> len(result.recording), result.recording.sample_time
+        (200, 0.02)
     """
     source = as_path(path)
     if not isinstance(layout, Layout):

@@ -38,6 +38,16 @@ class Recording(Shown):
         channels: name -> (time,) in SI; the set-points and the outputs are always there. NaN: sample missed.
         run: (time,) integers, constant over each experiment; 0 everywhere when not given.
         robot: whose channels these are; the paper's neck when not given.
+
+    Example:
+        >>> import numpy as np
+        >>> import softneck
+        >>> P = np.sin(np.arange(500) * 0.02)[:, None] * [1.0, -0.5, -0.5]
+        >>> recording = softneck.Recording.from_arrays(P, 0.08 * P[:, :2])
+        >>> len(recording), recording.sample_time
+        (500, 0.02)
+        >>> float(recording.outputs.max().round(3))
+        0.08
     """
 
     time: Vector
