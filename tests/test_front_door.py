@@ -32,6 +32,7 @@ TAKES: dict[str, Callable[[Any], object]] = {
     "read_recording": softneck.read_recording,
     "identify kind": lambda x: softneck.identify(x, RECORDING),
     "identify recording": lambda x: softneck.identify("rls", x),
+    "identify auto": lambda x: softneck.identify("auto", x),
     "identify robot": lambda x: softneck.identify("rls", RECORDING.set_points, robot=x),
     "identify train": lambda x: softneck.identify("rls", RECORDING, train=x),
     "family": softneck.family,

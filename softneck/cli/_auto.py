@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import CheckFailedError, DataError, SettingsError, refuse_existing
+from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import note, percent, print_json, print_table, progress
 from .shared._options import target
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from softneck.identification import Choice, Model, Validation
     from softneck.identification.selection._kind_trial import KindTrial
     from softneck.robot import Robot
-    from softneck.signals import Recording
 
 
 _HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
@@ -45,14 +44,12 @@ def identify_auto(
     as_json: bool,
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
-    from softneck.identification import choose, refit
-    from softneck.identification._identify import with_fit
-    from softneck.identification.models._fitting import check_training
+    from softneck.identification import refit
+    from softneck.identification._identify import choose_kind, with_fit
     from softneck.identification.models._validity import with_tolerance
     from softneck.identification.selection._auto import REFITTED
     from softneck.plots import write_page
-    from softneck.signals import concatenate, read_recording
-    from softneck.signals.quality._poor_excitation import stands_still
+    from softneck.signals import read_recording
 
     path, overwrite = target(output, "models/auto.npz", force=force)
     # Linear kinds are what `design` and `observer` take; the best of the others is the better plant for loops.
@@ -62,13 +59,8 @@ def identify_auto(
     if html is not None:
         refuse_existing(html, force=force)
     parts = [read_recording(source, robot=robot) for source in recordings]
-    head, tail, other = _split(parts, train)
-    check_training(head)
-    still = stands_still(tail, concatenate(parts))
-    if still is not None:
-        raise DataError(f"{recordings[-1]}: {still}. Record motion to the end, or hold out other rows by --train.")
     with progress("identify auto", quiet=as_json) as report:
-        choice = choose(head, tail, other_excitation=other, seed=seed or 0, progress=report)
+        choice = choose_kind(parts, name=str(recordings[-1]), train=train, seed=seed or 0, progress=report)
     others = _others(choice)
     saved = {path: choice, **{beside[sort]: other for sort, other in others.items()}}
     models: list[Model] = []
@@ -121,27 +113,6 @@ def _others(choice: Choice) -> dict[str, Choice]:
 
     found = best_others(choice.ranking, choice.chosen)
     return {sort: replace(choice, chosen=one) for sort, one in found.items() if one.model is not None}
-
-
-def _split(parts: list[Recording], train: float) -> tuple[Recording, Recording, bool]:
-    """Return what to train on, what to hold out, and whether that is another experiment."""
-    from softneck.signals import concatenate
-
-    if len(parts) > 1 and not _heavier_or_lighter(parts[-1], parts[:-1]):
-        return concatenate(parts[:-1]), parts[-1], True
-    if not 0.0 < train < 1.0:
-        raise SettingsError(f"--train: `auto` has to hold rows out; give a part below 1, got {train:g}.")
-    # The end of each run: a payload that was held out whole is one that the model would know nothing of.
-    head, tail = concatenate(parts).split(train)
-    return head, tail, False
-
-
-def _heavier_or_lighter(one: Recording, others: list[Recording]) -> bool:
-    """Return whether a recording has a payload beyond those of the others."""
-    from softneck.identification.models._fitting import payload_of
-
-    known = [payload_of(run) for part in others for run in part.runs()]
-    return any(not min(known) <= payload_of(run) <= max(known) for run in one.runs())
 
 
 def _title(robot: Robot) -> str:

@@ -8,15 +8,18 @@ from inspect import signature
 from pathlib import Path
 from typing import Any
 
-from softneck.core import Progress, SettingsError, file_hash, find_kind, require_positive, resolve
+from softneck.core import DataError, Progress, SettingsError, file_hash, find_kind, require_positive, resolve
 from softneck.core._kinds import make_settings
 from softneck.core._progress import shown_progress
 from softneck.robot import Robot
-from softneck.signals import Recording
+from softneck.signals import Recording, concatenate
+from softneck.signals.quality._poor_excitation import stands_still
 from softneck.signals.recording._files import RecordingLike, names_of, opened_recording
 
+from .models._fitting import check_training, payload_of
 from .models._model import Model
 from .models._validity import with_tolerance
+from .selection._auto import Choice, choose
 from .uncertainty._family import Family
 from .uncertainty._family_fit import FamilySettings
 from .validation._score_tables import INFINITE
@@ -41,7 +44,9 @@ def identify(
     It does what `softneck identify KIND` does; `summary()` and `findings["hold_out"]` tell the fit on the rest.
 
     Args:
-        kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...
+        kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...; "auto" compares all of them and returns the
+            best, with the reason in `findings["chosen"]` (`choose` returns the whole ranking). Of several recordings
+            it holds the last one out as a whole; its only setting is `seed`.
         recording: what to identify from, or its file; a DataFrame; an array of a `robot`; or a list of several.
         train: part of each run, from its start, to train on; 1 holds nothing out.
         robot: whose recording it is; None: `robot.toml` beside a file or above it, else what the recording says.
@@ -64,6 +69,8 @@ def identify(
         >>> model.findings["hold_out"]["rows"], model.findings["hold_out"]["fit"]["pitch"] > 50.0
         (275, True)
     """
+    if isinstance(kind, str) and kind == "auto":
+        return _best_kind(recording, train=train, robot=robot, tolerance=tolerance, progress=progress, **settings)
     estimator = make_settings(resolve(find_kind(kind, "model").settings), settings)
     whole = opened_recording(recording, robot)
     with shown_progress(f"identify {kind}", progress) as tell:
@@ -88,6 +95,58 @@ def identified(
         return model, None
     held_out = validate(model, tail, horizons=(1, INFINITE))
     return with_fit(model, held_out), held_out
+
+
+def _best_kind(
+    recording: RecordingLike, *, train: float, robot: Robot | str | Path | None, tolerance: float | None,
+    progress: Progress | None, seed: int = 0, **others: Any
+) -> Model:  # fmt: skip
+    """Return the model of the kind that `auto` chooses; its only setting is `seed`."""
+    if others:
+        raise SettingsError(f"`auto` has no setting {next(iter(others))!r}; use seed.")
+    listed: Sequence[Any] = recording if isinstance(recording, list | tuple) else [recording]
+    with shown_progress("identify auto", progress) as tell:
+        parts = [opened_recording(part, robot) for part in listed]
+        if not parts:
+            raise DataError("`auto` needs at least one recording; got an empty list.")
+        choice = choose_kind(parts, name=names_of(listed)[-1], train=train, seed=seed, progress=tell)
+    model = choice.chosen.model
+    if model is None:
+        raise DataError("the kind chosen by `auto` has no model.")
+    model = model if tolerance is None else with_tolerance(model, tolerance)
+    return with_fit(replace(model, findings={**model.findings, "chosen": choice.why}), choice.chosen.judged)
+
+
+def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: int, progress: Progress) -> Choice:
+    """Return what `auto` chooses from recordings; the last of several, called `name`, is held out as a whole.
+
+    Raises:
+        SettingsError: nothing would be held out.
+        DataError: what is held out stands still, or no kind could be identified.
+    """
+    head, tail, other = _split_for_choice(parts, train)
+    check_training(head)
+    still = stands_still(tail, concatenate(parts))
+    if still is not None:
+        raise DataError(f"{name}: {still}. Record motion to the end, or hold out other rows by `train`.")
+    return choose(head, tail, other_excitation=other, seed=seed, progress=progress)
+
+
+def _split_for_choice(parts: Sequence[Recording], train: float) -> tuple[Recording, Recording, bool]:
+    """Return what to train on, what to hold out, and whether that is another experiment."""
+    if len(parts) > 1 and not _is_other_payload(parts[-1], parts[:-1]):
+        return concatenate(parts[:-1]), parts[-1], True
+    if not 0.0 < train < 1.0:
+        raise SettingsError(f"`train`: `auto` has to hold rows out; give a part below 1, got {train:g}.")
+    # The end of each run: a model cannot know a payload that was held out whole.
+    head, tail = concatenate(parts).split(train)
+    return head, tail, False
+
+
+def _is_other_payload(one: Recording, others: Sequence[Recording]) -> bool:
+    """Return whether a recording has a payload beyond those of the others."""
+    known = [payload_of(run) for part in others for run in part.runs()]
+    return any(not min(known) <= payload_of(run) <= max(known) for run in one.runs())
 
 
 def with_fit(model: Model, held_out: Validation | None) -> Model:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.cli._auto import _split
-from softneck.core import load
+import softneck
+from softneck.core import SettingsError, load, read_archive
+from softneck.identification._identify import _split_for_choice
 from softneck.identification.selection import _auto
 from softneck.signals import write_recording
 
@@ -53,7 +54,7 @@ def test_no_payload_is_held_out_whole(payloads: tuple[float, ...], whole: bool) 
     """What nobody else carries is trained on as well, or the model would not know it."""
     one = neck_recording(300, seed=3)
     parts = [replace(one, channels={**one.channels, "payload": np.full(300, kg)}) for kg in payloads]
-    head, tail, other = _split(parts, 0.7)
+    head, tail, other = _split_for_choice(parts, 0.7)
     assert other == whole
     trained = set(np.unique(head.channels["payload"]))
     assert min(trained) == min(payloads)
@@ -117,6 +118,20 @@ def test_auto_prints_one_json_object_and_holds_out_the_last_of_several(call: Cal
         chosen["scores"]
     )
     assert not chosen["stopped_early"]
+
+
+def test_auto_in_python_makes_the_same_model(call: Call, recording: Path) -> None:
+    write_recording(Path("other.csv"), neck_recording(300, seed=44))
+    facts = json.loads(call("identify", "auto", recording, "other.csv", "-o", "cli.npz", "--json").out)
+    model = softneck.identify("auto", [recording, "other.csv"])
+    assert model.kind == facts["chosen"]
+    assert model.findings["chosen"] == facts["why"]
+    model.save("python.npz")
+    (head, arrays), (head_too, arrays_too) = read_archive(Path("cli.npz")), read_archive(Path("python.npz"))
+    assert head["findings"]["hold_out"] == head_too["findings"]["hold_out"]
+    assert all(np.array_equal(arrays[name], arrays_too[name], equal_nan=True) for name in arrays)
+    with pytest.raises(SettingsError, match="`auto` has no setting 'na'"):
+        softneck.identify("auto", recording, na=1)
 
 
 def test_auto_trains_the_chosen_kind_on_all_rows_and_says_so(call: Call, recording: Path) -> None:

@@ -258,7 +258,7 @@ def test_a_folder_of_another_study(place: Path) -> None:
     before = {path.name: path.read_bytes() for path in (place / "out").iterdir()}
     (place / "study.toml").write_text(STUDY.replace("seed = 7", "seed = 8"))
     with pytest.raises(SettingsError, match=r"holds another study \(other seed\)"):
-        study(load_study(place / "study.toml"), workers=0, output=place / "out")
+        study(place / "study.toml", workers=0, output=place / "out")
     assert {path.name: path.read_bytes() for path in (place / "out").iterdir()} == before
     study(load_study(place / "study.toml"), workers=0, output=place / "out", force=True)
     assert (place / "out" / "study.json").read_bytes() != before["study.json"]

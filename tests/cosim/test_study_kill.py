@@ -127,7 +127,7 @@ def test_ctrl_c_ends_cleanly(place: Path) -> None:
         assert said.strip().splitlines()[-1].startswith("softneck: interrupted; files already finished are kept")
         assert "Traceback" not in said
         assert gone(process.pid)
-    runs = study(load_study(place / "study.toml"), workers=0, output=place / "out")
+    runs = study(place / "study.toml", workers=0, output=place / "out")
     assert runs["run"].tolist() == list(range(40))
 
 

@@ -14,7 +14,7 @@ from softneck.core._progress import shown_progress
 
 from ._executors import Crew, check_sendable, crew
 from ._store import Store
-from ._study import Source, Study, make_study
+from ._study import Source, Study, load_study, make_study
 from ._study_run import Chunk, Row, failed_row, release, run_chunk
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def study(
     The numbers depend on the study and its seed alone, not on workers or the order in which runs end.
 
     Args:
-        loop: a loop file, its table, a loop, or a whole `Study`, to which no other setting is added.
+        loop: a loop file, its table, a loop; or a study file or a `Study`, to which no other setting is added.
         vary: dotted key -> {"grid": [...]}, {"choices": [...]}, {"uniform": [low, high]}, {"log_uniform": ...},
             {"normal": [mean, standard deviation]} or {"seed": True}; as [vary] in a study file.
         runs: how many; each random sample meets every point of the grids before the next one.
@@ -79,11 +79,13 @@ def study(
         >>> runs["reference.pitch_deg"].tolist()
         [5.0, 10.0]
     """
-    made = loop if isinstance(loop, Study) else make_study(
-        loop, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives, parquet=parquet
+    # A file without `vary` is a study file: a loop file alone has nothing to vary.
+    given = load_study(Path(loop)) if isinstance(loop, str | Path) and vary is None else loop
+    made = given if isinstance(given, Study) else make_study(
+        given, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives, parquet=parquet
     )  # fmt: skip
-    if isinstance(loop, Study) and (vary, runs, objectives) != (None, None, None):
-        raise SettingsError("a Study has its own vary, runs and objectives; make another one with `make_study`.")
+    if isinstance(given, Study) and (vary, runs, objectives) != (None, None, None):
+        raise SettingsError("a study has its own vary, runs and objectives; make another one with `make_study`.")
     with shown_progress("study", report) as tell:
         if output is not None:
             return run_study(made, Path(output), workers=workers, dask=dask, force=force, report=tell)
