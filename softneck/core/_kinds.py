@@ -135,6 +135,16 @@ REMOVED: dict[str, str] = {
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 
 
+#: Settings that the robot's file says since softneck 0.3, and where.
+_OF_ROBOT = {
+    "position_limit": "[motors] setpoint_min and setpoint_max",
+    "slew_limit": "[motors] rate_limit",
+    "least_position": "[motors] setpoint_min",
+    "tendon_angles": "[directions] angles_deg",
+    "sample_time": "sample_time_s",
+}
+
+
 def removed_kind(name: str) -> str:
     """Return a sentence on a kind that went; empty if `name` is none."""
     if name not in REMOVED:
@@ -170,6 +180,11 @@ def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:
     """
     fields = {field.name for field in dataclasses.fields(settings_class)}
     unknown = sorted(set(values) - fields)
+    if unknown and unknown[0] in _OF_ROBOT:
+        raise SettingsError(
+            f"`{unknown[0]}` is the robot's: robot.toml says it, `{_OF_ROBOT[unknown[0]]}`; name the file by --robot "
+            "(`robot=` in Python)."
+        )
     if unknown:
         meant = did_you_mean(unknown[0], fields)
         raise SettingsError(f"unknown setting `{unknown[0]}`; {meant}this kind has {', '.join(sorted(fields))}.")

@@ -10,6 +10,7 @@ import numpy as np
 
 from softneck.core import SettingsError, Vector, require_between, require_finite, require_positive, to_si
 from softneck.robot import Robot
+from softneck.robot._neck_default import NeckDefault
 from softneck.runtime import Port
 
 # The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
@@ -156,16 +157,10 @@ class ControllerLimits:
         return cls(robot=robot, **{name: float(header[name]) for name in LIMITS if name in header})
 
     def constants(self, sample_time: float) -> Vector:
-        """Return the runtime's constants: the sample time, of another robot also its ranges of set-points, references.
-
-        Raises:
-            SettingsError: the robot does not say how far its motors go.
-        """
-        if self.robot.is_neck:
-            return np.array([sample_time])
+        """Return the runtime's constants: the sample time, of another robot also its ranges of set-points, references."""
         ranges = motor_ranges(self.robot, self.position_limit)
-        if ranges is None:
-            raise _not_given(self.robot, "motors.setpoint_min` and `setpoint_max", "position_limit")
+        if self.robot.is_neck or ranges is None:
+            return np.array([sample_time])
         low, high = reference_ranges(self.robot)
         return np.array([sample_time, *ranges[0], *ranges[1], *low, ranges[0].min(), *high, ranges[1].max()])
 
@@ -202,6 +197,44 @@ class ControllerLimits:
 
 
 LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "least_cocontraction")
+# Of a neck, where its file allows more: 0.25 rad in 20 ms.
+_NECK_SLEW = 12.5
+
+
+def limits_of(robot: Robot, *, lead_limit: float, least_cocontraction: float) -> ControllerLimits:
+    """Return the limits of a robot: what its file says of its motors, and two of a controller's own.
+
+    Args:
+        robot: whose motors they are.
+        lead_limit, least_cocontraction: in the unit of its motors; a `NeckDefault` is of necks: other set-points may
+            run ahead of the motors as far as these go.
+
+    Raises:
+        SettingsError: a limit that the robot's file does not say.
+    """
+    motors, factor = robot.motors, to_si(robot.motors.unit)[0]
+    given = {"lead_limit": lead_limit, "least_cocontraction": least_cocontraction}
+    if robot.is_neck:
+        position = min((MAX_MOTOR, *(motors.setpoint_max or ())))
+        # Down to the same limit there is no need of a rule.
+        lowest = [low for low in motors.setpoint_min or () if low > -position]
+        return ControllerLimits(
+            robot=robot, position_limit=position, slew_limit=min((_NECK_SLEW, *(motors.rate_limit or ()))),
+            least_position=max((-MAX_MOTOR, *lowest)), **given,
+        )  # fmt: skip
+    ranges = motor_ranges(robot, None)
+    if ranges is None or motors.rate_limit is None:
+        missing = "setpoint_min` and `setpoint_max" if ranges is None else "rate_limit"
+        raise SettingsError(
+            f"robot {robot.label()} gives no `motors.{missing}`, which a controller needs; add it to its robot file."
+        )
+    most = float(np.abs(ranges).max())
+    own = {name: factor * value for name, value in given.items() if not isinstance(value, NeckDefault)}
+    usual = {"lead_limit": 2.0 * most, "least_cocontraction": -most}
+    return ControllerLimits(
+        robot=robot, position_limit=most, slew_limit=factor * min(motors.rate_limit), least_position=-most,
+        **{**usual, **own},
+    )  # fmt: skip
 
 
 def robot_limits(robot: Robot, given: Mapping[str, float]) -> ControllerLimits:
