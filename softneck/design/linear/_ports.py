@@ -157,7 +157,7 @@ class ControllerLimits:
         return cls(robot=robot, **{name: float(header[name]) for name in LIMITS if name in header})
 
     def constants(self, sample_time: float) -> Vector:
-        """Return the runtime's constants: the sample time, of another robot also its ranges of set-points, references."""
+        """Return the runtime's constants: sample time, of another robot also ranges of set-points, references."""
         ranges = motor_ranges(self.robot, self.position_limit)
         if self.robot.is_neck or ranges is None:
             return np.array([sample_time])
