@@ -9,7 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.plots import faults_figure, region_figure, spectrum_figure
+from softneck.plots import chart_figure
+from softneck.plots._quality_page import faults_chart
 from softneck.signals import Excitation, Recording, SetPointLimits, assess_quality, prepare, signal
 
 STATIC = Path(__file__).parent / "_static"
@@ -18,12 +19,9 @@ STATIC = Path(__file__).parent / "_static"
 def main() -> None:
     """Write every picture."""
     neck = VirtualNeck(NeckParameters.preset("paper"))
-    eq22, mixed = (record(signal(name), neck, seed=1) for name in ("eq22", "mixed"))
-    _save(spectrum_figure(assess_quality(eq22), "Eq. 22"), "quality_spectrum.png")
-    _save(region_figure(eq22, assess_quality(eq22), "Eq. 22"), "quality_region_eq22.png")
-    _save(region_figure(mixed, assess_quality(mixed), "mixed"), "quality_region_mixed.png")
+    eq22 = record(signal("eq22"), neck, seed=1)
     bad = _faulty(eq22.rows(0, 3000))
-    _save(faults_figure(bad, assess_quality(bad), "Eq. 22 with planted faults"), "quality_faults.png")
+    _save(chart_figure(faults_chart(bad, assess_quality(bad), "Eq. 22 with planted faults")), "quality_faults.png")
     _save(_limits_figure(), "excitation_limits.png")
 
 

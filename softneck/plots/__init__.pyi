@@ -3,12 +3,7 @@ from ._chart import Curve as Curve
 from ._chart import Level as Level
 from ._chart import Panel as Panel
 from ._figures import chart_figure as chart_figure
-from ._figures import delay_figure as delay_figure
-from ._figures import histogram_figure as histogram_figure
-from ._figures import loop_figure as loop_figure
-from ._figures import residual_figure as residual_figure
 from ._figures import validation_figure as validation_figure
-from ._identification_figures import convergence_figure as convergence_figure
 from ._identification_figures import cover_figure as cover_figure
 from ._identification_figures import frequency_response_figure as frequency_response_figure
 from ._identification_figures import local_map_figure as local_map_figure
@@ -17,11 +12,5 @@ from ._page import Section as Section
 from ._page import Table as Table
 from ._page import page as page
 from ._page import write_page as write_page
-from ._quality_page import correlation_figure as correlation_figure
-from ._quality_page import faults_figure as faults_figure
 from ._quality_page import quality_page as quality_page
-from ._quality_page import region_figure as region_figure
-from ._quality_page import spectrum_figure as spectrum_figure
-from ._study_charts import distribution_figure as distribution_figure
-from ._study_charts import influence_figure as influence_figure
 from ._study_charts import pareto_figure as pareto_figure

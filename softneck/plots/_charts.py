@@ -13,7 +13,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel
-from ._style import ALL_MOTOR_COLOURS, BLUE, COLOURS, GREEN, GREY, MOTOR_COLOURS, ORANGE, RED, SKY, looks, shown
+from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, MOTOR_COLOURS, ORANGE, RED, SKY, looks, shown
 
 # Of the whole time: the space between two runs that both start at zero.
 _SPACE = 0.03
@@ -83,7 +83,7 @@ def _moved(time: Vector, breaks: np.ndarray, usual: float) -> tuple[Vector, bool
     return x, moved
 
 
-BLACK = "black"
+BLACK, _BOUND = "black", "99 % bounds"
 _ZERO = Level(0.0, dashed=False)
 _OUTPUT_COLOURS = (BLUE, ORANGE, GREEN, SKY)
 
@@ -257,19 +257,62 @@ def _step_limits(
     return levels
 
 
-def delay_chart(curves: Mapping[str, list[list[float]]], title: str, *, caption: str = "") -> Chart:
-    """Describe the cost curve of the dead time: rows of (delay [s], free-run fit [%], one-step rms [rad])."""
-    tables = {name: np.array(rows) for name, rows in curves.items()}
-    fits, errors = [], []
-    for (name, table), colour in zip(tables.items(), COLOURS, strict=False):
-        fits.append(Curve(1e3 * table[:, 0], table[:, 1], name, colour, "marked"))
-        errors.append(Curve(1e3 * table[:, 0], np.degrees(table[:, 2]), name, colour, "marked"))
-    best = max(float(table[:, 1].max()) for table in tables.values())
-    # What lies far below the best is no candidate.
-    fit = Panel(fits, "free-run fit [%]", y_range=(best - 12.0, best + 1.0))
-    panels = [fit, Panel(errors, "one-step rms [deg]", legend=False)]
-    return Chart(title, panels, "dead time [ms]", caption=caption, row_height=1.9)
-
-
 def _borders(line: Timeline) -> tuple[Level, ...]:
     return tuple(Level(float(x), colour=GREY, vertical=True) for x in line.starts)
+
+
+def residual_chart(
+    autocorrelation: tuple[np.ndarray, Matrix, Vector],
+    cross_correlation: tuple[np.ndarray, Matrix, Matrix],
+    title: str,
+    *,
+    caption: str = "",
+    robot: Robot = NECK,
+) -> Chart:
+    """Describe residual tests as MATLAB's `resid`: one column for each output, of a neck pitch and roll.
+
+    Args:
+        autocorrelation: of the one-step errors: lags (n,) [samples], values (outputs, n) and their bounds (outputs,);
+            lag 0, which is 1, is not drawn.
+        cross_correlation: with the motors' set-points: lags (m,) [samples], values (outputs, motors, m), bounds
+            (outputs, motors).
+        title: of the chart.
+        caption: for under the chart.
+        robot: whose outputs and motors these are.
+
+    Raises:
+        DataError: shapes do not fit.
+    """
+    lags, values, bounds = autocorrelation
+    cross_lags, cross, cross_bounds = cross_correlation
+    axes, motors = robot.outputs.names, len(robot.motors.names)
+    if values.shape != (len(axes), len(lags)) or cross.shape != (len(axes), motors, len(cross_lags)):
+        raise DataError(
+            f"residual tests need correlations ({len(axes)}, lags) and ({len(axes)}, {motors}, lags); got "
+            f"{values.shape} at {len(lags)} lags and {cross.shape} at {len(cross_lags)}."
+        )
+    kept = np.asarray(lags) != 0
+    panels = [
+        _stems(np.asarray(lags)[kept], values[i, kept], float(bounds[i]), f"{axis}: error with itself later")
+        for i, axis in enumerate(axes)
+    ]
+    for j in range(motors):
+        panels += [
+            _stems(cross_lags, cross[i, j], float(cross_bounds[i, j]), f"{axis}: error with set-point {j + 1} earlier")
+            for i, axis in enumerate(axes)
+        ]
+    return Chart(title, panels, "lag [samples]", columns=len(axes), linked=False, caption=caption, row_height=1.9)
+
+
+def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
+    x = np.asarray(lags, dtype=np.float64)
+    out = np.abs(values) > bound
+    curves = [
+        Curve(x, np.where(out, np.nan, values), "within", BLUE, "stems"),
+        Curve(x, np.where(out, values, np.nan), "outside", RED, "stems"),
+    ]
+    levels = [Level(0.0, dashed=False)]
+    if np.isfinite(bound):  # too few rows have none
+        levels += [Level(bound, _BOUND), Level(-bound)]
+    edge = 1.15 * max(float(np.nan_to_num(bound)), float(np.nan_to_num(np.abs(values)).max(initial=0.0)), 1e-3)
+    return Panel(curves, "correlation", levels=levels, title=title, legend=False, y_range=(-edge, edge))

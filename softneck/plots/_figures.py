@@ -12,8 +12,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Panel, bar_width
-from ._charts import delay_chart, loop_chart, validation_chart
-from ._judgement_charts import histogram_chart, residual_chart
+from ._charts import validation_chart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,25 +100,3 @@ def validation_figure(
 ) -> Figure:
     """Draw `validation_chart`: measured and predicted outputs, of a neck (time, 2) [rad], each with its error below."""
     return chart_figure(validation_chart(time, measured, predictions, title, bounds=bounds, run=run, robot=robot))
-
-
-def loop_figure(time: Vector, signals: Mapping[str, Vector], title: str) -> Figure:
-    """Draw `loop_chart`: reference, true, measured and estimated angles, motors, tensions where there are any."""
-    return chart_figure(loop_chart(time, signals, title))
-
-
-def delay_figure(curves: Mapping[str, list[list[float]]], title: str) -> Figure:
-    """Draw `delay_chart`: the cost curve of the dead time."""
-    return chart_figure(delay_chart(curves, title))
-
-
-def residual_figure(
-    autocorrelation: tuple[np.ndarray, Matrix, Vector], cross_correlation: tuple[np.ndarray, Matrix, Matrix], title: str
-) -> Figure:
-    """Draw `residual_chart`: correlation of one-step errors with themselves and with the set-points, with bounds."""
-    return chart_figure(residual_chart(autocorrelation, cross_correlation, title))
-
-
-def histogram_figure(errors: Matrix, title: str) -> Figure:
-    """Draw `histogram_chart`: how errors (time, 2) [rad] are spread, in degrees, beside a normal curve."""
-    return chart_figure(histogram_chart(errors, title))

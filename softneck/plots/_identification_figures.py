@@ -1,8 +1,8 @@
-"""Figures of identification: convergence, maps of local models, cover of an uncertain plant."""
+"""Figures of identification: maps of local models, cover of an uncertain plant, frequency responses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,39 +19,6 @@ _COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)
 _QUANTITIES = ("pole [1/s]", "dead time [ms]")
 # Two-sided 95 %.
 _REACH = 1.96
-
-
-def convergence_figure(
-    time: Vector, parameters: Matrix, std: Matrix, names: Sequence[str], title: str, *, error: Vector | None = None
-) -> Figure:
-    """Draw parameters over time with 95 % bands, and the prediction error below where it is given.
-
-    Args:
-        time: (rows,) [s].
-        parameters: (rows, n).
-        std: (rows, n) standard deviations.
-        names: of the parameters.
-        title: of the figure.
-        error: (rows,) epsilon of Eq. 30 [rad].
-    """
-    n = parameters.shape[1]
-    figure, axes = new_figure(n + (error is not None), row_height=1.7)
-    for i, ax in enumerate(axes[:n]):
-        colour = _COLOURS[i % len(_COLOURS)]
-        ax.plot(time, parameters[:, i], color=colour, lw=1.0)
-        low, high = parameters[:, i] - _REACH * std[:, i], parameters[:, i] + _REACH * std[:, i]
-        ax.fill_between(time, low, high, color=colour, alpha=0.2, lw=0)
-        # Before anything is known the band is wider than any paper.
-        settled = parameters[len(time) // 10 :, i]
-        middle, span = 0.5 * (settled.min() + settled.max()), max(float(np.ptp(settled)), 1e-6)
-        ax.set_ylim(middle - 1.5 * span, middle + 1.5 * span)
-        label(ax, names[i], legend=False)
-    if error is not None:
-        axes[n].plot(time, np.degrees(error), color=GREY, lw=0.7)
-        label(axes[n], "error [deg]", legend=False)
-    axes[-1].set_xlabel("time [s]")
-    figure.suptitle(title)
-    return figure
 
 
 def local_map_figure(

@@ -3,152 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import SettingsError, Vector, to_si
-from softneck.signals import Quality, Recording, redefine
-from softneck.signals.quality._region import Region, reachable_hexagon
-from softneck.signals.recording._channels import file_unit, si_unit
+from softneck.core import Vector, to_si
+from softneck.signals import Quality, Recording
+from softneck.signals.recording._channels import file_unit
 
 from ._chart import Chart, Curve, Panel
-from ._figures import chart_figure
 from ._page import Section, Table, page
-from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, ORANGE, PURPLE, RED, label, new_figure
+from ._style import GREEN, GREY, ORANGE, PURPLE, RED
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-_INPUT_NAMES = {"theta_i": r"$\theta_i$", "phi_i": r"$\phi_i$", "delta_i": r"$\delta_i$"}
-# More points than this hide each other.
-_POINTS = 20_000
 _FAULTS = (("missed", RED), ("frozen", PURPLE), ("clipped", ORANGE), ("outliers", GREEN))
 _SHOWN = {"outliers": "spikes"}
 # Of one sort in one channel.
 _MOST_MARKED = 200
 
 
-def spectrum_figure(quality: Quality, title: str) -> Figure:
-    """Draw the spectral density of the inputs against the robot's bandwidth, of a neck 4 rad/s."""
-    figure, (ax,) = new_figure(1, row_height=3.6)
-    spectrum, whose = quality.spectrum, "neck" if quality.robot.is_neck else "robot"
-    omega, density, bandwidth = spectrum.omega[1:], spectrum.density[1:], spectrum.bandwidth
-    top = density.max(initial=1e-12)
-    for i, name in enumerate(spectrum.inputs):
-        if density[:, i].max(initial=0.0) > 1e-15:
-            below = f" below {bandwidth:.3g} rad/s" if quality.robot.is_neck else ""  # no room for more than three
-            share = "" if np.isnan(bandwidth) else f" ({100 * spectrum.below_bandwidth[i]:.0f} %{below})"
-            said = _INPUT_NAMES.get(name, f"motor {i + 1}") + share
-            ax.loglog(omega, np.maximum(density[:, i], 1e-12 * top), color=ALL_MOTOR_COLOURS[i], lw=1.2, label=said)
-    if not np.isnan(bandwidth):
-        ax.axvline(bandwidth, color="black", ls="--", lw=1.0)
-        ax.annotate(f"bandwidth of the {whose}", (bandwidth, 0.93), xycoords=("data", "axes fraction"), xytext=(5, 0),
-                    textcoords="offset points", fontsize="small")  # fmt: skip
-    ax.set_ylim(1e-7 * top, 3.0 * top)
-    ax.set_xlabel("frequency [rad/s]")
-    unit = si_unit(quality.robot.set_points[0], quality.robot)
-    label(ax, rf"density [{unit}$^2$ s/rad]", legend=len(ax.lines) > 1)
-    figure.suptitle(title)
-    return figure
-
-
-def region_figure(recording: Recording, quality: Quality, title: str) -> Figure:
-    """Draw the (theta_i, phi_i) that a neck visited, coloured by delta_i, in the hexagon that the motors reach."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    region = _neck_region(quality)
-    P = recording.motor_positions
-    P = P[np.isfinite(P).all(axis=1)]
-    theta, phi, delta = redefine(P[:: max(1, len(P) // _POINTS)]).T
-    figure = Figure(figsize=(10.0, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-    limit = region.limit
-    left.plot(*reachable_hexagon(limit).T, color=GREY, lw=1.0)
-    span = max(float(np.abs(delta).max(initial=0.0)), 1e-3)
-    points = left.scatter(theta, phi, c=delta, s=3, cmap="coolwarm", vmin=-span, vmax=span, rasterized=True)
-    figure.colorbar(points, ax=left, label=r"$\delta_i$ [rad]")
-    left.set_aspect("equal")
-    left.set_xlabel(r"$\theta_i$ [rad]")
-    left.set_ylabel(r"$\phi_i$ [rad]")
-    covered = 100 * region.tilt_coverage
-    left.set_title(f"{covered:.0f} % of what motors of $\\pm${limit:g} rad reach", fontsize="medium")
-    _behaviours(right, region)
-    figure.suptitle(title)
-    return figure
-
-
-def _neck_region(quality: Quality) -> Region:
-    if quality.region is None:
-        raise SettingsError(f"the region of theta_i and phi_i is a neck's, not that of robot {quality.robot.label()}.")
-    return quality.region
-
-
-def _behaviours(ax: Axes, region: Region) -> None:
-    """Draw for how long each behaviour took place; one that never did is marked."""
-    names = list(region.behaviours)
-    seconds = np.array([region.behaviours[name] for name in names])
-    never = np.array([name in region.never for name in names])
-    rows = np.arange(len(names))
-    ax.barh(rows, seconds, color=np.where(never, RED, BLUE))
-    for row in rows:
-        text = " never" if seconds[row] == 0.0 else f" {seconds[row]:.1f} s" + (": too little" if never[row] else "")
-        ax.annotate(text, (seconds[row], row), va="center", fontsize="small", color=RED if never[row] else "black")
-    ax.set_yticks(rows, names)
-    ax.invert_yaxis()
-    ax.set_xlim(0.0, 1.25 * max(1.0, float(seconds.max())))
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.set_xlabel("time spent [s]")
-    ax.set_title("behaviours that the paper names", fontsize="medium")
-
-
-def channels_figure(recording: Recording, quality: Quality, title: str) -> Figure:
-    """Draw how often each value occurs: a clipped channel piles up at its edge, a quantised one shows its levels."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import NullFormatter
-
-    names = _shown(recording)
-    columns = 3
-    figure = Figure(figsize=(10.0, 2.2 * -(-len(names) // columns) + 0.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(-(-len(names) // columns), columns, squeeze=False).ravel()
-    for ax in axes[len(names) :]:
-        ax.set_axis_off()
-    for ax, name in zip(axes, names, strict=False):
-        channel = quality.channels[name]
-        y = _values(recording, name)
-        y = y[np.isfinite(y)]
-        if y.size:
-            ax.hist(y, bins=_bins(channel.levels), color=BLUE)
-        if channel.clipped:
-            for stretch in channel.clipped[:50]:
-                ax.axvline(_values(recording, name)[stretch.start], color=ORANGE, lw=1.0)
-        step = "no steps" if channel.quantum is None else f"steps of {channel.shown(channel.quantum):.2g}"
-        ax.set_title(name if channel.command else f"{name}: {step}", fontsize="small")
-        ax.set_xlabel(f"[{channel.unit}]", fontsize="small")
-        ax.set_yscale("log")
-        ax.yaxis.set_minor_formatter(NullFormatter())
-        ax.spines[["top", "right"]].set_visible(False)
-    figure.suptitle(title)
-    return figure
-
-
-def _bins(levels: float | None) -> int:
-    """Return one bin for each level of a coarse channel, 60 otherwise."""
-    return 60 if levels is None or not 2 <= levels <= 120 else round(levels) + 1
-
-
-def faults_figure(recording: Recording, quality: Quality, title: str) -> Figure:
-    """Draw the measured channels over time, with the rows marked that are missed, frozen, clipped or spikes."""
-    return chart_figure(faults_chart(recording, quality, title))
-
-
 def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
-    """Describe the same: a band over the rows of a fault, a point on a spike."""
+    """Describe the measured channels over time: a band over the rows of a fault, a point on a spike."""
     # Times restart at each run; rows do not.
     t = np.arange(len(recording)) * recording.sample_time
     border = np.flatnonzero(np.diff(recording.run)) + 1
@@ -177,31 +50,6 @@ def _marked(t: Vector, y: Vector, rows: Sequence[np.ndarray], sort: str, colour:
     return Curve(x, low + gaps, sort, colour, "band", upper=high + gaps)
 
 
-def correlation_figure(quality: Quality, title: str) -> Figure:
-    """Draw the correlation between the motors' set-points; grey where a motor never moves."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.6, 3.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    ax = figure.subplots()
-    ax.set_facecolor("#dddddd")
-    image = ax.imshow(quality.correlation, cmap="coolwarm", vmin=-1.0, vmax=1.0)
-    figure.colorbar(image, ax=ax, label="correlation")
-    motors = range(len(quality.correlation))
-    for i in motors:
-        for j in motors:
-            r = quality.correlation[i, j]
-            text = "never\nmoves" if np.isnan(r) else f"{r:.2f}"
-            ax.text(j, i, text, ha="center", va="center", color="white" if abs(r) > 0.7 else "black")
-    ticks = [f"motor {j + 1}" for j in motors]
-    # Names of more motors than three would run into each other.
-    ax.set_xticks(motors, ticks if len(motors) <= 3 else [str(j + 1) for j in motors])
-    ax.set_yticks(motors, ticks)
-    figure.suptitle(title)
-    return figure
-
-
 def _shown(recording: Recording) -> list[str]:
     robot = recording.robot
     names = (*robot.set_points, *robot.motor_positions, *robot.outputs.names)
@@ -214,27 +62,17 @@ def _values(recording: Recording, name: str) -> Vector:
 
 
 def quality_page(recording: Recording, quality: Quality, title: str) -> str:
-    """Return the HTML text of a recording's quality: findings, tables and figures."""
+    """Return the HTML text of a recording's quality: findings and tables."""
     neck, bandwidth = quality.robot.is_neck, quality.spectrum.bandwidth
-    spectrum = [
-        f"Power spectral density of the {'redefined inputs' if neck else 'set-points'} (Welch, never across runs)."
-    ]
+    spectrum = f"Power of the {'redefined inputs' if neck else 'set-points'} (Welch, never across runs)."
     if not np.isnan(bandwidth):
-        spectrum[0] += f" What has no power up to the bandwidth of {bandwidth:.3g} rad/s cannot be identified."
+        spectrum += f" What has none up to the bandwidth of {bandwidth:.3g} rad/s cannot be identified."
     faults = faults_chart(recording, quality, "What was measured, with the rows of each fault marked")
     sections = [
         Section("Findings", charts=[faults], findings=_findings(quality)),
-        Section("Channels", [], [_channels(quality)], [
-            ("How often each value occurs, with faults at the edges.", channels_figure(recording, quality, "Values")),
-        ]),
-        Section("Excitation", spectrum, [_inputs(quality)], [
-            ("Spectrum of the inputs.", spectrum_figure(quality, "Excitation")),
-        ]),
-        _region(recording, quality),
-        Section("Independence", ["Correlation between the motors' set-points."], [_conditions(quality)], [
-            ("Correlation of the motors.", correlation_figure(quality, "Motors")),
-        ]),
-    ]  # fmt: skip
+        Section("Channels", tables=[_channels(quality)]),
+        Section("Excitation", text=[spectrum], tables=[_inputs(quality), _conditions(quality)]),
+    ]
     return page(
         title, sections, verdict=_verdict(recording, quality), holds=quality.severity != "warning",
         footer="Written by softneck info.",
@@ -266,20 +104,6 @@ def _findings(quality: Quality) -> list[tuple[str, str]]:
         )
         for one in quality.findings
     ]
-
-
-def _region(recording: Recording, quality: Quality) -> Section:
-    if not quality.robot.is_neck:
-        text = (
-            f"Robot {quality.robot.label()}: what its motors went through is in the tables. A map of tilt and the "
-            "behaviours that the paper names (one tendon alone, co-contraction) are shown of three-tendon necks only."
-        )
-        return Section("Region", [text])
-    text = (
-        "Each point is a row; the hexagon is what the motors reach. A model knows nothing outside the points, and "
-        "the paper's models failed at the behaviours beside it (section 7.4.2)."
-    )
-    return Section("Region", [text], [], [("Visited region.", region_figure(recording, quality, "Visited region"))])
 
 
 def _channels(quality: Quality) -> Table:

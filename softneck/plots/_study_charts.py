@@ -107,18 +107,6 @@ def pareto_figure(
     return chart_figure(pareto_chart(groups, front, labels, title))
 
 
-def distribution_figure(values: Mapping[str, Mapping[str, Vector]], title: str) -> Figure:
-    """Draw `distribution_chart`: how metrics are spread over the runs of each group."""
-    return chart_figure(distribution_chart(values, title))
-
-
-def influence_figure(
-    inputs: Mapping[str, Vector], metric: tuple[str, Vector], failed: np.ndarray, title: str
-) -> Figure:
-    """Draw `influence_chart`: a metric against each number that varied."""
-    return chart_figure(influence_chart(inputs, metric, failed, title))
-
-
 def _shares(metric: str, groups: Mapping[str, Vector], *, legend: bool) -> Panel:
     """Return the share of each group's runs in each of the bins that all groups have in common."""
     every = np.concatenate(list(groups.values()))

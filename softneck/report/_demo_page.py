@@ -9,7 +9,7 @@ import numpy as np
 from softneck.cosim import Result
 from softneck.identification import INFINITE, Model, Validation
 from softneck.plots import Chart, Section, Table
-from softneck.plots._charts import delay_chart, loop_chart, recording_chart, validation_chart
+from softneck.plots._charts import loop_chart, recording_chart, validation_chart
 from softneck.signals import Recording
 
 from ._closing import DemoDesign, limits_of
@@ -100,12 +100,8 @@ def _chart(recording: Recording, title: str) -> Chart:
 
 def _model_section(models: Mapping[str, Model]) -> Section:
     rows = [[name, line] for name, model in models.items() for line in model.summary().splitlines()[1:]]
-    caption = "The dead time's cost: a flat curve says that hysteresis lag hides in the pole."
-    curve = delay_chart(models["rls"].findings["delay_curve"], "Dead time of the linear model", caption=caption)
     return Section(
-        "What was identified",
-        tables=[Table("Models and their findings", ["model", "finding"], rows, text=2)],
-        charts=[curve],
+        "What was identified", tables=[Table("Models and their findings", ["model", "finding"], rows, text=2)]
     )
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from softneck.core import Matrix, to_si
 from softneck.identification import INFINITE, Validation
 from softneck.plots import Chart, Section, Table, page
-from softneck.plots._charts import validation_chart
-from softneck.plots._judgement_charts import histogram_chart, reliability_chart, residual_chart
+from softneck.plots._charts import residual_chart, validation_chart
 
 VALIDATION_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample: a one-step fit "
@@ -145,12 +144,6 @@ def _curves(r: Validation) -> Chart:
 def _section(r: Validation, *, drawn: bool) -> Section:
     """Return all on one result; its curves unless they are `drawn` already."""
     charts = [*([] if drawn else [_curves(r)]), _residuals(r)]
-    for name, values in _predictions(r).items():
-        errors = r.measured - values
-        if np.isfinite(errors).any(axis=0).all():
-            charts.append(histogram_chart(errors, f"Errors, {name}", robot=r.robot))
-    if r.validity is not None:
-        charts.append(reliability_chart(r.validity["reliability"], "Validity: predicted and observed"))
     return Section(_name(r), text=_remarks(r), tables=_run_tables(r), charts=charts)
 
 

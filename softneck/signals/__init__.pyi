@@ -13,7 +13,7 @@ from .importing._layout import read_layout as read_layout
 from .importing._layout_text import layout_toml as layout_toml
 from .importing._log import import_log as import_log
 from .quality._findings import Quality as Quality
-from .quality._report import assess_quality as assess_quality
+from .quality._findings import assess_quality as assess_quality
 from .recording._channels import SET_POINTS as SET_POINTS
 from .recording._files import read_recording as read_recording
 from .recording._files import write_recording as write_recording

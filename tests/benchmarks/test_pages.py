@@ -13,8 +13,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.plots import Section, page
-from softneck.plots._charts import recording_chart, validation_chart
-from softneck.plots._judgement_charts import histogram_chart, residual_chart
+from softneck.plots._charts import recording_chart, residual_chart, validation_chart
 
 from ..browser import shown
 
@@ -51,7 +50,6 @@ def validation_html(rows: int) -> str:
             (cross_lags, 0.01 * rng.standard_normal((2, 3, 51)), np.full((2, 3), 0.03)),
             "Residual tests",
         ),
-        histogram_chart(e, "Errors"),
     ]
     return page("30,000 samples", [Section("Validation", charts=charts)])
 

@@ -1,4 +1,4 @@
-"""Charts of residual tests and histograms show the numbers that they were given."""
+"""Charts of residual tests show the numbers that they were given."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError
-from softneck.plots import histogram_figure, residual_figure
-from softneck.plots._judgement_charts import histogram_chart, residual_chart
+from softneck.plots import chart_figure
+from softneck.plots._charts import residual_chart
 
 LAGS, CROSS_LAGS = np.arange(26), np.arange(-25, 26)
 
@@ -34,7 +34,7 @@ def test_bars_beyond_their_bound_stand_out_and_lag_zero_is_no_news() -> None:
         # Bounds are seen even where no bar comes near them.
         assert panel.y_range is not None
         assert panel.y_range[1] > max(level.value for level in panel.levels)
-    assert len(residual_figure(own, cross, "r").axes) == 8
+    assert len(chart_figure(chart).axes) == 8
 
 
 def test_too_few_rows_for_a_test_still_make_a_chart() -> None:
@@ -43,26 +43,3 @@ def test_too_few_rows_for_a_test_still_make_a_chart() -> None:
     assert len(nothing.panels[0].levels) == 1
     with pytest.raises(DataError, match="residual tests need correlations"):
         residual_chart((own[0][:3], own[1], own[2]), cross, "r")
-
-
-def test_a_histogram_is_a_density_beside_the_normal_curve_of_its_moments() -> None:
-    rng = np.random.default_rng(0)
-    errors = np.radians(rng.standard_normal((20_000, 2)) * [0.5, 2.0] + [0.1, 0.0])
-    errors[:25] = np.nan
-    chart = histogram_chart(errors, "h")
-    for panel in chart.panels:
-        bars, normal = panel.curves
-        width = np.diff(bars.x)[0]
-        assert bars.y.sum() * width == pytest.approx(1.0, abs=1e-12)
-        assert np.trapezoid(normal.y, normal.x) == pytest.approx(1.0, abs=1e-2)
-        # About 600 of 20,000 samples in the fullest bin are known to 4 %; 3 of these.
-        np.testing.assert_allclose(bars.y, np.interp(bars.x, normal.x, normal.y), atol=0.12 * normal.y.max())
-    assert len(histogram_figure(errors, "h").axes) == 2
-
-
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_equal_errors_make_a_histogram_and_none_do_not(value: float) -> None:
-    chart = histogram_chart(np.full((50, 2), value), "h")
-    assert np.isfinite(chart.panels[0].curves[0].y).all()
-    with pytest.raises(DataError, match="no error of pitch"):
-        histogram_chart(np.full((50, 2), np.nan), "h")

@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from matplotlib.collections import LineCollection
 from scipy.stats import norm
 
-from softneck.plots import convergence_figure, cover_figure, local_map_figure
-
-
-def test_a_convergence_has_an_axis_for_each_parameter_and_one_for_the_error() -> None:
-    t = np.arange(50) * 0.02
-    theta = np.column_stack([np.linspace(0, 1, 50), np.ones(50)])
-    figure = convergence_figure(t, theta, 0.1 * np.ones((50, 2)), ["a_1", "b_1"], "course", error=np.zeros(50))
-    assert [ax.get_ylabel() for ax in figure.axes] == ["a_1", "b_1", "error [deg]"]
-    np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), theta[:, 0])
-    # A band of 95 % of a normal distribution, to the three digits that are drawn.
-    reach = 0.1 * norm.ppf(0.975)
-    (band,) = figure.axes[1].collections
-    heights = np.asarray(band.get_paths()[0].vertices)[:, 1]
-    assert (heights.min(), heights.max()) == pytest.approx((1.0 - reach, 1.0 + reach), rel=1e-3)
+from softneck.plots import cover_figure, local_map_figure
 
 
 def test_a_map_shows_degrees_and_milliseconds() -> None:

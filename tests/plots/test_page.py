@@ -13,8 +13,7 @@ from softneck.core import OutputFileError
 from softneck.plots import (
     Section,
     Table,
-    delay_figure,
-    loop_figure,
+    chart_figure,
     page,
     validation_figure,
 )
@@ -35,7 +34,6 @@ def test_a_page_needs_nothing_from_outside_and_holds_its_pictures() -> None:
     figures = [
         ("experiment", Recording.from_arrays(_wave(3), _wave(2)).plot("experiment")),
         ("validation", validation_figure(t, _wave(2), {"model": 0.9 * _wave(2)}, "validation")),
-        ("delay", delay_figure({"pitch": [[0.0, 80.0, 0.01], [0.02, 81.0, 0.009]]}, "delay")),
     ]
     html = page("Title", [Section("First", figures=figures)])
     assert not re.search(r"(src|href)=\"(?!data:|#)", html)
@@ -58,7 +56,7 @@ def test_a_loop_is_drawn_with_what_the_plant_offers(tension: bool) -> None:
     signals = {f"motor_setpoint_{j}": np.zeros(50) for j in (1, 2, 3)} | {"pitch": np.ones(50), "roll": np.ones(50)}
     if tension:
         signals |= {f"tension_{j}": np.ones(50) for j in (1, 2, 3)}
-    figure = loop_figure(np.arange(50) * 0.02, signals, "loop")
+    figure = chart_figure(loop_chart(np.arange(50) * 0.02, signals, "loop"))
     assert len(figure.axes) == (4 if tension else 3)
 
 

@@ -17,7 +17,6 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.signals import (
     SET_POINTS,
-    Quality,
     Recording,
     assess_quality,
     concatenate,
@@ -28,7 +27,6 @@ from softneck.signals import (
     signal,
 )
 from softneck.signals.quality._excitation import welch
-from softneck.signals.quality._region import Region
 
 from ..data import LAYOUTS, neck_recording, recording_from
 
@@ -38,11 +36,6 @@ TS = 0.02
 def from_inputs(inputs: np.ndarray) -> Recording:
     """The tests' neck under theta_i, phi_i, delta_i (time, 3)."""
     return recording_from(motors_from(inputs), noise=1e-3)
-
-
-def region_of(found: Quality) -> Region:
-    assert found.region is not None
-    return found.region
 
 
 def topics(recording: Recording, severity: str) -> set[str]:
@@ -139,60 +132,15 @@ def test_the_correlation_is_numpys_and_two_motors_as_one_are_a_warning() -> None
     assert "correlation" in topics(recording_from(P), "warning")
 
 
-def test_each_behaviour_is_seen_when_it_happens_and_missed_when_not() -> None:
-    rest = np.zeros((200, 3))
-    for j in range(3):
-        alone = rest.copy()
-        alone[100:] = 3.0 * np.eye(3)[j]
-        found = region_of(assess_quality(recording_from(alone))).behaviours
-        expected = {f"tendon {i + 1} alone": (2.0 if i == j else 0.0) for i in range(3)}
-        # 100 samples of 20 ms.
-        assert {name: found[name] for name in expected} == pytest.approx(expected)
-        assert found["co-contraction"] == 0.0
-    together = rest + 2.0
-    assert region_of(assess_quality(recording_from(together))).behaviours["co-contraction"] == pytest.approx(4.0)
-    assert region_of(assess_quality(recording_from(together))).behaviours["holding still"] == pytest.approx(4.0)
-
-
-@pytest.mark.slow
-def test_the_papers_signal_misses_what_the_paper_says_and_mixed_does_not() -> None:
-    neck = VirtualNeck(NeckParameters.preset("paper"))
-    missing = ("tendon 1 alone", "tendon 2 alone", "tendon 3 alone", "co-contraction", "holding still")
-    assert region_of(assess_quality(record(signal("eq22"), neck))).never == missing
-    assert region_of(assess_quality(record(signal("mixed"), neck))).never == ()
-
-
-@pytest.mark.slow
-def test_coverage_is_whole_where_the_motors_went_everywhere() -> None:
-    # A grid of motor positions a third of a cell apart reaches every cell of the hexagon.
-    axis = np.arange(-2.0, 2.01, 1 / 6)
-    P = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-    region = region_of(assess_quality(recording_from(P), motor_limit=2.0))
-    assert region.tilt_coverage == 1.0
-    assert region.delta_coverage == 1.0
-    corner = region_of(assess_quality(recording_from(np.zeros((50, 3))), motor_limit=2.0))
-    assert 0.0 < corner.tilt_coverage < 0.1
-
-
-def test_runs_with_the_same_set_points_show_the_noise() -> None:
-    P = signal("aprbs", duration=30.0).set_points
-    pair = [recording_from(P, noise=2e-3, seed=seed) for seed in (1, 2)]
-    found = assess_quality(concatenate([*pair, neck_recording(1500)])).repeats
-    assert [repeat.runs for repeat in found] == [(0, 1)]
-    # The standard deviation of 1,500 samples scatters by 1.8 %.
-    np.testing.assert_allclose(found[0].rms, 2e-3, rtol=0.08)
-
-
 @pytest.mark.slow
 def test_nothing_reaches_across_runs() -> None:
-    """Runs in another order have the same spectrum, condition, correlation and region."""
+    """Runs in another order have the same spectrum, condition and correlation."""
     parts = [recording_from(signal("multisine", duration=30.0, seed=s).set_points, noise=1e-3) for s in (1, 2, 3)]
     one, other = assess_quality(concatenate(parts)), assess_quality(concatenate(parts[::-1]))
     # Sums in another order: rounding.
     np.testing.assert_allclose(one.spectrum.density, other.spectrum.density, rtol=1e-9, atol=1e-15)
     assert one.conditioning["roll"].number == pytest.approx(other.conditioning["roll"].number, rel=1e-9)
     np.testing.assert_allclose(one.correlation, other.correlation, atol=1e-12)
-    assert region_of(one).behaviours == pytest.approx(region_of(other).behaviours)
 
 
 @pytest.mark.slow
@@ -214,8 +162,8 @@ def test_any_recording_has_a_report(rows: int, runs: int, scale: float, missing:
 
 
 def test_a_wrong_limit_is_refused() -> None:
-    with pytest.raises(SettingsError, match=r"`motor_limit` must be positive \[rad\]; got -1"):
-        assess_quality(neck_recording(200), motor_limit=-1.0)
+    with pytest.raises(SettingsError, match=r"`bandwidth` must be positive \[rad/s\]; got -1"):
+        assess_quality(neck_recording(200), bandwidth=-1.0)
 
 
 def test_what_the_real_recordings_are_told(shared_data: Path) -> None:
@@ -225,9 +173,9 @@ def test_what_the_real_recordings_are_told(shared_data: Path) -> None:
 
     # The platform shakes at times, by up to 4 deg at 24.8 s: that is motion, and no sample of it is a spike.
     steps = report("neck_openloop/spring_test_0gr.csv", "neck_openloop")
-    assert steps == {("note", topic) for topic in ("co-contraction", "regressors", "region")}
+    assert steps == {("note", topic) for topic in ("co-contraction", "regressors")}
     loop = report("neck_closedloop/frontier_test_000gr.csv", "neck_closedloop")
-    assert loop == {("note", topic) for topic in ("co-contraction", "regressors", "region", "correlation")}
+    assert loop == {("note", topic) for topic in ("co-contraction", "regressors", "correlation")}
     arm = report("arm_multisine/arm_multisine_400s.csv", "arm_multisine")
     assert {("warning", "excitation"), ("warning", "regressors"), ("note", "co-contraction")} <= arm
 

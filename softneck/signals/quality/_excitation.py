@@ -1,11 +1,10 @@
-"""What the inputs tell: spectrum against the bandwidth, condition of Eq. 21's regressor, correlation, repeats.
+"""What the inputs tell: spectrum against the bandwidth, condition of Eq. 21's regressor, correlation.
 
 Inputs are a neck's theta_i, phi_i and delta_i, and the set-points of another robot's motors.
 """
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,8 +24,6 @@ _SEGMENT = 2048
 _NECK_STEP = 0.02 * BANDWIDTH
 # -20 dB: where a spectral density is below 1 % of its mean up to the bandwidth, a tenth of the amplitude is left.
 _REAL_POWER = 0.01
-# Two runs repeat each other if their set-points differ by no more than a drive's quantum: 2e-4 rad of a neck's 12.
-_SAME_SET_POINT, _SAME_SHARE = 2e-4, 2e-4 / 12.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +38,7 @@ class Spectrum:
         below_bandwidth: (n,) share of the power below the bandwidth.
         highest: (n,) highest frequency whose density is at least 1 % of the mean up to the bandwidth [rad/s].
         crest: (n,) largest deviation from the mean by standard deviation.
+        ranges: (n, 2) lowest and highest value [SI].
     """
 
     inputs: tuple[str, ...]
@@ -50,6 +48,7 @@ class Spectrum:
     below_bandwidth: Vector
     highest: Vector
     crest: Vector
+    ranges: Matrix
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON holds: the numbers of each input, not the curve."""
@@ -86,21 +85,6 @@ class Conditioning:
         return {"number": self.number, "rows": self.rows, "columns": self.columns, "weakest": self.weakest}
 
 
-@dataclass(frozen=True, slots=True)
-class Repeat:
-    """Two runs with the same set-points, and by how much their outputs differ.
-
-    Attributes:
-        runs: numbers of the two, from 0.
-        rows: that both have.
-        rms: of each output's difference by sqrt(2) [SI]: what no model can predict.
-    """
-
-    runs: tuple[int, int]
-    rows: int
-    rms: tuple[float, ...]
-
-
 def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     """Return the spectrum of the inputs, averaged over runs by their rows."""
     neck = recording.robot.is_neck
@@ -122,7 +106,8 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     density /= 2.0 * np.pi * max(rows, 1)
     pooled = np.concatenate(runs)
     names = INPUTS if neck else recording.robot.set_points
-    return Spectrum(names, bandwidth, omega, density, *_shares(omega, density, bandwidth), _crest(pooled))
+    ranges = np.column_stack([pooled.min(axis=0), pooled.max(axis=0)])
+    return Spectrum(names, bandwidth, omega, density, *_shares(omega, density, bandwidth), _crest(pooled), ranges)
 
 
 def welch(u: Matrix, sample_time: float, length: int, size: int) -> Matrix:
@@ -211,25 +196,3 @@ def correlation(recording: Recording) -> Matrix:
     still = std <= 1e-9
     z = np.divide(u, std, out=np.full_like(u, np.nan), where=~still)
     return np.clip(z.T @ z / len(z), -1.0, 1.0)
-
-
-def repeats(recording: Recording) -> tuple[Repeat, ...]:
-    """Return the pairs of runs with the same set-points over at least 1 s and nine tenths of the longer one."""
-    runs = recording.runs()
-    robot, span = recording.robot, float(np.ptp(recording.set_points))
-    near = _SAME_SET_POINT if robot.is_neck else _SAME_SHARE * span
-    # With more runs than this the pairs would take long, and nobody reads them.
-    pairs = itertools.combinations(range(min(len(runs), 100)), 2)
-    found = (_repeat(runs[a], runs[b], (a, b), near) for a, b in pairs)
-    return tuple(repeat for repeat in found if repeat is not None)
-
-
-def _repeat(first: Recording, second: Recording, numbers: tuple[int, int], near: float) -> Repeat | None:
-    rows = min(len(first), len(second))
-    if rows * first.sample_time < 1.0 or rows < 0.9 * max(len(first), len(second)):
-        return None
-    if np.abs(first.set_points[:rows] - second.set_points[:rows]).max() > near:
-        return None
-    difference = first.outputs[:rows] - second.outputs[:rows]
-    square = [np.mean(d[np.isfinite(d)] ** 2) if np.isfinite(d).any() else np.nan for d in difference.T]
-    return Repeat(numbers, rows, tuple(np.sqrt(np.array(square) / 2.0).tolist()))

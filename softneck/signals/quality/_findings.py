@@ -1,21 +1,21 @@
-"""Numbers of a recording's quality in the user's words: what is wrong, how much it matters and what to do."""
+"""The quality report of a recording: faults of its channels, and what its inputs can teach a model."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector, to_si
+from softneck.core import Matrix, require_positive, to_si
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 
-from ._channel_faults import ChannelQuality, Stretch, count_rows
-from ._excitation import BANDWIDTH, Conditioning, Repeat, Spectrum
-from ._region import Region
+from ..recording._recording import Recording
+from ._channel_faults import ChannelQuality, Stretch, check_channel, count_rows
+from ._excitation import BANDWIDTH, Conditioning, Spectrum, conditioning, correlation, spectrum
 
 SEVERITIES = ("ok", "note", "warning")
 # A loop must stop when the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a
@@ -54,14 +54,8 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what JSON holds."""
-        return {
-            "severity": self.severity,
-            "topic": self.topic,
-            "channel": self.channel,
-            "message": self.message,
-            "advice": self.advice,
-            "time_s": self.time,
-        }
+        said = asdict(self)
+        return {**said, "time_s": said.pop("time")}
 
     def __str__(self) -> str:
         about = f"{self.channel}: " if self.channel else ""
@@ -79,9 +73,7 @@ class Quality(Shown):
         channels: name -> faults of that channel.
         spectrum: of a neck's theta_i, phi_i, delta_i; of another robot's set-points.
         conditioning: output -> condition of Eq. 21's regressor.
-        region: of (theta_i, phi_i, delta_i) that was visited; None of another robot than the neck.
         correlation: (motors, motors) between the motors' set-points.
-        repeats: pairs of runs with the same set-points.
     """
 
     robot: Robot
@@ -90,9 +82,7 @@ class Quality(Shown):
     channels: dict[str, ChannelQuality]
     spectrum: Spectrum
     conditioning: dict[str, Conditioning]
-    region: Region | None
     correlation: Matrix
-    repeats: tuple[Repeat, ...]
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -114,9 +104,7 @@ class Quality(Shown):
             "bandwidth_rad_s": self.spectrum.bandwidth,
             "excitation": self.spectrum.as_dict(),
             "condition": {axis: condition.as_dict() for axis, condition in self.conditioning.items()},
-            **({} if self.region is None else {"region": self.region.as_dict()}),
             "correlation": {"channels": self.robot.set_points, "matrix": self.correlation},
-            "repeats": [self._repeat(repeat) for repeat in self.repeats],
         }
 
     def lines(self) -> tuple[str, ...]:
@@ -130,18 +118,9 @@ class Quality(Shown):
     @property
     def inputs(self) -> dict[str, tuple[float, float, str]]:
         """Return the lowest and highest value of each input of the spectrum, and their unit."""
-        if self.region is not None:
-            return {n: (*r, "rad") for n, r in zip(self.spectrum.inputs, self.region.ranges.tolist(), strict=True)}
-        said = {name: self.channels[name] for name in self.spectrum.inputs}
-        return {name: (c.shown(c.lowest), c.shown(c.highest), c.unit) for name, c in said.items()}
-
-    def _repeat(self, repeat: Repeat) -> dict[str, Any]:
-        shown = zip(self.robot.outputs.names, self.shown(repeat.rms), strict=True)
-        return {"runs": repeat.runs, "rows": repeat.rows, f"rms_{self.robot.outputs.display_unit}": dict(shown)}
-
-    def shown(self, values: Sequence[float] | Vector) -> list[float]:
-        """Return values of the outputs in SI in their display unit."""
-        return (np.asarray(values) / to_si(self.robot.outputs.display_unit)[0]).tolist()
+        unit = self.robot.motors.unit
+        shown = (self.spectrum.ranges / to_si(unit)[0]).tolist()
+        return {name: (low, high, unit) for name, (low, high) in zip(self.spectrum.inputs, shown, strict=True)}
 
     def _numbers(self) -> list[str]:
         spectrum, unit = self.spectrum, self.robot.outputs.display_unit
@@ -170,11 +149,36 @@ class Quality(Shown):
         return lines
 
 
+def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Quality:
+    """Check a recording's channels and what its inputs can teach; never across the border of two runs.
+
+    Args:
+        recording: to check.
+        bandwidth: up to where the outputs follow the motors [rad/s]; a neck's is 4 (section 3.1), and the spectrum of
+            another robot is not judged where it is not given.
+
+    Raises:
+        SettingsError: a bandwidth that is not positive.
+    """
+    if bandwidth is None:
+        bandwidth = BANDWIDTH if recording.robot.is_neck else float("nan")
+    else:
+        require_positive("bandwidth", bandwidth, "rad/s")
+    return Quality(
+        robot=recording.robot,
+        rows=len(recording),
+        sample_time=recording.sample_time,
+        channels={name: check_channel(recording, name) for name in recording.channels},
+        spectrum=spectrum(recording, bandwidth),
+        conditioning={axis: conditioning(recording, axis) for axis in recording.robot.outputs.names},
+        correlation=correlation(recording),
+    )
+
+
 def findings(quality: Quality) -> tuple[Finding, ...]:
     """Return all that there is to say, warnings first; a topic without fault says "ok" once."""
     said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality)]
-    said += [*_excitation(quality), *_conditioning(quality), *_region(quality), *_correlation(quality)]
-    said += _repeats(quality)
+    said += [*_excitation(quality), *_conditioning(quality), *_ranges(quality), *_correlation(quality)]
     topics = {finding.topic for finding in said if finding.severity != "ok"}
     moved = "pitch and roll are excited" if quality.robot.is_neck else "every motor moves"
     clean = _CLEAN | {"excitation": f"{moved} up to the bandwidth of {quality.spectrum.bandwidth:.3g} rad/s."}
@@ -268,7 +272,7 @@ def _excitation(quality: Quality) -> Iterator[Finding]:
     else:
         for i in range(len(quality.spectrum.inputs)):
             yield from _power(quality.spectrum, i, "", "robot")
-    if quality.region is not None and not np.ptp(quality.region.ranges[2]) > 0.5:
+    if quality.robot.is_neck and not np.ptp(quality.spectrum.ranges[2]) > 0.5:
         message = "hardly changes (co-contraction, the mean of the motors): its effect cannot be identified."
         advice = "Play `mixed`, which has co-contraction moves, if stiffness matters."
         yield Finding("note", "co-contraction", "delta_i", message, advice)
@@ -302,29 +306,14 @@ def _conditioning(quality: Quality) -> Iterator[Finding]:
         yield Finding("warning" if worst.number > _SINGULAR else "note", "regressors", "", message, advice)
 
 
-def _region(quality: Quality) -> Iterator[Finding]:
-    region = quality.region
-    if region is None:
-        yield from _ranges(quality)
-        return
-    message = (
-        f"visited {100 * region.tilt_coverage:.0f} % of the theta_i, phi_i and {100 * region.delta_coverage:.0f} % of "
-        f"the delta_i that motors of +-{region.limit:g} rad reach."
-    )
-    yield Finding("ok", "region", "", message, "Models know nothing outside.")
-    if region.never:
-        message = f"never visited: {', '.join(region.never)}."
-        advice = "The paper's models failed there (section 7.4.2); add `mixed` or `steps` if your use needs them."
-        yield Finding("note", "region", "", message, advice)
-
-
 def _ranges(quality: Quality) -> Iterator[Finding]:
-    """How much of its range each motor went through; the paper's behaviours are those of three tendons."""
+    """How much of its range each motor went through."""
     motors = quality.robot.motors
     if motors.setpoint_min is None or motors.setpoint_max is None:
         return
-    ends = zip(quality.inputs.items(), motors.setpoint_min, motors.setpoint_max, strict=True)
-    shares = [f"{100 * (high - low) / (most - least):.0f} % by {name}" for (name, (low, high, _)), least, most in ends]
+    asked = [quality.channels[name] for name in quality.robot.set_points]
+    ends = zip(asked, motors.setpoint_min, motors.setpoint_max, strict=True)
+    shares = [f"{100 * c.shown(c.highest - c.lowest) / (most - least):.0f} % by {c.name}" for c, least, most in ends]
     message = f"visited of each motor's range: {', '.join(shares)}."
     yield Finding("ok", "region", "", message, "Models know nothing outside.")
 
@@ -340,17 +329,6 @@ def _correlation(quality: Quality) -> Iterator[Finding]:
             message = f"motors {i + 1} and {j + 1} move together (correlation {r:.2f})."
             advice = "Their effects cannot be told apart well; move them independently."
             yield Finding("warning" if abs(r) > _ALIKE else "note", "correlation", "", message, advice)
-
-
-def _repeats(quality: Quality) -> Iterator[Finding]:
-    if quality.repeats:
-        outputs = quality.robot.outputs
-        rms = quality.shown(np.nanmean([repeat.rms for repeat in quality.repeats], axis=0))
-        said = " and ".join(f"{r:.2g} {outputs.display_unit} in {n}" for r, n in zip(rms, outputs.names, strict=True))
-        message = (
-            f"{len(quality.repeats)} pair(s) of runs have the same set-points and differ by {said} (rms / sqrt 2)."
-        )
-        yield Finding("ok", "repeats", "", message, "No model can predict better than that.")
 
 
 def _places(stretches: tuple[Stretch, ...]) -> str:
