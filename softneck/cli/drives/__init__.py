@@ -1,4 +1,4 @@
-"""`softneck drives`: arming, jogging, recording, running, replaying, and the live view.
+"""`softneck drives`: arming, jogging, recording, running, stopping.
 
 Whatever moves hardware asks first.
 May import `drives` and `cli.shared`.

@@ -26,7 +26,6 @@ from ._target import (
     sensor_or_reason,
     target_of,
 )
-from ._view import live_view
 
 if TYPE_CHECKING:
     from softneck.drives import DrivesResult
@@ -100,7 +99,6 @@ def run_command(
     simulate` covers controller, observer, loop and drives file for the whole run, and the loop, run again on its own
     plant, does the same. Exit code 1 if anything stopped it, or a drive did not confirm that it is off; 143 if SIGTERM
     ended it (to rest, then off).
-    On a terminal (stderr) a live view shows the run, on a bus and with --pace; not with --json.
     """
     from softneck.cosim import load_loop
     from softneck.cosim.loops._trust import require_trusted
@@ -134,27 +132,21 @@ def run_command(
         again = require_same_again(deployed.loop, certified[1])
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, chosen.path)
-    live = not as_json and (not chosen.simulated or asked.pace is not None)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file)
     with contextlib.ExitStack() as stack:
         link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
         log = stack.enter_context(opened_log(chosen, "run", asked.log, force=force))
-        with (
-            live_view(controller.name, deployed.loop.duration, wanted=live) as watches,
-            # Two things that draw in place would draw over each other; the view tells the time as well.
-            progress("drives", quiet=as_json or bool(watches)) as tell,
-            Keyboard() as keyboard,
-        ):
+        with progress("drives", quiet=as_json) as tell, Keyboard() as keyboard:
             report = lambda done: tell(done, controller.name)  # noqa: E731
             if link is None:
                 result = run_simulated(
                     deployed, chosen.file, neck=virtual, override=asked.override, pace=asked.pace,
-                    report=report, operator=keyboard, watches=watches, log=log, files=files,
+                    report=report, operator=keyboard, log=log, files=files,
                 )  # fmt: skip
             else:
                 result = run_on_bus(
                     deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=keyboard,
-                    watches=watches, realtime=realtime, log=log, files=files,
+                    realtime=realtime, log=log, files=files,
                 )  # fmt: skip
         # Before the log is closed: a full disk must not cost the recording and the result as well.
         if len(result.signals.time) > 1:
@@ -173,7 +165,7 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
     rows += [[name, str(count)] for name, count in result.counts.items()]
     if not result.simulated:
         times = result.times
-        rows.append(["cycle", f"{times.figures()} ms"])
+        rows.append(["cycle", f"{times} ms"])
         rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
     print_table(str(path), ["what", "value"], rows)

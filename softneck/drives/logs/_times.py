@@ -2,30 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 # 10 us a bin, up to 200 ms; what is longer falls into the last.
 _BIN = 1e-5
 _BINS = 20_000
-
-
-class CycleFigures(NamedTuple):
-    """What people see of periods between cycles.
-
-    Attributes:
-        p50, p99, longest: [s]; NaN without any.
-        number: of periods.
-    """
-
-    p50: float = math.nan
-    p99: float = math.nan
-    longest: float = math.nan
-    number: int = 0
-
-    def __str__(self) -> str:
-        """In ms."""
-        return f"p50 {1e3 * self.p50:.2f}   p99 {1e3 * self.p99:.2f}   max {1e3 * self.longest:.2f}"
 
 
 class CycleTimes:
@@ -67,11 +46,10 @@ class CycleTimes:
                 return (index + 1) * _BIN
         return 0.0
 
-    def figures(self) -> CycleFigures:
-        """Return those of all periods so far, to 10 us."""
-        if not self.count:
-            return CycleFigures()
-        return CycleFigures(self.quantile(0.5), self.quantile(0.99), self.longest_period, self.count)
+    def __str__(self) -> str:
+        """In ms."""
+        p50, p99 = 1e3 * self.quantile(0.5), 1e3 * self.quantile(0.99)
+        return f"p50 {p50:.2f}   p99 {p99:.2f}   max {1e3 * self.longest_period:.2f}"
 
     def table(self) -> dict[str, float | int]:
         """Return what JSON holds."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from softneck.core import SettingsError, Vector
-from softneck.loop import BlockPart, Loop
+from softneck.loop import Loop
 from softneck.loop._rows import Rows, cycle
 from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP
 from softneck.loop._wiring import wire
@@ -69,12 +69,6 @@ class LoopPilot:
         outputs = [*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names)]
         self._tilts = [(i, self._places[f"{name}{end}"]) for i, name in enumerate(outputs) for end in ("_measured", "")
                        if f"{name}{end}" in self._places]  # fmt: skip
-        # A model in the place of the hardware runs beside it, told what is measured, for its `validity` alone.
-        plant = loop.plant
-        self._model: BlockPart | None = None
-        if isinstance(plant, BlockPart) and "validity" in self._places:
-            self._model = BlockPart(plant.block)
-        self._validity = math.nan
         self._rows = round(loop.duration / self.sample_time)
         self._running = self._begun({})
         self._asked = [self.slot("reference", f"{name}_reference") for name in robot.outputs.names]
@@ -84,9 +78,6 @@ class LoopPilot:
         parameters = self._loop.parameters
         others = {name: part for name, part in self._parts.items() if name != "plant"}
         self._running = self._begun({n: part.start(0.0, parameters.get(n, {})) for n, part in others.items()})
-        if self._model is not None:
-            told = {**parameters.get("plant", {}), "use_measurement": 1.0}
-            self._validity = float(self._model.start(0.0, told)[-1])
 
     def _begun(self, starts: Mapping[str, Vector]) -> Rows:
         # What is no number is the master's to judge: it stops the drives where set-points become so.
@@ -108,9 +99,6 @@ class LoopPilot:
         if problem:
             self._wiring.taps[running.names[part]].read(running.bus, index * self.sample_time)
         set_points = running.bus[self._chosen]
-        if self._model is not None:
-            said = np.array([*set_points, *measured.tilt.values, *measured.positions])
-            self._validity = float(self._model.advance(index * self.sample_time, said)[-1])
         return tuple(set_points.tolist())
 
     def finished(self, index: int) -> bool:
@@ -120,19 +108,6 @@ class LoopPilot:
     def close(self) -> None:
         """Release the parts."""
         self._loop.close()
-
-    def value(self, name: str) -> float:
-        """Return a signal `part.port` as it is now; NaN where the loop has none."""
-        part, _, port = name.partition(".")
-        for item in self._wiring.named:
-            if item.part == part and item.port.name == port:
-                return float(self._running.bus[item.slot])
-        return math.nan
-
-    @property
-    def validity(self) -> float:
-        """The model's now; NaN where the loop's plant is no model, or one that does not know."""
-        return self._validity if self._validity > 0.0 else math.nan
 
     def slot(self, part: str, port: str) -> int | None:
         """Return where a signal lies in `signals`."""
@@ -161,9 +136,6 @@ class LoopPilot:
             place = places.get(name)
             if place is not None:
                 outputs[place] = position
-        place = places.get("validity")
-        if place is not None:
-            outputs[place] = self._validity if math.isfinite(self._validity) else 0.0
         place = places.get("measurement_valid")
         if place is not None:
             outputs[place] = 1.0 if measured.fresh else 0.0
