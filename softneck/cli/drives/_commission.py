@@ -46,7 +46,7 @@ def commission_command(
     scan     lists the nodes on the bus; sends reads only
     tendons  leads one motor after the other out of its slack until the neck tilts by a degree: signs, gears, encoder
              lines, current scales, which tendon it pulls, slack, friction; the sensor's axes, signs, noise and delay.
-             Tighten the tendons by hand before. Writes what drives and robot file should say, and a page
+             Tighten the tendons by hand before. Writes what drives and robot file should say
     zero     tensions each tendon gently, sets the encoders' zero there, and verifies with the inclinometer
     jog      pulls the tendon of --motor N a little, lets it out as much, and looks where the neck goes
 
@@ -71,9 +71,8 @@ def _tendons(
     asked: Asked, motors: tuple[int, ...], travel: float, output: Path | None, *, force: bool, as_json: bool
 ) -> None:
     """Ask who is there, move what is to be moved, and propose files."""
-    from softneck.drives.commissioning._commission import commission
+    from softneck.drives.commissioning._commission import commission, require_folder, write_files
     from softneck.drives.commissioning._moves import Guards
-    from softneck.drives.commissioning._proposal import require_folder, write_files
     from softneck.drives.running._keyboard import Keyboard
 
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)
@@ -111,7 +110,7 @@ def _print(result: Commissioned, written: dict[str, str], *, as_json: bool) -> N
     if rows:
         print_table("Motors, as they were found", head, rows)
     for finding in result.findings:
-        note(str(finding))
+        note(f"{finding}. {finding.advice}")
         for other in finding.instead:
             note(f"  or {other}: no move can tell")
     for what, path in written.items():

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from softneck.core import CheckFailedError, SettingsError, require_whole, to_si
+import tomli_w
+
+from softneck.core import (
+    CheckFailedError,
+    OutputFileError,
+    SettingsError,
+    atomic_write,
+    refuse_existing,
+    require_whole,
+    to_si,
+)
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
 from ..bus._objects import ampere
+from ..bus._write import drives_table
 from ..running._bus_loop import RunEnd, Session
 from ..running._scan import scan
 from ..simulated._springs import SimulatedSprings
@@ -23,6 +35,9 @@ from ._identify import LATE, Expected, Identified, identify, proposed
 from ._known import fatal, known_before, require_answers, typed
 from ._measure import expected_of, measure
 from ._moves import PULLED, Guards, Moves
+
+DRIVES, ROBOT = "drives.toml", "robot.toml"
+_REMARK = "# Proposed by `softneck drives commission`; read it before it is used.\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,3 +194,33 @@ def _robot(file: DrivesFile, found: Identified, expected: Expected | None) -> Ro
     if neck is not None and robot.folder is not None and Path(robot.folder / neck).is_file():
         neck = str((robot.folder / neck).resolve())
     return replace(robot, motors=motors, noise_std=noise, delay_s=delay, neck=neck, drives="drives.toml")
+
+
+def require_folder(folder: Path, *, force: bool) -> None:
+    """Raise where the files of a commissioning could not be written; before anything moves.
+
+    Raises:
+        OutputFileError: a file exists and not `force`, or the folder cannot be written.
+    """
+    for name in (DRIVES, ROBOT):
+        refuse_existing(folder / name, force=force)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputFileError(
+            f"{folder}: cannot be written: {error.strerror}. Choose another folder; nothing was sent."
+        ) from error
+
+
+def write_files(folder: Path, result: Commissioned, *, force: bool) -> dict[str, str]:
+    """Write the proposed drives and robot file; return what -> path. Where nothing moved there is none to propose."""
+    if result.moves is None:
+        return {}
+    # All in memory before the first is written.
+    texts = {DRIVES: tomli_w.dumps(drives_table(result.file)), ROBOT: tomli_w.dumps(result.robot.as_dict())}
+    for name, text in texts.items():
+        with atomic_write(folder / name, force=force) as temporary:
+            temporary.write_text(_REMARK + text, encoding="utf-8")
+    return {Path(name).stem: str(folder / name) for name in texts}
