@@ -13,9 +13,8 @@ from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives, load_drives
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._units import current_to_internal
-from softneck.drives.commissioning._commission import commission
+from softneck.drives.commissioning._commission import commission, write_files
 from softneck.drives.commissioning._moves import PULLED
-from softneck.drives.commissioning._commission import write_files
 from softneck.drives.running._bus_loop import Session
 from softneck.drives.running._timing import Ask
 from softneck.drives.running._virtual import simulated_plant
