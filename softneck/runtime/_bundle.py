@@ -27,6 +27,7 @@ from softneck.core import SettingsError
 
 from ._layout import Arrays, StateVector
 from ._names import lowered, state_size
+from ._own import PREFIX, own_text
 from ._tangent import with_tangent
 from ._unrolled import unrolled
 
@@ -137,6 +138,9 @@ def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = (), link
     """
     outer, members = _members(runtime)
     outer, sizes = _sizes(outer)
+    if outer.startswith(PREFIX):
+        loop = [piece.text for piece in _pieces(_LOOPS, sizes) if loops and "step" not in piece.names]
+        return "\n".join(["import numpy as np", own_text(outer), *loop])
     order: list[str] = []
     _collect(outer, order)
     tangents = any(_asks_for_tangents(module) for module in order)

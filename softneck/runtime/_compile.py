@@ -19,6 +19,7 @@ from softneck.core import atomic_write
 
 from ._bundle import bundle, content_name
 from ._numba_cache import compile_without_failing_cache, numba_cache_name
+from ._own import PREFIX
 from ._tangent import with_tangent
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
@@ -56,13 +57,13 @@ def load_runtime(module: str, *, compiled: bool = True) -> Runtime:
     The bundle is written to the user's cache folder so that numba keeps the compiled code between runs.
     """
     with _LOADING:
-        return _runtime(module, compiled)
+        return _runtime(module, compiled and PREFIX not in module)  # Python objects step in plain Python
 
 
 def load_functions(module: str, *, compiled: bool = True) -> ModuleType:
     """Return a namespace with the functions of runtime module `module`, which has no `step` of its own."""
     with _LOADING:
-        return _functions(module, compiled)
+        return _functions(module, compiled and PREFIX not in module)
 
 
 def load_tangent(module: str, *, compiled: bool = True) -> Callable[..., None]:

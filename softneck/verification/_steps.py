@@ -176,10 +176,11 @@ def _run(
     mixed = mixing(plants.cross, len(axes))
 
     def part(chosen: slice) -> None:
-        functions.sweep_run(
-            arrays, parameters, start, places, outputs_at, plants.numerator[chosen], plants.denominator[chosen],
-            plants.delay[chosen], mixed[chosen], signals, angles[chosen], motors[chosen],
-        )  # fmt: skip
+        with np.errstate(all="ignore"):  # an own controller runs in plain Python, and loops may diverge
+            functions.sweep_run(
+                arrays, parameters, start, places, outputs_at, plants.numerator[chosen], plants.denominator[chosen],
+                plants.delay[chosen], mixed[chosen], signals, angles[chosen], motors[chosen],
+            )  # fmt: skip
 
     borders = np.linspace(0, n, min(workers, n) + 1).astype(int)
     # The first plant compiles; two threads compiling the same function would do it twice.

@@ -16,6 +16,7 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.core._certificate import certificate_contents
 from softneck.core._progress import shown_progress
 from softneck.core._shown import Shown, marks
+from softneck.design.linear._own import own_controller
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
@@ -235,7 +236,7 @@ def verify(
     """Judge a controller on all that its plant may be.
 
     Args:
-        controller: anything with `block()`, or its file; with `ss()` linear checks too.
+        controller: anything with `block()`, its file, or an object with `step`; with `ss()` linear checks too.
         plants: linear models, families, plants that step, or the files of any: one, a list, or name -> one.
         requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`,
             which is asked of the plants that step if there are any, else of the linear ones.
@@ -258,7 +259,7 @@ def verify(
         >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
         True
     """
-    begin, controller = time.perf_counter(), opened(controller, "controller")
+    begin, controller = time.perf_counter(), opened(own_controller(controller), "controller")
     observer = None if observer is None else opened(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):

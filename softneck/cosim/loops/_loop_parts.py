@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load
+from softneck.design.linear._own import own_controller
 from softneck.loop import BlockPart, Part, RecordingReference, Reference
 from softneck.loop._reference_parts import AheadReference
 from softneck.loop._references import make_reference
@@ -136,6 +137,7 @@ class PartOpener:
             )
         key, value = given[0], table[given[0]]
         if key == OBJECT:
+            value = own_controller(value) if name == "controller" else value
             self._says(name, value)
             return _part_of(name, value)
         if not isinstance(value, str):
@@ -204,7 +206,8 @@ class PartOpener:
 
 
 def _part_of(name: str, made: Any, said: str = " is") -> Part:
-    """Return a part out of a part, a block, or what has a block."""
+    """Return a part out of a part, a block, what has a block, or a controller of one's own."""
+    made = own_controller(made) if name == "controller" else made
     made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
     if isinstance(made, Block):
         return BlockPart(made)

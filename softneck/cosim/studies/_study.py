@@ -13,6 +13,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
 from softneck.core._shown import Shown, sparkline
+from softneck.design.linear._own import own_attributes, own_controller
 from softneck.loop import Loop, LoopRun
 from softneck.loop._result import metric_names, shown_unit
 from softneck.loop._robot_references import reference_key
@@ -296,6 +297,8 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     block = value.block() if callable(getattr(value, "block", None)) else value
+    if own_controller(value) is not value:
+        return {OBJECT: type(value).__qualname__, "attributes": repr(own_attributes(value))}
     if not isinstance(block, Block):
         return {OBJECT: f"{type(value).__module__}.{type(value).__qualname__}"}
     text = repr((block.kind, block.runtime, block.sample_time, block.inputs, block.outputs, block.parameters))

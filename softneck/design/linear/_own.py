@@ -1,15 +1,24 @@
-"""A controller of one's own, written in Python: one text for loops, verification and FMUs."""
+"""Controllers of one's own, written in Python: objects that step, and modules of functions that are compiled."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ast
+import hashlib
+import inspect
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import ModuleType
+from typing import Any
+
+import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_positive
 from softneck.core._shown import Shown
-from softneck.robot import Robot
+from softneck.robot import Robot, find_robot
 from softneck.runtime import Block, Port, bundle
+from softneck.runtime._own import PREFIX, OwnStep, own_of, own_runtime
 
 from ._ports import controller_inputs, controller_outputs
 
@@ -61,3 +70,111 @@ class OwnController(Shown):
     def summary(self) -> str:
         """Return a line on what it is."""
         return f"{self._name}: a controller of one's own, {1e3 * self.sample_time:g} ms"
+
+
+class ObjectController(Shown):
+    """An object with `step(state, inputs) -> (state, outputs)` as a controller; see docs/howto/own_controller.md.
+
+    Attributes:
+        robot, order: as the object's attributes say, else a neck's and "sequential".
+        ss: the object's own method, where it has one.
+    """
+
+    ss: Callable[[], Any]
+
+    def __init__(self, stepped: Any) -> None:
+        """Look at ports and state, and step once with the start values."""
+        self.robot = find_robot(getattr(stepped, "robot", None))
+        self.order = getattr(stepped, "order", "sequential")
+        if hasattr(stepped, "ss"):
+            self.ss = stepped.ss
+        step = float(getattr(stepped, "sample_time", 0.02))
+        require_positive("sample_time", step, "s")
+        inputs, outputs = controller_inputs(self.robot), controller_outputs(self.robot)
+        own = OwnStep(stepped, [port.name for port in inputs])
+        name = type(stepped).__name__
+        try:
+            state, made = own.step(own.start(), np.array([port.start for port in inputs]))
+        except Exception as error:  # whatever the user's own code raises
+            raise SettingsError(f"{name}: its first step fails with {type(error).__name__}: {error}.") from error
+        if state.shape != own.start().shape or made.shape != (len(outputs),):
+            raise SettingsError(
+                f"{name}: `step` must return ({own.start().size} state, {len(outputs)} set-points); it returned "
+                f"shapes {state.shape} and {made.shape}."
+            )
+        self._block = Block(
+            kind=name, role="controller", runtime=own_runtime(own), sample_time=step, arrays=(), inputs=inputs,
+            outputs=outputs,
+        )  # fmt: skip
+
+    def block(self) -> Block:
+        """Return what is stepped."""
+        return self._block
+
+    def summary(self) -> str:
+        """Return a line on what it is."""
+        return f"{self._block.kind}: a controller of one's own, {1e3 * self._block.sample_time:g} ms"
+
+
+def own_controller(thing: Any) -> Any:
+    """Return an object that steps as a controller with a block, everything else as it is."""
+    if isinstance(thing, str | Path | Mapping | type) or any(hasattr(thing, name) for name in ("block", "advance")):
+        return thing
+    return ObjectController(thing) if callable(getattr(thing, "step", None)) else thing
+
+
+def own_module(runtime: str) -> tuple[str, str]:
+    """Return name and text of a module that holds the object of a runtime where softneck is not.
+
+    Raises:
+        SettingsError: its class has no file of its own, or the object holds more than numbers, texts and arrays.
+    """
+    own = own_of(runtime)
+    kind = type(own.stepped)
+    try:
+        source = Path(inspect.getfile(kind)).read_text(encoding="utf-8")
+    except (OSError, TypeError) as error:
+        raise SettingsError(f"{kind.__name__}: an FMU carries its class's file; write it in a file (.py).") from error
+    for node in ast.parse(source).body:  # what methods import is imported when they are called
+        imported = [node.module or "."] if isinstance(node, ast.ImportFrom) else []
+        imported += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        for name in (name.partition(".")[0] for name in imported):
+            if name not in sys.stdlib_module_names and name != "numpy":
+                raise SettingsError(
+                    f"{kind.__name__}: its file imports `{name}`, which an FMU has not; give the class a file of its "
+                    "own that imports numpy and the standard library only."
+                )
+    lines = ["import numpy as np", "from collections.abc import Sequence", "from typing import Any"]
+    lines += [inspect.getsource(OwnStep), f"own = object.__new__({kind.__qualname__})"]
+    lines += [
+        f"object.__setattr__(own, {name!r}, {_literal(kind.__name__, name, value)})"
+        for name, value in own_attributes(own.stepped)
+    ]
+    text = "\n".join([source, *lines, f"own = OwnStep(own, {own.names!r})", ""])
+    return f"{PREFIX}{hashlib.sha256(text.encode()).hexdigest()[:16]}", text
+
+
+def own_attributes(thing: Any) -> list[tuple[str, Any]]:
+    """Return name and value of each attribute of an object."""
+    slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ()) if hasattr(thing, name)]
+    return [*getattr(thing, "__dict__", {}).items(), *((name, getattr(thing, name)) for name in slots)]
+
+
+def _literal(kind: str, name: str, value: Any) -> str:
+    """Return the Python text of an attribute's value."""
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "fiub":
+        return f"np.array({_literal(kind, name, value.tolist())}, dtype={value.dtype.name!r})[()]"
+    if isinstance(value, float):
+        return f"float({float(value)!r})" if np.isfinite(value) else f'float("{value}")'
+    if value is None or isinstance(value, bool | int | str):
+        return repr(value)
+    if isinstance(value, list | tuple):
+        items = "".join(f"{_literal(kind, name, item)}, " for item in value)
+        return f"[{items}]" if isinstance(value, list) else f"({items})"
+    if isinstance(value, dict):
+        return f"dict({_literal(kind, name, [*map(list, value.items())])})"
+    if isinstance(value, Robot):  # what softneck alone looks at
+        return "None"
+    raise SettingsError(
+        f"{kind}: an FMU carries numbers, texts, lists and arrays; `{name}` is a {type(value).__name__}."
+    )

@@ -14,6 +14,7 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix, SettingsError
 from softneck.runtime import Block, Port
 from softneck.runtime._bundle import split_members
+from softneck.runtime._own import PREFIX
 
 from .translate._kinds import is_known, module_of, ranks_of
 
@@ -46,6 +47,11 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
     """
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in split_members(inner[:-1])] if inner else []
+    if outer.startswith(PREFIX):
+        raise SettingsError(
+            "a Python object cannot be in a compiled FMU; use `--backend python`, or write its `step` as a module of "
+            "functions for `softneck.design.OwnController`, which runs compiled in loops."
+        )
     runs = module_of(outer)
     if not is_known(runs):
         raise SettingsError(

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 from softneck.core import FileFormatError, SettingsError, to_si
 from softneck.core._budget import settings_text
+from softneck.design.linear._own import own_controller
 from softneck.identification import Validation
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
@@ -65,6 +66,7 @@ def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot |
         FileFormatError: a file of which nothing is stepped.
         SettingsError: no file, no preset and nothing with a block.
     """
+    thing = own_controller(thing)
     if not isinstance(thing, str | Path):
         if isinstance(thing, Block) or (hasattr(thing, "block") and not isinstance(thing, type)):
             return thing

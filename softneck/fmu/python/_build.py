@@ -22,7 +22,9 @@ import numpy as np
 
 from softneck.core import SettingsError, atomic_write, refuse_existing
 from softneck.core._files import as_path
+from softneck.design.linear._own import own_module
 from softneck.runtime import Block, Port
+from softneck.runtime._own import PREFIX
 
 from ..describe._cost import plain_cost
 from ..describe._describe import Buildable, block_and_info
@@ -98,7 +100,11 @@ def check_block(block: Block) -> None:
 
 
 def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
-    module = slave_module(block.runtime)
+    runtime, own = block.runtime, {}
+    if found := re.search(rf"{PREFIX}\w+", runtime):
+        carried, text = own_module(found[0])
+        runtime, own = runtime.replace(found[0], carried), {f"{carried}.py": text.encode()}
+    module = slave_module(runtime)
     arrays = _flat(block.arrays)
     facts = _facts(block, name) | {"module": module.name, "runtime": module.runtime, "options": module.options}
     content = hashlib.sha256()
@@ -109,6 +115,7 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
         "block.json": json.dumps(facts | {"guid": guid}, sort_keys=True).encode(),
         "arrays.npy": arrays,
         f"{module.name}.py": module.source.encode(),
+        **own,
     }
     members = _through_pythonfmu(module.script_name, module.script, resources)
     missing = [folder for folder in _BINARIES if not any(member.startswith(folder) for member in members)]
@@ -130,8 +137,10 @@ def _facts(block: Block, name: str) -> dict[str, Any]:
         "kind": block.kind,
         "role": block.role,
         "sample_time": float(block.sample_time),
-        "cost": plain_cost(block),
-        "module_of_runtime": block.runtime,  # nothing the slave reads: a compiled FMU can be made of this one
+        "cost": "own" if PREFIX in block.runtime else plain_cost(block),
+        "module_of_runtime": ""
+        if PREFIX in block.runtime
+        else block.runtime,  # nothing the slave reads: a compiled FMU can be made of this one
         "shapes": [list(array.shape) for array in block.arrays],
         "inputs": [_port_facts(port) for port in block.inputs],
         "outputs": [_port_facts(port) for port in block.outputs],

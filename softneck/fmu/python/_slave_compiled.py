@@ -33,7 +33,7 @@ def _fmu_compiled_step(
     """
     switch = os.environ.get(_FMU_SWITCH, "")
     wanted = always or switch == "1"
-    if switch == "0" or not (wanted or facts["cost"] != "light") or not _fmu_have("numba"):
+    if switch == "0" or facts["cost"] == "own" or not (wanted or facts["cost"] != "light") or not _fmu_have("numba"):
         return None
     alias = facts["runtime"] + "_compiled"
     here = sys.modules.get(alias)

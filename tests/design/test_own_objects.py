@@ -1,0 +1,151 @@
+"""A plain Python object with `step` as a controller: in a loop, in `verify` and as an FMU, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+
+import softneck
+from softneck.core import SettingsError
+from softneck.design import OwnController
+from softneck.fmu import build_compiled_fmu
+
+TEXT = """
+import math
+
+import numpy as np
+
+
+class Tilt:
+    def __init__(self, integral, weights=(1.0, -0.5, -0.5), name="tilt"):
+        self.integral, self.weights, self.name = integral, np.array(weights), name
+        self.table, self.limit = {"a": [1, True, None]}, math.inf
+
+    def initial_state(self):
+        return [0.0, 0.0]
+
+    def step(self, state, inputs):
+        errors = [inputs[f"{axis}_reference"] - inputs[axis] for axis in ("pitch", "roll")]
+        state = [x + 0.02 * error for x, error in zip(state, errors)]
+        turn = self.integral * state[1]
+        return state, self.integral * state[0] * self.weights + np.array([0.0, turn, -turn])
+
+
+def made():
+    return Tilt(4.0)
+
+
+class Linear(Tilt):
+    def ss(self):
+        import control
+
+        g = self.integral * 0.02
+        names = ["pitch_reference", "roll_reference", "pitch", "roll"]
+        return control.StateSpace(np.eye(2), np.hstack([np.eye(2), -np.eye(2)]), g * np.diag([1.5, 1.732]),
+                                  np.hstack([g * np.diag([1.5, 1.732]), -g * np.diag([1.5, 1.732])]), 0.02,
+                                  inputs=names, outputs=["theta_i", "phi_i"])
+"""
+FUNCTIONS = """
+def state_size(arrays):
+    return 2
+
+
+def initialise(arrays, parameters, state, outputs):
+    state[:] = 0.0
+    outputs[:] = 0.0
+
+
+def step(arrays, parameters, state, inputs, outputs):
+    for axis in range(2):
+        state[axis] += 0.02 * (inputs[axis] - inputs[3 + axis])
+    turn = arrays[0][0] * state[1]
+    outputs[0] = arrays[0][0] * state[0]
+    outputs[1] = -0.5 * arrays[0][0] * state[0] + turn
+    outputs[2] = -0.5 * arrays[0][0] * state[0] - turn
+"""
+LOOP: dict[str, Any] = {
+    "duration_s": 2.0, "plant": "paper", "reference": {"kind": "step", "pitch_deg": 10.0, "at_s": 0.5},
+}  # fmt: skip
+QUICK = {"sampling": {"plants": 10, "search_generations": 0}, "neck": {"necks": 1, "payloads_kg": [0.0]}}
+
+
+@pytest.fixture
+def tilt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    (tmp_path / "own_tilt.py").write_text(TEXT, encoding="utf-8")
+    (tmp_path / "own_functions.py").write_text(FUNCTIONS, encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_tilt", raising=False)
+    import own_tilt  # pyright: ignore[reportMissingImports]
+
+    return own_tilt
+
+
+def test_an_object_and_a_module_of_functions_make_one_loop(tilt: ModuleType) -> None:
+    ours = softneck.simulate({**LOOP, "controller": tilt.Tilt(4.0)})
+    theirs = softneck.simulate({**LOOP, "controller": OwnController(step="own_functions", arrays=[np.array([4.0])])})
+    assert float(ours["pitch"][-1]) > 0.01  # it moves
+    # The same sums in another order, in plain Python and compiled: rounding, which a loop does not let grow.
+    np.testing.assert_allclose(ours["pitch"], theirs["pitch"], rtol=0, atol=1e-12)
+    file = softneck.simulate({**LOOP, "controller": {"python": "own_tilt:made"}})
+    np.testing.assert_array_equal(file["pitch"], ours["pitch"])
+
+
+def test_the_fmu_computes_what_the_loop_does(tilt: ModuleType) -> None:
+    controller = tilt.Tilt(np.float64(4.0), weights=[1.0, -0.25, -0.75])
+    ours = softneck.simulate({**LOOP, "controller": controller})
+    softneck.build_fmu(controller, "Tilt.fmu")
+    theirs = softneck.simulate({**LOOP, "controller": {"fmu": "Tilt.fmu"}})
+    for name in ("pitch", "motor_setpoint_1", "motor_setpoint_3"):
+        np.testing.assert_array_equal(ours[name], theirs[name])
+
+
+@pytest.mark.parametrize("name", ["Tilt", "Linear"])
+def test_verify_judges_it(tilt: ModuleType, name: str) -> None:
+    model = softneck.identify("rls", softneck.record("eq22", "paper", seed=1))
+    found = softneck.verify(getattr(tilt, name)(4.0), model, {"overshoot_pct": 80.0, **QUICK})
+    values = {verdict.requirement.metric: verdict.value for verdict in found.verdicts}
+    assert values["step.overshoot_pct"] is not None
+    # Margins are of the linear form, which only `ss` tells.
+    assert (values["axes.gain_margin"] is None) == (name == "Tilt")
+
+
+def test_a_study_varies_objects_and_knows_them_by_their_attributes(tilt: ModuleType, tmp_path: Path) -> None:
+    vary = {"controller": {"choices": [tilt.Tilt(2.0), tilt.Tilt(6.0)]}, "reference.pitch_deg": [5.0, 10.0]}
+    runs = softneck.study(LOOP | {"controller": tilt.Tilt(1.0)}, vary=vary, runs=4, workers=0, output=tmp_path / "a")
+    assert not any(runs["error"])
+    again = softneck.study(LOOP | {"controller": tilt.Tilt(1.0)}, vary=vary, runs=4, workers=0, output=tmp_path / "a")
+    assert again["seconds"].tolist() == runs["seconds"].tolist()  # nothing was run again
+    vary["controller"] = {"choices": [tilt.Tilt(2.0), tilt.Tilt(7.0)]}
+    with pytest.raises(SettingsError, match="another study"):
+        softneck.study(LOOP | {"controller": tilt.Tilt(1.0)}, vary=vary, runs=4, workers=0, output=tmp_path / "a")
+
+
+def test_what_does_not_fit_is_said(tilt: ModuleType, tmp_path: Path) -> None:
+    class Short(tilt.Tilt):
+        def step(self, state: Any, inputs: Any) -> Any:  # noqa: ARG002
+            return state, [0.0]
+
+    class Wrong(tilt.Tilt):
+        def step(self, state: Any, inputs: Any) -> Any:
+            return state, inputs["yaw"]
+
+    with pytest.raises(SettingsError, match=r"Short: `step` must return \(2 state, 3 set-points\)"):
+        softneck.simulate({**LOOP, "controller": Short(1.0)})
+    with pytest.raises(SettingsError, match="Wrong: its first step fails with KeyError: 'yaw'"):
+        softneck.simulate({**LOOP, "controller": Wrong(1.0)})
+    with pytest.raises(SettingsError, match=r"`softneck\.design\.OwnController`"):
+        build_compiled_fmu(tilt.Tilt(1.0), tmp_path / "Compiled.fmu")
+    holding = tilt.Tilt(1.0)
+    holding.system = control.tf([1], [1, 1])
+    with pytest.raises(SettingsError, match="`system` is a TransferFunction"):
+        softneck.build_fmu(holding, tmp_path / "Holding.fmu")
+    (tmp_path / "own_tilt.py").write_text("import control\n" + TEXT, encoding="utf-8")
+    with pytest.raises(SettingsError, match="its file imports `control`"):
+        softneck.build_fmu(tilt.Tilt(1.0), tmp_path / "Control.fmu")
