@@ -3,9 +3,8 @@
 import softneck
 
 recording = softneck.record("eq22", "paper", seed=1)  # the paper's experiment on its virtual neck
-model = softneck.identify("rls", recording)  # on the first 70 %
+model = softneck.identify("rls", recording)  # trained on the first 70 %
 print(model.summary())  # with the fit on the rest
-print(softneck.validate(model, recording).fits)  # on the rest: 1, 5 and 25 steps ahead, and the free run
 controller = softneck.design_controller("pi", model)
 print(controller.summary())
 softneck.build_fmu(model, "build/Neck.fmu", force=True)
