@@ -1,7 +1,7 @@
-"""Draw the rooms and their imports, and list what each may touch: `python docs/architecture.py`.
+"""Draw the subpackages and their imports, and list what is inside each: `python docs/architecture.py`.
 
-Writes `docs/_static/architecture.svg` and the table of rooms inside `docs/architecture.md`, both from today's imports
-and the rooms' own docstrings; `tests/docs/test_architecture.py` fails where the committed ones are not those.
+Writes `docs/_static/architecture.svg` and the table inside `docs/architecture.md`, both from today's imports
+and the subpackages' own docstrings; `tests/docs/test_architecture.py` fails where the committed ones are not those.
 Needs grimp, which comes with import-linter (dependency group `lint`).
 """
 
@@ -115,16 +115,14 @@ def touches(room: str) -> tuple[str, ...]:
 
 
 def table(graph: Graph) -> str:
-    """Return the table of rooms, from the top of the house to its cellar."""
+    """Return the table of subpackages, from the top layer down."""
     level = levels(graph)
-    lines = ["| room | what is inside | what it keeps to | touches outside | imports |", "|---|---|---|---|---|"]
+    lines = ["| subpackage | what is inside | rules |", "|---|---|---|"]
     for room in sorted(graph, key=lambda name: (-level[name], name)):
-        inside, keeps, may = docstring(room)
+        inside, keeps, _ = docstring(room)
         inner = ", ".join(f"`{name}`" for name in inner_rooms(room))
-        below = ", ".join(f"`{name}`" for name in sorted(graph[room], key=lambda name: (-level[name], name)))
-        rooms = f" Rooms: {inner}." if inner else ""
-        outside = ", ".join(touches(room)) or "nothing"
-        lines.append(f"| `{room}` | {inside}{rooms} | {keeps} {may} | {outside} | {below or 'nothing'} |")
+        parts = f" Parts: {inner}." if inner else ""
+        lines.append(f"| `{room}` | {inside}{parts} | {keeps} |")
     return "\n".join(lines) + "\n"
 
 

@@ -1,6 +1,6 @@
 """Errors, checks, array types, units, archives, certificates and the table of kinds.
 
-For every room.
+For every subpackage.
 Imports nothing of ours.
 """
 

@@ -1,6 +1,6 @@
 """Controllers out of identified linear models, with limits and tendon allocation.
 
-One room for each family of controllers, `plants` below them.
+One part for each family of controllers, `plants` below them.
 May import `estimation`, `identification` and below; verification is above.
 """
 

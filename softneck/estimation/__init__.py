@@ -1,6 +1,6 @@
-"""Observers: Kalman filters over linear models, free runs with a disturbance over nonlinear ones.
+"""Observers: Kalman filters over linear models, simulation with a disturbance over nonlinear ones.
 
-filterpy designs and judges; our runtimes run in loops and FMUs.
+filterpy designs and tests; our runtimes run in loops and FMUs.
 May import `identification` and below.
 """
 

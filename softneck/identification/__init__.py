@@ -1,6 +1,6 @@
-"""Models of the neck from recordings, judged honestly.
+"""Models of a robot from recordings, and their validation.
 
-One room for each family of methods, and `validation` and `selection` above them.
+One part for each family of methods, and `validation` and `selection` above them.
 May import `plant`, `loop`, `signals` and below; no controller enters.
 """
 

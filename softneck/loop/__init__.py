@@ -1,4 +1,4 @@
-"""The closed loop over anything that steps: wiring by name, order, references, faults, metrics.
+"""The closed loop over objects with `step`: wiring by name, order, references, faults, metrics.
 
 Arrays and no FMI; a clock only paces a run, a file only keeps its state.
 May import `signals` and below.

@@ -1,6 +1,6 @@
 """The robot: its motors, outputs, directions and limits, read from a `robot.toml`, and the presets.
 
-Says what a file's channels are; what is not given is not assumed.
+Names the channels of files; assumes nothing that is not given.
 May import `core`.
 """
 

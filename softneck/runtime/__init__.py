@@ -1,4 +1,4 @@
-"""Blocks that step, and the runtime texts behind them: bundled, compiled by numba, plain Python without it.
+"""Blocks with `step`, and their runtime texts: bundled, compiled by numba, plain Python without it.
 
 A runtime module (`_*_runtime.py`) imports numpy, math and other runtimes only.
 Knows no kind; may import `core`.

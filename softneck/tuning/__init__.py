@@ -1,4 +1,4 @@
-"""Tuning: from requirements to the controller that keeps them, over kinds and settings.
+"""Tuning: search kinds and settings for the controller that meets the requirements.
 
 Requirements, the space of settings, judging by levels, search, results; nothing here reads or writes but its own log.
 May import `verification` and below.

@@ -1,6 +1,6 @@
-"""Verification: a controller against all that its plant may be, requirement by requirement.
+"""Verification: a controller on every plant of its family, requirement by requirement.
 
-What holds becomes a certificate; what does not is shown as its worst case.
+Writes a certificate, or the worst case of what does not hold.
 May import `cosim`, `design` and below.
 """
 
