@@ -11,12 +11,10 @@ import pytest
 
 from softneck.core import DataError, SettingsError, load
 from softneck.design import NmpcController, NmpcSettings
-from softneck.design.predictive._nmpc import NONLINEAR_KINDS
 from softneck.design.predictive._nmpc_prepared import NonlinearProblem, disturbance_ahead, estimate_gains
 from softneck.design.predictive._nmpc_state_runtime import NmpcArrays, NmpcState
 from softneck.estimation import LinearNeck
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play, Rls
-from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import State, load_functions, load_runtime
 from softneck.signals import Recording, signal
@@ -119,34 +117,6 @@ def sums_of(starts: tuple[int, ...]) -> np.ndarray:
     return np.kron(np.tril(np.ones((len(starts), len(starts)))), np.eye(3))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(NONLINEAR_KINDS, ["nn", "play"], ["nss", "greybox"]))
-@pytest.mark.parametrize("limit", [None, 0.1])
-def test_converged_it_is_what_ipopt_finds(kind: str, limit: float | None, models: dict[str, Model]) -> None:
-    settings = NmpcSettings(
-        horizon=12, moves=4, converged=True, slew_limit=4.0, lead_limit=12.0, angle_limit=limit
-    )  # fmt: skip
-    controller = settings.design(models[kind])
-    own, best = BlockPart(controller.block()), controller.part(solver="casadi")
-    f = load_functions(own.block.runtime, compiled=False)
-    motors = own.start(0.0, {})
-    best.start(0.0, {})
-    for k in range(30):
-        asked = [0.3, 0.1, 0.2] if k < 15 else [-0.2, 0.1, 0.2]
-        u = np.array([*asked, 0.05, 0.0, *motors, 1.0, 1.0])
-        best.set_state(own.get_state())
-        motors = own.advance(0.0, u)
-        best.advance(0.0, u)
-        if k == 0:
-            continue
-        found = best.moves.ravel().copy()
-        f.nmpc_shift(NmpcArrays(own.block.arrays).starts, found)
-        assert best.status == "Solve_Succeeded"
-        # The issue's bound; ipopt itself stops its barrier at 1e-10 of the scaled problem.
-        np.testing.assert_allclose(named(controller, own.memory[1])["plan"], found, atol=1e-5)
-    assert np.abs(motors).max() > 0.1
-
-
 def answers(controller: NmpcController, p: NonlinearProblem, a: Asked, z: np.ndarray) -> np.ndarray:
     """Return the angles (2 N,) that the model itself makes of the plan `z`."""
     plant = controller.model.block()
@@ -238,16 +208,6 @@ def test_a_bad_measurement_never_reaches_the_block_either(network: Model) -> Non
         step(block.arrays, state.parameters, values, np.array([0.1, 0.0, 0.0, y, 0.0, *out, 1.0, 1.0]), out)
         assert np.isfinite(values).all()
         assert values[2] == (4.0 if k >= 45 else 1.0)
-
-
-def test_one_iteration_a_sample_ends_where_all_do(network: Model) -> None:
-    ends = []
-    for converged in (False, True):
-        settings = NmpcSettings(horizon=12, moves=4, converged=converged, lead_limit=12.0)
-        ends.append(closed_loop(settings.design(network), network, 60, 0.15)[0])
-    # Near rest the problem changes less than it is linear: 0.1 deg in the transient, nothing at its end.
-    assert np.abs(ends[0] - ends[1]).max() < 2e-3
-    np.testing.assert_allclose(ends[0][-1], ends[1][-1], atol=1e-4)
 
 
 def test_it_reaches_the_reference_and_rejects_a_load(controller: NmpcController, network: Model) -> None:

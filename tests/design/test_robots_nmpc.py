@@ -16,13 +16,11 @@ from softneck.core import Matrix, SettingsError
 from softneck.cosim import simulate
 from softneck.cosim.parts._free_run import drive_fmu
 from softneck.design import NmpcController, NmpcSettings
-from softneck.design.predictive._nmpc_state_runtime import NmpcArrays, NmpcState
 from softneck.fmu import build_fmu
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play
-from softneck.loop import BlockPart
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
-from softneck.runtime import load_functions, load_runtime
+from softneck.runtime import load_runtime
 from softneck.signals import Recording, signal
 
 from ..data import ROOT
@@ -174,33 +172,6 @@ def test_it_settles_on_its_own_model(name: str, kind: str) -> None:
         # The pattern that neither tilts nor co-contracts is brought back to zero: with `nn`, whose gains differ from
         # motor to motor, 0.4 rad at the step and 0.003 rad at the end.
         assert np.abs(P[-50:] @ np.array([1.0, -1.0, 1.0, -1.0])).max() < 0.02
-
-
-@pytest.mark.slow
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", ["antagonist", "trunk4"])
-def test_converged_it_is_what_ipopt_finds(name: str) -> None:
-    controller = NmpcSettings(
-        horizon=10, moves=3, converged=True, slew_limit=4.0, angle_limit=0.1
-    ).design(identified(name, "play"))  # fmt: skip
-    own, best = BlockPart(controller.block()), controller.part(solver="casadi")
-    f, arrays = load_functions(own.block.runtime, compiled=False), NmpcArrays(own.block.arrays)
-    plan = NmpcState.parts(arrays)["plan"]
-    m = len(controller.robot.outputs.names)
-    motors = own.start(0.0, {})
-    best.start(0.0, {})
-    for k in range(12):
-        u = np.array([0.2 if k < 8 else -0.1, *[0.05] * (m - 1), 0.2, *[0.02] * m, *motors, 1.0, 1.0])
-        best.set_state(own.get_state())
-        motors = own.advance(0.0, u)
-        best.advance(0.0, u)
-        if k > 0:
-            found = best.moves.ravel().copy()
-            f.nmpc_shift(arrays.starts, found)
-            assert best.status == "Solve_Succeeded"
-            # As for the neck: ipopt itself stops its barrier at 1e-10 of the scaled problem.
-            np.testing.assert_allclose(own.memory[1][plan], found, atol=1e-5)
-    assert np.abs(motors).max() > 0.1
 
 
 @pytest.mark.slow

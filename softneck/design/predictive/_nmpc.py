@@ -62,7 +62,7 @@ class NmpcSettings(Shown):
     and those given are in the unit of its motors. Weights count as for a plant of the neck's size.
 
     One Gauss-Newton iteration for each sample, from the shifted plan of the sample before (real-time iteration, Diehl
-    et al. 2005); `converged` iterates to the end.
+    et al. 2005).
 
     Attributes:
         bandwidth: of the linear loop without dead time that has the same weights [rad/s].
@@ -74,7 +74,6 @@ class NmpcSettings(Shown):
         preview: how far ahead the reference is known [s].
         horizon: N, samples from now, the dead time among them.
         moves: times at which the motors move.
-        converged: iterate until nothing changes, for reference.
         position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
         angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
         minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], a wish that
@@ -97,7 +96,6 @@ class NmpcSettings(Shown):
     preview: float = 0.0
     horizon: int = NeckCount(20)
     moves: int = NeckCount(10)
-    converged: bool = False
     position_limit: float = NeckDefault(6.0)
     slew_limit: float = NeckDefault(12.5)
     lead_limit: float = NeckDefault(1.0)
@@ -313,20 +311,9 @@ class NmpcController(Shown):
         """Return what the sample that led to `state` decided."""
         return explain(self._block, state.values)
 
-    def part(self, *, solver: str = "own") -> Any:
-        """Return the controller as a part of a loop that tells what each sample decided.
-
-        Args:
-            solver: "own", or "casadi" for each sample's optimum by ipopt: slow, a reference to compare with.
-        """
-        from ._optimal import OptimalPart
-
-        require_one_of("solver", solver, ("own", "casadi"))
-        if solver == "own":
-            return NmpcPart(self._block)
-        if self.settings.minimum_tautness is not None:
-            raise SettingsError("`solver=casadi` knows no `minimum_tautness`; leave one of them out.")
-        return OptimalPart(self)
+    def part(self) -> NmpcPart:
+        """Return the controller as a part of a loop that tells what each sample decided."""
+        return NmpcPart(self._block)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
@@ -355,7 +342,7 @@ class NmpcController(Shown):
             f"nmpc controller over {self.model.kind}, {1e3 * self.sample_time:g} ms, {s.order} order",
             f"  {len(robot.motors.names) * s.moves} unknowns, horizon {s.horizon} samples, bandwidth "
             f"{s.bandwidth:.4g} rad/s, disturbance over {s.window} samples, "
-            f"{'converged' if s.converged else 'one iteration a sample'}",
+            "one iteration a sample",
         ]
         if not robot.is_neck:
             lines += self.limits.lines(self.sample_time)

@@ -163,7 +163,7 @@ def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
         coast, settle = (max(1, round(n * NECK_SAMPLE * stretch / controller.sample_time)) for n in (COAST, SETTLE))
     constants = np.array([
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
-        p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, float(s.converged), coast, settle,
+        p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, coast, settle,
         len(block.outputs), -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness, s.tautness_lever,
         p.look,
         *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),

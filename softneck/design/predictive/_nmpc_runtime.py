@@ -14,7 +14,6 @@ from softneck.design.predictive._nmpc_state_runtime import (
     NMPC_BUDGET,
     NMPC_COAST,
     NMPC_COCONTRACTION,
-    NMPC_CONVERGED,
     NMPC_HOLDING,
     NMPC_MOVE,
     NMPC_NO_BOUND,
@@ -39,8 +38,6 @@ from softneck.design.predictive._nmpc_state_runtime import (
 )
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
 
-_MOST_ITERATIONS = 50  # of the iterated form; a real-time iteration takes one
-_CONVERGED = 1e-10  # [rad] in any move
 _TOLERANCE = 1e-10  # [rad] by which the QP's rows may be beyond their bounds
 _LARGEST_RESIDUAL = 1e-7  # 1000 times `_TOLERANCE`: beyond it the answer is none
 
@@ -342,7 +339,7 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
     """Plan, check the plan, and move `held` by its first moves, or by those of the plan before."""
     q = p.setup
     nz, rows = p.motors * p.moves, p.outputs * p.N
-    at, sign = x.plan.copy(), x.active.copy()
+    sign = x.active.copy()
     n, m = nz + p.slacks, sign.shape[0]
     target, asked, ahead = np.empty(rows), np.empty(nz), np.empty(rows)
     nmpc_asked(p, x, target, asked)
@@ -352,34 +349,21 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
     nmpc_bounds(p, parameters, x.held, inputs[first : first + p.motors], lower, upper)
     Y, S = np.empty(rows), np.zeros((rows, nz))
     H, f, A, z = np.empty((n, n)), np.empty(n), np.empty((m, n)), np.empty(n)
-    total = 0
+    # Once: a real-time iteration (Diehl, Bock and Schloeder 2005), a full step without a line search.
+    nmpc_linear(p, x, x.plan, Y, S)
+    Y += ahead
+    nmpc_quadratic(p, x, x.plan, Y - target, S, asked, H, f)
+    nmpc_rows(p, x.plan, Y, S, A, lower, upper)
+    iterations = nmpc_solve(H, f, A, lower, upper, sign, int(q[NMPC_BUDGET]), z, lam)
+    x.iterations = iterations if iterations >= 0 else int(q[NMPC_BUDGET])
     answered = False
-    slack = 0.0
-    # Once (real-time iteration, Diehl, Bock and Schloeder 2005), or until nothing changes.
-    for _ in range(_MOST_ITERATIONS if q[NMPC_CONVERGED] > 0.5 else 1):
-        nmpc_linear(p, x, at, Y, S)
-        Y += ahead
-        nmpc_quadratic(p, x, at, Y - target, S, asked, H, f)
-        nmpc_rows(p, at, Y, S, A, lower, upper)
-        iterations = nmpc_solve(H, f, A, lower, upper, sign, int(q[NMPC_BUDGET]), z, lam)
-        total += iterations if iterations >= 0 else int(q[NMPC_BUDGET])
-        answered = False
-        if iterations >= 0:
-            x.residual = nmpc_residual(H, f, A, z, lam, lower, upper)
-            answered = x.residual <= _LARGEST_RESIDUAL
-        if not answered:
-            break
-        # A start for the next iteration's and the next sample's QP.
-        for i in range(m):
-            sign[i] = 1.0 if lam[i] > 0.0 else (-1.0 if lam[i] < 0.0 else 0.0)
-        change = np.max(np.abs(z[:nz] - at))
-        # Full steps, without a line search.
-        at[:] = z[:nz]
-        slack = float(z[nz]) if p.slacks > 0 else 0.0
-        if change < _CONVERGED:
-            break
-    x.iterations = total
-    nmpc_take(p, x, at, sign, answered, slack)
+    if iterations >= 0:
+        x.residual = nmpc_residual(H, f, A, z, lam, lower, upper)
+        answered = bool(x.residual <= _LARGEST_RESIDUAL)
+    # A start for the next sample's QP.
+    for i in range(m):
+        sign[i] = 1.0 if lam[i] > 0.0 else (-1.0 if lam[i] < 0.0 else 0.0)
+    nmpc_take(p, x, z[:nz], sign, answered, float(z[nz]) if p.slacks > 0 else 0.0)
     plan, held = x.plan, x.held
     for j in range(p.motors):
         # Bounds of now: a plan of an earlier sample knew others.

@@ -33,16 +33,15 @@ NMPC_COCONTRACTION = 7
 NMPC_SLACK = 8  # weight; zero for no soft limit
 NMPC_ANGLE_LIMIT = 9
 NMPC_BUDGET = 10
-NMPC_CONVERGED = 11
-NMPC_COAST = 12
-NMPC_SETTLE = 13
-NMPC_OUTPUTS = 14  # of the model
-NMPC_TAUT = 15  # least tautness wished for; -NMPC_NO_BOUND for none
-NMPC_LEVER = 16  # motor that one radian of neck takes up [rad/rad]
-NMPC_LOOK = 17  # samples by which what is measured is ahead of the sensor
+NMPC_COAST = 11
+NMPC_SETTLE = 12
+NMPC_OUTPUTS = 13  # of the model
+NMPC_TAUT = 14  # least tautness wished for; -NMPC_NO_BOUND for none
+NMPC_LEVER = 15  # motor that one radian of neck takes up [rad/rad]
+NMPC_LOOK = 16  # samples by which what is measured is ahead of the sensor
 # Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
 # units in SI, that of the motors and one for each output.
-NMPC_NUMBERS = 18
+NMPC_NUMBERS = 17
 
 
 def nmpc_slacks(setup: np.ndarray) -> int:

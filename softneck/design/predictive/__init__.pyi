@@ -1,2 +1,0 @@
-from ._plan import PlanSettings as PlanSettings
-from ._plan import plan as plan
