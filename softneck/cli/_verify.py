@@ -126,10 +126,6 @@ def _print(path: Path, found: Verification, folder: Path) -> None:
 
     table = verdict_table(found)
     print_table(str(path), table.head, table.rows)
-    for item in found.agreements:
-        if not item.agree:
-            answers = ", ".join(f"{method} {value}" for method, value in item.answers.items())
-            click.echo(f"methods disagree: {item.question} {item.note} ({answers})")
     for name, why in found.evidence.not_computed.items():
         click.echo(f"not computed: {name}: {why}")
     click.echo(f"{found.summary()}; worst plants as loops in {folder}")

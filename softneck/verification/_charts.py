@@ -15,7 +15,7 @@ from softneck.robot import Robot
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
 from ._neck_loops import NeckRun, direction
-from ._plants import QUANTITIES, Plants
+from ._plants import Plants
 from ._steps import Steps
 
 RED, PURPLE = "#D55E00", "#CC79A7"
@@ -27,8 +27,6 @@ _FREQUENCY = "frequency [rad/s]"
 _CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: the plant with the least disk margin."
 # What no robot's numbers in SI reach: pressures have some 1e6 Pa.
 _LARGEST = 1e9
-# Disk margins are shown in five colours between these.
-_LEVELS = ((0.0, RED), (0.3, ORANGE), (0.5, PURPLE), (0.7, BLUE), (0.9, GREEN))
 
 
 def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
@@ -110,28 +108,6 @@ def gain_unit(robot: Robot) -> tuple[str, float]:
     return f"{unit}/{robot.motors.unit}", motors * (math.degrees(1.0) if factor is None else 1.0 / factor)
 
 
-def margin_map(part: LinearEvidence, robot: Robot) -> Chart:
-    """Return where in gain, pole and dead time the disk margin is small, of each axis."""
-    panels = []
-    unit, factor = gain_unit(robot)
-    scale = np.array([factor, 1.0, 1e3])
-    units = (f"static gain [{unit}]", "pole [1/s]", "dead time [ms]")
-    for i, axis in enumerate(part.plants.axes):
-        margins, numbers = part.margins[f"{axis}.disk_margin"], part.plants.numbers[:, i] * scale
-        for x, y in ((0, 2), (0, 1)):
-            curves = []
-            for k, (low, colour) in enumerate(_LEVELS):
-                high = _LEVELS[k + 1][0] if k + 1 < len(_LEVELS) else math.inf
-                rows = (margins >= low) & (margins < high)
-                label = f"{low:g} to {high:g}" if math.isfinite(high) else f"{low:g} and more"
-                if rows.any():
-                    curves.append(Curve(numbers[rows, x], numbers[rows, y], label, colour, "points", 2.2))
-            panels.append(
-                Panel(curves, units[y], units[x], title=f"{axis}: disk margin over {QUANTITIES[x]} and {QUANTITIES[y]}")
-            )
-    return Chart("Margin map", panels, columns=2, linked=False, row_height=3.0)
-
-
 def mu_charts(part: LinearEvidence) -> list[Chart]:
     """Return the structured singular value over frequency with its bounds; nothing where the middle is not stable."""
     panels = []
@@ -139,14 +115,8 @@ def mu_charts(part: LinearEvidence) -> list[Chart]:
         for row in rows:
             if not np.isfinite(row.upper).all():
                 continue
-            found = row.lower > 0.0
-            curves = [
-                Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4),
-                Curve(row.frequency[found], row.lower[found], "lower bound, around the peak", ORANGE, "points", 2.0),
-            ]
+            curves = [Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4)]
             levels = [Level(1.0, "certain below", RED)]
-            if row.sampled > 0.0:
-                levels.append(Level(row.sampled, "sampled plants in a scaled box", GREEN))
             top = max(1.1, 1.1 * float(row.upper.max()))
             panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
     return (
@@ -154,25 +124,6 @@ def mu_charts(part: LinearEvidence) -> list[Chart]:
         if panels
         else []
     )
-
-
-def delay_sensitivity(part: LinearEvidence, sample_time: float) -> Chart:
-    """Return margins of the worst plant against delay that is added to the loop."""
-    ms = 1e3 * sample_time * part.delays[:, 0]
-    stable = part.delays[:, 1] < 1.0
-    peaks = np.where(stable, part.delays[:, 3], np.nan)
-    panels = [
-        Panel([Curve(ms, part.delays[:, 2], "least disk margin", BLUE, "marked")], "disk margin", legend=False),
-        Panel([Curve(ms, peaks, "largest sensitivity", ORANGE, "marked")], "Ms", legend=False),
-        Panel(
-            [Curve(ms, part.delays[:, 1], "largest spectral radius", GREY, "marked")], "spectral radius",
-            levels=(Level(1.0),), legend=False,
-        ),
-    ]  # fmt: skip
-    return Chart(
-        "Sensitivity to delay", panels, "delay added to every plant [ms]", row_height=1.8,
-        caption="Of the worst of nominal, corners and the first samples; no sensitivity where one is not stable.",
-    )  # fmt: skip
 
 
 def step_chart(steps: Steps, plants: Plants, robot: Robot) -> Chart:

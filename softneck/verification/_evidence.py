@@ -14,7 +14,6 @@ from softneck.core._shown import Shown
 from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
-from ._confidence import MarginInterval, intervals
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
 from ._laws import ControllerUnderTest
 from ._linear import LinearLaw, judged, margins
@@ -34,13 +33,6 @@ from ._search import SearchResult, search
 from ._steps import UNTOLD, Steps, StepTest, run_steps
 from ._structured import StructuredResult, structured
 from ._tested import TestedAxis, tested_axes
-
-# Samples of delay that are added to see how the loop stands it.
-_DELAYS = 9
-# Plants that are tried at each: nominals, corners and the first samples.
-_DELAY_PLANTS = 60
-# Points that scale a box up; the corners are among them.
-_SCALED = 200
 
 Describe = Callable[[int], dict[str, Any]]
 
@@ -69,8 +61,6 @@ class LinearEvidence:
         margins: name -> (n,).
         found: by the search; None where it was switched off.
         structured: by neck.
-        intervals: of the margins.
-        delays: rows of (samples added, largest radius, least disk margin, largest sensitivity).
     """
 
     name: str
@@ -79,8 +69,6 @@ class LinearEvidence:
     margins: dict[str, Vector]
     found: SearchResult | None
     structured: list[list[StructuredResult]]
-    intervals: list[MarginInterval]
-    delays: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -183,23 +171,9 @@ def _linear(
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (_SCALED, len(plants.axes), 3))
-    drawn[: _SCALED // 3] = np.sign(drawn[: _SCALED // 3])
     wanted = detailed or any(item.metric == "robust.sensitivity" for item in asked.bounds)
-    parts = [structured(neck, law, extra=extra, drawn=drawn, performance=wanted) for neck in necks]
-    spread = [row for neck in necks for row in intervals(neck, law, w, extra=extra)] if detailed else []
-    return LinearEvidence(name, law, tried, table, found, parts, spread, _delays(plants, law, w))
-
-
-def _delays(plants: Plants, law: LinearLaw, w: Vector) -> np.ndarray:
-    rows = []
-    few = plants.take(np.arange(min(_DELAY_PLANTS, len(plants))))
-    for samples in range(_DELAYS):
-        table = margins(few.later(samples), law, w)
-        disks = np.min([table[f"{axis}.disk_margin"] for axis in plants.axes], axis=0)
-        peaks = np.max([table[f"{axis}.sensitivity"] for axis in plants.axes], axis=0)
-        rows.append([samples, table["stability.radius"].max(), disks.min(), peaks.max()])
-    return np.array(rows)
+    parts = [structured(neck, law, extra=extra, performance=wanted) for neck in necks]
+    return LinearEvidence(name, law, tried, table, found, parts)
 
 
 def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
@@ -253,8 +227,6 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         absent["steps of other payloads"] = UNTOLD
     if not asked.sampling["search_generations"]:
         absent["stability.searched_radius"] = "the search is switched off (search_generations = 0)"
-    if evidence.linear and not evidence.linear[0].intervals:
-        absent["confidence intervals of the margins"] = "no FAMILY was given that knows its samples' uncertainty"
     if any(part.name for part in evidence.linear):
         absent["stability between frozen points"] = (
             "linear checks hold at frozen points; motion between them is simulated"

@@ -10,10 +10,8 @@ import numpy as np
 from softneck.plots import Chart, Section, Table, page
 
 from ._charts import (
-    delay_sensitivity,
     frequency_charts,
     gain_unit,
-    margin_map,
     mu_charts,
     neck_chart,
     step_chart,
@@ -73,7 +71,7 @@ def verification_page(found: Verification, controller: str, certificate: str = "
     evidence, robot = found.evidence, found.controller.robot
     first, *others = robot.outputs.names
     stepped = step_chart(evidence.steps, evidence.stepped, robot)
-    sections = [_first(found, certificate, stepped), _methods(found)]
+    sections = [_first(found, certificate, stepped)]
     for part in evidence.linear:
         sections += _linear_sections(found, part)
     each = f" and, in a run of its own, of {' and '.join(others)}" if others else ""
@@ -126,7 +124,6 @@ def _first(found: Verification, certificate: str, stepped: Chart) -> Section:
     text = [f"{found.summary()[0].upper()}{found.summary()[1:]}."]
     if certificate:
         text.append(f"Certificate: {certificate}. Each worst plant stands beside it as a loop for softneck simulate.")
-    text += [f"Methods disagree: {item.question} {item.note}." for item in found.agreements if not item.agree]
     text += [f"Not computed: {name}: {why}." for name, why in found.evidence.not_computed.items()]
     table = verdict_table(found)
     return Section(
@@ -134,52 +131,26 @@ def _first(found: Verification, certificate: str, stepped: Chart) -> Section:
     )
 
 
-def _methods(found: Verification) -> Section:
-    rows = []
-    for item in found.agreements:
-        for k, (method, value) in enumerate(item.answers.items()):
-            first = k == 0
-            rows.append([
-                item.question if first else "", method, number(value),
-                ("agree" if item.agree else "disagree") if first else "", item.note if first else "",
-            ])  # fmt: skip
-    head = ["question", "method", "answer", "", "note"]
-    return Section("Methods side by side", tables=[Table("No average is taken", head, rows, text=2)])
-
-
 def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]:
     title = f" at {part.name}" if part.name else ""
-    evidence, Ts, robot = found.evidence, part.plants.sample_time, found.controller.robot
     mu = [
         [
-            neck.name, row.axes, f"{row.mu:.3f}", f"{row.lower.max():.3f}",
-            f"{row.sampled:.3f}" if row.sampled else f"none up to {row.sampled_scale:.2g} of the box",
+            neck.name, row.axes, f"{row.mu:.3f}",
             number(None if math.isnan(row.worst_sensitivity) else row.worst_sensitivity),
         ]
         for neck, rows in zip(found.necks, part.structured, strict=True) for row in rows
     ]  # fmt: skip
-    head = ["plants", "axis", "mu upper", "mu lower", "sampled in a scaled box", "worst Ms, bound"]
-    sections = [
+    head = ["plants", "axis", "mu, bound", "worst Ms, bound"]
+    return [
         Section(
             f"Frequency responses{title}",
             tables=[_margin_table(part)],
-            charts=[*frequency_charts(part, evidence.frequency), margin_map(part, robot)],
+            charts=frequency_charts(part, found.evidence.frequency),
         ),
         Section(
             f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
         ),
-        Section(
-            f"Delay{title}", tables=[_delay_table(part, Ts)], charts=[delay_sensitivity(part, Ts)],
-        ),
     ]  # fmt: skip
-    if part.intervals:
-        rows = [
-            [row.plant, row.metric, number(row.value), f"+-{row.half_width:.3g}", row.most] for row in part.intervals
-        ]
-        table = Table("95 % intervals", ["plant", "margin", "value", "half width", "most by"], rows, text=2)
-        text = ["What the confidence intervals of the identified numbers leave open about the margins, to first order."]
-        sections.append(Section(f"Confidence{title}", text=text, tables=[table]))
-    return sections
 
 
 def _margin_table(part: LinearEvidence) -> Table:
@@ -189,15 +160,6 @@ def _margin_table(part: LinearEvidence) -> Table:
         middle = float(np.median(finite)) if finite.size else math.inf
         rows.append([name, *(number(float(v)) for v in (values[0], middle, values.min(), values.max()))])
     return Table("Margins over all plants tried", ["margin", "nominal", "median", "least", "largest"], rows)
-
-
-def _delay_table(part: LinearEvidence, sample_time: float) -> Table:
-    rows = [
-        [f"{int(row[0])}", f"{1e3 * sample_time * row[0]:.0f}", *(number(float(value)) for value in row[1:])]
-        for row in part.delays
-    ]
-    head = ["samples added", "[ms]", "spectral radius", "least disk margin", "largest Ms"]
-    return Table("The same controller with more delay", head, rows)
 
 
 def _spread(found: Verification, group: str) -> Table:

@@ -22,7 +22,6 @@ from softneck.robot._redefined import redefinition_of
 
 from ._axis_box import AxisBox, sampled, within_weight
 
-QUANTITIES = ("static gain", "pole", "dead time")
 # A pole that does not count: so fast [1/s] that a sample is over before it shows.
 _NO_POLE = 1e4
 _ROUNDING = 1e-6

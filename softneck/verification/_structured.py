@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector
-from softneck.design.robust._mu import Structure, mu_lower, mu_upper, worst_gains
+from softneck.design.robust._mu import Structure, mu_upper, worst_gains
 from softneck.identification.uncertainty._measured import response_of
 
 from ._axis_box import AxisBox
@@ -37,29 +37,22 @@ _FREQUENCIES, _PERFORMANCE_FREQUENCIES = 90, 24
 # Between which the peaks of a real scalar alone are looked for: 0.2 % apart, so that a dead time of 0.1 s turns by
 # 0.03 rad at the most from one to the next.
 _FINE = 4000
-# The box is grown up to this many times to find what makes the loop unstable.
-_LARGEST_SCALE = 4.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StructuredResult:
-    """Bounds over frequency, and what sampling says beside them.
+    """Bounds over frequency.
 
     Attributes:
         axes: "pitch", "roll", or "both" (of more than two "all") where they are coupled.
         frequency: (m,) [rad/s].
-        upper, lower: (m,) bounds of mu for stability; the lower one is found around the peak only, 0 elsewhere.
-        sampled: 1 / the least scale of the box at which a sampled plant was unstable; 0 where none was.
-        sampled_scale: up to which the box was scaled.
+        upper: (m,) bound of mu for stability.
         worst_sensitivity: that no plant of the box exceeds (skewed mu); inf where stability itself is not certain.
     """
 
     axes: str
     frequency: Vector
     upper: Vector
-    lower: Vector
-    sampled: float
-    sampled_scale: float
     worst_sensitivity: float
 
     @property
@@ -68,16 +61,13 @@ class StructuredResult:
         return float(self.upper.max())
 
 
-def structured(
-    neck: UncertainNeck, law: LinearLaw, *, extra: int, drawn: np.ndarray, performance: bool
-) -> list[StructuredResult]:
+def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int, performance: bool) -> list[StructuredResult]:
     """Return the bounds of each axis, or of both together where plant or controller couple them.
 
     Args:
         neck: with its box.
         law: the controller's linear form.
         extra: samples of delay that the loop's order adds.
-        drawn: (n, axes, 3) from -1 to 1 across the box, scaled up to find instability.
         performance: whether the worst sensitivity is bounded too.
     """
     Ts = neck.sample_time
@@ -88,19 +78,18 @@ def structured(
         peaks = _real_peaks(neck, law, np.geomspace(low, -high, _FINE), axes, extra)
         w = np.union1d(np.geomspace(low, -high, _FREQUENCIES), peaks)
         M, blocks = interconnection(neck, law, w, axes, extra)
-        sampled, scale = _sampled(neck, law, axes, extra, drawn)
         name = together(neck, axes)
         if not _middle_is_stable(neck, law, axes, extra):
             # The bound grows the box from a stable middle; without one there is nothing to grow.
             never = np.full(w.size, math.inf)
-            results.append(StructuredResult(name, w, never, never, math.inf, scale, math.inf))
+            results.append(StructuredResult(name, w, never, math.inf))
             continue
-        upper, lower = _bounds(M, blocks)
+        upper = mu_upper(M, Structure.of(blocks))[0]
         sensitivity = math.nan
         if performance:
             at = np.union1d(np.geomspace(max(0.3, low), -high, _PERFORMANCE_FREQUENCIES), peaks[peaks > 0.3])
             sensitivity = max(_worst_sensitivity(neck, law, at, axes, extra))
-        results.append(StructuredResult(name, w, upper, lower, sampled, scale, sensitivity))
+        results.append(StructuredResult(name, w, upper, sensitivity))
     return results
 
 
@@ -125,17 +114,6 @@ def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], 
         box = neck.axes[i]
         numbers[i] = [box.middle[0], _middle_pole(box, neck.sample_time), box.middle[2]]
     return bool(radii(make_plants(neck, numbers[None], [""]).later(extra), law)[0] < 1.0)
-
-
-def _bounds(M: np.ndarray, blocks: list[tuple[int, int]]) -> tuple[Vector, Vector]:
-    """Return both bounds (m,); the lower one, which is slow, around the peak only and 0 elsewhere."""
-    shape = Structure.of(blocks)
-    upper = mu_upper(M, shape)[0]
-    peak = int(np.argmax(upper))
-    near = np.arange(max(0, peak - 3), min(upper.size, peak + 4))
-    lower = np.zeros(upper.size)
-    lower[near] = np.minimum(mu_lower(M[near], shape), upper[near])
-    return upper, lower
 
 
 def interconnection(
@@ -231,32 +209,3 @@ def _worst_sensitivity(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Seq
         M, blocks = interconnection(neck, law, w, axes, extra, judged=axis)
         peaks.append(float(worst_gains(M, blocks).max()))
     return peaks
-
-
-def _sampled(
-    neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], extra: int, drawn: np.ndarray
-) -> tuple[float, float]:
-    """Return 1 / the least scale of the box at which a drawn plant is unstable (0 for none), and the largest tried."""
-    middle, widths = (np.stack([getattr(box, name) for box in neck.axes]) for name in ("middle", "widths"))
-    held = np.zeros((len(neck.axes), 3))
-    held[list(axes)] = 1.0
-    # Gains and poles keep their sign, dead times stay above zero: beyond that the box means nothing.
-    room = np.where(held * widths > 0.0, 0.98 * np.abs(middle) / np.maximum(widths, 1e-12), math.inf)
-    limit = min(_LARGEST_SCALE, float(room[:, :2].min()))
-
-    def unstable(scale: float) -> bool:
-        numbers = middle + scale * drawn * held * widths
-        numbers[..., 2] = np.maximum(numbers[..., 2], 0.0)
-        plants = make_plants(neck, numbers, [""] * len(numbers)).later(extra)
-        return bool((radii(plants, law) >= 1.0).any())
-
-    # Where the largest box hides an unstable plant, the least scale is sought by halves from the first that fails.
-    scales = np.linspace(limit / 8.0, limit, 8)
-    failing = next((k for k, scale in enumerate(scales) if unstable(float(scale))), None)
-    if failing is None:
-        return 0.0, limit
-    low, high = (0.0 if failing == 0 else float(scales[failing - 1])), float(scales[failing])
-    for _ in range(5):
-        half = 0.5 * (low + high)
-        low, high = (low, half) if unstable(half) else (half, high)
-    return 1.0 / high, limit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,6 @@ from softneck.robot import Robot
 from softneck.robot._opened import opened
 from softneck.signals.recording._recording import require_same_robot
 
-from ._agreement import Agreement, agreements
 from ._evidence import Evidence, gather, worst_row
 from ._experiments import crossing_values
 from ._laws import ControllerUnderTest, judge
@@ -62,7 +61,6 @@ class Verification(Shown):
     Attributes:
         verdicts: one for each requirement.
         evidence: all that was computed.
-        agreements: methods side by side.
         controller: as it was judged.
         necks: the sources of plants.
         requirements: that were asked.
@@ -74,7 +72,6 @@ class Verification(Shown):
 
     verdicts: list[Verdict]
     evidence: Evidence
-    agreements: list[Agreement]
     controller: ControllerUnderTest
     necks: list[UncertainNeck]
     requirements: Requirements
@@ -129,8 +126,6 @@ class Verification(Shown):
         evidence = self.evidence
         more = {
             "requirements": rows,
-            "disagreements": [asdict(item) for item in self.agreements if not item.agree],
-            "methods": [asdict(item) for item in self.agreements],
             "not_computed": evidence.not_computed,
             "order": self.controller.order,
             "extra_delay_samples": self.controller.extra,
@@ -146,11 +141,6 @@ class Verification(Shown):
             "virtual_neck_loops": len(evidence.necks),
             "foreign_plants": evidence.foreign,
             **validity(evidence, self.tested),
-            "delay_sensitivity": [
-                dict(zip(("samples_added", "spectral_radius", "disk_margin", "sensitivity"), row, strict=True))
-                for part in evidence.linear[:1] for row in part.delays
-            ],
-            "confidence": [asdict(row) for part in evidence.linear for row in part.intervals],
             "settings": {
                 name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "neck")
             },
@@ -297,7 +287,6 @@ def verify(
     return Verification(
         verdicts=[_verdict(item, evidence, elsewhere) for item in asked.bounds],
         evidence=evidence,
-        agreements=agreements(evidence, asked.scale[1]),
         controller=judged,
         necks=necks,
         requirements=asked,

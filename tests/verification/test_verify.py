@@ -122,18 +122,6 @@ def test_the_order_adds_its_samples_and_says_so() -> None:
     assert one - two == pytest.approx(1e3 * TS, rel=0.05)
 
 
-@pytest.mark.slow
-def test_intervals_come_from_the_familys_own_uncertainty() -> None:
-    widths = []
-    for std in (0.01, 0.02):
-        found = verify(pi(), family(std=std), make_requirements(QUICK))
-        rows = {(row.plant, row.metric): row.half_width for row in found.evidence.linear[0].intervals}
-        widths.append(rows["plant: nominal", "pitch.sensitivity"])
-    # First order: twice the deviation, twice the interval, but for the curvature.
-    assert widths[1] == pytest.approx(2.0 * widths[0], rel=0.1)
-    assert verify(pi(), linear_neck(), make_requirements(QUICK)).evidence.linear[0].intervals == []
-
-
 def test_the_sweep_is_the_loop_to_the_last_bits() -> None:
     """The compiled sweep and `run_loop` over `linear_plant` are the same system."""
     plants = all_plants([neck_of_family(family(cross=0.1), "f")], 24, 0)
