@@ -40,8 +40,7 @@ from softneck.runtime import Block
 from softneck.signals import Excitation, Recording, SetPointLimits, concatenate, multisine_experiments, prepare, signal
 from softneck.verification import make_requirements, verify
 from softneck.verification._experiments import LoopUnderTest, crossing_values, crossings
-from softneck.verification._neck_loops import run_necks
-from softneck.verification._own_plants import OwnPlant
+from softneck.verification._neck_loops import OwnPlant, run_necks
 from tests.foreign_necks.held_out import HELD_OUT
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import NECKS, ForeignNeck

@@ -82,7 +82,7 @@ def command(
     from softneck.report._tune_page import said_of
     from softneck.tuning import tune
     from softneck.tuning._tune import task_of
-    from softneck.verification._own_plants import is_own_plant, named_plants
+    from softneck.verification._neck_loops import is_own_plant, named_plants
 
     if output.exists() and not output.is_dir():
         raise SettingsError(f"{output}: is a file; name a folder.")
@@ -129,7 +129,7 @@ def _print(found: Tuned, folder: Path) -> None:
 
 def _why(found: Tuned, folder: Path) -> str:
     from softneck.report._tune_page import stands_in_the_way
-    from softneck.verification._own_plants import ALONE
+    from softneck.verification._neck_loops import ALONE
 
     failed = found.verification.failed
     binds = [item.note for item in failed if item.requirement.metric == found.binding]

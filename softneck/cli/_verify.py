@@ -72,9 +72,8 @@ def command(
     """
     from softneck.estimation._axis import robot_of
     from softneck.verification import read_requirements, verify
-    from softneck.verification._neck_loops import neck_file_of
-    from softneck.verification._own_plants import named_plants
-    from softneck.verification._reserve import left_to_tune
+    from softneck.verification._neck_loops import named_plants, neck_file_of
+    from softneck.verification._requirements import left_to_tune
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)

@@ -14,8 +14,7 @@ from softneck.loop._references import Reference
 from softneck.loop._robot_references import RobotReference
 from softneck.robot import Robot
 from softneck.runtime import Block
-from softneck.verification._neck_loops import direction, judge_loop, step_at
-from softneck.verification._own_plants import OwnPlant
+from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at
 
 from ._requirements import TuneRequirements
 from ._task import Task

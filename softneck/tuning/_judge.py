@@ -18,11 +18,9 @@ from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.identification.models._ports import payloads
 from softneck.runtime import Block
 from softneck.verification._experiments import crossing_values, crossings
-from softneck.verification._laws import ControllerUnderTest
-from softneck.verification._laws import judge as under_test
-from softneck.verification._linear import LARGE, SMALL, judged, margins
-from softneck.verification._neck_loops import loops_under_test
-from softneck.verification._own_plants import OwnPlant, own_plant
+from softneck.verification._linear import LARGE, SMALL, ControllerUnderTest, judged, margins
+from softneck.verification._linear import judge as under_test
+from softneck.verification._neck_loops import OwnPlant, loops_under_test, own_plant
 from softneck.verification._plants import Plants, all_plants
 from softneck.verification._steps import StepTest, run_steps
 from softneck.verification._tested import tested_axes

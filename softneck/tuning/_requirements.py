@@ -14,8 +14,7 @@ from softneck.core._budget import settings_text
 from softneck.loop import default_limits
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
-from softneck.verification._requirements import VERSION, Requirement, with_groups
-from softneck.verification._reserve import TRACK_METRICS, kept_back
+from softneck.verification._requirements import TRACK_METRICS, VERSION, Requirement, kept_back, with_groups
 
 _RISE = "neck.rise_s"
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")

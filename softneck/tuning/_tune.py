@@ -19,9 +19,8 @@ from softneck.robot import Robot
 from softneck.robot._opened import opened
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
-from softneck.verification._own_plants import OwnPlant, is_own_plant, named_plants
-from softneck.verification._scale import scaled
-from softneck.verification._verify import sources_of, standing_for
+from softneck.verification._neck_loops import OwnPlant, is_own_plant, named_plants
+from softneck.verification._verify import scaled, sources_of, standing_for
 
 from ._beforehand import default_rise, quickest, refuse_impossible
 from ._digest import digest_of

@@ -15,23 +15,22 @@ from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
-from ._laws import ControllerUnderTest
-from ._linear import LinearLaw, judged, margins
+from ._linear import ControllerUnderTest, LinearLaw, judged, margins
 from ._neck_loops import (
     NeckRun,
+    OwnPlant,
     direction,
     loops_under_test,
     neck_changes,
     no_virtual_plant,
+    payloads_left_out,
     run_necks,
     step_at,
 )
-from ._own_plants import OwnPlant, payloads_left_out
 from ._plants import Plants, UncertainNeck, all_plants, join
 from ._requirements import Requirements
-from ._search import SearchResult, search
 from ._steps import UNTOLD, Steps, StepTest, run_steps
-from ._structured import StructuredResult, structured
+from ._structured import SearchResult, StructuredResult, search, structured
 from ._tested import TestedAxis, tested_axes
 
 Describe = Callable[[int], dict[str, Any]]

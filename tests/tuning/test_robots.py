@@ -26,8 +26,7 @@ from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
 from softneck.verification import read_requirements
 from softneck.verification._neck_loops import direction
-from softneck.verification._scale import scaled
-from softneck.verification._verify import sources_of
+from softneck.verification._verify import scaled, sources_of
 from tests.design.test_robots import BELLOWS, plant
 
 QUICK: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "step": {"duration_s": 2.0},

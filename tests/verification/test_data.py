@@ -23,14 +23,14 @@ from softneck.verification import Verification, _tested, make_requirements, veri
 from softneck.verification._evidence import Values, worst_row
 from softneck.verification._experiments import Crossing, LoopUnderTest, _Case
 from softneck.verification._linear import LinearLaw, margins
-from softneck.verification._neck_loops import step_at
-from softneck.verification._own_plants import (
+from softneck.verification._neck_loops import (
     ALONE,
     OwnPlant,
     is_own_plant,
     named_plants,
     not_recorded,
     own_plant,
+    step_at,
 )
 from softneck.verification._plants import all_plants, neck_of_family
 from softneck.verification._steps import Steps

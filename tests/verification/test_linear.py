@@ -24,8 +24,7 @@ from softneck.verification._plants import (
     neck_of_model,
     nominal_plants,
 )
-from softneck.verification._search import search
-from softneck.verification._structured import _axis, structured
+from softneck.verification._structured import _axis, search, structured
 
 from .necks import PAPER, TS, controller_of, family, linear_neck, pi
 

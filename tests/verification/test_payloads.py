@@ -11,8 +11,7 @@ import pytest
 from softneck.core import load, silent
 from softneck.plant import NeckParameters
 from softneck.verification import make_requirements
-from softneck.verification._neck_loops import run_necks
-from softneck.verification._own_plants import OwnPlant, own_plant, payloads_left_out
+from softneck.verification._neck_loops import OwnPlant, own_plant, payloads_left_out, run_necks
 
 from ..data import ROOT
 from ..identification.structured.test_payload import at

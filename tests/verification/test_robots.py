@@ -19,7 +19,7 @@ from softneck.robot import Robot
 from softneck.verification import make_requirements, verify
 from softneck.verification._experiments import _SMALL, LoopUnderTest, _Case, _first_crossing, crossings
 from softneck.verification._linear import LinearLaw, judged, margins, radii
-from softneck.verification._own_plants import own_plant
+from softneck.verification._neck_loops import own_plant
 from softneck.verification._plants import all_plants, between, mixing, neck_of_model
 from softneck.verification._requirements import read_requirements
 from softneck.verification._steps import StepTest, run_steps

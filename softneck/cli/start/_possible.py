@@ -51,7 +51,7 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
     """Return metric -> why no controller keeps what the defaults of `tune` ask of it."""
     from softneck.tuning._beforehand import refuse_impossible
     from softneck.tuning._tune import task_of
-    from softneck.verification._own_plants import named_plants
+    from softneck.verification._neck_loops import named_plants
 
     things, refused = named_plants(list(plants)), dict[str, str]()
     while True:
