@@ -118,7 +118,7 @@ class ObjectController(Shown):
 
 def own_controller(thing: Any) -> Any:
     """Return an object that steps as a controller with a block, everything else as it is."""
-    if isinstance(thing, str | Path | Mapping | type) or any(hasattr(thing, name) for name in ("block", "advance")):
+    if isinstance(thing, str | Path | Mapping | type | Block) or hasattr(thing, "block") or hasattr(thing, "advance"):
         return thing
     return ObjectController(thing) if callable(getattr(thing, "step", None)) else thing
 
