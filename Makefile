@@ -43,7 +43,7 @@ conformance: $(VENV)/.tested
 	$(BIN)/python -m tests.fmu.conformance
 
 # Change one thing at a time in the rooms that protect people and promises, and see whether a test notices: an hour or
-# more for all; `make mutate ROOMS="master loop"` tries some. docs/howto/mutation.md has the figures.
+# more for all; `make mutate ROOMS="master loop"` tries some. docs/howto/nightly.md has the figures.
 mutate: $(VENV)/.mutated
 	$(BIN)/python tests/mutation/run.py $(ROOMS) --out build/mutation.json
 

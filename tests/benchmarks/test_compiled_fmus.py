@@ -1,7 +1,7 @@
 """Cost of a compiled FMU's step; run with `pytest tests/benchmarks/test_compiled_fmus.py --benchmark-only -p no:xdist`.
 
 All kinds in one run, fmpy's low-level `doStep` alone, inputs set before each. The last lines are the table of
-docs/howto/fmus_compiled.md: times of the compiled FMU and of the pythonfmu one of the same model, side by side, and
+docs/howto/fmus.md: times of the compiled FMU and of the pythonfmu one of the same model, side by side, and
 what of the former is fmpy's own: a `doStep` over no time, in which the FMU has nothing to do.
 """
 

@@ -1,4 +1,4 @@
-"""The commands and scripts of the how-to pages work as they stand there."""
+"""The commands and scripts of the page on other tools work as they are printed there."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from .every_kind import block_of
 from .test_importers import need
 
 PAGES = Path(__file__).parents[2] / "docs" / "howto"
+PAGE = "fmu_in_tools.md"
 
 
 def _parts(page: str, language: str) -> list[str]:
@@ -47,7 +48,7 @@ def elsewhere(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_fmpy_s_commands_run(folder: Path) -> None:
-    lines = [line.removeprefix("$ ") for part in _parts("fmu_fmpy.md", "console") for line in part.splitlines()]
+    lines = [line.removeprefix("$ ") for part in _parts(PAGE, "console") for line in part.splitlines()]
     # Those before make the FMU; `make documents` runs them.
     commands = [line for line in lines if line.startswith("python -m fmpy")]
     assert len(commands) == 3
@@ -56,25 +57,25 @@ def test_fmpy_s_commands_run(folder: Path) -> None:
     assert (folder / "neck.csv").read_text().startswith('"time"')
 
 
-@pytest.mark.parametrize(("page", "package"), [("fmu_fmpy.md", "fmpy"), ("fmu_libcosim.md", "libcosimpy")])
-def test_the_scripts_compute_the_same_pitch(page: str, package: str, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize(("place", "package"), [("folder", "fmpy"), ("elsewhere", "fmpy"), ("elsewhere", "libcosimpy")])
+def test_the_scripts_compute_the_same_pitch(place: str, package: str, request: pytest.FixtureRequest) -> None:
     need(package)
-    folder = request.getfixturevalue("folder" if package == "fmpy" else "elsewhere")
-    (script,) = _parts(page, "python")
-    printed = _run([sys.executable, "-c", script], folder)
+    (script,) = [part for part in _parts(PAGE, "python") if f"from {package}" in part]
+    printed = _run([sys.executable, "-c", script], request.getfixturevalue(place))
     block = block_of("rls")
-    steps = 175 if page == "fmu_fmpy.md" else 200  # 2 rad for 3.5 s, and for 4 s
+    steps = 175 if package == "fmpy" else 200  # 2 rad for 3.5 s, and for 4 s
     u = [[2.0, 0.0, 0.0, *[float("nan")] * 5]] * steps
     _, y = block.run(block.initial_state(), np.array(u))
     numbers = [line for line in printed.splitlines() if re.fullmatch(r"[\[\](), \d.e+-]+", line)]  # not the log
     value = float(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", numbers[-1])[0])
-    wanted = np.degrees(y[-1, 0]) if page == "fmu_fmpy.md" else y[-1, 0]
+    wanted = np.degrees(y[-1, 0]) if package == "fmpy" else y[-1, 0]
     assert value == pytest.approx(wanted, rel=1e-9)  # printed in full
 
 
-@pytest.mark.parametrize("page", ["fmu_fmpy.md", "fmu_libcosim.md", "fmu_openmodelica.md", "fmu_simulink.md"])
-def test_every_page_says_what_was_run(page: str) -> None:
-    text = (PAGES / page).read_text(encoding="utf-8")
-    assert "**Run here**" in text or "**Not run here:**" in text
-    assert page == "fmu_fmpy.md" or "--backend compiled" in text.split("LD_PRELOAD")[0]
-    assert page.removesuffix(".md") in (PAGES / "exchange.md").read_text(encoding="utf-8")
+def test_every_section_says_what_was_run() -> None:
+    text = (PAGES / PAGE).read_text(encoding="utf-8")
+    for tool in ("fmpy", "libcosim", "OpenModelica and OMSimulator", "Simulink"):
+        section = text.split(f"\n## {tool}\n")[1].split("\n## ")[0]
+        assert "**Run here**" in section or "**Not run here:**" in section
+    assert "--backend compiled" in text.split("LD_PRELOAD")[0]
+    assert PAGE.removesuffix(".md") in (PAGES / "exchange.md").read_text(encoding="utf-8")
