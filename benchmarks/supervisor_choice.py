@@ -20,8 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from softneck.drives import default_drives
 from softneck.drives.supervision._baseline import Baseline
 from softneck.drives.supervision._calibrate import calibrate
-from softneck.drives.supervision._log import MotionLog
-from softneck.drives.supervision._motor_models import Motion
+from softneck.drives.supervision._motor_models import Motion, MotionLog
 from softneck.drives.supervision._plausibility import Plausibility
 from tests.drives.bench import T
 from tests.drives.broken import ROWS, Row, _excited, break_at, calm_run

@@ -67,7 +67,7 @@ def _stops(name: str) -> bool:
 
 
 def _first_error(frames: Sequence[tuple[float, bool, Frame]]) -> str:
-    from softneck.drives.bus._meaning import meaning
+    from softneck.drives.logs._cycle import meaning
 
     for time, _, frame in frames:
         emergency = frame.identifier & 0x780 == 0x80 and frame.identifier != 0x80 and any(frame.data[:2])

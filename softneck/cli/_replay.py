@@ -11,7 +11,7 @@ from .shared._console import note, print_json, print_table
 
 if TYPE_CHECKING:
     from softneck.drives.logs._log_file import LoggedRun
-    from softneck.drives.master._measured import Pilot
+    from softneck.drives.master._master import Pilot
 
 
 def replay_log(log: Path, *, as_json: bool) -> None:

@@ -110,7 +110,7 @@ def test_a_baseline_of_no_log_or_of_a_minute_of_a_loop_is_refused(monkeypatch: p
     loop = Motion(setpoints=rows, positions=rows, tensions=rows, values=rows[:, :2], rates=rows[:, :2],
                   due=np.ones(6000, dtype=bool), references=rows[:, :2])  # fmt: skip
     run = SimpleNamespace(settings=lambda: default_drives().master_settings(0.02))
-    monkeypatch.setattr("softneck.drives.logs._baseline.read_run_log", lambda _: run)
-    monkeypatch.setattr("softneck.drives.logs._baseline.logged_motion", lambda *_: loop)
+    monkeypatch.setattr("softneck.drives.logs._replay.read_run_log", lambda _: run)
+    monkeypatch.setattr("softneck.drives.logs._replay.logged_motion", lambda *_: loop)
     with pytest.raises(DataError, match="60 s of a loop's motion"):
         baseline(["run.mcap"])

@@ -10,8 +10,8 @@ from softneck.drives import DrivesFile, default_drives
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._objects import Write, guarding_writes, limit_writes, mode_writes, option_writes, pdo_writes
 from softneck.drives.master import Frame, Master, MasterSettings, Phase
-from softneck.drives.master._cia301 import Command, nmt_frame
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._fieldbus import Command, nmt_frame
+from softneck.drives.master._master import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._virtual import VirtualRun, simulated_plant
 from softneck.drives.simulated import SimulatedDrive

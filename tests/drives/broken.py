@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softneck.drives.master import Phase
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._master import Measurement
 from softneck.drives.simulated._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_ZERO
 from softneck.drives.supervision._baseline import Baseline
 from softneck.drives.supervision._tilt_charts import TiltModel

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from softneck.drives.bus._objects import Write
 from softneck.drives.master import Frame, MasterSettings, Phase
-from softneck.drives.master._cia301 import BUS_OFF
+from softneck.drives.master._fieldbus import BUS_OFF
 
 from .bench import DISABLED, FAULT, REACTION, Bench, T
 

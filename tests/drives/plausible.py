@@ -13,12 +13,11 @@ import numpy as np
 from softneck.drives import default_drives
 from softneck.drives.commissioning._record import drive_limits
 from softneck.drives.master import Phase
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._master import Measurement
 from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.supervision._baseline import Baseline, load_baseline
 from softneck.drives.supervision._calibrate import calibrate
-from softneck.drives.supervision._log import MotionLog
-from softneck.drives.supervision._motor_models import Motion
+from softneck.drives.supervision._motor_models import Motion, MotionLog
 from softneck.plant import NeckParameters
 from softneck.signals import prepare, signal
 

@@ -30,8 +30,8 @@ from softneck.drives import (
     run_simulated,
     zero,
 )
+from softneck.drives.bus._file import bus_load, frame_bits
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.bus._load import bus_load, frame_bits
 from softneck.drives.bus._objects import limit_writes
 from softneck.drives.commissioning._neck_file import neck_drives
 from softneck.drives.commissioning._record import drive_limits
@@ -43,8 +43,7 @@ from softneck.drives.running._certified import _require_robot
 from softneck.drives.running._deploy import Deployment
 from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.running._virtual import physics_of, simulated_plant, simulated_springs, stand_in
-from softneck.drives.sensing._python_sensor import PythonInclinometer
-from softneck.drives.sensing._sensor import CanInclinometer
+from softneck.drives.sensing._sources import CanInclinometer, PythonInclinometer
 from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.simulated._springs import SimulatedSprings
 from softneck.loop import Loop

@@ -32,14 +32,12 @@ from softneck.drives import (
     simulated_neck,
     stop,
 )
-from softneck.drives.bus._link import BusError, VirtualLink
-from softneck.drives.bus._why import reason
+from softneck.drives.bus._link import BusError, VirtualLink, reason
 from softneck.drives.master import Frame, Tilt
-from softneck.drives.master._cia301 import BUS_OFF
+from softneck.drives.master._fieldbus import BUS_OFF
 from softneck.drives.running._stop import require_reset, require_stopped
-from softneck.drives.sensing._python_sensor import make_python_sensor
-from softneck.drives.sensing._sensor import look_at
 from softneck.drives.sensing._serial import SensorError
+from softneck.drives.sensing._sources import look_at, make_python_sensor
 from softneck.plant import NeckParameters
 
 

@@ -30,7 +30,7 @@ from softneck.drives.bus._file import DriveEntry
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._units import DriveScale
 from softneck.drives.master import Tilt
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._master import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve

@@ -22,7 +22,7 @@ import pytest
 from softneck.drives.bus import _sdo
 from softneck.drives.bus._link import CanLink
 from softneck.drives.bus._sdo import NUMBERS, Objects, SdoError
-from softneck.drives.running._scan import scan
+from softneck.drives.running._preflight import scan
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._profiles import PROFILES

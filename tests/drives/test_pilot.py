@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from softneck.drives.master._gate import sample_of
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._master import Measurement
 from softneck.drives.running._pilot import LoopPilot
 from softneck.loop import BlockPart, Loop
 

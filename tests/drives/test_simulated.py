@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from softneck.drives.simulated import SimulatedDrive, SimulatedNeck, SimulatedSettings
 from softneck.drives.simulated.__main__ import signals
-from softneck.drives.simulated._frame import CanFrame
+from softneck.drives.simulated._node import CanFrame
 from softneck.plant import NeckParameters
 
 CPR = 1539 / 65 * 2048 / (2 * math.pi)

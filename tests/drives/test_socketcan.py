@@ -24,7 +24,7 @@ import pytest
 from softneck.drives import default_drives, open_bus, preflight, scan
 from softneck.drives.bus._link import CanLink
 from softneck.drives.master import Frame
-from softneck.drives.master._cia301 import BUS_OFF
+from softneck.drives.master._fieldbus import BUS_OFF
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
 from softneck.plant import NeckParameters
 

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from softneck.drives.master import Phase
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
-from softneck.drives.simulated._frame import CanFrame
 from softneck.drives.simulated._habits import WireHabits
+from softneck.drives.simulated._node import CanFrame
 from softneck.drives.simulated._sdo import SdoServer
 from softneck.plant import NeckParameters
 

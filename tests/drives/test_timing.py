@@ -17,10 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.drives.logs._times import CycleTimes
+from softneck.drives.logs._result import CycleTimes
 from softneck.drives.running import _timing as timing
-from softneck.drives.running._notify import Notifier
-from softneck.drives.running._timing import Ask, Ending, steady
+from softneck.drives.running._timing import Ask, Ending, Notifier, steady
 
 from .bench import Bench
 

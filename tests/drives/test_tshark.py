@@ -13,7 +13,7 @@ import pytest
 from softneck.drives import default_drives, preflight, simulated_neck
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.master import Frame
-from softneck.drives.master._cia301 import NodeState
+from softneck.drives.master._fieldbus import NodeState
 from softneck.plant import NeckParameters
 
 from .bench import Bench

@@ -11,8 +11,7 @@ import pytest
 from softneck.cli._main import run
 from softneck.core import CheckFailedError
 from softneck.drives import DrivesFile, default_drives, preflight, scan, simulated_neck
-from softneck.drives.bus._link import VirtualLink
-from softneck.drives.bus._why import reason
+from softneck.drives.bus._link import VirtualLink, reason
 from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.master import Frame
 from softneck.drives.running._bus_loop import Session, run_session
@@ -55,7 +54,7 @@ def test_the_pre_flight_refuses_two_devices_with_one_number_before_it_writes() -
 def test_scan_of_two_devices_with_one_number_is_exit_code_1(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("softneck.drives.running._scan.devices_at", lambda _link, nodes: {nodes[0]: [11, None]})
+    monkeypatch.setattr("softneck.drives.running._preflight.devices_at", lambda _link, nodes: {nodes[0]: [11, None]})
     assert run(["drives", "commission", "--only", "scan", "--simulated", "--json"]) == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["nodes"][0]["serials"] == [11, None]

@@ -13,7 +13,7 @@ import numpy as np
 from softneck.core import Matrix
 from softneck.drives.master._events import Event, Reaction
 from softneck.drives.master._gate import Reading
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._master import Measurement
 from softneck.drives.simulated._servo_runtime import (
     SERVO_CURRENT,
     SERVO_DEMAND,

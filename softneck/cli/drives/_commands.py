@@ -14,14 +14,16 @@ from ..shared._console import note, print_json, print_table, progress
 from ..shared._groups import NearGroup
 from ..shared._options import common_options, output_option, target, trust_option
 from ._commission import commission_command
-from ._log import acting_files, opened_log, require_log
 from ._record import record_command
 from ._target import (
     Asked,
+    acting_files,
     drives_options,
     leave_if_asked,
     open_drives,
     open_link,
+    opened_log,
+    require_log,
     sensor_of,
     sensor_or_reason,
     target_of,

@@ -13,9 +13,8 @@ from softneck.signals import signal_names, write_recording
 
 from ..shared._console import note, print_json, progress
 from ..shared._options import common_options, output_option
-from ._log import drives_of, opened_log, require_log
-from ._steps import session_of
-from ._target import Asked, drives_options, leave_if_asked, open_link
+from ._commission import session_of
+from ._target import Asked, drives_of, drives_options, leave_if_asked, open_link, opened_log, require_log
 
 if TYPE_CHECKING:
     from softneck.drives.commissioning._record import ExperimentResult

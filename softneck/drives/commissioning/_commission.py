@@ -26,13 +26,12 @@ from softneck.robot import Robot
 from ..bus._file import DrivesFile
 from ..bus._link import VirtualLink
 from ..bus._objects import ampere
-from ..bus._write import drives_table
+from ..bus._read import drives_table
 from ..running._bus_loop import RunEnd, Session
-from ..running._scan import scan
+from ..running._preflight import scan
 from ..simulated._springs import SimulatedSprings
-from ._findings import Finding
+from ._findings import Finding, fatal, known_before, require_answers, typed
 from ._identify import LATE, Expected, Identified, identify, proposed
-from ._known import fatal, known_before, require_answers, typed
 from ._measure import expected_of, measure
 from ._moves import PULLED, Guards, Moves
 

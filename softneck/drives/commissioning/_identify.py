@@ -16,9 +16,9 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 
-from ..bus._axes import Axes, axes_of, inverse, said_of
 from ..bus._file import DrivesFile
 from ..bus._objects import ampere
+from ..bus._sensor_source import Axes, axes_of, inverse, said_of
 from ._features import Features, features
 from ._findings import Finding
 from ._mounting import FITS, Mounting, explain

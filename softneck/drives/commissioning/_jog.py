@@ -13,7 +13,7 @@ import numpy as np
 from softneck.core import CheckFailedError, SettingsError, Vector, require_between, require_whole
 
 from ..running._bus_loop import RunEnd, Session, run_session
-from ..running._signals import SignalLog, SignalPilot, raised_cosine
+from ..running._pilot import SignalLog, SignalPilot, raised_cosine
 
 SAMPLE_TIME = 0.02
 # One way takes this long, the motor then stands for this long; angles are means over the last part of it [s].

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from softneck.core import Matrix, Vector
 
-from ..bus._axes import Axes
+from ..bus._sensor_source import Axes
 
 # Explanations fit alike within this [rad]: tendons of a neck come out up to 6 deg off, and the nearest two directions
 # that two different mistakes give are 30 deg apart.

@@ -16,7 +16,7 @@ from softneck.core import Vector
 
 from ..master import Master
 from ..master._fieldbus import DriveView
-from ..master._measured import Measurement, Motors
+from ..master._master import Measurement, Motors
 from ._features import answer
 from ._moves import (
     BACK,

@@ -24,7 +24,7 @@ from ..bus._file import DrivesFile
 from ..logs._rows import experiment_recording
 from ..master import Frame, Master, Tilt
 from ..running._bus_loop import RunEnd, Session, run_session
-from ..running._signals import SignalLog, SignalPilot
+from ..running._pilot import SignalLog, SignalPilot
 
 # Between two runs the motors stand at rest for this long [s]: 15 time constants of the neck.
 _PAUSE = 3.0

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from ..master import Frame, Master
+from ..master._cia402 import state_of
+from ..master._fieldbus import node_state
 from ..master._gate import Reading, sample_of
-from ..master._measured import Measurement, Motors, Pilot, reference_of
+from ..master._master import Measurement, Motors, Pilot, reference_of
 
 # What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None) and, of a
 # loop, ("reference", what it wanted its outputs to be), or (what, "Error: text") where it raised.
@@ -188,3 +191,39 @@ def _tilt(values: Sequence[Any]) -> Reading:
     *numbers, valid = values
     count = len(numbers) // 2
     return sample_of(_motors(numbers[:count]), _motors(numbers[count:]), valid=bool(valid))
+
+
+_NMT = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset", 130: "reset communication"}
+
+
+def meaning(frame: Frame) -> str:
+    """Return one frame in words, its bytes behind; for our own PDO mapping."""
+    text = _words(frame)
+    bytes_ = "remote request" if frame.remote else frame.data.hex(" ") or "no data"
+    return f"{text} [{bytes_}]"
+
+
+def _words(frame: Frame) -> str:
+    base, node, data = frame.identifier & 0x780, frame.identifier & 0x7F, frame.data
+    if frame.error:
+        return "bus-off" if data == b"off" else "error on the bus"
+    if frame.identifier == 0 and len(data) == 2:
+        return f"NMT {_NMT.get(data[0], data[0])} to {'all' if data[1] == 0 else f'node {data[1]}'}"
+    if frame.identifier == 0x80:
+        return "SYNC"
+    if base == 0x80 and len(data) >= 3:
+        return f"emergency {int.from_bytes(data[:2], 'little'):04X}h of node {node}"
+    if base == 0x200 and len(data) == 6:
+        word, target = struct.unpack("<Hi", data)
+        return f"to node {node}: control word {word:04X}h, target {target} counts"
+    if base == 0x180 and len(data) == 8:
+        word, counts, current = struct.unpack("<Hih", data)
+        return f"from node {node}: {state_of(word).name}, {counts} counts, current {current}"
+    if base in (0x580, 0x600) and len(data) == 8:
+        index, subindex = struct.unpack_from("<HB", data, 1)
+        return f"SDO {'to' if base == 0x600 else 'from'} node {node}: {index:04X}h:{subindex}"
+    if base == 0x700:
+        if frame.remote:
+            return f"guarding of node {node}"
+        return f"node {node} is {node_state(data[0]).name}" if len(data) == 1 else f"guarding of node {node}"
+    return f"{frame.identifier:03X}h"

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from softneck.core import CheckFailedError, DataError
+from softneck.core import CheckFailedError, DataError, SettingsError
+from softneck.drives.logs._cycle import meaning
 
-from ..bus._meaning import meaning
 from ..master import Master, MasterSettings
-from ..master._measured import Measurement, Motors, Pilot
-from ..supervision._log import MotionLog
-from ..supervision._motor_models import Motion
+from ..master._master import Measurement, Motors, Pilot
+from ..supervision._baseline import Baseline
+from ..supervision._calibrate import calibrate, require_loops
+from ..supervision._motor_models import Motion, MotionLog
 from ._cycle import Answer, Cycle, LoggedPilot, cycle_of
-from ._log_file import LoggedRun
+from ._log_file import LoggedRun, read_run_log
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,3 +225,25 @@ def _first(logged: Cycle, again: Cycle) -> tuple[str, str, str] | None:
 
 def _answers(answers: Sequence[Answer]) -> str:
     return "; ".join(f"{what} {value}" for what, value in answers) or "none"
+
+
+def baseline(logs: Sequence[str | Path]) -> Baseline:
+    """Return what plausibility is judged by; `save` it and name it in the drives file: [supervision] baseline.
+
+    Args:
+        logs: `.mcap` of `softneck drives record`, such as one without and one with a payload, together at least 40 s;
+            those of `run` let a loop's tracking be compared as well.
+
+    Raises:
+        SettingsError: no log.
+        DataError: of different drives, disturbed, too short, or motors that did not move.
+        CheckFailedError: a log that does not replay.
+    """
+    if not logs:
+        raise SettingsError("no log was given.")
+    runs = [read_run_log(Path(path)) for path in logs]
+    like = runs[0].settings()
+    motions = [logged_motion(run, like) for run in runs]
+    if loops := [len(motion.due) * like.bus.cycle for motion in motions if motion.references is not None]:
+        require_loops(sum(loops))
+    return calibrate(motions, cycle=like.bus.cycle, sample_cycles=like.sample_cycles, slack=like.limits.slack)

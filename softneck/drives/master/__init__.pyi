@@ -1,5 +1,5 @@
-from ._cia301 import Frame as Frame
 from ._events import Event as Event
+from ._fieldbus import Frame as Frame
 from ._gate import Tilt as Tilt
 from ._master import Master as Master
 from ._settings import MasterSettings as MasterSettings

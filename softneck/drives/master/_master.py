@@ -5,17 +5,59 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
 
-from ._cia301 import Frame
 from ._cia402 import OFF, POWERED, DriveState, Goal
 from ._events import IDLE_TOO, Event, Reaction
-from ._fieldbus import Fieldbus
+from ._fieldbus import Fieldbus, Frame
 from ._gate import Gate, Reading
 from ._limiter import Limiter
-from ._measured import Measurement, Motors, Pilot, reference_of
 from ._settings import MasterSettings
 from ._supervisor import ACTIVE, FINAL, GOALS, Phase, Signal, Supervisor
 from ._watches import Leaky, Watches, timing
+
+# One number for each motor.
+Motors = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What the pilot gets at a sample.
+
+    Attributes:
+        index: of the sample, from 0 where the phase `running` begins.
+        tilt: last believed sample.
+        fresh: whether it is of now.
+        positions: of the motors [rad].
+    """
+
+    index: int
+    tilt: Reading
+    fresh: bool
+    positions: Motors
+
+
+class Pilot(Protocol):
+    """Observer and controller: what turns measurements into set-points."""
+
+    def start(self) -> None:
+        """Begin anew."""
+        ...
+
+    def step(self, measured: Measurement) -> Motors | None:
+        """Return the set-points [rad], one for each motor; None if there are none in time."""
+        ...
+
+    def finished(self, index: int) -> bool:
+        """Return whether the run ends before sample `index`."""
+        ...
+
+
+def reference_of(pilot: Pilot) -> tuple[float, ...]:
+    """Return what a pilot that closes a loop wanted its outputs to be at its last step [rad]; () of any other."""
+    return tuple(getattr(pilot, "reference", ()))
+
 
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
 _LOST = 5

@@ -17,19 +17,17 @@ from softneck.core import SettingsError, SoftneckError
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
 from ..logs._cycle import LoggedPilot
-from ..logs._result import fault_table, require_unstopped
+from ..logs._result import CycleTimes, fault_table, require_unstopped
 from ..logs._run_log import RunLogger, run_facts
-from ..logs._times import CycleTimes
 from ..master import Event, Frame, Master, MasterSettings
-from ..master._cia301 import Command as NmtCommand
-from ..master._cia301 import nmt_frame
-from ..master._measured import Pilot
+from ..master._fieldbus import Command as NmtCommand
+from ..master._fieldbus import nmt_frame
+from ..master._master import Pilot
 from ..master._supervisor import ACTIVE
-from ..sensing._sensor import Sensor
-from ._notify import Notifier
+from ..sensing._sources import Sensor
 from ._preflight import preflight
 from ._stop import disarm, stop
-from ._timing import Ask, Ending, Operator, steady
+from ._timing import Ask, Ending, Notifier, Operator, steady
 from ._virtual import VirtualRun, Watch
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].

@@ -22,10 +22,9 @@ from ..bus._link import CanLink, VirtualLink
 from ..logs._result import DrivesResult
 from ..logs._run_log import RunLogger
 from ..master import Frame, Master, MasterSettings
-from ..sensing._sensor import Sensor
+from ..sensing._sources import Sensor
 from ._bus_loop import Session, run_session
-from ._pilot import LoopPilot
-from ._signals import RunLog
+from ._pilot import LoopPilot, RunLog
 from ._timing import Operator
 from ._virtual import Watch, physics_of, simulated_plant
 

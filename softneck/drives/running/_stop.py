@@ -12,7 +12,7 @@ from ..bus._objects import disarm_writes
 from ..bus._sdo import Objects, SdoError
 from ..master import Frame
 from ..master._cia402 import OFF, DriveState, state_of
-from ._scan import require_bus
+from ._preflight import require_bus
 
 # Between two looks at a drive [s].
 _LOOK = 0.02

@@ -18,7 +18,7 @@ from typing import Any
 from softneck.core import SoftneckError
 from softneck.signals.importing._tilt import pitch_roll
 
-from ..bus._why import reason
+from ..bus._link import reason
 from ..master import Frame, Tilt
 
 # Two decimals or more: a number that was torn within its decimals is none.

@@ -13,9 +13,8 @@ from softneck.core import Matrix, SettingsError, require_between, require_one_of
 from softneck.core._shown import Shown
 
 from ._axis import Axis
-from ._frame import CanFrame
 from ._habits import WireHabits
-from ._node import SimulatedDrive
+from ._node import CanFrame, SimulatedDrive
 from ._profiles import PROFILES
 from ._servo_runtime import (
     SERVO_CURRENT_LIMIT,

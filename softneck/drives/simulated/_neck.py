@@ -16,7 +16,7 @@ from softneck.runtime import load_functions
 from softneck.runtime._bundle import sized
 
 from ._drives import Sample, SimulatedDrives, SimulatedSettings, sensed
-from ._frame import CanFrame
+from ._node import CanFrame
 from ._servo_runtime import SERVO_GEARING, SERVO_STUCK
 
 

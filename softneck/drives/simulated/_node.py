@@ -5,10 +5,25 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ._axis import Axis, fields_of
-from ._frame import CanFrame
 from ._sdo import WRONG_STATE, WRONG_VALUE, SdoServer
+
+
+class CanFrame(NamedTuple):
+    """One frame with an 11-bit identifier.
+
+    Attributes:
+        identifier: COB-ID.
+        data: at most 8 bytes.
+        remote: a request (RTR).
+    """
+
+    identifier: int
+    data: bytes
+    remote: bool = False
+
 
 _PREOPERATIONAL, _OPERATIONAL, _STOPPED = 0x7F, 0x05, 0x04
 _COMMANDS = {0x01: _OPERATIONAL, 0x02: _STOPPED, 0x80: _PREOPERATIONAL}

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 from . import _power as power
-from ._frame import CanFrame
 from ._neck import SimulatedNeck
+from ._node import CanFrame
 from ._springs import SimulatedSprings
 
 _NOTHING = -(2**31)

@@ -24,7 +24,7 @@ from softneck.plant._mechanics_runtime import neck_drive
 from softneck.runtime import load_functions
 
 from ._drives import Sample, SimulatedDrives, SimulatedSettings, sensed
-from ._frame import CanFrame
+from ._node import CanFrame
 from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_STUCK, SERVO_ZERO
 from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRING_SIZE, SPRING_STIFFNESS
 

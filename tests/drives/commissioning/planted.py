@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from softneck.drives.bus._axes import Axes, axes_of, inverse, said_of
 from softneck.drives.bus._file import DrivesFile
 from softneck.drives.bus._link import VirtualLink
+from softneck.drives.bus._sensor_source import Axes, axes_of, inverse, said_of
 from softneck.drives.running._virtual import simulated_plant
 from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.simulated._drives import Sample, twin

@@ -15,13 +15,19 @@ from hypothesis import strategies as st
 
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives, load_drives
-from softneck.drives.bus._axes import Axes, axes_of, inverse, said_of, turned
-from softneck.drives.bus._read import make_drives
-from softneck.drives.bus._write import drives_table
+from softneck.drives.bus._read import drives_table, make_drives
+from softneck.drives.bus._sensor_source import Axes, axes_of, inverse, said_of, turned
 from softneck.drives.commissioning._features import Features
-from softneck.drives.commissioning._findings import FINDINGS, Finding
+from softneck.drives.commissioning._findings import (
+    FINDINGS,
+    Finding,
+    fatal,
+    known_before,
+    peak_of,
+    require_answers,
+    typed,
+)
 from softneck.drives.commissioning._identify import Identified, Scale, factors, identify, proposed
-from softneck.drives.commissioning._known import fatal, known_before, peak_of, require_answers, typed
 from softneck.drives.commissioning._mounting import Mounting, exchanges, explain, seen
 from softneck.drives.commissioning._moves import WIGGLE
 from softneck.drives.master import Tilt

@@ -11,7 +11,7 @@ from typing import Any
 from softneck.drives.commissioning._mover import Mover
 from softneck.drives.commissioning._moves import Guards, Moves
 from softneck.drives.master import Tilt
-from softneck.drives.master._measured import Measurement
+from softneck.drives.master._master import Measurement
 
 STEP = 0.02
 COUNTS, TURN = 7717.0, 2048.0

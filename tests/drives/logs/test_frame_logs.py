@@ -7,11 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.drives import read_run_log
-from softneck.drives.bus._meaning import meaning
-from softneck.drives.logs._cycle import frame_of, frame_text
+from softneck.drives.logs._cycle import frame_of, frame_text, meaning
 from softneck.drives.logs._run_log import RunLogger
 from softneck.drives.master import Frame
-from softneck.drives.master._cia301 import BUS_OFF
+from softneck.drives.master._fieldbus import BUS_OFF
 
 FRAMES = st.builds(Frame, st.integers(0, 0x7FF), st.binary(max_size=8), st.booleans(), st.booleans())
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
 from softneck.drives.master import Frame, Phase
-from softneck.drives.master._cia301 import BUS_OFF
+from softneck.drives.master._fieldbus import BUS_OFF
 
 from ..bench import DISABLED, ENABLED, FAULT, Bench
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import struct
 
 from softneck.drives.master import Frame
-from softneck.drives.master._cia301 import BUS_OFF, NodeState
 from softneck.drives.master._cia402 import DriveState, Goal
-from softneck.drives.master._fieldbus import BusSettings, Fieldbus
+from softneck.drives.master._fieldbus import BUS_OFF, BusSettings, Fieldbus, NodeState
 
 T = 0.01
 OFF = (Goal.OFF,) * 3

@@ -9,9 +9,8 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.drives.master import Frame, Phase
-from softneck.drives.master._cia301 import Command, NodeState, nmt_frame, node_state
 from softneck.drives.master._events import IDLE_TOO, RULES, Event, Reaction
-from softneck.drives.master._fieldbus import BusSettings
+from softneck.drives.master._fieldbus import BusSettings, Command, NodeState, nmt_frame, node_state
 from softneck.drives.master._settings import (
     LimitSettings,
     MasterSettings,

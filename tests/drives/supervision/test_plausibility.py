@@ -16,7 +16,7 @@ from softneck.drives.bus._read import load_drives, make_drives
 from softneck.drives.master import Phase
 from softneck.drives.master._events import RULES, Reaction
 from softneck.drives.supervision._baseline import Baseline, Tracking, load_baseline
-from softneck.drives.supervision._log import MotionLog
+from softneck.drives.supervision._motor_models import MotionLog
 from softneck.drives.supervision._plausibility import Plausibility
 
 from ..bench import Bench, T
