@@ -43,7 +43,7 @@ TITLES = {"runs": 6, "excited": 9, "found": 7, "in time": 9, "least": 8, "named"
 
 def judged_by() -> str:
     """Return what a result hangs on: the baseline and the supervisor's text."""
-    folders = ("softneck/drives/supervision", "softneck/signals/detection")
+    folders = ("softneck/drives/supervision",)
     files = [BASELINE, *(path for folder in folders for path in sorted(Path(folder).glob("*.py")))]
     return hashlib.sha256("".join(map(file_hash, files)).encode()).hexdigest()[:16]
 

@@ -160,11 +160,12 @@ def sampled(bench: Bench, spoil: Spoil) -> None:
     """Change each sample of the inclinometer: `spoil(now, values, rates)` returns the two."""
     neck = bench.neck
     assert isinstance(neck, SimulatedNeck)
-    take = neck._sampled
+    take = neck.sample
 
     def taken(now: float):
         sample = take(now)
         values, rates = spoil(now, sample.values, sample.rates)
-        return sample._replace(values=values, rates=rates)
+        neck.newest = sample._replace(values=values, rates=rates)
+        return neck.newest
 
-    neck._sampled = taken
+    neck.sample = taken

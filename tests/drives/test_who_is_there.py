@@ -31,7 +31,7 @@ def with_twin() -> VirtualLink:
     """Two drives with number 2, of serial numbers 11 and 12."""
     link = linked(default_drives(), WireHabits(twin=2))
     link.neck.drives[1].axis.values[(0x1018, 4)] = 11
-    link.neck._on_bus.twins[0].axis.values[(0x1018, 4)] = 12
+    link.neck.twins[0].axis.values[(0x1018, 4)] = 12
     return link
 
 

@@ -16,9 +16,8 @@ from softneck.core import SettingsError, SoftneckError
 from ..master import Frame
 from ..master._fieldbus import BUS_OFF
 from ..master._gate import Reading
-from ..simulated import SimulatedNeck
+from ..simulated._drives import SimulatedDrives
 from ..simulated._node import CanFrame
-from ..simulated._springs import SimulatedSprings
 
 # Interfaces whose far end is a program on this machine: no drive can be behind them.
 HARMLESS = ("virtual", "udp_multicast")
@@ -62,7 +61,7 @@ class VirtualLink:
         sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
     """
 
-    def __init__(self, neck: SimulatedNeck | SimulatedSprings) -> None:
+    def __init__(self, neck: SimulatedDrives) -> None:
         """Begin at t = 0."""
         self.neck = neck
         self.cycle = neck.settings.cycle

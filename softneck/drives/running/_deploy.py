@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,12 +20,10 @@ from softneck.signals.recording._recording import require_same_robot
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink
 from ..logs._result import DrivesResult
-from ..logs._run_log import RunLogger
-from ..master import Frame, Master, MasterSettings
+from ..master import Frame, Master
 from ..sensing._sources import Sensor
 from ._bus_loop import Session, run_session
 from ._pilot import LoopPilot, RunLog
-from ._timing import Operator
 from ._virtual import Watch, physics_of, simulated_plant
 
 
@@ -99,15 +97,10 @@ def run_simulated(
     file: DrivesFile,
     *,
     neck: NeckParameters | None = None,
-    override: Collection[str] = (),
-    pace: float | None = None,
     report: Callable[[float], None] | None = None,
-    watches: Sequence[Watch] = (),
-    operator: Operator | None = None,
     hook: Callable[[VirtualLink], None] | None = None,
-    settings: Callable[[MasterSettings], MasterSettings] | None = None,
-    log: RunLogger | None = None,
-    files: Mapping[str, str | Path] | None = None,
+    watches: Sequence[Watch] = (),
+    **how: Any,
 ) -> DrivesResult:
     """Run the whole loop on simulated drives, in virtual time.
 
@@ -115,15 +108,9 @@ def run_simulated(
         deployed: the loop.
         file: how drives and master are set up.
         neck: the virtual neck; if not given, that of the loop, else that of the robot.
-        override: names of pre-flight checks that may fail.
-        pace: at this multiple of real time; as fast as possible if not given.
         report: called now and then with the done fraction.
-        watches: called after each bus cycle, see `Session`.
-        operator: asked each cycle what the operator wants.
         hook: called after each bus cycle, to let things go wrong.
-        settings: changes the master's settings, for tests.
-        log: where frames and cycles are written.
-        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
+        watches, how: see `Session`; of `files` a replay looks for "loop" and "controller".
 
     Raises:
         CheckFailedError: the pre-flight failed.
@@ -137,14 +124,8 @@ def run_simulated(
     disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)
-    more = [*watches]
-    if hook is not None:
-        more.append(lambda _now, _in, _out, _tilt, _master: hook(link))
-    session = Session(
-        file=file, link=link, override=override, pace=pace, watches=tuple(more), operator=operator, settings=settings,
-        log=log, files=files or {},
-    )  # fmt: skip
-    return _run(deployed, pilot, session, report)
+    more = () if hook is None else (lambda _now, _in, _out, _tilt, _master: hook(link),)
+    return _run(deployed, pilot, Session(file=file, link=link, watches=(*watches, *more), **how), report)
 
 
 def run_on_bus(
@@ -153,13 +134,8 @@ def run_on_bus(
     link: CanLink,
     sensor: Sensor,
     *,
-    override: Collection[str] = (),
     report: Callable[[float], None] | None = None,
-    watches: Sequence[Watch] = (),
-    operator: Operator | None = None,
-    log: RunLogger | None = None,
-    files: Mapping[str, str | Path] | None = None,
-    realtime: bool = False,
+    **how: Any,
 ) -> DrivesResult:
     """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
 
@@ -168,13 +144,8 @@ def run_on_bus(
         file: how drives and master are set up.
         link: an open bus.
         sensor: the inclinometer.
-        override: names of pre-flight checks that may fail.
         report: called now and then with the done fraction.
-        watches: called after each bus cycle, see `Session`.
-        operator: asked each cycle what the operator wants.
-        log: where frames and cycles are written.
-        files: role -> path of what acts, for the log; `replay` looks for "loop" and "controller".
-        realtime: see `Session`.
+        how: see `Session`; of `files` a replay looks for "loop" and "controller".
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
@@ -182,12 +153,7 @@ def run_on_bus(
     """
     pilot = LoopPilot(deployed.loop, file.moves)
     pilot.warm()
-    session = Session(
-        file=file, link=link, sensor=sensor, override=override, watches=tuple(watches), operator=operator,
-        log=log, files=files or {},
-        realtime=realtime,
-    )  # fmt: skip
-    return _run(deployed, pilot, session, report)
+    return _run(deployed, pilot, Session(file=file, link=link, sensor=sensor, **how), report)
 
 
 def _run(

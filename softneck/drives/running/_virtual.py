@@ -16,6 +16,7 @@ from ..bus._link import VirtualLink
 from ..master import Frame, Master
 from ..master._gate import Reading
 from ..simulated import SimulatedNeck, SimulatedSettings
+from ..simulated._drives import SimulatedDrives
 from ..simulated._habits import WireHabits
 from ..simulated._springs import SimulatedSprings, SpringSettings
 
@@ -77,7 +78,7 @@ def simulated_springs(
 def simulated_plant(
     file: DrivesFile, neck: NeckParameters | None, *, sample_time: float, homed: bool = True, seed: int = 0,
     habits: WireHabits | None = None,
-) -> SimulatedNeck | SimulatedSprings:  # fmt: skip
+) -> SimulatedDrives:  # fmt: skip
     """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
 
     Args:

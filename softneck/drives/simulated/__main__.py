@@ -16,11 +16,12 @@ from softneck.core import SettingsError
 from softneck.plant import NeckParameters
 from softneck.robot import Robot, find_robot
 
-from ._drives import SimulatedSettings
+from ._drives import SimulatedDrives, SimulatedSettings
 from ._habits import habits_of
 from ._neck import SimulatedNeck
+from ._power import STATES
 from ._profiles import PROFILES
-from ._server import STATES, serve
+from ._server import serve
 from ._springs import SimulatedSprings, SpringSettings
 
 # Of the lab's drives: static tilt by Eq. 31 [rad/rad], range [rad], current limit [A].
@@ -92,7 +93,7 @@ def _springs(robot: Robot, common: dict[str, Any]) -> SimulatedSprings:
     return SimulatedSprings(springs, settings)
 
 
-def _print(now: float, neck: SimulatedNeck | SimulatedSprings, row: int) -> None:
+def _print(now: float, neck: SimulatedDrives, row: int) -> None:
     axis = neck.drives[row].axis
     line = {"time_s": now, "node": axis.node, "state": STATES[axis.state], "fault": f"{axis.fault:04X}h",
             "counts": axis.getters[(0x6064, 0)]()}  # fmt: skip
@@ -101,7 +102,7 @@ def _print(now: float, neck: SimulatedNeck | SimulatedSprings, row: int) -> None
 
 
 @contextlib.contextmanager
-def signals(neck: SimulatedNeck | SimulatedSprings) -> Iterator[None]:
+def signals(neck: SimulatedDrives) -> Iterator[None]:
     """Let SIGUSR1 open and close the Enable inputs of all drives, and SIGUSR2 silence and wake the inclinometer."""
     if not hasattr(signal, "SIGUSR1"):
         yield

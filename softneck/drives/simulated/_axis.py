@@ -9,33 +9,10 @@ from collections import deque
 from softneck.core import Vector
 
 from . import _power as power
+from . import _servo_runtime as servo
 from ._habits import WireHabits
 from ._profiles import Item, Profile
 from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
-from ._servo_runtime import (
-    SERVO_ACCELERATION,
-    SERVO_ACTUAL_SPEED,
-    SERVO_AT_LIMIT,
-    SERVO_CURRENT,
-    SERVO_CURRENT_LIMIT,
-    SERVO_DECELERATION,
-    SERVO_DEMAND,
-    SERVO_DEMAND_SPEED,
-    SERVO_HIGH,
-    SERVO_LEFT,
-    SERVO_LOW,
-    SERVO_MODE,
-    SERVO_POSITION,
-    SERVO_POWER,
-    SERVO_SLOPE,
-    SERVO_SPEED,
-    SERVO_TARGET,
-    SERVO_TARGET_SPEED,
-    SERVO_TIMEOUT,
-    SERVO_TRIPPED,
-    SERVO_WINDOW,
-    SERVO_ZERO,
-)
 
 # Current in internal units: A x 65520 / (2 I_peak).
 _CURRENT_RANGE = 65520.0
@@ -78,11 +55,11 @@ class Axis:
         self.setters = {(0x6040, 0): self._control, (0x607A, 0): self._set_target, (0x60FF, 0): self._set_speed}
         self.getters = {
             (0x6041, 0): self.status_word,
-            (0x6064, 0): lambda: int(motion[SERVO_POSITION]),
-            (0x606C, 0): lambda: round(motion[SERVO_ACTUAL_SPEED] * self._units_per_count),
+            (0x6064, 0): lambda: int(motion[servo.SERVO_POSITION]),
+            (0x606C, 0): lambda: round(motion[servo.SERVO_ACTUAL_SPEED] * self._units_per_count),
             (0x6061, 0): self._shown_mode,
-            (0x207E, 0): lambda: round(motion[SERVO_CURRENT] * _CURRENT_RANGE / (2.0 * self.peak_current)),
-            (0x6078, 0): lambda: round(1000.0 * motion[SERVO_CURRENT] / max(profile.rated_current, 1e-9)),
+            (0x207E, 0): lambda: round(motion[servo.SERVO_CURRENT] * _CURRENT_RANGE / (2.0 * self.peak_current)),
+            (0x6078, 0): lambda: round(1000.0 * motion[servo.SERVO_CURRENT] / max(profile.rated_current, 1e-9)),
             (0x603F, 0): lambda: self.fault,
             (0x1001, 0): lambda: 1 if self.fault else 0,
             (0x2000, 0): lambda: _MOTION_ERRORS.get(self.fault, 0),
@@ -110,9 +87,9 @@ class Axis:
         self._limit_told = self._target = 0
         self._turn, self._captured = None, None
         m = self.motion
-        m[SERVO_POWER] = m[SERVO_TRIPPED] = m[SERVO_LEFT] = 0.0
-        m[SERVO_ZERO] -= m[SERVO_POSITION]
-        m[SERVO_POSITION] = 0.0
+        m[servo.SERVO_POWER] = m[servo.SERVO_TRIPPED] = m[servo.SERVO_LEFT] = 0.0
+        m[servo.SERVO_ZERO] -= m[servo.SERVO_POSITION]
+        m[servo.SERVO_POSITION] = 0.0
         self._configure()
 
     def _default_limits(self) -> None:
@@ -189,16 +166,16 @@ class Axis:
         """Carry what the objects say into the motion row."""
         v, m = self.values, self.motion
         unit, square = self._units_per_count, self._units_per_count * (1.0 if self._plain else self.slow_loop)
-        m[SERVO_SPEED] = v[(0x6081, 0)] / unit
-        m[SERVO_ACCELERATION] = v[(0x6083, 0)] / square or math.inf
-        m[SERVO_DECELERATION] = v[(0x6085, 0)] / square or math.inf
-        m[SERVO_LOW], m[SERVO_HIGH] = v[(0x607D, 1)], v[(0x607D, 2)]
-        m[SERVO_WINDOW], m[SERVO_TIMEOUT] = v[(0x6065, 0)], v[(0x6066, 0)] / 1000.0
+        m[servo.SERVO_SPEED] = v[(0x6081, 0)] / unit
+        m[servo.SERVO_ACCELERATION] = v[(0x6083, 0)] / square or math.inf
+        m[servo.SERVO_DECELERATION] = v[(0x6085, 0)] / square or math.inf
+        m[servo.SERVO_LOW], m[servo.SERVO_HIGH] = v[(0x607D, 1)], v[(0x607D, 2)]
+        m[servo.SERVO_WINDOW], m[servo.SERVO_TIMEOUT] = v[(0x6065, 0)], v[(0x6066, 0)] / 1000.0
         if (0x207F, 0) in v:
-            m[SERVO_CURRENT_LIMIT] = v[(0x207F, 0)] * 2.0 * self.peak_current / _CURRENT_RANGE
+            m[servo.SERVO_CURRENT_LIMIT] = v[(0x207F, 0)] * 2.0 * self.peak_current / _CURRENT_RANGE
         else:
-            m[SERVO_CURRENT_LIMIT] = v[(0x6073, 0)] * v[(0x6075, 0)] / 1e6
-        if self.state == power.ENABLED and m[SERVO_MODE] != v[(0x6060, 0)]:
+            m[servo.SERVO_CURRENT_LIMIT] = v[(0x6073, 0)] * v[(0x6075, 0)] / 1e6
+        if self.state == power.ENABLED and m[servo.SERVO_MODE] != v[(0x6060, 0)]:
             self._take_mode()
 
     @property
@@ -213,15 +190,15 @@ class Axis:
         word = self.state | 0x0200 | 0x0010
         if self.state != power.QUICK_STOP:
             word |= 0x0020 if self.state & 0x04 else 0
-        if m[SERVO_AT_LIMIT] != 0.0:
+        if m[servo.SERVO_AT_LIMIT] != 0.0:
             word |= 0x0800
         if mode == 6:
             return word | (0x1400 if self._attained else 0)
-        if mode == 1 and m[SERVO_DEMAND] == m[SERVO_TARGET]:
+        if mode == 1 and m[servo.SERVO_DEMAND] == m[servo.SERVO_TARGET]:
             word |= 0x0400
         if (mode == 8 and self.state == power.ENABLED) or (mode == 1 and self._acknowledged):
             word |= 0x1000
-        return word | (0x2000 if m[SERVO_TRIPPED] else 0)
+        return word | (0x2000 if m[servo.SERVO_TRIPPED] else 0)
 
     def _shown_mode(self) -> int:
         mode = self.values[(0x6060, 0)]
@@ -232,7 +209,7 @@ class Axis:
         if self.state == power.FAULT:
             if word & 0x80 and not before & 0x80 and self.enable_input:
                 self.fault = 0
-                self.motion[SERVO_TRIPPED] = 0.0
+                self.motion[servo.SERVO_TRIPPED] = 0.0
                 self.emergencies.append((0x0000, 0))
                 self.state = power.SWITCH_ON_DISABLED
             return
@@ -248,10 +225,10 @@ class Axis:
         rising = word & 0x10 and not before & 0x10
         self._acknowledged = bool(word & 0x10)
         if mode == 1 and rising:
-            m[SERVO_TARGET] = self._target + (m[SERVO_DEMAND] if word & 0x40 else 0.0)
+            m[servo.SERVO_TARGET] = self._target + (m[servo.SERVO_DEMAND] if word & 0x40 else 0.0)
         if mode == 6 and rising and self.values[(0x6098, 0)] in (35, 37):
-            shift = self.values[(0x607C, 0)] - m[SERVO_POSITION]
-            for column in (SERVO_ZERO, SERVO_POSITION, SERVO_DEMAND, SERVO_TARGET):
+            shift = self.values[(0x607C, 0)] - m[servo.SERVO_POSITION]
+            for column in (servo.SERVO_ZERO, servo.SERVO_POSITION, servo.SERVO_DEMAND, servo.SERVO_TARGET):
                 m[column] += shift
             self._attained = self.homed = True
 
@@ -270,24 +247,24 @@ class Axis:
                 self.trip(_ENABLE_INPUT)
                 return
             if before != power.QUICK_STOP:
-                self.motion[SERVO_DEMAND] = self.motion[SERVO_POSITION]
-                self.motion[SERVO_DEMAND_SPEED] = 0.0
-            self.motion[SERVO_POWER] = 1.0
+                self.motion[servo.SERVO_DEMAND] = self.motion[servo.SERVO_POSITION]
+                self.motion[servo.SERVO_DEMAND_SPEED] = 0.0
+            self.motion[servo.SERVO_POWER] = 1.0
             self._attained = False
             self._take_mode()
         elif state != power.REACTION:
-            self.motion[SERVO_POWER] = 0.0
+            self.motion[servo.SERVO_POWER] = 0.0
 
     def _take_mode(self) -> None:
         m, mode = self.motion, self.values[(0x6060, 0)]
-        m[SERVO_MODE] = mode if mode in (1, 3, 8) else 0
-        m[SERVO_LEFT] = 0.0
+        m[servo.SERVO_MODE] = mode if mode in (1, 3, 8) else 0
+        m[servo.SERVO_LEFT] = 0.0
         if mode == 1:
-            m[SERVO_TARGET] = m[SERVO_DEMAND]
+            m[servo.SERVO_TARGET] = m[servo.SERVO_DEMAND]
 
     def _stop(self, then: int) -> None:
         """Ramp down, then go to state `then`; 0 stays in Quick Stop Active."""
-        self.motion[SERVO_MODE] = 0.0
+        self.motion[servo.SERVO_MODE] = 0.0
         self._stop_then = then
 
     def trip(self, code: int) -> None:
@@ -296,7 +273,7 @@ class Axis:
             return
         self.fault = code
         self.emergencies.append((code, 1))
-        if self.motion[SERVO_POWER] > 0.5 and self.values[(0x605E, 0)] == 2:
+        if self.motion[servo.SERVO_POWER] > 0.5 and self.values[(0x605E, 0)] == 2:
             self._enter(power.REACTION)
             self._stop(power.FAULT)
         else:
@@ -318,18 +295,18 @@ class Axis:
         """To be called after each stretch of motion: limits, following error, inputs, the end of stop ramps."""
         m = self.motion
         self._probe()
-        if m[SERVO_POWER] < 0.5:
+        if m[servo.SERVO_POWER] < 0.5:
             return
-        if m[SERVO_TRIPPED] and self.state not in (power.FAULT, power.REACTION):
+        if m[servo.SERVO_TRIPPED] and self.state not in (power.FAULT, power.REACTION):
             self.trip(_FOLLOWING_ERROR)
         if not self.enable_input:
             self.trip(_ENABLE_INPUT)
-        at = m[SERVO_AT_LIMIT]
+        at = m[servo.SERVO_AT_LIMIT]
         if at != self._limit_told:
             self._limit_told = at
             if at:
                 self.emergencies.append((_LIMIT_CODES[at], 0))
-        if m[SERVO_MODE] == 0.0 and self._stop_then and abs(m[SERVO_DEMAND_SPEED]) < _STANDS:
+        if m[servo.SERVO_MODE] == 0.0 and self._stop_then and abs(m[servo.SERVO_DEMAND_SPEED]) < _STANDS:
             then, self._stop_then = self._stop_then, 0
             self._enter(then)
 
@@ -340,9 +317,9 @@ class Axis:
             return
         # Counts that home offset and reset do not move: the index sits on the rotor.
         m = self.motion
-        turn = math.floor((m[SERVO_POSITION] - m[SERVO_ZERO]) / self.counts_per_turn)
+        turn = math.floor((m[servo.SERVO_POSITION] - m[servo.SERVO_ZERO]) / self.counts_per_turn)
         if self._turn is not None and turn != self._turn:
-            self._captured = round(max(turn, self._turn) * self.counts_per_turn + m[SERVO_ZERO])
+            self._captured = round(max(turn, self._turn) * self.counts_per_turn + m[servo.SERVO_ZERO])
         self._turn = turn
 
     # -- set-points ---------------------------------------------------------------------------------------------
@@ -351,18 +328,18 @@ class Axis:
         self._target = counts
 
     def _set_speed(self, units: int) -> None:
-        self.motion[SERVO_TARGET_SPEED] = units / self._units_per_count
+        self.motion[servo.SERVO_TARGET_SPEED] = units / self._units_per_count
 
     def synchronise(self) -> None:
         """SYNC came: in the cyclic mode go to the target within one interpolation period (60C2h)."""
         m = self.motion
-        if m[SERVO_MODE] != 8.0 or m[SERVO_POWER] < 0.5:
+        if m[servo.SERVO_MODE] != 8.0 or m[servo.SERVO_POWER] < 0.5:
             return
         period = self.values[(0x60C2, 1)] * 10.0 ** self.values[(0x60C2, 2)]
         ticks = max(1.0, float(round(period / self.tick)))
-        m[SERVO_TARGET] = self._target
-        m[SERVO_SLOPE] = (self._target - m[SERVO_DEMAND]) / ticks
-        m[SERVO_LEFT] = ticks
+        m[servo.SERVO_TARGET] = self._target
+        m[servo.SERVO_SLOPE] = (self._target - m[servo.SERVO_DEMAND]) / ticks
+        m[servo.SERVO_LEFT] = ticks
 
 
 def fields_of(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import abc
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -12,20 +13,11 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, require_between, require_one_of
 from softneck.core._shown import Shown
 
+from . import _servo_runtime as servo
 from ._axis import Axis
 from ._habits import WireHabits
 from ._node import CanFrame, SimulatedDrive
 from ._profiles import PROFILES
-from ._servo_runtime import (
-    SERVO_CURRENT_LIMIT,
-    SERVO_GEARING,
-    SERVO_LAG,
-    SERVO_PLACE,
-    SERVO_POSITION,
-    SERVO_SCALE,
-    SERVO_SIZE,
-    SERVO_ZERO,
-)
 
 _TICK = 1e-3
 # What the ring must hold: the upper end of `drive_latency`, 0.1 s, in ticks.
@@ -74,13 +66,16 @@ class SimulatedSettings(Shown):
                 raise SettingsError(f"`{name}` must have one value for each of the {len(self.nodes)} nodes.")
 
 
-class SimulatedDrives:
-    """All drives of a robot, stepped by whoever owns the time and what they turn.
+class SimulatedDrives(abc.ABC):
+    """All drives of a robot with what they turn and what measures it, stepped by whoever owns the time.
 
     Attributes:
-        nodes: on the bus; twins: with the number of one of them.
+        settings: of the drives.
+        drives: the nodes on the bus; twins: with the number of one of them.
         motion: (motors, SERVO_SIZE), see the servo runtime; ring: (motors, n) past demands.
         ticks: of the servo loops in one bus cycle; h: time of one [s].
+        sensor: "works", "drops", "freezes", "nan", "jumps", or "silent" on a bus.
+        newest: the last sample that was taken.
     """
 
     def __init__(self, settings: SimulatedSettings, *, current_limit: float, latency: float) -> None:
@@ -92,24 +87,60 @@ class SimulatedDrives:
             latency: of the cyclic mode [s].
         """
         count = len(settings.nodes)
-        self.motion: Matrix = np.zeros((count, SERVO_SIZE))
+        self.settings = settings
+        self.motion: Matrix = np.zeros((count, servo.SERVO_SIZE))
         self.ring: Matrix = np.zeros((count, _RING))
         self.ticks = max(1, round(settings.cycle / _TICK))
         self.h = settings.cycle / self.ticks
         lag = latency - 0.5 * settings.hold
         for row in range(count):
             size = settings.gear[row] * settings.counts_per_turn[row] / (2.0 * math.pi)
-            self.motion[row, SERVO_SCALE] = -size if settings.reversed[row] else size
-            self.motion[row, SERVO_LAG] = max(0, round(lag / self.h))
-            self.motion[row, SERVO_PLACE], self.motion[row, SERVO_GEARING] = 0, 1.0
-        self.nodes = tuple(self._drive(settings, row, current_limit) for row in range(count))
+            self.motion[row, servo.SERVO_SCALE] = -size if settings.reversed[row] else size
+            self.motion[row, servo.SERVO_LAG] = max(0, round(lag / self.h))
+            self.motion[row, servo.SERVO_PLACE], self.motion[row, servo.SERVO_GEARING] = 0, 1.0
+        self.drives = tuple(self._drive(settings, row, current_limit) for row in range(count))
         # A second device with somebody's number turns nothing; its boot-up message was long ago.
         self.twins = tuple(twin(node, settings) for node in (settings.habits.twin,) if node)
         self._latency = settings.habits.sdo_latency
         self._late: list[tuple[float, CanFrame]] = []
+        self.sensor = "works"
+        self.newest = self._last = Sample(0.0, (), (), valid=True)
 
-    def exchange(self, drives: Sequence[SimulatedDrive], frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
-        """Deliver `frames` at `now` [s] to `drives`, and return what they say; SDO answers after their latency."""
+    @abc.abstractmethod
+    def set(self, **disturbance: float) -> None:
+        """Set what acts from outside, by name."""
+
+    @abc.abstractmethod
+    def move(self) -> None:
+        """Let one cycle of time pass for drives and what they turn."""
+
+    @abc.abstractmethod
+    def truth(self) -> Mapping[str, float]:
+        """Return what is true at the last sample, by name: outputs [rad], tensions [N]."""
+
+    @abc.abstractmethod
+    def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+        """Return values [rad] and rates [rad/s] of a new sample of a sensor that works, and whether it came."""
+
+    def block(self, motor: int) -> None:
+        """Hold a winch, from 1 on, where it is, whatever its motor does."""
+        self.motion[motor - 1, servo.SERVO_STUCK] = 1.0
+
+    def sample(self, now: float) -> Sample:
+        """Take one sample of the sensor; to be called each `sample_time`."""
+        values, rates, valid = self._measured()
+        if self.sensor == "freezes":
+            self.newest = self._last._replace(time=now)
+            return self.newest
+        values, rates, valid = sensed(self.sensor, values, rates, valid=valid)
+        self.newest = Sample(now, values, rates, valid=valid)
+        if not math.isnan(values[0]):
+            self._last = self.newest
+        return self.newest
+
+    def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
+        """Deliver `frames` at `now` [s], and return what the drives say; SDO answers after their latency."""
+        drives = (*self.drives, *self.twins)
         for frame in frames:
             for drive in drives:
                 drive.receive(now, frame)
@@ -129,11 +160,11 @@ class SimulatedDrives:
             habits=s.habits,
         )  # fmt: skip
         axis.tick, axis.counts_per_turn = self.h, s.counts_per_turn[row]
-        m[SERVO_CURRENT_LIMIT] = current_limit
+        m[servo.SERVO_CURRENT_LIMIT] = current_limit
         if s.homed:
             # As `drives commission --only zero` leaves it: home offset 1 count, which no drive has after a reset.
             axis.values[(0x607C, 0)] = 1
-            m[SERVO_ZERO], m[SERVO_POSITION] = 1.0, 1.0
+            m[servo.SERVO_ZERO], m[servo.SERVO_POSITION] = 1.0, 1.0
             axis.homed = True
         return SimulatedDrive(axis)
 
@@ -141,7 +172,7 @@ class SimulatedDrives:
 def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
     """Return a drive with number `node` that turns nothing, as one that was forgotten on the bus."""
     axis = Axis(
-        node, PROFILES[settings.profile](), np.zeros(SERVO_SIZE), peak_current=10.0, slow_loop=1e-3,
+        node, PROFILES[settings.profile](), np.zeros(servo.SERVO_SIZE), peak_current=10.0, slow_loop=1e-3,
         habits=settings.habits,
     )  # fmt: skip
     axis.values[(0x1018, 4)] = 2000 + node

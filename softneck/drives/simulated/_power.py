@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 # States by their status word under the mask 6Fh.
-NOT_READY = 0x00
-SWITCH_ON_DISABLED = 0x40
-READY = 0x21
-SWITCHED_ON = 0x23
-ENABLED = 0x27
-QUICK_STOP = 0x07
-REACTION = 0x0F
-FAULT = 0x08
+STATES = {0x00: "NOT_READY", 0x40: "DISABLED", 0x21: "READY", 0x23: "SWITCHED_ON", 0x27: "ENABLED", 0x07: "QUICK_STOP",
+          0x0F: "REACTION", 0x08: "FAULT"}  # fmt: skip
+NOT_READY, SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, REACTION, FAULT = STATES
 
 # What a control word asks for: (mask, value, request), first match wins; bit 7 is looked at for its rising edge.
 _REQUESTS = (

@@ -9,27 +9,20 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from . import _power as power
-from ._neck import SimulatedNeck
+from ._drives import SimulatedDrives
 from ._node import CanFrame
-from ._springs import SimulatedSprings
 
 _NOTHING = -(2**31)
 _RESOLUTION = math.radians(0.001)
-STATES = {
-    power.NOT_READY: "NOT_READY", power.SWITCH_ON_DISABLED: "DISABLED", power.READY: "READY",
-    power.SWITCHED_ON: "SWITCHED_ON", power.ENABLED: "ENABLED", power.QUICK_STOP: "QUICK_STOP",
-    power.REACTION: "REACTION", power.FAULT: "FAULT",
-}  # fmt: skip
 
 
 def serve(
     bus: Any,
-    neck: SimulatedNeck | SimulatedSprings,
+    neck: SimulatedDrives,
     *,
     sensor_node: int = 10,
     stopped: Callable[[], bool] | None = None,
-    report: Callable[[float, SimulatedNeck | SimulatedSprings, int], None] | None = None,
+    report: Callable[[float, SimulatedDrives, int], None] | None = None,
 ) -> None:
     """Answer frames on `bus` and let the neck move, until `stopped` returns True.
 
@@ -79,7 +72,7 @@ def serve(
             tell()
 
 
-def _slopes(neck: SimulatedNeck | SimulatedSprings, now: float, node: int) -> CanFrame:
+def _slopes(neck: SimulatedDrives, now: float, node: int) -> CanFrame:
     sample = neck.sample(now)
     # An inclinometer has one axis or two.
     angles = sample.values[:2]

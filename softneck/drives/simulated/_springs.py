@@ -6,7 +6,7 @@ It holds drives, master and sensor to each other in every fault, and says nothin
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -23,9 +23,8 @@ from softneck.plant._index_runtime import (
 from softneck.plant._mechanics_runtime import neck_drive
 from softneck.runtime import load_functions
 
-from ._drives import Sample, SimulatedDrives, SimulatedSettings, sensed
-from ._node import CanFrame
-from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_STUCK, SERVO_ZERO
+from ._drives import Sample, SimulatedDrives, SimulatedSettings
+from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_ZERO
 from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRING_SIZE, SPRING_STIFFNESS
 
 # From rest to the end of its range a tendon pulls by this part more than at rest, if its motor can.
@@ -69,23 +68,18 @@ class SpringSettings:
         require_positive("noise_std", self.noise_std, "rad")
 
 
-class SimulatedSprings:
-    """Springs with their drives and sensor, stepped by whoever owns the time; in the place of a `SimulatedNeck`.
+class SimulatedSprings(SimulatedDrives):
+    """Springs with their drives and sensor, in the place of a `SimulatedNeck`.
 
     Attributes:
-        settings: of the drives.
-        drives: the nodes on the bus.
         outputs: (2, outputs) values [rad] and rates [rad/s] as they are.
-        motion: of the drives, see the servo runtime.
-        sensor: "works", "drops", "freezes", "nan", "jumps", or "silent" on a bus.
     """
 
     def __init__(self, springs: SpringSettings, settings: SimulatedSettings) -> None:
         """Put all at rest; drives are without power, and tendons are loose where they were not homed."""
-        self.settings, self._springs = settings, springs
         latency = NeckParameters.paper().drive_latency
-        self._on_bus = SimulatedDrives(settings, current_limit=springs.current_limit[0], latency=latency)
-        self.drives, self.motion = self._on_bus.nodes, self._on_bus.motion
+        super().__init__(settings, current_limit=springs.current_limit[0], latency=latency)
+        self._springs = springs
         count = len(settings.nodes)
         self._winches: Matrix = np.zeros((4, count))
         self._winches[3] = 1.0
@@ -97,9 +91,8 @@ class SimulatedSprings:
         self._table = np.array([_spring(springs, settings.gear[row], row) for row in range(count)])
         self.outputs: Matrix = np.zeros((2, len(springs.outputs)))
         self._functions: ModuleType = load_functions("softneck.drives.simulated._springs_runtime")
-        self._share = 1.0 - math.exp(-springs.pole * self._on_bus.h)
+        self._share = 1.0 - math.exp(-springs.pole * self.h)
         self._noise = np.random.default_rng(settings.seed)
-        self.sensor = "works"
         nothing = (0.0,) * len(springs.outputs)
         self.newest = self._last = Sample(0.0, nothing, nothing, valid=True)
 
@@ -117,34 +110,16 @@ class SimulatedSprings:
         """Let tendon `tendon`, from 1, hang: nothing pulls at its winch any more."""
         self._table[tendon - 1, SPRING_REST : SPRING_STIFFNESS + 1] = 0.0
 
-    def block(self, motor: int) -> None:
-        """Hold winch `motor`, from 1, where it is, whatever its motor does."""
-        self.motion[motor - 1, SERVO_STUCK] = 1.0
-
-    def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
-        """Deliver `frames` at `now`, and return what the drives send in answer."""
-        return self._on_bus.exchange((*self.drives, *self._on_bus.twins), frames, now)
-
     def move(self) -> None:
         """Let one cycle of time pass."""
-        bus = self._on_bus
         self._functions.springs_ticks(
-            self._table, self._springs.weights, self._share, self._winches, self.outputs, bus.motion, bus.ring,
-            bus.ticks, bus.h,
+            self._table, self._springs.weights, self._share, self._winches, self.outputs, self.motion, self.ring,
+            self.ticks, self.h,
         )  # fmt: skip
 
-    def sample(self, now: float) -> Sample:
-        """Take one sample of the sensor; to be called each `sample_time`."""
+    def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
         noise: Vector = self._noise.normal(0.0, self._springs.noise_std, len(self._springs.outputs))
-        if self.sensor == "freezes":
-            self.newest = self._last._replace(time=now)
-            return self.newest
-        values, rates = tuple((self.outputs[0] + noise).tolist()), tuple(self.outputs[1].tolist())
-        values, rates, valid = sensed(self.sensor, values, rates, valid=True)
-        self.newest = Sample(now, values, rates, valid=valid)
-        if not math.isnan(self.newest.values[0]):
-            self._last = self.newest
-        return self.newest
+        return tuple((self.outputs[0] + noise).tolist()), tuple(self.outputs[1].tolist()), True
 
     def truth(self) -> Mapping[str, float]:
         """Return outputs [rad] and tensions [N] by name."""

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
-from softneck.signals.detection._threshold import Budget, thresholds
-from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Baseline, Row, Rows, Tracking
+from ._detection import Budget, Whitening, thresholds
 from ._motor_charts import EDGES, MotorCharts, motor_names
 from ._motor_models import Features, Flags, Motion, features_of, level_rows, motor_rows, row_of, variance_of
 from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names

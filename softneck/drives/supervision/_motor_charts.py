@@ -8,11 +8,10 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
-from softneck.signals.detection._cusum import Charts
-from softneck.signals.detection._whitening import Filter, Whitening
 
 from ._baseline import Baseline
 from ._charts_runtime import SUPERVISED_NOT
+from ._detection import Charts, Filter, Whitening
 
 RUNTIME = "softneck.drives.supervision._charts_runtime"
 # Set-points that a step of a motor may still answer to [cycles]: the slowest drives' latency is 0.1 s.

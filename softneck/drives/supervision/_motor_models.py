@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.runtime import load_functions
-from softneck.signals.detection._whitening import Whitening
 
 from ._baseline import Row, Rows
+from ._detection import Whitening
 from ._motor_charts import RULES, RUNTIME, MotorFeatures
 
 Flags = NDArray[np.bool_]

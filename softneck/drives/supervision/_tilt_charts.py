@@ -10,10 +10,9 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
-from softneck.signals.detection._cusum import Charts, shift_score
-from softneck.signals.detection._whitening import Filter, Whitening
 
 from ._baseline import Baseline
+from ._detection import Charts, Filter, Whitening, shift_score
 from ._motor_charts import RUNTIME
 
 # Faults as large as those that have to be found: a gear of another stage, a filter that takes 0.2 s, 1.5 deg of drift

@@ -16,10 +16,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.signals.detection._cusum import Charts, shift_score
-from softneck.signals.detection._whitening import Filter, Whitening
 
 from ._baseline import Tracking
+from ._detection import Charts, Filter, Whitening, shift_score
 from ._motor_models import Flags, Motion, row_of, variance_of
 
 # Time constants of the lags [s]: from one sample to what the slowest loop needs, each twice the one before.

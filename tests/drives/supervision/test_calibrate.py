@@ -11,8 +11,8 @@ import pytest
 from softneck.drives import default_drives
 from softneck.drives.supervision import _calibrate
 from softneck.drives.supervision._calibrate import calibrate
+from softneck.drives.supervision._detection import Budget
 from softneck.drives.supervision._motor_models import Motion
-from softneck.signals.detection._threshold import Budget
 
 from ..bench import TS, T
 from ..plausible import watched

@@ -16,9 +16,9 @@ from softneck.drives.logs._replay import logged_motion, replay
 from softneck.drives.logs._run_log import RunLogger, run_facts
 from softneck.drives.master import Phase
 from softneck.drives.supervision._calibrate import _tracking, calibrate, require_loops
+from softneck.drives.supervision._detection import Budget
 from softneck.drives.supervision._motor_models import Motion
 from softneck.drives.supervision._tracking import _SETTLE, LoopRun, TrackingCharts, fit_tracking, tracking_scores
-from softneck.signals.detection._threshold import Budget
 
 from ..bench import TS, Bench, T
 from ..plausible import Tracker, baseline, experiments, looped, watched

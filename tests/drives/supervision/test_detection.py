@@ -8,10 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError
-from softneck.signals.detection._charts_runtime import CHART_CLIP, chart_push, chart_shift, chart_spread
-from softneck.signals.detection._cusum import Charts, shift_score
-from softneck.signals.detection._threshold import Budget, thresholds, window_maxima
-from softneck.signals.detection._whitening import Filter, Whitening
+from softneck.drives.supervision._charts_runtime import CHART_CLIP, chart_push, chart_shift, chart_spread
+from softneck.drives.supervision._detection import (
+    Budget,
+    Charts,
+    Filter,
+    Whitening,
+    shift_score,
+    thresholds,
+    window_maxima,
+)
 
 
 def coloured(rng: np.random.Generator, a: float, n: int) -> np.ndarray:
