@@ -117,12 +117,11 @@ def touches(room: str) -> tuple[str, ...]:
 def table(graph: Graph) -> str:
     """Return the table of subpackages, from the top layer down."""
     level = levels(graph)
-    lines = ["| subpackage | what is inside | rules |", "|---|---|---|"]
+    lines = ["| subpackage | what is inside |", "|---|---|"]
     for room in sorted(graph, key=lambda name: (-level[name], name)):
-        inside, keeps, _ = docstring(room)
+        inside = docstring(room)[0]
         inner = ", ".join(f"`{name}`" for name in inner_rooms(room))
-        parts = f" Parts: {inner}." if inner else ""
-        lines.append(f"| `{room}` | {inside}{parts} | {keeps} |")
+        lines.append(f"| `{room}` | {inside}{f' Parts: {inner}.' if inner else ''} |")
     return "\n".join(lines) + "\n"
 
 
