@@ -63,7 +63,7 @@ def test_two_files_of_one_name_are_refused(call: Call, folder: Path) -> None:
     assert "would both become out/rls_model.fmu" in said.error
 
 
-def test_scores_and_free_run_on_data_go_into_the_fmu(call: Call, rls_file: Path, recording: Path) -> None:
+def test_scores_on_data_go_into_the_fmu(call: Call, rls_file: Path, recording: Path) -> None:
     said = call("fmu", rls_file, "-o", "Rls.fmu", "--data", recording)
     assert said.code == 0, said.err
     judged = json.loads(call("validate", rls_file, "--data", recording, "--json").out)["models"][0]
@@ -71,7 +71,6 @@ def test_scores_and_free_run_on_data_go_into_the_fmu(call: Call, rls_file: Path,
         page = archive.read("documentation/index.html").decode()
     assert f"on {judged['rows_scored']} rows of neck.csv" in page
     assert f"<td>free run</td><td>{judged['fits']['model']['inf']['pitch']:.2f}</td>" in page
-    assert page.count("free run</text>") == 2  # pitch and roll, beside what was measured
 
 
 def test_the_tolerance_that_identify_was_given_is_that_of_the_fmu(call: Call, recording: Path) -> None:

@@ -17,7 +17,7 @@ from fmpy.validation import validate_fmu
 from softneck import load
 from softneck.core import OutputFileError, SettingsError, to_si
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
-from softneck.fmu.describe._units import _UNITS
+from softneck.fmu.describe._description import _UNITS
 from softneck.runtime import Block, Port
 
 GOLDEN = Path(__file__).parents[1] / "golden"

@@ -105,7 +105,7 @@ def test_fmus_keep_compiled_code_where_softneck_does() -> None:
     ],
 )
 def test_the_cost_decides_what_is_compiled(kind: str, cost: str, toys: Any) -> None:
-    from softneck.fmu.describe._cost import plain_cost
+    from softneck.fmu.python._build import plain_cost
 
     # The paper's 7,000 points; the network's lines do not depend on its size.
     special = {"nlsm": _many_points, "lag": toys.lag}

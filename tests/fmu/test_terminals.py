@@ -13,7 +13,7 @@ import pytest
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] - it has no stubs
 
 from softneck.fmu import build_compiled_fmu, build_fmu
-from softneck.fmu.describe._terminals_and_icons import TERMINALS, terminals
+from softneck.fmu.describe._description import TERMINALS, terminals
 from softneck.loop import ReferenceBlock, StepReference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block

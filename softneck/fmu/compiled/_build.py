@@ -17,13 +17,10 @@ from softneck.runtime import Block, Port, bundle
 from softneck.runtime._tangent import with_tangent
 from softneck.runtime._tangent_activity import TangentError
 
-from ..describe._describe import Buildable, block_and_info
-from ..describe._description import Identity, described_block, model_description
-from ..describe._documentation import FmuInfo, documentation_page
-from ..describe._terminals_and_icons import icon_png, terminals_file
+from ..describe._describe import Buildable, FmuInfo, block_and_info, documentation_page
+from ..describe._description import Identity, described_block, model_description, terminals_file
 from ..python._build import check_block, generation_date, license_text, model_name
 from ..python._zip import write_zip
-from ._description3 import model_description3
 from ._library import Library, find_library
 from ._model_file import model_bytes, node_of
 from ._platforms import PLATFORMS
@@ -158,13 +155,11 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources,
         content.update(part)
     guid = str(uuid.uuid5(uuid.NAMESPACE_OID, content.hexdigest()))
     identity = Identity(name, guid, generation_date(), tool, (MAIN,), ahead)
-    describe = model_description if fmi == 2 else model_description3
     members = {
-        "modelDescription.xml": describe(block, info, identity),
+        "modelDescription.xml": model_description(block, info, identity, fmi=fmi),
         "resources/model.bin": model_bytes(block, name, guid, ahead=ahead),
-        "documentation/index.html": documentation_page(name, block, info, _HOST, ahead=ahead).encode(),
+        "documentation/index.html": documentation_page(name, block, info, _HOST).encode(),
         "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
-        ("model.png" if fmi == 2 else "terminalsAndIcons/icon.png"): icon_png(block.kind, block.role),
         "sources/README.txt": _REBUILD.format(
             flags=" ".join(FLAGS), name=name, main=MAIN, version=__version__
         ).encode(),

@@ -1,6 +1,7 @@
-"""`modelDescription.xml` of a block (FMI 2.0.4, section 2.2): what pythonfmu leaves out and importers need.
+"""`modelDescription.xml` (FMI 2.0.4, section 2.2; FMI 3.0, section 2.4) and terminals of a block.
 
-Value references and indices count inputs, outputs, parameters, as the slave does.
+Value references count inputs, outputs, parameters, as the slave does; FMI 3.0 has `time` behind them. The members of
+terminals have the same names in plants, observers, controllers and references, so that tools connect them by name.
 """
 
 from __future__ import annotations
@@ -11,16 +12,36 @@ from importlib.metadata import version
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck import __version__
-from softneck.core import SettingsError
+from softneck.core import SettingsError, to_si
 from softneck.runtime import Block, Port
 
-from ._documentation import FmuInfo
+from ._describe import FmuInfo
 from ._modelled_drives import with_modelled_drives
-from ._units import base_exponents, display_unit
 
 # Paper, section 3: the neck tilts up to 0.7 rad or so; more in a reference is nearly always degrees.
 REFERENCE_LIMIT = 0.8
 _NONE = ("", "1")
+_TIME = "time"
+# unit -> exponents of the SI base units and (usual display unit, factor to it).
+_UNITS: dict[str, tuple[dict[str, str], tuple[str, float] | None]] = {
+    "rad": ({"rad": "1"}, ("deg", 180.0 / math.pi)),
+    "rad/s": ({"rad": "1", "s": "-1"}, ("deg/s", 180.0 / math.pi)),
+    "s": ({"s": "1"}, None),
+    "m": ({"m": "1"}, ("mm", 1e3)),
+    "kg": ({"kg": "1"}, None),
+    "N": ({"kg": "1", "m": "1", "s": "-2"}, None),
+    "Pa": ({"kg": "1", "m": "-1", "s": "-2"}, None),
+}
+TERMINALS = "terminalsAndIcons/terminalsAndIcons.xml"
+_TERMINALS = {
+    "motors": "Set-points and positions of the motors",
+    "angles": "Angles of the platform, and what an observer says of them",
+    "outputs": "Outputs of the robot, and what an observer says of them",
+    "measurement": "What the sensors say",
+    "reference": "Where the platform shall be",
+}
+# Behind an output's name: what tells that there is one.
+_TOLD = ("_measured", "_reference")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,24 +74,32 @@ def generation_tool() -> str:
     return f"softneck {__version__} (PythonFMU {version('pythonfmu')})"
 
 
-def model_description(block: Block, info: FmuInfo, identity: Identity) -> bytes:
-    """Return the XML text of the model description.
+def model_description(block: Block, info: FmuInfo, identity: Identity, *, fmi: int = 2) -> bytes:
+    """Return the XML text of the model description of FMI 2.0 or 3.0.
 
     Raises:
-        SettingsError: two ports of one name.
+        SettingsError: two ports of one name, or in FMI 3.0 one that is called `time`.
     """
-    check_names(block)
-    root = Element("fmiModelDescription", _head(block, info, identity))
-    _co_simulation(root, identity)
-    add_unit_definitions(root, block)
+    _check_names(block, _TIME if fmi == 3 else "")
+    root = Element("fmiModelDescription", _head(block, info, identity, fmi))
+    _co_simulation(root, block, identity, fmi)
+    _unit_definitions(root, block)
     categories = SubElement(root, "LogCategories")
-    for name, text in (("logStatusWarning", "Warnings"), ("logStatusError", "Errors"), ("logAll", "Everything")):
+    told = (("logStatusWarning", "Warnings"), ("logStatusError", "Errors"), ("logAll", "Everything"))
+    for name, text in told if fmi == 2 else told[:2]:
         SubElement(categories, "Category", name=name, description=text)
     times = {"startTime": "0", "stopTime": repr(float(info.stop_time)), "stepSize": repr(float(block.sample_time))}
     SubElement(root, "DefaultExperiment", times)
-    _annotation(root, block, info)
-    _variables(root, block)
-    _structure(root, block, identity.ahead)
+    if fmi == 2:
+        _annotation(SubElement(SubElement(root, "VendorAnnotations"), "Tool", name="softneck"), block, info)
+    _variables(root, block, fmi)
+    _structure(root, block, identity.ahead, fmi)
+    if fmi == 3:
+        _annotation(SubElement(SubElement(root, "Annotations"), "Annotation", type="softneck"), block, info)
+    return _text(root)
+
+
+def _text(root: Element) -> bytes:
     indent(root)
     return b'<?xml version="1.0" encoding="UTF-8"?>\n' + tostring(root, encoding="utf-8") + b"\n"
 
@@ -82,28 +111,22 @@ def _with_reference_range(port: Port) -> Port:
     return replace(port, minimum=-REFERENCE_LIMIT, maximum=REFERENCE_LIMIT)
 
 
-def check_names(block: Block, reserved: str = "") -> None:
-    """Refuse two variables of one name; `reserved` is one that is taken already."""
+def _check_names(block: Block, reserved: str) -> None:
     names = [port.name for port in (*block.inputs, *block.outputs, *block.parameters)] + [reserved] * bool(reserved)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise SettingsError(f"{block.kind}: an FMU variable needs one name of its own; twice: {', '.join(twice)}.")
 
 
-def _head(block: Block, info: FmuInfo, identity: Identity) -> dict[str, str]:
-    return {
-        "fmiVersion": "2.0",
+def _head(block: Block, info: FmuInfo, identity: Identity, fmi: int) -> dict[str, str]:
+    head = {
+        "fmiVersion": f"{fmi}.0",
         "modelName": identity.name,
-        "guid": identity.guid,
+        "guid" if fmi == 2 else "instantiationToken": identity.guid,
         "generationTool": identity.tool or generation_tool(),
         "generationDateAndTime": identity.date,
         "variableNamingConvention": "structured",
-        "numberOfEventIndicators": "0",
-    } | head_texts(block, info)
-
-
-def head_texts(block: Block, info: FmuInfo) -> dict[str, str]:
-    """Return the attributes that say what the FMU is, without the empty ones."""
+    } | ({"numberOfEventIndicators": "0"} if fmi == 2 else {})
     texts = {
         "description": info.description or f"{block.kind} ({block.role}), sample time {block.sample_time:g} s",
         "author": info.author,
@@ -111,28 +134,27 @@ def head_texts(block: Block, info: FmuInfo) -> dict[str, str]:
         "copyright": info.copyright,
         "license": info.license,
     }
-    return {name: text for name, text in texts.items() if text}
+    return head | {name: text for name, text in texts.items() if text}
 
 
-def _co_simulation(root: Element, identity: Identity) -> None:
-    yes = (
-        "canHandleVariableCommunicationStepSize",
-        "canNotUseMemoryManagementFunctions",
-        "canGetAndSetFMUstate",
-        "canSerializeFMUstate",
-    )
-    python = {} if identity.sources else {"needsExecutionTool": "true"}  # the Python of the host
-    yes += ("providesDirectionalDerivative",) if identity.ahead else ()
-    attributes = {"modelIdentifier": identity.name} | python | dict.fromkeys(yes, "true")
-    element = SubElement(root, "CoSimulation", attributes)
-    if identity.sources:
+def _co_simulation(root: Element, block: Block, identity: Identity, fmi: int) -> None:
+    yes = ["canHandleVariableCommunicationStepSize"] + ["canNotUseMemoryManagementFunctions"] * (fmi == 2)
+    state = "FMUstate" if fmi == 2 else "FMUState"
+    yes += [f"canGetAndSet{state}", f"canSerialize{state}"]
+    yes += ["providesDirectionalDerivative" + "s" * (fmi == 3)] * bool(identity.ahead)
+    attributes = {"modelIdentifier": identity.name}
+    if fmi == 3:
+        attributes["fixedInternalStepSize"] = repr(float(block.sample_time))
+    elif not identity.sources:
+        attributes["needsExecutionTool"] = "true"  # the Python of the host
+    element = SubElement(root, "CoSimulation", attributes | dict.fromkeys(yes, "true"))
+    if identity.sources and fmi == 2:
         files = SubElement(element, "SourceFiles")
         for name in identity.sources:
             SubElement(files, "File", name=name)
 
 
-def add_unit_definitions(root: Element, block: Block) -> None:
-    """Add the units that the variables use; FMI 2 and 3 write them alike."""
+def _unit_definitions(root: Element, block: Block) -> None:
     ports = [port for port in (*block.inputs, *block.outputs, *block.parameters) if _has_unit(port)]
     used = sorted({port.unit for port in ports})
     if not used:
@@ -140,34 +162,36 @@ def add_unit_definitions(root: Element, block: Block) -> None:
     definitions = SubElement(root, "UnitDefinitions")
     for name in used:
         unit = SubElement(definitions, "Unit", name=name)
-        base = base_exponents(name)
+        base = _UNITS.get(name, ({}, None))[0]  # nothing of a unit that FMUs only name
         if base:
             SubElement(unit, "BaseUnit", base)
-        shown = {display_unit(port) for port in ports if port.unit == name}
+        shown = {_display_unit(port) for port in ports if port.unit == name}
         for display, factor in sorted(pair for pair in shown if pair[0] != name):
             SubElement(unit, "DisplayUnit", name=display, factor=repr(factor))
 
 
-def _annotation(root: Element, block: Block, info: FmuInfo) -> None:
+def _annotation(parent: Element, block: Block, info: FmuInfo) -> None:
     # For our own tools: FMI has no place for the role, nor for "NaN means not measured".
     missing = [port.name for port in (*block.inputs, *block.outputs, *block.parameters) if port.missing]
     facts = {"kind": block.kind, "role": block.role, "sampleTime": repr(float(block.sample_time))}
     if info.robot is not None:
         facts |= {"robot": info.robot[0], "robotHash": info.robot[1]}
-    tool = SubElement(SubElement(root, "VendorAnnotations"), "Tool", name="softneck")
-    SubElement(tool, "Block", facts | {"missing": " ".join(missing)})
+    SubElement(parent, "Block", facts | {"missing": " ".join(missing)})
 
 
-def _variables(root: Element, block: Block) -> None:
+def _variables(root: Element, block: Block, fmi: int) -> None:
     table = SubElement(root, "ModelVariables")
     reference = 0
     for causality, ports in (("input", block.inputs), ("output", block.outputs), ("parameter", block.parameters)):
         for port in ports:
-            _variable(table, port, causality, reference)
+            _variable(table, port, causality, reference, fmi)
             reference += 1
+    if fmi == 3:
+        head = {"name": _TIME, "valueReference": str(reference), "causality": "independent"}
+        SubElement(table, "Float64", head | {"variability": "continuous", "description": "Simulation time"})
 
 
-def _variable(table: Element, port: Port, causality: str, reference: int) -> None:
+def _variable(table: Element, port: Port, causality: str, reference: int, fmi: int) -> None:
     variability = {"input": "discrete" if port.boolean else "continuous", "output": "discrete", "parameter": "fixed"}
     head = {"name": port.name, "valueReference": str(reference), "causality": causality}
     head["variability"] = variability[causality]
@@ -175,51 +199,102 @@ def _variable(table: Element, port: Port, causality: str, reference: int) -> Non
         head["initial"] = "calculated" if causality == "output" else "exact"
     if port.description:
         head["description"] = port.description
-    variable = SubElement(table, "ScalarVariable", head)
-    start = {} if causality == "output" else {"start": start_attribute(port)}
+    numbers = _range_attributes(port) | ({} if causality == "output" else {"start": _start_attribute(port)})
     if port.boolean:
-        SubElement(variable, "Boolean", start)
+        kind, own = "Boolean", {name: text for name, text in numbers.items() if name == "start"}
+    elif port.integer and fmi == 3:
+        kind, own = "Int64", {name: str(int(float(text))) for name, text in numbers.items()}
     else:
-        SubElement(variable, "Real", unit_attributes(port) | range_attributes(port) | start)
+        kind, own = "Float64" if fmi == 3 else "Real", _unit_attributes(port) | numbers
+    if fmi == 3:
+        SubElement(table, kind, head | own)
+    else:
+        SubElement(SubElement(table, "ScalarVariable", head), kind, own)
 
 
-def _structure(root: Element, block: Block, ahead: int) -> None:
+def _structure(root: Element, block: Block, ahead: int, fmi: int) -> None:
     structure = SubElement(root, "ModelStructure")
     n_in, n_out = len(block.inputs), len(block.outputs)
-    first = n_in + n_out
-    parameters = [str(first + i + 1) for i in range(len(block.parameters))]
-    inputs = [str(i + 1) for i in range(n_in)]
+    first = 1 if fmi == 2 else 0  # FMI 2.0 counts variables from one, FMI 3.0 has their references
+    parameters = [str(n_in + n_out + i + first) for i in range(len(block.parameters))]
+    inputs = [str(i + first) for i in range(n_in)]
     # Outputs change in a communication step alone: an input that is set shows in none before. A master that were told
     # otherwise would find an algebraic loop between observer and controller. At the start they follow the parameters.
     # Those of the next sample follow the inputs at once.
-    for tag, known in (("Outputs", []), ("InitialUnknowns", parameters)):
-        if n_out:
-            group = SubElement(structure, tag)
-            for i in range(n_out):
-                all_known = [*inputs, *known] if i >= n_out - ahead else known
-                SubElement(group, "Unknown", index=str(n_in + i + 1), dependencies=" ".join(all_known))
+    for tag, known in (("Output", []), ("InitialUnknown", parameters)):
+        group = SubElement(structure, f"{tag}s") if fmi == 2 and n_out else structure
+        for i in range(n_out):
+            all_known = " ".join([*inputs, *known] if i >= n_out - ahead else known)
+            place = str(n_in + i + first)
+            if fmi == 2:
+                SubElement(group, "Unknown", index=place, dependencies=all_known)
+            else:
+                SubElement(group, tag, valueReference=place, dependencies=all_known)
 
 
 def _has_unit(port: Port) -> bool:
     return port.unit not in _NONE and not port.boolean
 
 
-def unit_attributes(port: Port) -> dict[str, str]:
-    """Return unit and display unit."""
+def _unit_attributes(port: Port) -> dict[str, str]:
     if not _has_unit(port):
         return {}
-    display, _ = display_unit(port)
+    display, _ = _display_unit(port)
     return {"unit": port.unit} | ({"displayUnit": display} if display != port.unit else {})
 
 
-def range_attributes(port: Port) -> dict[str, str]:
-    """Return min, max and nominal."""
+def _range_attributes(port: Port) -> dict[str, str]:
     values = {"min": port.minimum, "max": port.maximum, "nominal": port.nominal}
     return {name: repr(float(value)) for name, value in values.items() if value is not None and math.isfinite(value)}
 
 
-def start_attribute(port: Port) -> str:
-    """Return the start value as XML writes it."""
+def _start_attribute(port: Port) -> str:
     if port.boolean:
         return "true" if port.start else "false"
     return "NaN" if math.isnan(port.start) else repr(float(port.start))
+
+
+def _display_unit(port: Port) -> tuple[str, float]:
+    """Return the unit in which people see a port, and what its values are multiplied by for that."""
+    if port.display_unit:
+        return port.display_unit, 1.0 / to_si(port.display_unit)[0]
+    return _UNITS.get(port.unit, ({}, None))[1] or (port.unit, 1.0)
+
+
+def terminals(block: Block) -> dict[str, list[str]]:
+    """Return terminal -> names of its inputs and outputs, without empty terminals."""
+    ports = (*block.inputs, *block.outputs)
+    outputs = {port.name.removesuffix(end) for port in ports for end in _TOLD if port.name.endswith(end)}
+    found = {title: [port.name for port in ports if _terminal_of(port, outputs) == title] for title in _TERMINALS}
+    return {title: members for title, members in found.items() if members}
+
+
+def _terminal_of(port: Port, outputs: set[str]) -> str:
+    name = port.name
+    if "_measured" in name or name == "measurement_valid":
+        return "measurement"
+    if name.startswith(("motor_setpoint_", "motor_position_")):
+        return "motors"
+    if name.endswith("_reference") or name == "enabled":
+        return "reference"
+    if name != "healthy" and name.removesuffix("_rate") not in outputs - {"cocontraction"}:
+        return ""
+    return "angles" if port.boolean or port.unit in ("rad", "rad/s") else "outputs"
+
+
+def terminals_file(block: Block) -> dict[str, bytes]:
+    """Return the file's name in the FMU and its XML; nothing for a block without terminals."""
+    found = terminals(block)
+    if not found:
+        return {}
+    root = Element("fmiTerminalsAndIcons", fmiVersion="3.0")
+    group = SubElement(root, "Terminals")
+    for title, members in found.items():
+        # A bus: an observer takes the set-points and leaves the positions.
+        head = {"name": title, "matchingRule": "bus", "description": _TERMINALS[title]}
+        terminal = SubElement(group, "Terminal", head)
+        for name in members:
+            SubElement(
+                terminal, "TerminalMemberVariable", {"variableName": name, "memberName": name, "variableKind": "signal"}
+            )
+    return {TERMINALS: _text(root)}

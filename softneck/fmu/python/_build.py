@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import distribution
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -23,14 +24,12 @@ import numpy as np
 from softneck.core import SettingsError, atomic_write, refuse_existing
 from softneck.core._files import as_path
 from softneck.design.linear._own import own_module
-from softneck.runtime import Block, Port
+from softneck.runtime import Block, Port, load_runtime
 from softneck.runtime._own import PREFIX
 
-from ..describe._cost import plain_cost
-from ..describe._describe import Buildable, block_and_info
-from ..describe._description import Identity, described_block, generation_tool, model_description
-from ..describe._documentation import HOST_NEEDS, FmuInfo, documentation_page
-from ..describe._terminals_and_icons import icon_png, terminals_file
+from ..describe._describe import HOST_NEEDS, Buildable, FmuInfo, block_and_info, documentation_page
+from ..describe._description import Identity, described_block, generation_tool, model_description, terminals_file
+from ..python._build import plain_cost
 from ._module import slave_module
 from ._zip import read_zip, write_zip
 
@@ -126,7 +125,6 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
     members["documentation/host.txt"] = f"{HOST_NEEDS}\n".encode()
     members["documentation/licenses/license.txt"] = license_text("softneck", info.license).encode()
     members["documentation/licenses/pythonfmu.txt"] = license_text("pythonfmu", "MIT").encode()
-    members["model.png"] = icon_png(block.kind, block.role)
     return members | terminals_file(block)
 
 
@@ -223,3 +221,39 @@ def license_text(package: str, stated: str) -> str:
             text = file.read_text(encoding="utf-8")
             return f"{stated}\n\nThe code of {package} in this FMU:\n\n{text}".lstrip()
     return f"{stated}\n\nThe code of {package} in this FMU is under the licence that {package} states.\n".lstrip()
+
+
+# 0.1 us a line and 1 ns a number, about: 15 us and more are middling, 100 us and more are heavy.
+_MIDDLING_LINES, _HEAVY_LINES, _HEAVY_NUMBERS = 150, 1000, 20_000
+
+
+def plain_cost(block: Block) -> str:
+    """Return "light", "middling" or "heavy": what an FMU of `block` costs where its runtime is not compiled."""
+    if sum(array.size for array in block.arrays) > _HEAVY_NUMBERS:
+        return "heavy"
+    lines = _lines(block)
+    return "heavy" if lines > _HEAVY_LINES else "middling" if lines > _MIDDLING_LINES else "light"
+
+
+def _lines(block: Block) -> int:
+    """Return the number of lines that one plain step runs through."""
+    runtime = load_runtime(block.runtime, compiled=False)
+    parameters = np.array([port.start for port in block.parameters])
+    inputs = np.array([np.nan if port.missing else port.start for port in block.inputs])
+    state, outputs = np.zeros(runtime.state_size(block.arrays)), np.zeros(len(block.outputs))
+    count = 0
+
+    def trace(_frame: FrameType, event: str, _argument: Any) -> Any:
+        nonlocal count
+        count += event == "line"
+        return trace
+
+    before = sys.gettrace()
+    with np.errstate(all="ignore"):
+        runtime.initialise(block.arrays, parameters, state, outputs)
+        sys.settrace(trace)
+        try:
+            runtime.step(block.arrays, parameters, state, inputs, outputs)
+        finally:
+            sys.settrace(before)
+    return count

@@ -16,7 +16,7 @@ from softneck.runtime import _numba_cache, bundle
 from softneck.runtime._bundle import content_name
 from softneck.runtime._compile import COMPILE_OPTIONS, compiled_name
 
-from ..describe._documentation import MINIMUM_PYTHON
+from ..describe._describe import MINIMUM_PYTHON
 
 # Stated in the FMU and checked before anything else: old hosts must get past the syntax of this part.
 _CHECK = f'''"""A softneck FMU: generated, do not edit."""
