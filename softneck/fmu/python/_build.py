@@ -29,7 +29,6 @@ from softneck.runtime._own import PREFIX
 
 from ..describe._describe import HOST_NEEDS, Buildable, FmuInfo, block_and_info, documentation_page
 from ..describe._description import Identity, described_block, generation_tool, model_description, terminals_file
-from ..python._build import plain_cost
 from ._module import slave_module
 from ._zip import read_zip, write_zip
 
