@@ -62,10 +62,9 @@ def own_text(html: str) -> str:
 
 
 def charts_of(html: str) -> str:
-    """Return the packed charts of a page as their JSON, without the numbers."""
+    """Return the compressed charts of a page as their JSON."""
     (packed,) = re.findall(r'id="charts">([^<]*)<', html)
-    data = gzip.decompress(base64.b64decode(packed))
-    return data[4 : 4 + int.from_bytes(data[:4], "little")].decode()
+    return gzip.decompress(base64.b64decode(packed)).decode()
 
 
 def chromium_path() -> str:

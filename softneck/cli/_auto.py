@@ -11,9 +11,8 @@ import click
 
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
-from .shared._console import note, percent, print_json, print_table, progress
+from .shared._console import left_out, note, percent, print_json, print_table, progress, useless
 from .shared._options import target
-from .shared._validate_table import left_out, useless
 
 if TYPE_CHECKING:
     from softneck.identification import Choice, Model, Validation

@@ -57,7 +57,7 @@ def _refuse_foreign(folder: Path, *, force: bool) -> None:
 
 
 def _print(demo: Demo) -> None:
-    from softneck.report._tables import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
+    from softneck.report._demo import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
 
     print_table("Models, ours beside the paper's (fit in %, pitch/roll)", FIT_HEAD, fit_rows(demo.judged, demo.rough))
     click.echo(FIT_NOTE + "\n")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,10 +12,10 @@ import click
 
 from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, require_positive, resolve
 from softneck.core._kinds import kinds_of
+from softneck.robot._opened import opened
 
-from ._adapt import adapt
 from ._auto import identify_auto
-from .shared._console import print_json, progress
+from .shared._console import left_out, percent, print_json, progress, useless
 from .shared._groups import kinds_complete
 from .shared._kind_help import kind_command
 from .shared._options import (
@@ -24,11 +26,9 @@ from .shared._options import (
     target,
     tolerance_option,
 )
-from .shared._validate_table import left_out, useless
 
 if TYPE_CHECKING:
     from softneck.identification import Model, Validation
-
 
 _ANOTHER = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
@@ -152,3 +152,39 @@ def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:
         "summary": model.summary(),
         "hold_out": None if held_out is None else held_out.as_dict(),
     }
+
+
+@dataclass(frozen=True, slots=True)
+class _Adaptation:
+    """What `--set` takes beside `--from`; `window`: the latest seconds to look at."""
+
+    window: float = 30.0
+
+
+def adapt(
+    kind: str, model: Path, recordings: tuple[Path, ...], output: Path | None, *, settings: Sequence[str],
+    robot: str | None, force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Refit MODEL to the latest data, starting from what it is; write the model, and say what became of it."""
+    from softneck.signals.recording._files import opened_recording
+
+    path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
+    refuse_existing(path, force=replace)
+    old = opened(model, "model", robot)
+    if kind not in (old.kind, "auto"):
+        raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; what is refitted stays what it is.")
+    window = float(apply_settings(_Adaptation, settings).window)
+    require_positive("window", window, "s")
+    new = old.adapted(opened_recording(recordings, robot), window=window)
+    new.save(path, force=replace)
+    said = new.findings["adaptation"]
+    if as_json:
+        print_json({"model": str(path), "kind": new.kind, **said})
+        return
+    names = "/".join(new.robot.outputs.names)
+    before, after = ("/".join(percent(fit) for fit in said[key]) for key in ("fit_before", "fit_after"))
+    told = f"free run on {said['rows_held_out']} rows held out of {said['window_s']:.3g} s, fit [%] {names}:"
+    if said["adapted"]:
+        click.echo(f"{path}: adapted\n{told} {before} -> {after}")
+    else:
+        click.echo(f"{path}: the old model, kept: {said['why']}" + (f"\n{told} {before}" if before else ""))

@@ -17,8 +17,7 @@ from softneck import __version__
 from softneck.core import SoftneckError
 from softneck.core._errors import missing_extra
 
-from .shared._groups import NearGroup
-from .shared._moved import now
+from .shared._groups import NearGroup, now
 
 # Subcommand -> module and what it does; a module is imported when its command is called, so that
 # `softneck --help` answers at once.

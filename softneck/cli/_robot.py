@@ -13,8 +13,7 @@ from softneck.core import SettingsError, atomic_write
 from softneck.core._budget import settings_text
 
 from .shared._console import print_json
-from .shared._groups import NearGroup
-from .shared._moved import now
+from .shared._groups import NearGroup, now
 from .shared._options import common_options
 
 if TYPE_CHECKING:

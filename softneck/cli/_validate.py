@@ -10,9 +10,8 @@ import click
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 from softneck.robot._opened import opened
 
-from .shared._console import print_json, print_table, progress
+from .shared._console import print_json, print_table, progress, useless
 from .shared._options import common_options, tolerance_option
-from .shared._validate_table import fit_table, remarks, useless
 
 if TYPE_CHECKING:
     from softneck.identification import Validation
@@ -89,11 +88,13 @@ def command(
 
 
 def _print(results: list[Validation]) -> None:
-    outputs = results[0].robot.outputs
-    print_table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", *fit_table(results))
-    for result in results:
-        for line in remarks(result):
-            click.echo(line)
+    from softneck.report._validation_page import fit_table, remarks
+
+    table = fit_table(results)
+    print_table(table.caption, table.head, table.rows)
+    for r in results:
+        for line in remarks(r):
+            click.echo(f"{Path(r.model).stem} on {Path(r.data).stem}: {line}")
     click.echo(_NOTE)
 
 

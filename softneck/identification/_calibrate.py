@@ -13,8 +13,8 @@ from softneck.core._progress import shown_progress
 from softneck.plant._calibration import Calibration
 from softneck.plant._calibration import calibrate as calibrated
 from softneck.signals import Recording, signal
-from softneck.signals.recording._conditions import conditions
 from softneck.signals.recording._files import RecordingLike, opened_recording
+from softneck.signals.recording._recording import conditions
 
 from .models._model import Model
 

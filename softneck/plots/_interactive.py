@@ -6,6 +6,8 @@ the first page with a chart is made, for the command line to start fast.
 
 from __future__ import annotations
 
+import base64
+import gzip
 import itertools
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
@@ -16,7 +18,6 @@ import numpy as np
 from softneck.core import Vector
 
 from ._chart import Chart, Curve, Panel, bar_width
-from ._packed import compressed
 
 if TYPE_CHECKING:
     from bokeh.models import ColumnDataSource, GlyphRenderer, Legend, UIElement
@@ -34,6 +35,11 @@ _DASHES = {"dashed": [6, 4], "dotted": [2, 3]}
 #: Bokeh's licence (BSD-3) asks for its notice; packed as the library is, nobody would find it there.
 LICENCE = "Plots: Bokeh, Copyright (c) Anaconda, Inc., and Bokeh Contributors; BSD-3-Clause, text in the library."
 _TOOLS = "box_zoom,pan,reset,save"
+
+
+def compressed(data: bytes) -> str:
+    """Return bytes as base64 text of their gzip; the same for the same bytes."""
+    return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode()
 
 
 @lru_cache(maxsize=1)

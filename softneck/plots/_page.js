@@ -1,26 +1,10 @@
 "use strict";
-// Draws the charts of a page. The library and the charts' numbers are packed (softneck/plots/_packed.py); what unpacks
-// them is the browser's own.
+// Draws the charts of a page. The library and the charts are compressed; what unpacks them is the browser's own.
 async function unpacked(id) {
   const text = atob(document.getElementById(id).textContent.trim());
   const bytes = Uint8Array.from(text, letter => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
-}
-// One array: sums of differences, whose bytes lie in planes; or the numbers as they are.
-function numbers({kind, count, low, step, start}, bytes) {
-  const width = {x: 4, y: 2, f8: 8, f4: 4}[kind];
-  const own = bytes.slice(start, start + width * count);
-  if (kind === "f8") return new Float64Array(own.buffer);
-  if (kind === "f4") return new Float32Array(own.buffer);
-  const values = kind === "x" ? new Float64Array(count) : new Float32Array(count);
-  for (let i = 0, sum = 0; i < count; i++) {
-    let by = 0;
-    for (let plane = 0; plane < width; plane++) by |= own[plane * count + i] << (8 * plane);
-    sum = kind === "x" ? (sum + by) >>> 0 : (sum + by) & 0xffff;
-    values[i] = kind === "y" && sum === 0xffff ? NaN : low + step * sum;
-  }
-  return values;
 }
 function wrapped(text, most) {
   const lines = [""];
@@ -59,20 +43,9 @@ async function draw() {
   const script = document.createElement("script");
   script.textContent = new TextDecoder().decode(await unpacked("library"));
   document.head.append(script);
-  const bytes = await unpacked("charts");
-  const size = new DataView(bytes.buffer).getUint32(0, true);
-  const {charts, arrays} = JSON.parse(new TextDecoder().decode(bytes.subarray(4, 4 + size)));
-  const made = new Map();
-  const fill = node => {
-    if (node === null || typeof node !== "object") return;
-    if (node.type === "bytes" && typeof node.data === "number") {
-      if (!made.has(node.data)) made.set(node.data, numbers(arrays[node.data], bytes.subarray(4 + size)));
-      node.data = made.get(node.data).slice();
-    } else for (const child of Object.values(node)) fill(child);
-  };
+  const charts = JSON.parse(new TextDecoder().decode(await unpacked("charts")));
   for (const [id, chart] of Object.entries(charts)) {
     fitted(chart, document.getElementById(id).clientWidth);
-    fill(chart);
     await Bokeh.embed.embed_item(chart, id);
     const named = Bokeh.documents.at(-1).roots()[0].children.flatMap(([plot]) => plot.renderers).filter(r => r.name);
     // Curves of one name vanish together in all panels. (Bokeh's own links are compiled in the browser, which the

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from markupsafe import Markup
 
 from softneck.core import atomic_write
 from softneck.core._shown import Shown
 
-from ._chart import Chart
-from ._interactive import LICENCE, draw, library
-from ._packed import Packer, thinned
+from ._chart import Chart, Curve
+from ._interactive import LICENCE, compressed, draw, library
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,23 +83,23 @@ def page(
     import jinja2
 
     charts = iter(thinned([chart for section in sections for chart in section.charts]))
-    packer = Packer()
-    parts = [_part(number, section, charts, packer) for number, section in enumerate(sections, start=1)]
+    drawn: dict[str, Any] = {}
+    parts = [_part(number, section, charts, drawn) for number, section in enumerate(sections, start=1)]
+    packed = Markup(compressed(json.dumps(drawn, separators=(",", ":")).encode()))
     script = Markup(library()) if any(section.charts for section in sections) else ""
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_file("_page.html"))
     return template.render(
         title=title, verdict=verdict, mark={None: "", True: "holds", False: "fails"}[holds], sections=parts,
-        footer=footer, library=script, licence=LICENCE, charts=Markup(packer.text()), start=Markup(_file("_page.js")),
+        footer=footer, library=script, licence=LICENCE, charts=packed, start=Markup(_file("_page.js")),
     )  # fmt: skip
 
 
-def _part(number: int, section: Section, charts: Iterator[Chart], packer: Packer) -> dict[str, Any]:
-    """Return what the template shows of a section; its charts' numbers go to the packer."""
+def _part(number: int, section: Section, charts: Iterator[Chart], drawn: dict[str, Any]) -> dict[str, Any]:
+    """Return what the template shows of a section; its charts go to `drawn`."""
     shown = []
     for k, _ in enumerate(section.charts, start=1):
         chart, name = next(charts), f"c{number}-{k}"
-        item, height = draw(chart)
-        packer.add(name, item)
+        drawn[name], height = draw(chart)
         shown.append({"id": name, "title": chart.title, "caption": chart.caption, "height": height})
     figures = [{"caption": caption, "data": figure_png(figure)} for caption, figure in section.figures]
     cards = [{"title": a, "link": b, "picture": Markup(c), "text": d} for a, b, c, d in section.cards]
@@ -121,3 +122,46 @@ def figure_png(figure: Figure) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
     return base64.b64encode(buffer.getvalue()).decode()
+
+
+# Samples of a page: compressed, about three bytes each, and a third more as text.
+_MOST_SAMPLES = 300_000
+_CONTINUOUS = ("line", "dashed", "dotted", "step", "band", "points")
+
+
+def thinned(charts: Sequence[Chart], most: int = _MOST_SAMPLES) -> list[Chart]:
+    """Return charts of at most `most` samples: as they are, or their longest curves in pieces; captions say so."""
+    sizes = [curve.y.size for chart in charts for panel in chart.panels for curve in panel.curves]
+    limit = max(sizes, default=0)
+    while sum(min(size, limit) for size in sizes) > most:
+        limit = int(0.9 * limit)
+    return [_thinned(chart, limit) for chart in charts]
+
+
+def _thinned(chart: Chart, limit: int) -> Chart:
+    longest = max(curve.y.size for panel in chart.panels for curve in panel.curves)
+    if longest <= limit:
+        return chart
+    panels = [replace(panel, curves=[_piecewise(curve, limit) for curve in panel.curves]) for panel in chart.panels]
+    said = f"Of {longest} samples the least and the most of each {2 * longest / limit:.0f} are drawn."
+    return replace(chart, panels=panels, caption=f"{chart.caption} {said}".strip())
+
+
+def _piecewise(curve: Curve, limit: int) -> Curve:
+    """Return the least and the most of each piece, in the order in which they came, at its first and middle x."""
+    if curve.y.size <= limit or curve.style not in _CONTINUOUS:
+        return curve
+    edges = np.unique(np.linspace(0, curve.y.size, limit // 2 + 1).astype(int))
+    start, stop = edges[:-1], edges[1:]
+    x = np.column_stack([curve.x[start], curve.x[(start + stop) // 2]]).ravel()
+    least, most = (np.where(np.isnan(curve.y), fill, curve.y) for fill in (np.inf, -np.inf))
+    low, high = np.minimum.reduceat(least, start), np.maximum.reduceat(most, start)
+    gap = ~np.isfinite(low)
+    low[gap] = high[gap] = np.nan
+    if curve.upper is not None:
+        top = np.maximum.reduceat(np.where(np.isnan(curve.upper), -np.inf, curve.upper), start)
+        top[~np.isfinite(top)] = np.nan
+        return replace(curve, x=x, y=np.repeat(low, 2), upper=np.repeat(top, 2))
+    falls = curve.y[stop - 1] < curve.y[start]
+    pair = np.where(falls[:, None], np.column_stack([high, low]), np.column_stack([low, high]))
+    return replace(curve, x=x, y=pair.ravel())

@@ -1,4 +1,4 @@
-"""The page of `softneck validate`: fits, then every model beside what was measured, its errors and residual tests."""
+"""What `softneck validate` tells: the table of fits, remarks, and the page that shows each model beside the data."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, to_si
+from softneck.core._shown import percent
 from softneck.identification import INFINITE, Validation
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import residual_chart, validation_chart
@@ -26,10 +27,7 @@ _RESIDUALS = (
     "model misses; slow or periodic set-points spread it over many lags, negative ones too. Set-points made by a "
     "controller from the outputs show at negative lags."
 )
-_HEAD = [
-    "model on data", "samples ahead", "persistence", "best linear", "model", "95 % interval", "rms [{unit}]",
-    "worst [{unit}]", "R2",
-]  # fmt: skip
+_HEAD = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst", "R2")
 # A free run beyond this has diverged [rad], of other outputs than angles beyond so many times what was measured; it is
 # not drawn from there on, for the rest to stay readable.
 _DRAWN, _DRAWN_TIMES = np.pi, 10.0
@@ -72,35 +70,21 @@ def _last(r: Validation) -> dict[str, float | None]:
     return r.fits[list(r.fits)[-1]]
 
 
-def _overview(results: Sequence[Validation], charts: Sequence[Chart]) -> Section:
+def fit_table(results: Sequence[Validation]) -> Table:
+    """Return the fits [%] of the outputs, a row for each horizon, beside what they must be compared with."""
     rows, outputs = [], results[0].robot.outputs
-    names, unit = "/".join(outputs.names), outputs.display_unit
     for r in results:
         for h in r.fits:
             tables = (r.persistence, r.best_linear, r.fits, r.intervals)
-            rows.append(
-                [
-                    _name(r),
-                    "free run" if h == INFINITE else h,
-                    *(_cell(table.get(h, {}), 1) for table in tables),
-                    _cell(r.rmse_deg[h], 2),
-                    _cell(r.worst_deg[h], 1),
-                    _cell(r.r2[h], 3),
-                ]
-            )
-    fits = Table(f"Fit in %, errors in {unit}, {names}", [title.format(unit=unit) for title in _HEAD], rows)
-    counts = [[_name(r), str(r.rows_scored), str(r.rows_left_out), *_verdicts(r)] for r in results]
-    head = ["model on data", "rows judged", "left out", "one-step errors white", "follow no input", "free run diverged"]
-    return Section(
-        "Fits", charts=charts, tables=[fits, Table("What was judged", head, counts)],
-        method=[VALIDATION_NOTE.format(outputs=names)],
-    )  # fmt: skip
+            cells = [_cell(table.get(h, {}), 1) for table in tables]
+            errors = [_cell(r.rmse_deg[h], 2), _cell(r.worst_deg[h], 1), _cell(r.r2[h], 3)]
+            rows.append([_name(r), "free run" if h == INFINITE else h, *cells, *errors])
+    return Table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", _HEAD, rows)
 
 
-def _verdicts(r: Validation) -> list[str]:
-    tested = not np.isnan(r.residual_tests.p_value).any()
-    words = ["-" if not tested else "holds" if verdict else "fails" for verdict in (r.white, r.uncorrelated)]
-    return [*words, "no" if r.diverged is None else f"at {r.diverged:.2f} s"]
+def _overview(results: Sequence[Validation], charts: Sequence[Chart]) -> Section:
+    names = "/".join(results[0].robot.outputs.names)
+    return Section("Fits", charts=charts, tables=[fit_table(results)], method=[VALIDATION_NOTE.format(outputs=names)])
 
 
 def _comparisons(results: Sequence[Validation]) -> list[Chart]:
@@ -144,7 +128,8 @@ def _curves(r: Validation) -> Chart:
 def _section(r: Validation, *, drawn: bool) -> Section:
     """Return all on one result; its curves unless they are `drawn` already."""
     charts = [*([] if drawn else [_curves(r)]), _residuals(r)]
-    return Section(_name(r), text=_remarks(r), tables=_run_tables(r), charts=charts)
+    text = [f"{said[0].upper()}{said[1:]}." for said in remarks(r)]
+    return Section(_name(r), text=text, tables=_run_tables(r), charts=charts)
 
 
 def _residuals(r: Validation) -> Chart:
@@ -158,36 +143,71 @@ def _residuals(r: Validation) -> Chart:
     )
 
 
-def _remarks(r: Validation) -> list[str]:
-    p_values = "/".join(f"{p:.2g}" for p in r.residual_tests.p_value)
-    words = ["There are too few one-step errors to test whether they are white."]
-    if not np.isnan(r.residual_tests.p_value).any():
-        words = [
-            f"One step ahead the errors are {'white' if r.white else 'not white'} (portmanteau p {p_values}) and "
-            f"{'follow no set-point' if r.uncorrelated else 'follow the set-points'} (99 %)."
-        ]
-    if r.diverged is not None:
-        far = "half a turn" if _turns(r) else f"{_DRAWN_TIMES:g} times what was measured"
-        words.append(f"The free run diverged at {r.diverged:.2f} s and is not drawn beyond {far}.")
+def remarks(r: Validation) -> list[str]:
+    """Return what there is to say of a model on a recording beside its fits."""
+    lines = [f"{r.rows_scored} rows judged, {r.rows_left_out} left out as the model was trained on them"]
+    lost = [entry for entry in r.per_run if entry["diverged"] is not None]
+    lines += [f"the free run of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
+    if INFINITE in r.fits:
+        lines.append(f"free run {_cell(r.cold_fits, 1)} % from the first row only (cold, as an FMU starts)")
+    lines += [
+        f"free run {_cell(table, 1)} % over {what} of these rows, least..largest"
+        for what, table in r.spread.items()
+        if any(table.values()) and not lost
+    ]
     if any(fit is not None for fit in r.noise_ceiling.values()):
-        ceiling = _cell(r.noise_ceiling, 1)
-        words.append(f"Repeated set-points say that a perfect model would fit {ceiling} % (noise ceiling).")
+        lines.append(f"repeats allow a perfect model {_cell(r.noise_ceiling, 1)} % (noise ceiling)")
+    lines.append(_residuals_said(r))
+    if lost:
+        return lines
     if r.coverage_pct is not None and r.mean_width_deg is not None:
-        words.append(
-            f"The bounds of the free run hold {_cell(r.coverage_pct, 1)} % of the samples and are "
-            f"{_cell(r.mean_width_deg, 1)} {r.robot.outputs.display_unit} wide in the mean."
+        lines.append(
+            f"free-run bounds hold {_cell(r.coverage_pct, 1)} % of the samples, "
+            f"{_cell(r.mean_width_deg, 1)} {r.robot.outputs.display_unit} wide"
         )
     if r.outside_pct is not None:
-        words.append(f"{_cell(r.outside_pct, 1)} % of the samples lie outside what the model has seen.")
+        lines.append(f"{_cell(r.outside_pct, 1)} % of the samples lie outside what the model has seen")
     if r.validity is not None:
         v = r.validity
-        words.append(
-            f"Validity is {v['mean']:.2f} in the mean, {v['least']:.2f} at least; {100 * v['held']:.0f} % of the "
-            f"samples were within the tolerance. Brier score {v['brier']:.3f} (0 is best); that share alone gets "
-            f"{v['brier_base_rate']:.3f}."
+        lines.append(
+            f"validity {v['mean']:.2f} in the mean, {v['least']:.2f} at least; {100 * v['held']:.0f} % of the "
+            f"samples were within the tolerance (Brier score {v['brier']:.3f}, of that share alone "
+            f"{v['brier_base_rate']:.3f})"
         )
-    words += [f"{said[0].upper()}{said[1:]}." for said in r.bounds_remarks]
-    return words
+    return [*lines, *r.bounds_remarks, *_calibrated(r)]
+
+
+def _residuals_said(r: Validation) -> str:
+    p_value = r.residual_tests.p_value
+    if np.isnan(p_value).any():
+        return "too few one-step errors to test whether they are white"
+    p_values = "/".join("<0.001" if p < 1e-3 else f"{p:.3f}" for p in p_value)
+    return (
+        f"one-step errors are {'' if r.white else 'not '}white (p {p_values}) and "
+        f"{'do not follow' if r.uncorrelated else 'follow'} the inputs (99 %)"
+    )
+
+
+def _calibrated(r: Validation) -> list[str]:
+    """Return the bounds that whole records allow, or why there are none."""
+    found, unit = r.calibrated_bounds, r.robot.outputs.display_unit
+    lines = []
+    for what, of in (("pointwise", "any sample"), ("path", "all samples")):
+        for axis, bound in found.get(what, {}).items():
+            held = (
+                "" if bound["coverage_pct"] is None else f"; left out one by one it held {bound['coverage_pct']:.0f} %"
+            )
+            lines.append(
+                f"calibrated on {found['records']} records, 90 % for {of} of a further one: {axis} "
+                f"+-{bound['half_width']:.2f} {unit}{held}"
+            )
+    if lines:
+        unit, ends = r.robot.motors.unit, zip(found["domain"]["min"], found["domain"]["max"], strict=True)
+        said = "  ".join("..".join(f"{end / to_si(unit)[0]:.3g}" for end in pair) for pair in ends)
+        lines.append(f"beyond the set-points of these records ({said} {unit}) there is no such bound")
+    if found["reason"] is not None:
+        lines.append(found["reason"] if lines else f"no calibrated bounds, {found['reason']}")
+    return lines
 
 
 def _run_tables(r: Validation) -> list[Table]:
@@ -211,7 +231,7 @@ def _text(value: float | Iterable[float] | None, digits: int) -> str:
     if value is None:
         return "-"
     if isinstance(value, float | int):
-        return f"{value:.{digits}f}"
+        return percent(value) if digits == 1 else f"{value:.{digits}f}"
     return "..".join(f"{edge:.{digits}f}" for edge in value)
 
 

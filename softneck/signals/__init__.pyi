@@ -1,8 +1,8 @@
 from .excitation._limits import SetPointLimits as SetPointLimits
 from .excitation._limits import prepare as prepare
-from .excitation._multisine import multisine_experiments as multisine_experiments
 from .excitation._signals import SAMPLE_TIME as SAMPLE_TIME
 from .excitation._signals import Excitation as Excitation
+from .excitation._signals import multisine_experiments as multisine_experiments
 from .excitation._signals import signal as signal
 from .excitation._signals import signal_names as signal_names
 from .importing._guess import Guess as Guess

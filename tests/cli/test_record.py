@@ -8,7 +8,7 @@ import numpy as np
 
 from softneck import frequency_response
 from softneck.signals import read_recording
-from softneck.signals.recording._conditions import conditions
+from softneck.signals.recording._recording import conditions
 
 from .conftest import Call
 
@@ -23,7 +23,7 @@ def test_what_it_needs_is_recorded_and_refused_in_a_line(call: Call, tmp_path: P
             "`--band` asks for experiments of a frequency response: the signal is `multisine` then",
         ),
         (("multisine", "--amplitude", "1", "--duration", "9"), "takes no `--duration`"),
-        (("multisine", "--band", "1,2,3"), "`--band` is two frequencies in rad/s, such as 0.5,25, or one; got `1,2,3`"),
+        (("multisine", "--band", "1,2,3"), "`--band` is two frequencies in rad/s, such as 0.5,25; got `1,2,3`"),
         (("multisine", "--band", "9,2"), "`band` must rise within"),
         (("multisine", "--amplitude", "20"), "beyond the motors' limits; lower `--amplitude`"),
     ):

@@ -103,4 +103,4 @@ def test_what_too_few_rows_cannot_tell_is_not_told(call: Call, rls_file: Path) -
     assert "too few one-step errors to test whether they are white" in said.out
     assert "nan" not in said.out
     page = Path("page.html").read_text(encoding="utf-8")
-    assert "There are too few one-step errors to test whether they are white." in page
+    assert "Too few one-step errors to test whether they are white." in page

@@ -12,7 +12,7 @@ from softneck.core import CheckFailedError, DataError, OutputFileError
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plant._calibration import _Run, calibrate
 from softneck.signals import Recording, read_recording, signal, write_recording
-from softneck.signals.recording._conditions import conditions
+from softneck.signals.recording._recording import conditions
 
 TRUE = NeckParameters.paper().replace(bending_stiffness=0.75, drive_latency=0.03, pretension=2.5)
 

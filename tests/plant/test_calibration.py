@@ -12,7 +12,7 @@ from softneck.identification import Rls, nrmse_fit, validate
 from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
-from softneck.signals.importing._tilt import pitch_roll
+from softneck.signals.importing._clocks import pitch_roll
 
 OPEN_LOOP = Path(__file__).parents[3] / "shared" / "data" / "neck_openloop" / "spring_test_0gr.csv"
 # Later work is scored on these: a change needs an issue of its own.

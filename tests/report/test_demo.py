@@ -11,8 +11,7 @@ import pytest
 from softneck.core import OutputFileError, SettingsError, load, silent
 from softneck.identification import INFINITE, validate
 from softneck.report import DemoSettings, run_demo
-from softneck.report._demo import Demo
-from softneck.report._tables import fit_rows
+from softneck.report._demo import Demo, fit_rows
 from softneck.signals import read_recording
 
 from ..browser import own_text

@@ -9,8 +9,7 @@ from softneck.core import SettingsError, silent
 from softneck.identification import nrmse_fit
 from softneck.plots import chart_figure
 from softneck.report import ReproduceSettings, paper_page, reproduce
-from softneck.report._paper_figures import paper_chart
-from softneck.report._paper_page import grouped, linear_facts
+from softneck.report._paper_page import grouped, linear_facts, paper_chart
 from softneck.report._paper_tables import paper_entries
 from softneck.report._reproduce import Reproduction
 

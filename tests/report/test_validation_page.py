@@ -68,7 +68,7 @@ def test_all_free_runs_come_first_and_then_each_model(html: str) -> None:
     assert [h for h in headings if h.endswith("measured and predicted")] == [
         f"{name} on neck: measured and predicted" for name in names
     ]
-    assert headings.count("Errors, one step") == 3
+    assert headings.count("Residual tests of the one-step errors") == 3
 
 
 def test_one_model_or_other_rows_are_not_compared(results: Sequence[Validation], models: dict, neck: Recording) -> None:
@@ -98,13 +98,14 @@ def test_a_diverged_free_run_is_said_and_not_drawn_to_infinity(results: Sequence
     r = results[0]
     free = r.free_run.copy()
     free[400:] = 1e9
-    lost = replace(r, free_run=free, diverged=float(r.time[400]))
+    runs = [entry | {"diverged": float(r.time[400])} for entry in r.per_run]
+    lost = replace(r, free_run=free, per_run=runs, diverged=float(r.time[400]))
     assert f"diverged at {r.time[400]:.2f} s" in validation_page([lost])
 
 
 def test_a_validation_without_free_run_makes_a_page_too(models: dict[str, Model], neck: Recording) -> None:
     r = validate(models["rls"], neck.rows(600, 900), names=("rls.npz", "neck.csv"), horizons=(1,))
-    assert "Errors, free run" not in _headings(validation_page([r]))
+    assert "Residual tests of the one-step errors" in _headings(validation_page([r]))
 
 
 def test_a_browser_draws_all_of_it_in_silence(html: str, browser: Browser, tmp_path: Path) -> None:
@@ -140,7 +141,7 @@ def test_residual_tests_and_scores_of_each_run_are_told(models: dict[str, Model]
     r = validate(models["rls"], parts, names=("rls.npz", "neck.csv"))
     html = validation_page([r])
     assert "Residual tests of the one-step errors" in _headings(html)
-    head, *rows = _tables(html)[2]
+    head, *rows = _tables(html)[1]
     assert len(rows) == len(r.per_run) == 2
     free = head.index("free run")
     for row, entry in zip(rows, r.per_run, strict=True):

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError
 from softneck.signals import guess_layout, import_log
-from softneck.signals.importing._clocks import integrated, merged
+from softneck.signals.importing._clocks import integrated, merged, turns
+from softneck.signals.importing._guess_units import judge
 from softneck.signals.importing._layout import Source, Term
-from softneck.signals.importing._tilt import turns
-from softneck.signals.importing._unit_odds import judge
 from softneck.signals.importing.formats._dates import is_date, seconds
 from softneck.signals.importing.formats._mat import mat_arrays
 from softneck.signals.recording._resampling import Samples, gaps

@@ -28,33 +28,6 @@ def rows_of(recording: Recording) -> list[int]:
     return np.round(recording.outputs[:, 0] / 1e-4).astype(int).tolist()
 
 
-def test_runs_are_picked_by_their_numbers() -> None:
-    whole = numbered([5, 6, 7])
-    picked, rest = whole.split_runs([10])
-    assert rows_of(picked) == list(range(5, 11))
-    assert rows_of(rest) == [*range(5), *range(11, 18)]
-    assert len(rest.runs()) == 2
-
-
-@pytest.mark.parametrize(("fraction", "rows"), [(0.1, [5]), (0.5, [5, 6]), (0.7, [5, 6])])
-def test_a_fraction_of_the_runs(fraction: float, rows: list[int]) -> None:
-    picked, rest = numbered([5, 6, 7]).split_runs(fraction)
-    assert [len(run) for run in picked.runs()] == rows
-    assert len(picked) + len(rest) == 18
-
-
-def test_what_cannot_be_split_by_runs() -> None:
-    with pytest.raises(DataError, match=r"there is no run 3; the recording has 0, 10"):
-        numbered([5, 6]).split_runs([3])
-    for runs in ([], [0, 10], 0.99):
-        with pytest.raises(DataError, match=r"2 run\(s\) cannot be split so: one part would be empty"):
-            numbered([5, 6]).split_runs(runs)
-    with pytest.raises(DataError, match="between 0 and 1, without both; got 1"):
-        numbered([5, 6]).split_runs(1.0)
-    with pytest.raises(DataError, match="cannot be split so"):
-        numbered([5]).split_runs(0.5)
-
-
 @pytest.mark.slow
 @given(rows=st.lists(st.integers(2, 40), min_size=1, max_size=7), data=st.data())
 def test_folds_hold_out_each_row_once_and_join_nothing(rows: list[int], data: st.DataObject) -> None:

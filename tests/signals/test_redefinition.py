@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from softneck.core import SettingsError
 from softneck.signals import TENDON_ANGLES, motors_from, redefine, redefinition_matrix
-from softneck.signals.importing._tilt import pitch_roll
+from softneck.signals.importing._clocks import pitch_roll
 
 MOTORS = st.lists(st.floats(-6, 6), min_size=3, max_size=3)
 

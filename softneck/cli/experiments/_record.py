@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from softneck.core import SettingsError, refuse_existing, require_between, require_finite, to_si
 from softneck.robot import Robot, find_robot
+from softneck.robot._opened import opened
 from softneck.signals import (
     Excitation,
     SetPointLimits,
@@ -22,9 +25,13 @@ from softneck.signals import (
 )
 from softneck.signals.recording._recording import require_same_robot
 
-from ..shared._console import print_json, progress
+from ..shared._console import print_json, print_table, progress
 from ..shared._options import common_options, output_option
-from ._next import record_next
+
+if TYPE_CHECKING:
+    from softneck.identification.selection._experiment_design import Known
+    from softneck.robot import Robot
+    from softneck.signals import SetPointLimits
 
 
 @click.command(
@@ -50,7 +57,7 @@ from ._next import record_next
     "--seed", type=click.IntRange(0, 2**31 - 2), default=0, show_default=True, help="Seed of noise and signal."
 )
 @click.option("--amplitude", type=float, metavar="A", help="`multisine`: largest input. [default: 1]")
-@click.option("--band", metavar="LOW,HIGH", help="`multisine`: from where to where [rad/s]; one value: a sine.")
+@click.option("--band", metavar="LOW,HIGH", help="`multisine`: from where to where [rad/s].")
 @click.option(
     "--cocontraction", type=float, default=0.0, show_default=True, metavar="RAD",
     help="Played around this common position of all motors, which keeps tendons taut.",
@@ -147,9 +154,9 @@ def _band(text: str | None) -> tuple[float, float] | None:
         return None
     words = text.split(",")
     try:
-        low, high = (float(word) for word in (words if len(words) == 2 else words * 2))
+        low, high = map(float, words)
     except ValueError:
-        raise SettingsError(f"`--band` is two frequencies in rad/s, such as 0.5,25, or one; got `{text}`.") from None
+        raise SettingsError(f"`--band` is two frequencies in rad/s, such as 0.5,25; got `{text}`.") from None
     return low, high
 
 
@@ -161,3 +168,61 @@ def _allowed(robot: Robot) -> dict[str, float]:
     ends = [*(motors.setpoint_min or ()), *(motors.setpoint_max or ())]
     given = {"position": [abs(end) for end in ends], "speed": motors.rate_limit and [min(motors.rate_limit)]}
     return {name: scale * max(values) for name, values in given.items() if values}
+
+
+def record_next(
+    source: Path, output: Path, *, duration: float, seed: int, limits: Mapping[str, float | None], robot: str | None,
+    force: bool, as_json: bool,
+) -> None:  # fmt: skip
+    """Write the set-points of the next recording, and as outputs what the members of the model expect."""
+    from softneck.identification.selection._candidate_motions import Bounds
+    from softneck.identification.selection._experiment_design import next_experiment
+    from softneck.signals import write_recording
+
+    known = _known(source, robot)
+    with progress("next experiment", quiet=as_json) as report:
+        bounds = Bounds.of(known.robot, _limits(known.robot, limits))
+        found = next_experiment(known, duration=duration, seed=seed, bounds=bounds, progress=report)
+    write_recording(output, found.recording, force=force)
+    facts = {
+        "next": str(output),
+        "rows": len(found.recording),
+        "sample_time_s": found.recording.sample_time,
+        **found.as_dict(),
+    }
+    if as_json:
+        print_json(facts)
+        return
+    rows = [
+        [f"{part['start_s']:.1f}", part["signal"], f"{part['size']:g}", f"{part['speed']:g}", part["why"]]
+        for part in facts["parts"]
+    ]
+    unit = known.robot.outputs.display_unit
+    doubt = facts[f"disagreement_{unit}"]
+    print_table(f"{output}: {len(found.recording)} rows", ["at [s]", "signal", "size", "speed", "why"], rows)
+    click.echo(
+        f"{facts['members']}: {doubt['before']:.2g} {unit} rms over all that could be played, "
+        f"{doubt['expected_after']:.2g} {unit} expected once this is recorded"
+    )
+
+
+def _known(source: Path, robot: str | None) -> Known:
+    from softneck.identification import Model
+    from softneck.identification.selection._experiment_design import Known
+
+    model = opened(source, robot=robot)
+    if not isinstance(model, Model):
+        raise SettingsError(f"{source}: is no model; give one of kind `guarded`.")
+    return Known.of_model(model)
+
+
+def _limits(robot: Robot, given: Mapping[str, float | None]) -> SetPointLimits:
+    """Return what is asked for, and what the drives of a robot allow where it names them."""
+    from softneck.drives import load_drives
+    from softneck.drives.commissioning._record import drive_limits
+    from softneck.signals import SetPointLimits
+
+    if robot.drives is not None and robot.folder is not None:
+        return drive_limits(load_drives(robot.folder / robot.drives), **given)
+    asked = {name: value for name, value in given.items() if value is not None}
+    return SetPointLimits(**{"position": float("inf"), **asked})

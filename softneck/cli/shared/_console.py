@@ -8,13 +8,16 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softneck.core import Progress, silent
 from softneck.core import Progress as ProgressCallback
 from softneck.core._shown import percent as percent
+
+if TYPE_CHECKING:
+    from softneck.identification import Validation
 
 
 def print_json(value: Any) -> None:
@@ -112,3 +115,31 @@ class Stages:
         if self._name and not self._quiet:
             note(f"{self._name}: {time.monotonic() - self._since:.1f} s")
         self._name = ""
+
+
+# [%] What the mean of the rows scores: a model that is further off knows less than one that never moves.
+_USELESS = 0.0
+# [%] What `design` asks for at least.
+_WORTH = 30.0
+
+
+def useless(r: Validation) -> str | None:
+    """Return why a model is no model of the rows that it was judged on, or None."""
+    if r.diverged is not None:
+        return f"its free run diverges at {r.diverged:.2f} s"
+    fits = [(fit, "in free run" if h == "inf" else f"{h} sample(s) ahead", axis)
+            for h, table in r.fits.items() for axis, fit in table.items() if fit is not None]  # fmt: skip
+    worst, horizon, axis = min(fits, default=(0.0, "", ""))
+    return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _USELESS else None
+
+
+def left_out(r: Validation) -> str:
+    """Return the advice to go on without the outputs that spoil a model of the others; "" where that is no way out."""
+    fits = {axis: fit for axis, fit in r.fits.get("inf", {}).items() if fit is not None}
+    poor = [axis for axis, fit in fits.items() if fit < _USELESS]
+    good = [axis for axis in fits if axis not in poor]
+    if r.diverged is not None or not poor or not good or min(fits[axis] for axis in good) < _WORTH:
+        return ""
+    said = "/".join(percent(fits[axis]) for axis in good)
+    without = ", ".join(poor)
+    return f"Leave {without} out of `outputs.names` in a robot.toml: without it {', '.join(good)} fits {said} %."

@@ -8,7 +8,62 @@ import click
 
 from softneck.core._errors import did_you_mean
 
-from ._moved import now
+# Command, or command and option, as they were -> what to call instead.
+_NOW = {
+    "calibrate": "softneck.calibrate(recordings).save(NECK.toml) in Python",
+    "frf": "softneck.frequency_response(recordings) in Python",
+    "linearize": "softneck.linearize(MODEL, at=S).to_mat(SS.mat) in Python",
+    "resample": "softneck import REC --resample S -o REC2",
+    "adapt": "softneck identify KIND REC --from MODEL -o MODEL2",
+    "excite": "softneck record MODEL -o NEXT.csv (of a recording: identify guarded first)",
+    "drives scan": "softneck drives commission --only scan",
+    "drives zero": "softneck drives commission --only zero",
+    "drives jog": "softneck drives commission --only jog --motor N",
+    "drives replay": "softneck simulate LOG.mcap",
+    "drives record --supervision": "softneck.drives.baseline(LOGS).save(FILE) in Python",
+    "drives record --beside": "softneck.drives.baseline(LOGS).save(FILE) in Python",
+    "drives record --runs": "play a longer signal, or a recording of several runs",
+    "drives record --ramp": "it is 2 s",
+    "drives record --max-speed": "[limits] of the drives file, or a recording of `softneck record` that is slower",
+    "drives record --max-slack": "[limits] slack_unwind_rad of the drives file",
+    "drives commission --neck": "[plant] neck of the robot file (--robot)",
+    "drives commission --no-log": "--log none",
+    "drives record --neck": "[plant] neck of the robot file (--robot)",
+    "drives record --no-log": "--log none",
+    "drives run --neck": "[plant] neck of the robot file (--robot)",
+    "drives run --no-log": "--log none",
+    "record --realisations": "it is 4",
+    "record --no-noise": "softneck.record(signal, neck, noise=False) in Python",
+    "record --ramp": "softneck.signals.prepare(signal, limits, ramp_s=S) in Python; `drives record` ramps by itself",
+    "record --max-speed": "[motors] rate_limit of the robot file",
+    "record --max-slack": "[motors] setpoint_min of the robot file",
+    "validate --initial": 'cold_fits of --json; Rules(initial="cold") in Python',
+    "validate --training": "leave it out: `validity` says how far a model is beyond its training",
+    "observer --sensor": "--set sensor=NAME",
+    "observer --gyro": "--set form=gyro",
+    "identify --search": "a loop over `identify KIND --set` and `validate`",
+    "identify --hold-out": "softneck validate MODEL --data REC",
+    "identify --strategy": "a loop over `identify KIND --set` and `validate`",
+    "identify --plot": "softneck validate MODEL --data REC -o PAGE.html",
+    "demo --out": "-o",
+    "design --mat": "softneck.load(CONTROLLER).to_mat(FILE) in Python",
+    "doctor --compile": "softneck demo --quick",
+    "report --no-run": "leave it out: loops are run",
+    "fmu --all": "softneck fmu FOLDER",
+    "study --dask": '`dask = "tcp://head:8786"` in the study file',
+    "study --resume": "leave it out: the same command goes on where it was",
+    "study --worst": "three are written; softneck.cosim.write_worst in Python",
+    "tune --resume": "leave it out: the same command goes on where it was",
+    "ssp": "softneck fmu LOOP.toml -o X.ssp",
+    "completion": 'eval "$(_SOFTNECK_COMPLETE=bash_source softneck)" (or zsh_source, fish_source)',
+    "robot show": "softneck robot FILE",
+    "robot check": "softneck robot FILE",
+}
+
+
+def now(ctx: click.Context, name: str) -> str | None:
+    """Return what does now what command or option `name` did in the command of `ctx`; None where there was none."""
+    return _NOW.get(" ".join([*ctx.command_path.split()[1:], name]))
 
 
 class NearGroup(click.Group):

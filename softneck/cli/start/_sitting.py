@@ -30,7 +30,7 @@ from softneck.core import (
 from softneck.core._budget import MOST_JSON, settings_text
 
 from ..shared._console import note
-from ._step import STAGES, Step, Unmet
+from ._plan import STAGES, Step, Unmet
 
 #: In the folder: which steps are done, from what, by which command, and what they found.
 FILE = "start.json"

@@ -25,10 +25,9 @@ from softneck.core._files import require_file
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import columns_options, common_options
 from ..shared._settle import is_terminal
-from ._plan import BEST, PI, Asked, linear_model, nonlinear_model, steps
-from ._preflight import backend, has_pytest, require_disk
+from ._plan import BEST, PI, STAGES, Asked, Step, linear_model, nonlinear_model, steps
+from ._possible import backend, has_pytest, require_disk
 from ._sitting import FILE, Sitting
-from ._step import STAGES, Step
 
 _PATH = click.Path(path_type=Path)
 _TUNED = "tune/best.certificate.json"

@@ -21,7 +21,7 @@ from softneck.core import (
 )
 from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate
-from softneck.signals.recording._conditions import conditions
+from softneck.signals.recording._recording import conditions
 
 from ..linear._oe import SOURCES
 from ..linear._srivc_fit import Continuous, SrivcFitOptions

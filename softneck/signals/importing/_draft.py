@@ -10,12 +10,11 @@ import numpy as np
 from softneck.core import Matrix, Vector
 
 from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_channels
+from ._clocks import pitch_roll
 from ._column_shapes import shortened
-from ._column_titles import COUNTS_ROWS, Title, read_title
+from ._column_titles import COUNTS_ROWS, Title, is_german, plain, read_title
 from ._layout import Column, Quaternion, Term
 from ._table_format import SniffResult
-from ._tilt import pitch_roll
-from ._title_words import is_german, plain
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,7 @@ from ._doubts import (
     sign_doubt,
 )
 from ._draft import Draft, say
-from ._guess_inputs import drop_or_turn_quaternion, one_axis, stand_ins
-from ._guess_names import by_names
+from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, stand_ins
 from ._guess_shapes import by_shapes
 from ._guess_units import Unit, nominal_step, units
 from ._layout import Column, Layout, Source, Term

@@ -22,6 +22,10 @@ from .formats._encodings import ENCODINGS
 
 Column = str | int
 DUPLICATES = ("first", "last")
+#: Keys of [file], attributes of a layout by the same names, in the order in which they are written.
+FILE_KEYS = ("variable", "sheet", "encoding", "skip", "unit_row", "header", "delimiter", "decimal", "rows")
+_TIME_KEYS = {"column", "terms", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column",
+              "merge"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,26 +164,8 @@ def _layout(table: dict[str, Any], robot: Robot) -> Layout:
     _known_keys(table, {"file", "time", "channels", "tilt", "quaternion"}, "the layout")
     file, time = table.get("file", {}), table.get("time", {})
     tilt = table.get("tilt", {})
-    _known_keys(
-        file,
-        {"header", "delimiter", "decimal", "skip", "unit_row", "rows", "variable", "sheet", "encoding"},
-        "[file]",
-    )
-    _known_keys(
-        time,
-        {
-            "column",
-            "terms",
-            "unit",
-            "factor",
-            "sample_time_s",
-            "new_run_at_restart",
-            "duplicates",
-            "run_column",
-            "merge",
-        },
-        "[time]",
-    )
+    _known_keys(file, {*FILE_KEYS}, "[file]")
+    _known_keys(time, _TIME_KEYS, "[time]")
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
     if tilt:
         robot.require_neck("[tilt]")

@@ -10,7 +10,7 @@ from pathlib import Path
 from softneck.core import FileFormatError, SettingsError
 from softneck.core._budget import settings_text
 
-from ._layout import Layout, Source
+from ._layout import FILE_KEYS, Layout, Source
 
 
 def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, open_ends: Sequence[str] = ()) -> str:
@@ -49,23 +49,8 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
 
 def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
     plain = Layout(channels={})
-    lines = [f"variable = {_text(layout.variable)}"] if layout.variable is not None else []
-    if layout.sheet is not None:
-        lines.append(f"sheet = {_text(layout.sheet)}")
-    if layout.encoding != plain.encoding:
-        lines.append(f"encoding = {_text(layout.encoding)}")
-    if layout.skip:
-        lines.append(f"skip = {layout.skip}")
-    if layout.unit_row:
-        lines.append("unit_row = true")
-    if layout.header != plain.header:
-        lines.append("header = false")
-    if layout.delimiter != plain.delimiter:
-        lines.append(f"delimiter = {_text(layout.delimiter)}")
-    if layout.decimal != plain.decimal:
-        lines.append(f"decimal = {_text(layout.decimal)}")
-    if layout.rows is not None:
-        lines.append(f"rows = [{layout.rows[0]}, {layout.rows[1]}]")
+    said = {key: getattr(layout, key) for key in FILE_KEYS if getattr(layout, key) != getattr(plain, key)}
+    lines = [f"{key} = {_text(value)}" for key, value in said.items()]
     return ["[file]", *_comment(why.get("file")), *lines] if lines else []
 
 
@@ -85,10 +70,9 @@ def _time(layout: Layout, why: Mapping[str, str]) -> list[str]:
         lines.append('sample_time_s = "estimate"')
     elif layout.sample_time is not None:
         lines.append(f"sample_time_s = {layout.sample_time!r}")
-    lines += ["new_run_at_restart = true"] if layout.new_run_at_restart else []
-    lines += [f"duplicates = {_text(layout.duplicates)}"] if layout.duplicates is not None else []
-    lines += [f"run_column = {_text(layout.run)}"] if layout.run is not None else []
-    lines += ["merge = true"] if layout.merge else []
+    rest = {"new_run_at_restart": layout.new_run_at_restart, "duplicates": layout.duplicates, "run_column": layout.run,
+            "merge": layout.merge}  # fmt: skip
+    lines += [f"{key} = {_text(value)}" for key, value in rest.items() if value is not None and value is not False]
     return ["[time]", *lines] if lines else []
 
 
@@ -113,10 +97,8 @@ def _sum(source: Source) -> list[str]:
     ]
 
 
-def _text(value: str | int) -> str:
-    """Return a string as TOML writes it, or a whole number."""
-    if isinstance(value, int):
-        return str(value)
+def _text(value: str | int | tuple[int, int]) -> str:
+    """Return a string as TOML writes it, whole numbers, or true and false."""
     # JSON leaves DEL as it is, TOML does not.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 

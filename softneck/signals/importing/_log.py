@@ -13,15 +13,17 @@ from softneck.core import DataError, SettingsError, SoftneckError, Vector, to_si
 from softneck.core._files import as_path
 
 from ..recording._channels import may_miss
-from ..recording._files import integers, numbers
-from ..recording._recording import Recording
+from ..recording._files import integers, numbers, read_table
+from ..recording._recording import Recording, check_rising, median_step, uneven
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
-from ..recording._times import check_rising, median_step, uneven
-from ._clocks import clocked, filled, integrated, merged, time_of
+from ._clocks import clocked, filled, integrated, merged, pitch_roll, time_of, turns
 from ._layout import Column, Layout, Source
 from ._sample_time import estimate_sample_time
-from ._tilt import pitch_roll, turns
-from .formats._read import read_foreign
+from ._table_format import without_remarks
+from .formats._encodings import format_of
+from .formats._mat import mat_arrays, table_of
+from .formats._mcap import mcap_table
+from .formats._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,8 +86,21 @@ def read_log(source: Path, layout: Layout) -> pd.DataFrame:
         FileFormatError: no such file or no table.
         DataError: the layout names a variable or a sheet that is not there.
     """
-    wanted = tuple(str(column) for column in _columns(layout))
-    return read_foreign(source, layout.form, variable=layout.variable, sheet=layout.sheet, wanted=wanted)
+    kind, form = format_of(source), layout.form
+    if layout.variable is not None and kind != "mat":
+        raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
+    if layout.sheet is not None and kind != "sheet":
+        raise DataError(f"{source}: the layout's `sheet` is for a spreadsheet.")
+    if kind == "mat":
+        return table_of(source, mat_arrays(source), layout.variable, tuple(map(str, _columns(layout))))
+    if kind == "mcap":
+        return mcap_table(source)
+    if kind == "sheet":
+        _, cells = sheet_cells(source, layout.sheet)
+        return sheet_table(cells, header=form.header, skip=form.skip, unit_row=form.unit_row)
+    frame = without_remarks(read_table(source, ".parquet" if kind == "parquet" else ".csv", form))
+    frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
+    return frame
 
 
 def _columns(layout: Layout) -> tuple[Column, ...]:

@@ -15,12 +15,10 @@ from softneck.core import DataError, FileFormatError, Vector
 
 from ..recording._files import WHITESPACE, read_table
 from ._layout import Column, Layout
-from .formats._arrays import table_of
 from .formats._dates import is_date, seconds
 from .formats._encodings import encoding_of, format_of
-from .formats._mat import mat_arrays
+from .formats._mat import mat_arrays, table_of
 from .formats._mcap import mcap_table
-from .formats._read import without_remarks
 from .formats._sheets import sheet_cells, sheet_table
 
 if TYPE_CHECKING:
@@ -126,6 +124,14 @@ def _form(source: Path, fewest: int) -> Form:
     if form.header:
         frame.columns = [str(name).strip() for name in frame.columns]
     return frame, form, lines, units
+
+
+def without_remarks(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return a table without the lines that a logger or its operator put between its rows: `# paused`, `% mark 2`."""
+    if not frame.shape[1] or frame.iloc[:, 0].dtype.kind != "O":
+        return frame
+    remark = frame.iloc[:, 0].astype(str).str.lstrip().str.startswith(("#", "%"))
+    return frame.loc[~remark].reset_index(drop=True) if remark.any() else frame
 
 
 def _is_sparse(columns: dict[Column, Vector]) -> bool:

@@ -24,8 +24,7 @@ from softneck.robot import Robot, find_robot
 from softneck.robot._search import robot_file_of
 
 from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
-from ._recording import Recording, concatenate, require_same_robot
-from ._times import median_step
+from ._recording import Recording, concatenate, median_step, require_same_robot
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,11 +17,72 @@ from softneck.core._shown import Shown, sparkline
 from softneck.robot import Robot, find_robot
 
 from ._channels import NECK, known_channels, may_miss
-from ._times import check_times
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
+
+# A logger's jitter; above it the samples are not equidistant and a discrete-time fit would be wrong.
+MAX_JITTER = 0.02
+# [s]; rounding of printed times is no jitter.
+_ROUNDING = 1e-9
+
+
+def uneven(time: Vector, sample_time: float, run: np.ndarray, *, tolerance: float = MAX_JITTER) -> np.ndarray:
+    """Return (time - 1,) which steps inside a run are off `sample_time` [s] by more than `tolerance` of it."""
+    off = np.abs(np.diff(time) - sample_time) > max(tolerance * sample_time, _ROUNDING)
+    return off & (np.diff(run) == 0)
+
+
+def check_times(time: Vector, sample_time: float, run: np.ndarray, *, tolerance: float = MAX_JITTER) -> None:
+    """Raise DataError where `time` (time,) runs backwards or jumps inside a run.
+
+    Args:
+        time: [s].
+        sample_time: [s].
+        run: (time,) numbers of the runs.
+        tolerance: how much of a sample time a step may be off.
+    """
+    check_rising(time, run)
+    step = np.diff(time)
+    jump = uneven(time, sample_time, run, tolerance=tolerance)
+    if jump.any():
+        row = int(np.argmax(jump)) + 1
+        raise DataError(
+            f"`time` jumps by {step[row - 1]:.6g} s at row {row} (t = {time[row]:g} s) where the "
+            f"sample time is {sample_time:.6g} s; fill the gap, split the record there by "
+            "the `run` column, or let `softneck import --guess` do it (it evens jitter out too)."
+        )
+
+
+def check_rising(time: Vector, run: np.ndarray, *, may_stand: bool = False) -> None:
+    """Raise DataError where `time` (time,) is not finite or falls inside a run, or stands still there."""
+    if not np.isfinite(time).all():
+        raise DataError(f"`time` is not finite at row {int(np.argmax(~np.isfinite(time)))}.")
+    step = np.diff(time)
+    back = (np.diff(run) == 0) & ((step < 0) if may_stand else (step <= 0))
+    if back.any():
+        row = int(np.argmax(back)) + 1
+        raise DataError(
+            f"`time` runs backwards or stands still at row {row} ({time[row - 1]:g} to {time[row]:g} s); "
+            "where a new experiment starts there, give it another number in the `run` column."
+        )
+
+
+def median_step(time: Vector, run: np.ndarray) -> float:
+    """Return the sample time [s] of a time column: the mean step of its longest regular part."""
+    if time.size < 2:
+        raise DataError(f"a recording needs at least 2 rows; got {time.size}.")
+    step = np.diff(time)
+    inside = step[np.diff(run) == 0] if run.size else step
+    positive = inside[inside > 0]
+    if positive.size == 0:
+        raise DataError("`time` never increases; it must rise by the sample time from row to row.")
+    typical = float(np.median(positive))
+    near = positive[np.abs(positive - typical) < 0.5 * typical]
+    # The mean removes the rounding of printed times; ten digits are more than any clock has.
+    return float(f"{near.mean():.10g}")
+
 
 # [s] Where neither the caller nor the robot says.
 _SAMPLE_TIME = 0.02
@@ -197,33 +258,6 @@ class Recording(Shown):
             raise DataError(f"{len(self)} rows cannot be split at {fraction:g}: one part would be empty.")
         return concatenate(heads), concatenate(tails)
 
-    def split_runs(self, runs: Sequence[int] | float) -> tuple[Recording, Recording]:
-        """Return whole runs and the others: by their numbers in `run`, or the first part of them.
-
-        Args:
-            runs: numbers of the runs to pick, or a fraction of the runs in (0, 1), rounded, at least one.
-
-        Raises:
-            DataError: no such run, or one of the parts is empty.
-        """
-        parts = self.runs()
-        if isinstance(runs, int | float):
-            if not 0.0 < runs < 1.0:
-                raise DataError(f"the part of the runs must be between 0 and 1, without both; got {runs:g}.")
-            count = max(1, round(runs * len(parts)))
-            picked, rest = parts[:count], parts[count:]
-        else:
-            numbers = {int(part.run[0]) for part in parts}
-            unknown = sorted(set(runs) - numbers)
-            if unknown:
-                listed = ", ".join(map(str, sorted(numbers)))
-                raise DataError(f"there is no run {unknown[0]}; the recording has {listed}.")
-            picked = tuple(part for part in parts if int(part.run[0]) in set(runs))
-            rest = tuple(part for part in parts if int(part.run[0]) not in set(runs))
-        if not picked or not rest:
-            raise DataError(f"{len(parts)} run(s) cannot be split so: one part would be empty; split by time instead.")
-        return concatenate(picked), concatenate(rest)
-
     def folds(self, count: int) -> tuple[tuple[Recording, Recording], ...]:
         """Return `count` pairs (to train on, held out): each row is held out once, borders of runs stay borders.
 
@@ -344,3 +378,25 @@ def require_same_robot(one: Robot, other: Robot, what: str) -> None:
     """Raise DataError where `what` are of two robots whose numbers mean different things; `other` is named first."""
     if one.hash != other.hash:
         raise DataError(f"{what} of two robots cannot be used together: {other.label()} and {one.label()}.")
+
+
+Conditions = dict[str, list[float]]
+
+
+def conditions(recording: Recording) -> Conditions:
+    """Return least and largest payload [kg] and co-contraction [the motors' SI unit], the mean of the set-points.
+
+    A recording without the channel `payload` had none.
+    """
+    payload = recording.channels.get("payload", np.zeros(1))
+    mean = recording.set_points.mean(axis=1)
+    return {"payload_kg": _ends(payload), "cocontraction": _ends(mean)}
+
+
+def joined(parts: Sequence[Conditions]) -> Conditions:
+    """Return the conditions from the least to the largest of all parts."""
+    return {name: _ends(np.concatenate([part[name] for part in parts])) for name in parts[0]} if parts else {}
+
+
+def _ends(values: np.ndarray) -> list[float]:
+    return [float(np.nanmin(values)), float(np.nanmax(values))]

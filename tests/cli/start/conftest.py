@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from softneck.cli.start import _start
-from softneck.cli.start._plan import Asked
+from softneck.cli.start._plan import Asked, Step, Unmet
 from softneck.cli.start._sitting import Sitting
 from softneck.cli.start._start import _doubts
-from softneck.cli.start._step import Step, Unmet
 
 
 def short_plan(asked: Asked) -> Iterator[Step]:

@@ -13,8 +13,7 @@ import pandas as pd
 import pytest
 
 from softneck.cli.start import _plan, _start
-from softneck.cli.start._plan import Asked
-from softneck.cli.start._step import STAGES, Step
+from softneck.cli.start._plan import STAGES, Asked, Step
 from softneck.signals import read_recording
 from softneck.signals.importing._robot_guess import is_of_another_robot
 

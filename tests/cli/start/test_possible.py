@@ -14,8 +14,7 @@ import pytest
 
 import softneck.tuning._tune  # noqa: F401  (before a test replaces what it imports)
 from softneck.cli.start import _plan, _possible, _sitting, _start
-from softneck.cli.start._plan import PI, Asked
-from softneck.cli.start._step import Step, Unmet
+from softneck.cli.start._plan import PI, Asked, Step, Unmet
 from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
 from softneck.tuning import _beforehand

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.cli.start import _preflight, _start
+from softneck.cli.start import _possible, _start
 from softneck.cli.start._sensor import propose_sensor
 from softneck.core import OutputFileError
 from softneck.fmu.compiled import _library
@@ -96,8 +96,8 @@ def test_without_a_compiler_and_without_pytest_it_goes_on_and_says_so(
 def test_kinds_whose_package_is_absent_are_not_searched(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(_preflight, "find_spec", lambda name: None if name == "casadi" else object())
-    assert _preflight.kinds_here("pi,mpc,nmpc") == "pi,mpc"
+    monkeypatch.setattr(_possible, "find_spec", lambda name: None if name == "casadi" else object())
+    assert _possible.kinds_here("pi,mpc,nmpc") == "pi,mpc"
     assert "not searched: nmpc: casadi is not installed" in capsys.readouterr().err
 
 
@@ -105,7 +105,7 @@ def test_a_disk_that_is_nearly_full_is_said_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = type("Usage", (), {"free": 12_000_000})
-    monkeypatch.setattr(_preflight.shutil, "disk_usage", lambda _: usage)
+    monkeypatch.setattr(_possible.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(OutputFileError, match="only 12 MB are free there, a project takes up to 50 MB"):
-        _preflight.require_disk(tmp_path / "a" / "b")
+        _possible.require_disk(tmp_path / "a" / "b")
     assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.cli.start._step import STAGES
+from softneck.cli.start._plan import STAGES
 from softneck.core import load
 from softneck.identification.selection import _auto
 
