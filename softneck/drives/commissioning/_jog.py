@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import cmath
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from softneck.core import CheckFailedError, SettingsError, Vector, require_between, require_whole
+from softneck.core import CheckFailedError, Matrix, SettingsError, Vector, require_between, require_whole
+from softneck.signals import Excitation
 
-from ..running._bus_loop import RunEnd, Session, run_session
-from ..running._pilot import SignalLog, SignalPilot, raised_cosine
+from ..running._bus_loop import RunEnd, Session
+from ..running._pilot import SignalPilot, raised_cosine
+from ._record import record_signal
 
 SAMPLE_TIME = 0.02
 # One way takes this long, the motor then stands for this long; angles are means over the last part of it [s].
@@ -72,13 +73,11 @@ class JogResult:
         """Return the JSON of `softneck drives commission --only jog`."""
 
         def way(angles: tuple[float, ...]) -> dict[str, float | None]:
-            size = math.hypot(*angles)
-            table: dict[str, float | None] = {
-                f"{name}_deg": math.degrees(angle) for name, angle in zip(self.outputs, angles, strict=True)
-            }
+            size, named = math.hypot(*angles), zip(self.outputs, angles, strict=True)
             plane = len(angles) == 2 and size > 0.0
             direction = math.degrees(math.atan2(angles[1], angles[0])) % 360.0 if plane else None
-            return {**table, "tilt_deg": math.degrees(size), "direction_deg": direction}
+            values = {f"{name}_deg": math.degrees(angle) for name, angle in named}
+            return {**values, "tilt_deg": math.degrees(size), "direction_deg": direction}
 
         return {
             "motor": self.motor,
@@ -132,36 +131,26 @@ def jog(
         raise SettingsError(f"--travel {amplitude:g} moves at up to {fastest:.2g} rad/s; the {whose} allows {speed:g}.")
     lowest = max(-amplitude, low)
     path, stands = _path(amplitude, lowest)
-    log = SignalLog(len(path), session=session)
-
-    def tell(*cycle: Any) -> None:
-        master = cycle[4]
-        if report is not None and master.ran and master.index % 25 == 0:
-            report(master.index / len(path))
-
-    played: dict[str, Any] = {"motor": motor, "amplitude": amplitude}
-    if not robot.is_neck:
-        played |= {"lowest": lowest, "motors": motors}
-    facts = {**session.facts, "jog": played}
-    session = replace(session, watches=(log, tell, *session.watches), facts=facts)
-    ended = run_session(session, jog_pilot(**played), sample_time=SAMPLE_TIME, most=len(path) * SAMPLE_TIME)
+    played = {"motor": motor, "amplitude": amplitude, "lowest": lowest, "motors": motors}
+    time, rows = np.arange(len(path)) * SAMPLE_TIME, _rows(path, motor, motors)
+    session = replace(session, facts={**session.facts, "jog": played})
+    run = record_signal([Excitation(f"motor {motor}", time, rows, SAMPLE_TIME)], session, report=report)
     ways = _ways(session, tendon_angles)
     way = 0.5 * (amplitude - lowest) * session.file.watch.gain
     expected = tuple(way * part for part in ways[motor - 1]) if ways else (math.nan,) * len(outputs)
-    node = session.file.nodes[motor - 1]
-    if log.rows < len(path):
-        nothing = (math.nan,) * len(outputs)
-        verdict, advice = _stopped(ended, motor)
-        return JogResult(motor, node, amplitude, expected, nothing, math.nan, math.nan, verdict, advice, ended, outputs)
-    columns = log.columns()
-    seen, noise = _seen(columns, outputs, stands)
-    position = columns[f"motor_position_{motor}"]
-    up, down = stands[1], stands[3]
-    turned = float(position[up].mean() - position[down].mean())
+    found = JogResult(
+        motor, session.file.nodes[motor - 1], amplitude, expected, (math.nan,) * len(outputs), math.nan, math.nan,
+        *_stopped(run.ended, motor), run.ended, outputs,
+    )  # fmt: skip
+    if run.recording is None or run.rows < len(path):
+        return found
+    seen, noise = _response(np.column_stack([run.recording.channels[name] for name in outputs]), stands)
+    position = run.recording.channels[f"motor_position_{motor}"]
+    turned = float(position[stands[1]].mean() - position[stands[3]].mean())
     verdict, advice = judge(seen, noise, expected, ways, motor) if ways else ("not judged", "")
     if verdict == "no movement" and turned < 0.5 * (amplitude - lowest):
         advice = f"The motor itself turned by {turned:.2f} of {amplitude - lowest:g} rad: is it blocked? {advice}"
-    return JogResult(motor, node, amplitude, expected, seen, noise, turned, verdict, advice, ended, outputs)
+    return replace(found, seen=seen, noise=noise, turned=turned, verdict=verdict, advice=advice)
 
 
 def _ways(session: Session, tendon_angles: tuple[float, ...] | None) -> list[tuple[float, ...]]:
@@ -173,10 +162,13 @@ def _ways(session: Session, tendon_angles: tuple[float, ...] | None) -> list[tup
 
 def jog_pilot(motor: int, amplitude: float, lowest: float | None = None, motors: int = 3) -> SignalPilot:
     """Return what moves one of the motors up by `amplitude` [rad], and down as far or to `lowest`."""
-    path, _ = _path(amplitude, -amplitude if lowest is None else lowest)
-    set_points = np.zeros((len(path), motors))
-    set_points[:, motor - 1] = path
-    return SignalPilot(set_points)
+    return SignalPilot(_rows(_path(amplitude, -amplitude if lowest is None else lowest)[0], motor, motors))
+
+
+def _rows(path: Vector, motor: int, motors: int) -> Matrix:
+    rows = np.zeros((len(path), motors))
+    rows[:, motor - 1] = path
+    return rows
 
 
 def _stopped(ended: RunEnd, motor: int) -> tuple[str, str]:
@@ -215,31 +207,20 @@ def _path(amplitude: float, lowest: float) -> tuple[Vector, tuple[slice, ...]]:
     return np.concatenate(parts), tuple(stands)
 
 
-def _seen(
-    columns: Mapping[str, Vector], outputs: Sequence[str], stands: tuple[slice, ...]
-) -> tuple[tuple[float, ...], float]:
-    """Return the response of all outputs and its standard error; two at a time, as a complex number."""
-    names = [*outputs, *outputs[:1]] if len(outputs) % 2 else list(outputs)
-    pairs = [_response(columns[a] + 1j * columns[b], stands) for a, b in zip(names[::2], names[1::2], strict=True)]
-    parts = [part for seen, _ in pairs for part in (seen.real, seen.imag)]
-    return tuple(parts[: len(outputs)]), math.hypot(*(noise for _, noise in pairs))
-
-
-def _response(angles: np.ndarray, stands: tuple[slice, ...]) -> tuple[complex, float]:
-    """Return half of the change from the lower end to the upper, and its standard error.
+def _response(angles: Matrix, stands: tuple[slice, ...]) -> tuple[tuple[float, ...], float]:
+    """Return half of the change of all outputs from the lower end to the upper, and its standard error.
 
     Samples of an inclinometer are not independent of each other (the lab's stay off by 0.3 deg for a while): the
     error is the larger of that of independent samples and of what the three stands at rest differ by.
     """
-    means = [complex(np.nanmean(angles[part])) for part in stands]
-    seen = (means[1] - means[3]) / 2.0
-    spread = max(float(np.nanstd(angles[part])) for part in stands)
-    count = min(int(np.isfinite(angles[part]).sum()) for part in stands)
+    parts = [angles[part] for part in stands]
+    means = np.array([np.nanmean(part, axis=0) for part in parts])
+    spread = max(float(np.sqrt(np.nanvar(part, axis=0).sum())) for part in parts)
+    count = min(int(np.isfinite(part).all(axis=1).sum()) for part in parts)
     alone = spread / math.sqrt(max(count, 1)) / math.sqrt(2.0)
     # Rest before, between and after should be one: what is left is drift, hysteresis and slow noise.
-    rest = np.array([means[0], means[2], means[4]])
-    slow = float(np.sqrt(np.mean(np.abs(rest - rest.mean()) ** 2))) / math.sqrt(2.0)
-    return seen, max(alone, slow)
+    slow = float(np.sqrt(np.var(means[::2], axis=0).sum())) / math.sqrt(2.0)
+    return tuple(((means[1] - means[3]) / 2.0).tolist()), max(alone, slow)
 
 
 def judge(
@@ -265,26 +246,21 @@ def judge(
     gaps = {(number, sign): _gap(seen, way, sign) for number, way in enumerate(ways, start=1) for sign in (1, -1)}
     # Where two motors pull the same way, or against each other, this one is meant.
     number, sign = min(gaps, key=lambda key: (round(gaps[key], 6), key[0] != motor))
-    count = {1: "the motor", 2: "both motors"}.get(len(ways), f"all {_COUNTS.get(len(ways), len(ways))} motors")
     direction = ""
     if len(seen) == 2:
-        direction = f": it tilts towards {math.degrees(cmath.phase(complex(*seen))) % 360.0:.0f} deg"
+        direction = f": it tilts towards {math.degrees(math.atan2(seen[1], seen[0])) % 360.0:.0f} deg"
     if (number, sign) == (motor, 1):
         return "ok", ""
     if number == motor:
-        show = "shows" if len(ways) == 1 else "show"
         return "wrong sign", (
-            f"A positive move lets the tendon out{direction}. Change `reversed` of this drive; where {count} "
-            f"{show} this, the inclinometer is mounted turned."
+            f"A positive move lets the tendon out{direction}. Change `reversed` of this drive; where every motor shows "
+            "this, the inclinometer is mounted turned."
         )
     turned = "" if sign > 0 else ", turning the wrong way"
     return "other motor?", (
         f"It moves the neck as motor {number} would{turned}{direction}. Exchange the node numbers in the drives "
-        f"file; where {count} are off by the same angle, the inclinometer is mounted turned."
+        "file; where every motor is off by the same angle, the inclinometer is mounted turned."
     )
-
-
-_COUNTS = {3: "three", 4: "four", 5: "five", 6: "six", 7: "seven", 8: "eight"}
 
 
 def _gap(seen: Sequence[float], way: Sequence[float], sign: int) -> float:
