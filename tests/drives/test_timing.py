@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from softneck.core import SettingsError
 from softneck.drives.logs._result import CycleTimes
 from softneck.drives.running import _timing as timing
-from softneck.drives.running._timing import Ask, Ending, Notifier, steady
+from softneck.drives.running._keyboard import Keyboard
+from softneck.drives.running._timing import Ask, Notifier, steady
 
 from .bench import Bench
 
@@ -132,29 +133,27 @@ def test_a_manager_that_reads_nothing_does_not_hold_up_the_loop(manager: Manager
 
 def test_each_signal_is_one_request_and_the_second_one_is_at_once() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    ending = Ending()
-    with ending.watched():
-        assert ending.ask() is None
+    with Keyboard() as keyboard:
+        assert keyboard() is None
         signal.raise_signal(signal.SIGTERM)
-        assert [ending.ask() for _ in range(3)] == [Ask.LEAVE, None, None]
+        assert [keyboard() for _ in range(3)] == [Ask.LEAVE, None, None]
         signal.raise_signal(signal.SIGTERM)
-        assert [ending.ask() for _ in range(3)] == [Ask.STOP, None, None]
+        assert [keyboard() for _ in range(3)] == [Ask.STOP, None, None]
     assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_two_signals_between_two_steps_stop_at_once() -> None:
-    ending = Ending()
-    with ending.watched():
+    with Keyboard() as keyboard:
         signal.raise_signal(signal.SIGTERM)
         signal.raise_signal(signal.SIGTERM)
-        assert ending.ask() is Ask.STOP
+        assert keyboard() is Ask.STOP
 
 
 def test_the_signal_is_given_back_after_an_error_and_left_alone_in_threads() -> None:
     before = signal.getsignal(signal.SIGTERM)
 
     def fails() -> None:
-        with Ending().watched():
+        with Keyboard():
             raise SettingsError("whatever")
 
     with pytest.raises(SettingsError, match="whatever"):
@@ -163,7 +162,7 @@ def test_the_signal_is_given_back_after_an_error_and_left_alone_in_threads() -> 
     seen: list[object] = []
 
     def inside() -> None:
-        with Ending().watched():
+        with Keyboard():
             seen.append(signal.getsignal(signal.SIGTERM))
 
     thread = threading.Thread(target=inside)

@@ -24,7 +24,7 @@ from softneck.cosim.studies._store import read_description, read_runs
 from softneck.drives.bus._read import load_drives
 from softneck.drives.logs._cycle import Cycle
 from softneck.drives.logs._log_file import read_run_log
-from softneck.drives.logs._run_log import _Entry, _McapSink
+from softneck.drives.logs._run_log import RunLogger, _Entry
 from softneck.drives.master import Frame
 from softneck.drives.supervision._baseline import load_baseline
 from softneck.fmu import build_fmu
@@ -99,13 +99,12 @@ def text(content: str) -> Callable[[Path], Any]:
 
 
 def run_log(path: Path) -> None:
-    with path.open("wb") as stream:
-        sink = _McapSink(stream)
-        sink.describe({"files": {}, "settings": {}})
+    with RunLogger(path.with_suffix(".mcap"), wait=True, epoch=1.0) as log:
+        log.describe({"files": {}, "settings": {}})
         for k in range(20):
             cycle = Cycle(0.01 * k, (Frame(0x181, bytes(8)),), None, (), (), (), "idle", (0.0,), (0.0,), (0.0,))
-            sink.entry(1.0, _Entry([], cycle, {"pitch": 0.1 * k}, (), 0.01 * k))
-        sink.close()
+            log._put(_Entry([], cycle, {"pitch": 0.1 * k}, (), 0.01 * k))
+    log.path.replace(path)
 
 
 def certificate(path: Path) -> None:

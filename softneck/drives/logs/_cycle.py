@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..master import Frame, Master
@@ -54,21 +54,23 @@ class LoggedPilot:
 
     def start(self) -> None:
         """Begin anew."""
-        try:
-            self._pilot.start()
-        except Exception as error:
-            self._answers.append(("start", f"{type(error).__name__}: {error}"))
-            raise
-        self._answers.append(("start", None))
+        self._heard("start", self._pilot.start)
 
     def step(self, measured: Measurement) -> Motors | None:
         """Return what the pilot returns."""
+        return self._heard("step", lambda: self._pilot.step(measured))
+
+    def finished(self, index: int) -> bool:
+        """Return what the pilot returns."""
+        return self._heard("finished", lambda: self._pilot.finished(index))
+
+    def _heard(self, what: str, ask: Callable[[], Any]) -> Any:
         try:
-            answer = self._pilot.step(measured)
+            answer = ask()
         except Exception as error:
-            self._answers.append(("step", f"{type(error).__name__}: {error}"))
+            self._answers.append((what, f"{type(error).__name__}: {error}"))
             raise
-        self._answers.append(("step", answer))
+        self._answers.append((what, answer))
         return answer
 
     @property
@@ -78,16 +80,6 @@ class LoggedPilot:
         if reference:
             self._answers.append(("reference", reference))
         return reference
-
-    def finished(self, index: int) -> bool:
-        """Return what the pilot returns."""
-        try:
-            answer = self._pilot.finished(index)
-        except Exception as error:
-            self._answers.append(("finished", f"{type(error).__name__}: {error}"))
-            raise
-        self._answers.append(("finished", answer))
-        return answer
 
     def take(self) -> tuple[Answer, ...]:
         """Return the answers since the last call."""
@@ -127,7 +119,9 @@ def encode_cycle(cycle: Cycle) -> dict[str, Any]:
     if cycle.taken:
         table["taken"] = [list(pair) for pair in cycle.taken]
     if cycle.answers:
-        table["answers"] = [[what, _answer(value)] for what, value in cycle.answers]
+        table["answers"] = [
+            [what, _numbers(value) if isinstance(value, tuple) else value] for what, value in cycle.answers
+        ]
     return table
 
 
@@ -143,7 +137,10 @@ def decode_cycle(table: dict[str, Any]) -> Cycle:
         tuple(frame_of(text) for text in table["received"]),
         None if tilt is None else _tilt(tilt),
         tuple((str(what), str(why)) for what, why in table.get("taken", ())),
-        tuple((str(what), _read_answer(value)) for what, value in table.get("answers", ())),
+        tuple(
+            (str(what), _motors(value) if isinstance(value, list) else value)
+            for what, value in table.get("answers", ())
+        ),
         tuple(frame_of(text) for text in table["sent"]),
         str(table["phase"]),
         _motors(table["positions"]),
@@ -168,14 +165,6 @@ def frame_of(text: str) -> Frame:
     digits = data.lstrip("RX")
     kind = data[: len(data) - len(digits)]
     return Frame(int(number, 16), bytes.fromhex(digits), "R" in kind, "X" in kind)
-
-
-def _answer(value: Any) -> Any:
-    return _numbers(value) if isinstance(value, tuple) else value
-
-
-def _read_answer(value: Any) -> Any:
-    return _motors(value) if isinstance(value, list) else value
 
 
 def _numbers(values: Sequence[float]) -> list[Any]:

@@ -29,39 +29,29 @@ _FLUSH = 0.25
 _PIECE = 8192
 # Cycles that may wait for the disk before the loop drops them: 200 s at 100 Hz.
 _WAITING = 20_000
+
+
+def _schema(**kinds: Any) -> dict[str, Any]:
+    """Return the JSON schema of a table: name -> type, a list of one for an array, a dict for a table in it."""
+
+    def of(kind: Any) -> dict[str, Any]:
+        if isinstance(kind, dict):
+            return _schema(**kind)
+        return {"type": "array", "items": {"type": kind[0]}} if isinstance(kind, list) else {"type": kind}
+
+    return {"type": "object", "properties": {name: of(kind) for name, kind in kinds.items()}}
+
+
 _SCHEMAS: dict[str, dict[str, Any]] = {
-    "softneck.Cycle": {
-        "type": "object",
-        "properties": {
-            "time": {"type": "number"},
-            "phase": {"type": "string"},
-            "received": {"type": "array", "items": {"type": "string"}},
-            "sent": {"type": "array", "items": {"type": "string"}},
-            "positions": {"type": "array", "items": {"type": "number"}},
-            "setpoints": {"type": "array", "items": {"type": "number"}},
-            "tensions": {"type": "array", "items": {"type": "number"}},
-        },
-    },
+    "softneck.Cycle": _schema(time="number", phase="string", received=["string"], sent=["string"],
+                              positions=["number"], setpoints=["number"], tensions=["number"]),
     # What no cycle holds: frames of the pre-flight, of `zero`, of the end.
-    "softneck.Frame": {
-        "type": "object",
-        "properties": {"time": {"type": "number"}, "sent": {"type": "boolean"}, "frame": {"type": "string"}},
-    },
+    "softneck.Frame": _schema(time="number", sent="boolean", frame="string"),
     "softneck.Signals": {"type": "object", "additionalProperties": {"type": "number"}},
     # A well-known schema: Foxglove shows it in its log panel.
-    "foxglove.Log": {
-        "type": "object",
-        "properties": {
-            "timestamp": {
-                "type": "object",
-                "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-            },
-            "level": {"type": "integer"},
-            "message": {"type": "string"},
-            "name": {"type": "string"},
-        },
-    },
-}
+    "foxglove.Log": _schema(timestamp={"sec": "integer", "nsec": "integer"}, level="integer", message="string",
+                            name="string"),
+}  # fmt: skip
 _TOPICS = {"/cycle": "softneck.Cycle", "/frames": "softneck.Frame", "/signals": "softneck.Signals",
            "/events": "foxglove.Log"}  # fmt: skip
 
@@ -147,7 +137,7 @@ class RunLogger:
             self._stream: BinaryIO = partial(path).open("wb")
         except OSError as error:
             raise OutputFileError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
-        self._sink = _McapSink(self._stream)
+        self._writer, self._channels = self._begun()
         self._thread = threading.Thread(target=self._write, name="softneck-log", daemon=True)
         self._thread.start()
 
@@ -258,7 +248,7 @@ class RunLogger:
                 continue
             try:
                 if entry is None:
-                    self._sink.close()
+                    self._writer.finish()
                     return
                 self._take(entry)
                 if time.monotonic() - flushed >= _FLUSH:
@@ -269,38 +259,28 @@ class RunLogger:
                 if entry is None:
                     return
 
-    def _take(self, entry: _Entry | Mapping[str, Any]) -> None:
-        if isinstance(entry, _Entry):
-            self._sink.entry(self._epoch, entry)
-        else:
-            self._sink.describe(entry)
-
-
-class _McapSink:
-    """Writes MCAP with JSON messages, in small compressed pieces."""
-
-    def __init__(self, stream: BinaryIO) -> None:
+    def _begun(self) -> tuple[Any, dict[str, int]]:
+        """Begin MCAP with JSON messages, in small compressed pieces; return its writer, and topic -> channel."""
         from mcap.writer import Writer
 
-        self._writer = Writer(stream, chunk_size=_PIECE)
-        self._writer.start(profile="", library=f"softneck {__version__}")
+        writer = Writer(self._stream, chunk_size=_PIECE)
+        writer.start(profile="", library=f"softneck {__version__}")
         schemas = {
-            name: self._writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
+            name: writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
             for name, schema in _SCHEMAS.items()
         }
-        self._channels = {
-            topic: self._writer.register_channel(topic, "json", schemas[schema]) for topic, schema in _TOPICS.items()
-        }
+        channels = {topic: writer.register_channel(topic, "json", schemas[name]) for topic, name in _TOPICS.items()}
+        return writer, channels
 
-    def describe(self, facts: Mapping[str, Any]) -> None:
-        self._writer.add_metadata(METADATA, {"version": str(LOG_VERSION), "facts": json.dumps(facts)})
-
-    def entry(self, epoch: float, entry: _Entry) -> None:
+    def _take(self, entry: _Entry | Mapping[str, Any]) -> None:
+        if not isinstance(entry, _Entry):
+            self._writer.add_metadata(METADATA, {"version": str(LOG_VERSION), "facts": json.dumps(entry)})
+            return
         for now, sent, frame in entry.frames:
-            self._add("/frames", _stamp(epoch, now), {"time": now, "sent": sent, "frame": frame_text(frame)})
+            self._add("/frames", self._stamp(now), {"time": now, "sent": sent, "frame": frame_text(frame)})
         if entry.cycle is None:
             return
-        stamp = _stamp(epoch, entry.time)
+        stamp = self._stamp(entry.time)
         self._add("/cycle", stamp, encode_cycle(entry.cycle))
         if entry.signals is not None:
             # A number that is missing is left out: JSON has none for it.
@@ -313,13 +293,9 @@ class _McapSink:
                 "message": str(event), "name": event.name, "node": event.node,
             })  # fmt: skip
 
-    def close(self) -> None:
-        self._writer.finish()
-
     def _add(self, topic: str, stamp: int, table: Mapping[str, Any]) -> None:
         data = json.dumps(table, separators=(",", ":"), allow_nan=False).encode()
         self._writer.add_message(self._channels[topic], stamp, data, stamp)
 
-
-def _stamp(epoch: float, now: float) -> int:
-    return max(0, round((epoch + now) * 1e9))
+    def _stamp(self, now: float) -> int:
+        return max(0, round((self._epoch + now) * 1e9))

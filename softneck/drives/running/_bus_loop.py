@@ -6,6 +6,7 @@ On simulated drives it runs in virtual time, on a bus at the pace of the monoton
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,9 +26,10 @@ from ..master._fieldbus import nmt_frame
 from ..master._master import Pilot
 from ..master._supervisor import ACTIVE
 from ..sensing._sources import Sensor
+from ._keyboard import Keyboard
 from ._preflight import preflight
 from ._stop import disarm, stop
-from ._timing import Ask, Ending, Notifier, Operator, steady
+from ._timing import Ask, Notifier, Operator, steady
 from ._virtual import VirtualRun, Watch
 
 # Before the first cycle on a bus each drive is given this time to become operational [s].
@@ -121,8 +123,8 @@ def run_session(
 ) -> RunEnd:
     """Check the drives, enable them, ramp in, let `pilot` lead, ramp out, switch off.
 
-    On a bus SIGTERM ends it by the ramp to rest, a second one at once. A service manager is told (sd_notify) when the
-    pre-flight holds, in which phase the run is, and from each cycle that the loop is alive.
+    On a bus without an operator a `Keyboard` is one: SIGTERM ends it by the ramp to rest, a second one at once. A
+    service manager is told (sd_notify) when the pre-flight holds, which phase the run is in, and that the loop lives.
 
     Args:
         session: on what.
@@ -137,8 +139,9 @@ def run_session(
     """
     if session.simulated:
         return _run_session(session, pilot, sample_time, most, begin, Notifier({}))
-    with steady(realtime=session.realtime), Notifier() as notifier:
-        return _run_session(session, pilot, sample_time, most, begin, notifier)
+    with steady(realtime=session.realtime), Notifier() as notifier, contextlib.ExitStack() as stack:
+        operator = session.operator or stack.enter_context(Keyboard())
+        return _run_session(replace(session, operator=operator), pilot, sample_time, most, begin, notifier)
 
 
 def _run_session(
@@ -167,7 +170,7 @@ def _run_session(
     link.send([nmt_frame(NmtCommand.START, node) for node in file.nodes])
     if begin is not None:
         begin(master)
-    times, ending = CycleTimes(file.cycle), Ending()
+    times = CycleTimes(file.cycle)
     tensions = [(0.0,) * len(file.nodes)]
 
     def remember(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Any, master: Master) -> None:
@@ -184,13 +187,13 @@ def _run_session(
         time.sleep(_START_TIME)
         link.receive(0.0)
         notifier.ready()
-        with ending.watched():
-            _in_real_time(session, link, master, times, notifier, ending)
+        _in_real_time(session, link, master, times, notifier)
     left = disarm(link, file, checked.guarding, () if master.starved else master.bus.signs_of_life())
     if master.supervisor.fault is None:
         for node, why in left.items():
             _take_back(master, Event(link.now, "not_off", node, why))
-    return RunEnd(master, times, time.perf_counter() - started, ending.asked > 0, tensions[0])
+    terminated = bool(getattr(session.operator, "terminated", False))
+    return RunEnd(master, times, time.perf_counter() - started, terminated, tensions[0])
 
 
 def _take_back(master: Master, event: Event) -> None:
@@ -219,9 +222,7 @@ def _in_virtual_time(
     run.run(most)
 
 
-def _in_real_time(
-    session: Session, link: CanLink, master: Master, times: CycleTimes, notifier: Notifier, ending: Ending
-) -> None:
+def _in_real_time(session: Session, link: CanLink, master: Master, times: CycleTimes, notifier: Notifier) -> None:
     """Step the master at its period until it is done."""
     sensor, operator = session.sensor, session.operator
     if sensor is None:
@@ -243,7 +244,6 @@ def _in_real_time(
                 sensor.take(frames)
             if operator is not None:
                 _ask(master, operator())
-            _ask(master, ending.ask())
             out = master.step(now, frames, tilt)
             link.send(out)
             times.take(now, link.now - now)

@@ -1,4 +1,4 @@
-"""What a process does so that its cycles come in time, and what it does when it is asked to end."""
+"""What a process does so that its cycles come in time, and what it tells a service manager (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import ctypes
 import gc
 import os
-import signal
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -94,37 +93,6 @@ def _in_line_again() -> None:
         with contextlib.suppress(OSError):
             os.sched_setscheduler(thread, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
     ctypes.CDLL(None).munlockall()
-
-
-class Ending:
-    """Marks that SIGTERM came, for the loop to look at between two steps: to rest, and at once if it comes again."""
-
-    def __init__(self) -> None:
-        """Begin without."""
-        self.asked = self._done = 0
-
-    def ask(self) -> Ask | None:
-        """Return what is to be done now, once for each signal."""
-        if self._done == self.asked:
-            return None
-        self._done = self.asked
-        return Ask.LEAVE if self.asked == 1 else Ask.STOP
-
-    @contextlib.contextmanager
-    def watched(self) -> Iterator[None]:
-        """Take SIGTERM instead of ending at once; a signal reaches the main thread only."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def mark(*_: object) -> None:
-            self.asked += 1
-
-        before = signal.signal(signal.SIGTERM, mark)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGTERM, before)
 
 
 # A sign of life for each quarter of the manager's time-out: two may be lost.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from ..master import Frame, Master
 from ..master._gate import Reading
 from ..simulated import SimulatedNeck, SimulatedSettings
 from ..simulated._drives import SimulatedDrives
-from ..simulated._habits import WireHabits
 from ..simulated._springs import SimulatedSprings, SpringSettings
 
 # A run is over at the latest this long after its loop, whatever happens [s].
@@ -29,23 +29,23 @@ Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Reading | None, Maste
 _LITTLE = 1e-5
 
 
-def simulated_neck(
-    file: DrivesFile, parameters: NeckParameters, *, sample_time: float, homed: bool = True, seed: int = 0,
-    habits: WireHabits | None = None,
-) -> SimulatedNeck:  # fmt: skip
+def simulated_neck(file: DrivesFile, parameters: NeckParameters, **how: Any) -> SimulatedNeck:
     """Return the virtual neck, or a robot built like it, with drives that are set up as `file` says the real ones are.
+
+    Args:
+        file: of the drives, and what they move.
+        parameters: physics.
+        how: `sample_time`, `homed`, `seed`, `habits`: see `SimulatedSettings`.
 
     Raises:
         SettingsError: a robot without tendons, or that the neck's physics does not fit.
     """
     # The neck's tendons stand where its own file says.
     robot = None if file.moves.is_neck else file.moves
-    return SimulatedNeck(parameters, _settings(file, sample_time, homed, seed, habits), robot)
+    return SimulatedNeck(parameters, _settings(file, **how), robot)
 
 
-def simulated_springs(
-    file: DrivesFile, *, sample_time: float, homed: bool = True, seed: int = 0, habits: WireHabits | None = None
-) -> SimulatedSprings:  # fmt: skip
+def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
     """Return drives on what stands for a robot without virtual plant: springs, and outputs by its directions.
 
     Gain and lag of the outputs are those that the drives file watches for, motors and winches its own.
@@ -72,24 +72,19 @@ def simulated_springs(
         pretension_current=file.zero.current,
         noise_std=(robot.noise_std or 0.0) * to_si(robot.outputs.unit)[0] or _LITTLE,
     )
-    return SimulatedSprings(springs, _settings(file, sample_time, homed, seed, habits))
+    return SimulatedSprings(springs, _settings(file, **how))
 
 
-def simulated_plant(
-    file: DrivesFile, neck: NeckParameters | None, *, sample_time: float, homed: bool = True, seed: int = 0,
-    habits: WireHabits | None = None,
-) -> SimulatedDrives:  # fmt: skip
+def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -> SimulatedDrives:
     """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
 
     Args:
         file: of the drives, and what they move.
         neck: physics of the virtual plant; None: those that the robot names.
-        sample_time, homed, seed, habits: see `SimulatedSettings`.
+        how: see `simulated_neck`.
     """
     physics = physics_of(file.moves, neck)
-    if physics is None:
-        return simulated_springs(file, sample_time=sample_time, homed=homed, seed=seed, habits=habits)
-    return simulated_neck(file, physics, sample_time=sample_time, homed=homed, seed=seed, habits=habits)
+    return simulated_springs(file, **how) if physics is None else simulated_neck(file, physics, **how)
 
 
 def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParameters | None:
@@ -112,9 +107,7 @@ def stand_in(file: DrivesFile, neck: NeckParameters | None) -> str:
     )
 
 
-def _settings(
-    file: DrivesFile, sample_time: float, homed: bool, seed: int, habits: WireHabits | None
-) -> SimulatedSettings:
+def _settings(file: DrivesFile, *, sample_time: float, **how: Any) -> SimulatedSettings:
     scales = [entry.scale for entry in file.drives]
     return SimulatedSettings(
         nodes=file.nodes,
@@ -127,9 +120,7 @@ def _settings(
         sample_time=sample_time,
         cycle=file.cycle,
         hold=sample_time,
-        homed=homed,
-        seed=seed,
-        habits=habits or WireHabits(),
+        **{name: value for name, value in how.items() if value is not None},
     )
 
 
