@@ -57,7 +57,7 @@ def test_files_carry_the_robot_s_names_and_units(tmp_path: Path) -> None:
     write_recording(path, recorded(ROBOTS["bellows"]))
     robot, titles = path.read_text().splitlines()[:2]
     assert robot.startswith('# robot {"name": "bellows"')
-    assert titles.startswith("time [s],motor_setpoint_1 [bar],")
+    assert titles.startswith("time [s],chamber_0_setpoint [bar],")
     assert titles.endswith("x [mm],y [mm],z [mm],twist [mm]")
     assert read_recording(path).outputs.mean() == pytest.approx(recorded(ROBOTS["bellows"]).outputs.mean(), nan_ok=True)
 

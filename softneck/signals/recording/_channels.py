@@ -72,9 +72,20 @@ def si_unit(channel: str, robot: Robot = NECK) -> str:
     return to_si(_table(robot)[channel])[1]
 
 
+@cache
+def own_names(robot: Robot) -> dict[str, str]:
+    """Return channel -> name in files of the motors' channels, such as `pressure_setpoint`; none for `motor_1`."""
+    names = {}
+    for j, name in enumerate(robot.motors.names, start=1):
+        if name != f"motor_{j}":
+            stem = name.removesuffix("_setpoint")
+            names |= {f"motor_{what}_{j}": f"{stem}_{what}" for what in ("setpoint", "position", "velocity")}
+    return {channel: name for channel, name in names.items() if name not in _table(robot)}
+
+
 def column_name(channel: str, robot: Robot = NECK) -> str:
-    """Return the column title of `channel`, such as `pitch [deg]`."""
-    return f"{channel} [{_table(robot)[channel]}]"
+    """Return the column title of `channel`, such as `pitch [deg]`; motors have their own names."""
+    return f"{own_names(robot).get(channel, channel)} [{_table(robot)[channel]}]"
 
 
 def may_miss(channel: str, robot: Robot = NECK) -> bool:
@@ -89,7 +100,7 @@ def is_held(channel: str) -> bool:
 
 
 def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
-    """Return (channel, factor to SI) of a column title such as `pitch [deg]`.
+    """Return (channel, factor to SI) of a column title such as `pitch [deg]`; motors by number or by name.
 
     Raises:
         DataError: no such channel, no unit, or a unit of another quantity.
@@ -101,6 +112,7 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
         hint = f"write `{column_name(name, robot)}`" if name in table else "use `softneck import` with a layout"
         raise DataError(f"column `{name}` names no unit; {hint}.")
     name, unit = match["name"], match["unit"].strip()
+    name = {own: channel for channel, own in own_names(robot).items()}.get(name, name)
     if name not in table:
         whose = "" if robot.is_neck else f" of robot {robot.label()}"
         raise DataError(
