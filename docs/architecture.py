@@ -120,8 +120,7 @@ def table(graph: Graph) -> str:
     lines = ["| subpackage | what is inside |", "|---|---|"]
     for room in sorted(graph, key=lambda name: (-level[name], name)):
         inside = docstring(room)[0]
-        inner = ", ".join(f"`{name}`" for name in inner_rooms(room))
-        lines.append(f"| `{room}` | {inside}{f' Parts: {inner}.' if inner else ''} |")
+        lines.append(f"| `{room}` | {inside} |")
     return "\n".join(lines) + "\n"
 
 

@@ -13,11 +13,14 @@ from types import ModuleType
 
 import pytest
 
+from softneck.cli._main import group
+
 from ..data import ROOT
 
 PAGE = ROOT / "docs" / "architecture.md"
 Graph = dict[str, frozenset[str]]
 TEXT = PAGE.read_text(encoding="utf-8")
+_PLACES = ("Where things are", "The path of a sample", "Where to add what")
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +72,22 @@ def test_every_arrow_points_down_and_no_box_is_cut(drawing: ModuleType, graph: G
 def test_every_room_of_the_source_tree_is_in_the_table() -> None:
     rooms = {path.parent.name for path in (ROOT / "softneck").glob("*/__init__.py")}
     assert set(re.findall(r"^\| `(\w+)` \|", TEXT, re.MULTILINE)) == rooms
+
+
+def test_every_function_and_subpackage_in_the_tables_of_places_is_there() -> None:
+    sections = "".join(TEXT.partition(f"\n## {head}\n")[2].partition("\n## ")[0] for head in _PLACES)
+    sources = sorted((ROOT / "softneck").rglob("*.py"))
+    text = "\n".join(path.read_text(encoding="utf-8") for path in sources)
+    known = set(re.findall(r"^ *(?:def|class) (\w+)|^([A-Z]\w+)\b.*=", text, re.MULTILINE))
+    known = (
+        {name for pair in known for name in pair}
+        | {name for path in sources for name in (path.stem, path.parent.name)}
+        | {"auto", "case"}
+    )
+    named = re.findall(r"`([A-Za-z_][\w.]*)`", sections)
+    assert len(named) > 50
+    inner = {name for item in named if not item.endswith((".toml", ".md")) for name in item.split(".")}
+    assert inner - known - {"softneck", *group.commands} == set()
 
 
 @pytest.mark.parametrize(
