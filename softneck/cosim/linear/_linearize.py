@@ -4,7 +4,9 @@
     y(k)   = C x(k) + D u(k)
 
 of small changes, at the sample time. Of files and FMUs of ours whose step has derivatives they are exact; of all others
-they come from pulses on saved states.
+they come from pulses on a saved state (Ho and Kalman 1966; Juang and Pappa 1985): each input is held off its value for
+one sample, up and down; half the difference of the outputs is the answer to a pulse, h(k). The least order whose system
+answers all pulses alike is taken: A, B, C from the singular vectors of the matrix of h(i + j + 1), D = h(0).
 """
 
 from __future__ import annotations
@@ -12,20 +14,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, require_between
 from softneck.fmu.describe._describe import Buildable, buildable
 from softneck.identification.models._linearisation import moved_through
+from softneck.loop import BlockPart
 from softneck.runtime import Block, Port, State
 from softneck.runtime._compile import load_tangent
 from softneck.runtime._tangent_activity import TangentError
 
 from ..parts._fmu_part import FmuPart
 from ..parts._ours import block_of
-from ._pulses import BlockSteps, FmuSteps, realised
 
 if TYPE_CHECKING:
     import control
@@ -37,6 +39,14 @@ _POOR = 1e-3
 # Of a sample time: where `at` is meant to be one.
 _ON_GRID = 1e-6
 _MOST_SAMPLES = 10_000_000
+# Samples that an answer is followed for: two of ours' seconds and a half.
+SAMPLES = 128
+# A pulse, of the size of an input's moves: its square is what curvature leaves in the difference, 1e-8.
+_PULSE = 1e-4
+# What answers may differ by, of the largest: curvature, and rounding of the difference, with room.
+_ALIKE = 1e-6
+_ROUNDING = 1e3 * float(np.finfo(float).eps)
+_MOST_STATES = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,9 +148,7 @@ def linearize(
         ours = block is not None and sample_time in (None, block.sample_time)
         if block is not None and ours and _agrees(part, block, at, given):
             return _of_block(block, at, given)
-        ports, parameters = _split(part.inputs, part.parameters, given, str(source))
-        steps = FmuSteps(part, parameters, ports)
-        return _by_pulses(steps, part.inputs, part.outputs, ports, at, Path(source).stem)
+        return _by_pulses(part, part.parameters, at, given, Path(source).stem)
 
 
 def _opened(source: str | Path | Block | Buildable) -> Block:
@@ -162,11 +170,11 @@ def _says_role(path: str | Path) -> bool:
 
 def _of_block(block: Block, at: float, given: Mapping[str, float]) -> LinearPoint:
     held, parameters = _split(block.inputs, block.parameters, given, block.kind)
-    state = _reached_state(block, block.initial_state(**parameters), held, at)
     try:
         tangent = load_tangent(block.runtime, compiled=False)  # for once: numba would take its time
     except TangentError:
-        return _by_pulses(BlockSteps(block, state), block.inputs, block.outputs, held, at, block.kind, ready=True)
+        return _by_pulses(BlockPart(block), block.parameters, at, given, block.kind)
+    state = _reached_state(block, block.initial_state(**parameters), held, at)
     moved, shown = _moved(block.inputs, held), _shown(block.outputs)
     n, m = state.values.size, len(moved)
     X, U = np.zeros((n, n + m)), np.zeros((held.size, n + m))
@@ -195,16 +203,19 @@ def _of_block(block: Block, at: float, given: Mapping[str, float]) -> LinearPoin
 
 
 def _by_pulses(
-    steps: BlockSteps | FmuSteps, inputs: tuple[Port, ...], outputs: tuple[Port, ...], held: Vector, at: float,
-    name: str, *, ready: bool = False,
-) -> LinearPoint:  # fmt: skip
-    for _ in range(0 if ready else _samples(at, steps.sample_time, name)):
-        steps.step(held)
-    moved, shown = _moved(inputs, held), _shown(outputs)
-    A, B, C, D, error = realised(steps, held, moved, [_size(inputs[i]) for i in moved], shown, name)
-    return LinearPoint(
-        A, B, C, D, steps.sample_time, at, _names(inputs, moved), _names(outputs, shown), name, "pulses", error
-    )
+    part: FmuPart | BlockPart, parameters: tuple[Port, ...], at: float, given: Mapping[str, float], name: str
+) -> LinearPoint:
+    held, chosen = _split(part.inputs, parameters, given, name)
+    part.start(0.0, chosen)
+    part.get_state()  # one that cannot says so before it has run for long
+    count, Ts = _samples(at, part.sample_time, name), part.sample_time
+    for k in range(count):
+        part.advance(k * Ts, held)
+    moved, shown = _moved(part.inputs, held), _shown(part.outputs)
+    sizes = [_size(part.inputs[i]) for i in moved]
+    A, B, C, D, error = realised(part, count, held, moved, sizes, shown, name)
+    inputs, outputs = _names(part.inputs, moved), _names(part.outputs, shown)
+    return LinearPoint(A, B, C, D, Ts, at, inputs, outputs, name, "pulses", error)
 
 
 def _split(
@@ -275,3 +286,76 @@ def _size(port: Port) -> float:
     if port.minimum is not None and port.maximum is not None and 0.0 < port.maximum - port.minimum < 1e6:
         return 0.5 * (port.maximum - port.minimum)
     return 1.0
+
+
+def realised(
+    part: Any, first: int, held: Vector, moved: list[int], sizes: list[float], shown: list[int], name: str
+) -> tuple[Matrix, Matrix, Matrix, Matrix, float]:
+    """Return A, B, C, D of least order that answer pulses as `part` does from where it is, and what they miss.
+
+    Args:
+        part: what is stepped; the outputs of plants and references come one sample later than the inputs.
+        first: samples that it has taken.
+        held: (inputs,) the inputs off which pulses go.
+        moved, sizes: the inputs that are moved, and how large their moves are.
+        shown: the outputs that are looked at.
+        name: for messages.
+
+    Raises:
+        SettingsError: nothing to move or look at, or no input moves an output.
+    """
+    if not moved or not shown:
+        raise SettingsError(f"{name}: has no {'output' if moved else 'input'} that is a number, so no linear system.")
+    h, noise = _answers(part, first, held, moved, sizes, shown)
+    scale = float(np.abs(h).max())
+    if not np.isfinite(scale):
+        raise SettingsError(f"{name}: its outputs are not finite there, or after a pulse.")
+    if scale <= noise:
+        raise SettingsError(f"{name}: no input moves an output within {SAMPLES} samples from there.")
+    half, outputs, inputs = (SAMPLES - 1) // 2, len(shown), len(moved)
+    H = np.block([[h[i + j + 1] for j in range(half)] for i in range(half)])
+    shifted = np.block([[h[i + j + 2] for j in range(half)] for i in range(half)])
+    left, s, right = np.linalg.svd(H, full_matrices=False)
+    best: Any = None
+    for order in range(min(_MOST_STATES, int(np.sum(s > noise))) + 1):
+        root = np.sqrt(s[:order])
+        A = (left[:, :order] / root).T @ shifted @ (right[:order].T / root)
+        B, C = root[:, None] * right[:order, :inputs], left[:outputs, :order] * root
+        missed = float(np.abs(_markov(A, B, C, h[0]) - h).max()) / scale
+        if best is None or missed < best[-1]:
+            best = (A, B, C, h[0], missed)
+        if missed <= max(_ALIKE, noise / scale):
+            break
+    return best
+
+
+def _answers(
+    part: Any, first: int, held: Vector, moved: list[int], sizes: list[float], shown: list[int]
+) -> tuple[np.ndarray, float]:
+    """Return answers (SAMPLES, outputs, inputs) for pulses of 1, and what rounding leaves in them."""
+    late = part.role in ("plant", "reference")
+    h = np.zeros((SAMPLES, len(shown), len(moved)))
+    noise, state = 0.0, part.get_state()
+    for column, (i, size) in enumerate(zip(moved, sizes, strict=True)):
+        off = _PULSE * size
+        sides = []
+        for sign in (1.0, -1.0):
+            part.set_state(state)
+            u = held.copy()
+            u[i] += sign * off
+            seen = []
+            for k in range(SAMPLES - late):
+                seen.append(np.array(part.advance((first + k) * part.sample_time, u))[shown])
+                u = held
+            sides.append(np.array(seen))
+        h[int(late) :, :, column] = (sides[0] - sides[1]) / (2.0 * off)
+        noise = max(noise, _ROUNDING * float(np.abs(sides[0]).max()) / off)
+    return h, noise
+
+
+def _markov(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> np.ndarray:
+    answers, x = [D], B
+    for _ in range(SAMPLES - 1):
+        answers.append(C @ x)
+        x = A @ x
+    return np.array(answers)

@@ -131,28 +131,6 @@ class FmuPart:
         except CallError as error:
             raise self._refused(f"in the step from t = {time:g} s", error) from error
 
-    def outputs_at(self, inputs: Vector) -> Vector:
-        """Set `inputs` (n_in,) and return the outputs (n_out,) that the FMU has with them, without a step."""
-        self._do("inputs", self._inputs.write, inputs)
-        return self._do("outputs", self._outputs.read)
-
-    def keep(self) -> None:
-        """Keep the whole state inside the FMU, in the place of one kept before; `go_back` returns to it.
-
-        Raises:
-            SettingsError: the FMU cannot save its state.
-        """
-        experiment: Any = self._description.model.coSimulation
-        if not experiment.canGetAndSetFMUstate or self._native is None:
-            raise SettingsError(f"{self.path}: cannot save its state; its canGetAndSetFMUstate is false.")
-        self._do("its state", self._native.keep)
-
-    def go_back(self) -> None:
-        """Return to the state that was kept."""
-        if self._native is None:
-            raise FmuError(f"{self.path}: is not running; call `start` first.")
-        self._do("its state", self._native.go_back)
-
     def close(self) -> None:
         """Terminate the FMU, free it and remove what was unpacked."""
         native, self._native = self._native, None

@@ -53,7 +53,6 @@ class Native:
         from fmpy.fmi3 import FMU3Slave
 
         self.version = description.version
-        self._kept: Any = None
         common = {
             "guid": description.model.guid,
             "unzipDirectory": str(folder),
@@ -137,7 +136,6 @@ class Native:
             return
         if not broken:
             try:
-                self.forget()
                 self.fmu.terminate()
             except Exception as error:  # a failing end is no reason to lose the run
                 broken = getattr(error, "status", 0) >= FATAL
@@ -160,21 +158,6 @@ class Native:
             self._named("set")(state)
         finally:
             self._named("free")(state)
-
-    def keep(self) -> None:
-        """Keep a state inside the FMU, in the place of one kept before."""
-        self.forget()
-        self._kept = self._named("get")()
-
-    def go_back(self) -> None:
-        """Return to the state that was kept."""
-        self._named("set")(self._kept)
-
-    def forget(self) -> None:
-        """Free the state that was kept."""
-        if self._kept is not None:
-            self._named("free")(self._kept)
-            self._kept = None
 
     def _named(self, verb: str) -> Callable[..., Any]:
         # fmpy spells it `...FMUstate` for FMI 2.0 and `...FMUState` for FMI 3.0.
