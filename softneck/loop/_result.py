@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
-from softneck.core._shown import Shown, sparkline
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 
@@ -39,10 +39,6 @@ class LoopResult(Shown):
         """Return a line on what ran."""
         length, step = len(self.time) * self.sample_time, 1e3 * self.sample_time
         return f"{length:g} s in steps of {step:g} ms, {len(self.signals)} signals of {self.robot.name}"
-
-    def _picture(self) -> str:
-        axes = [axis for axis in self.robot.outputs.names if axis in self.signals or f"{axis}_measured" in self.signals]
-        return sparkline([self.angle(axis) for axis in axes])
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,); raise DataError with the known names if there is none."""

@@ -53,7 +53,7 @@ class Section(Shown):
         charts: interactive ones.
         findings: severity (ok, note, warning) and a sentence of each; a numbered list.
         method: paragraphs at the end: how the numbers are defined and made.
-        cards: what leads elsewhere: title, link, a small picture as SVG and a line of text.
+        cards: what leads elsewhere: title, link and a line of text.
     """
 
     title: str
@@ -63,7 +63,7 @@ class Section(Shown):
     charts: Sequence[Chart] = ()
     findings: Sequence[tuple[str, str]] = ()
     method: Sequence[str] = ()
-    cards: Sequence[tuple[str, str, str, str]] = ()
+    cards: Sequence[tuple[str, str, str]] = ()
 
 
 def page(
@@ -102,7 +102,7 @@ def _part(number: int, section: Section, charts: Iterator[Chart], drawn: dict[st
         drawn[name], height = draw(chart)
         shown.append({"id": name, "title": chart.title, "caption": chart.caption, "height": height})
     figures = [{"caption": caption, "data": figure_png(figure)} for caption, figure in section.figures]
-    cards = [{"title": a, "link": b, "picture": Markup(c), "text": d} for a, b, c, d in section.cards]
+    cards = [{"title": a, "link": b, "text": c} for a, b, c in section.cards]
     taken = {name: getattr(section, name) for name in ("title", "text", "tables", "findings", "method")}
     return {**taken, "charts": shown, "figures": figures, "cards": cards}
 

@@ -11,7 +11,6 @@ from typing import Any
 
 from softneck.core import Progress, SoftneckError, file_hash, silent
 from softneck.core._certificate import required_rows
-from softneck.core._shown import Shown
 from softneck.cosim import Result
 from softneck.identification import INFINITE
 from softneck.identification.validation._validation import Rules, judge, judged_parts
@@ -80,7 +79,7 @@ def _shortly(doubts: Sequence[str]) -> str:
     return f"{doubts[0].partition(' sure): ')[0]} sure){more}"
 
 
-def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, str, str]]:
+def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, str]]:
     """Return a card for each thing of the project: a small picture, a line, and the way to its section."""
     groups = {
         "Loops": project.loops, "Data": {name: recording for name, (recording, _) in project.recordings.items()},
@@ -92,14 +91,7 @@ def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, 
         for name, thing in list(things.items())[:_MOST_CARDS]:
             lines = _lines(thing)
             said = lines[1] if title == "Loops" and len(lines) > 1 else lines[0]
-            cards.append(
-                (
-                    name,
-                    places[title],
-                    thing._picture() if isinstance(thing, Shown) else "",
-                    shorten(said, 90, placeholder=" ..."),
-                )
-            )
+            cards.append((name, places[title], shorten(said, 90, placeholder=" ...")))
     return cards
 
 

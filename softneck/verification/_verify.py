@@ -15,7 +15,7 @@ from softneck.core import DataError, Progress, SettingsError, to_si
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._certificate import certificate_contents
 from softneck.core._progress import shown_progress
-from softneck.core._shown import Shown, marks
+from softneck.core._shown import Shown
 from softneck.design.linear._own import own_controller
 from softneck.estimation._axis import robot_of
 from softneck.estimation._forms import Reach
@@ -153,9 +153,6 @@ class Verification(Shown):
             f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} loops over the virtual neck, "
             f"{self.order_words()}; {self.wall_time:.1f} s"
         )
-
-    def _picture(self) -> str:
-        return marks([verdict.holds for verdict in self.verdicts])
 
     def contents(self, loops: Mapping[int, Path] | None = None) -> dict[str, Any]:
         """Return the certificate's JSON values; `loops`: number of a verdict -> the loop file of its worst plant."""

@@ -56,9 +56,6 @@ class Result(Shown):
         said = f"fails {', '.join(failed)}" if failed else f"keeps {len(rows)} limits" if rows else "no limits stated"
         return f"{self.signals.summary()}\n{said}" + "".join(f"\n{remark}" for remark in self.remarks)
 
-    def _picture(self) -> str:
-        return self.signals._picture()
-
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,) in SI."""
         return self.signals[name]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
-from softneck.core._shown import Shown, sparkline
+from softneck.core._shown import Shown
 from softneck.design.linear._own import own_attributes, own_controller
 from softneck.loop import Loop, LoopRun
 from softneck.loop._result import metric_names, shown_unit
@@ -27,8 +27,6 @@ from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "sampling", "objectives", "parquet", "dask", "vary")
-# Runs in the picture of a study.
-_MOST_SHOWN = 200
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
 
 
@@ -74,15 +72,6 @@ class Study(Shown):
             raise SettingsError(f"`parquet` must be true or false; got {self.parquet!r}.")
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
-
-    def _picture(self) -> str:
-        # What the first number that varies is in each run.
-        runs = [self.points[run].values for run in range(min(len(self.points), _MOST_SHOWN))]
-        for key in self.vary:
-            values = [values[key] for values in runs]
-            if all(isinstance(value, int | float) for value in values):
-                return sparkline([values])
-        return ""
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:

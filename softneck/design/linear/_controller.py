@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, Vector, atomic_write, write_archive
-from softneck.core._shown import Shown, sparkline
+from softneck.core._shown import Shown
 from softneck.identification.models._linear_systems import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import Block, State
@@ -27,9 +27,6 @@ if TYPE_CHECKING:
 
 
 _RUNTIME = "softneck.design.linear._linear_controller_runtime"
-
-# Samples of the picture.
-_SHOWN = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -130,17 +127,6 @@ class LinearController(Shown):
                 if key in item and (title == "as identified" or self.robot.is_neck):
                     lines.append(f"    {title}: {_margins(item[key])}")
         return "\n".join(lines)
-
-    def _picture(self) -> str:
-        # What it asks for after a step of each reference, no motion following.
-        p, axes = LinearArrays(self.arrays), range(len(self.robot.outputs.names))
-        curves = np.empty((len(axes), _SHOWN))
-        for axis in axes:
-            x = np.zeros(len(p.A))
-            for k in range(_SHOWN):
-                curves[axis, k] = p.C[axis] @ x + p.Dr[axis, axis]
-                x = p.A @ x + p.Br[:, axis]
-        return sparkline(curves)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller to one `.npz` file."""

@@ -25,7 +25,7 @@ from softneck.core import (
 )
 from softneck.core import load as load_file
 from softneck.core._checks import finite_matrix, finite_vector
-from softneck.core._shown import Shown, bars, percent
+from softneck.core._shown import Shown, percent
 from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Recording
@@ -323,11 +323,6 @@ class Model(Shown):
         lines.append(f"trained on {self.training_rows.size} rows")
         lines += _held_out_lines(self.findings.get("hold_out", {}), self.robot.outputs.names)
         return "\n".join(lines)
-
-    def _picture(self) -> str:
-        # Of the rows held out, where it was judged on some: the fit of its free run.
-        fits = self.findings.get("hold_out", {}).get("fit", {})
-        return bars({axis: fit for axis, fit in fits.items() if fit is not None})
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the model to an `.npz` file.

@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_one_of, resolve
 from softneck.core._blas_threads import one_blas_thread
-from softneck.core._shown import Shown, sparkline
+from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.robot._opened import opened
 from softneck.signals import Recording
@@ -126,9 +126,6 @@ class Validation(Shown):
         fits = self.fits.get("inf", {})
         said = ", ".join(f"{axis} {'-' if fit is None else f'{fit:.1f} %'}" for axis, fit in fits.items())
         return f"{self.model} on {self.data}, {self.rows_scored} rows judged\nfree run: {said or 'not asked for'}"
-
-    def _picture(self) -> str:
-        return sparkline([self.measured[:, 0], self.free_run[:, 0]])
 
     def plot(self, title: str = "") -> Figure:
         """Return a matplotlib figure of what was measured, the free run and one step ahead, with bounds and errors."""

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Vector, resolve, to_si
 from softneck.core._errors import require_package
-from softneck.core._shown import sparkline
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,9 +74,6 @@ class Labelled(np.ndarray):
         span = f"{self.time[0]:g} to {self.time[-1]:g} s" if len(self) else "no rows"
         text = ", ".join(f"{name} [{unit}]" for name, unit in self.units.items())
         return f"{len(self)} rows over {span}: {text if len(text) < 200 else f'{len(self.units)} channels'}"
-
-    def _repr_html_(self) -> str:
-        return f"<div>{self!r}<br/>{sparkline(np.asarray(self).T)}</div>" if self.channels else f"<pre>{self!r}</pre>"
 
     def _parts(self) -> tuple[Vector, dict[str, Vector], Mapping[str, str]]:
         if not self.channels:

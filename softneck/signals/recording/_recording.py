@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, Vector, require_positive, resolve, to_si
 from softneck.core._checks import finite_matrix
-from softneck.core._shown import Shown, sparkline
+from softneck.core._shown import Shown
 from softneck.robot import Robot, find_robot
 
 from ._channels import NECK, known_channels, may_miss
@@ -200,9 +200,6 @@ class Recording(Shown):
             f"{len(self)} rows of {1e3 * self.sample_time:g} ms in {runs} run(s), robot {self.robot.name}\n"
             f"set-points of {len(self.robot.set_points)} motors, {', '.join(names)}"
         )
-
-    def _picture(self) -> str:
-        return sparkline(self.outputs.T)
 
     @property
     def set_points(self) -> Matrix:
