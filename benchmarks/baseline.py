@@ -39,8 +39,8 @@ OURS = ("paper", "rough")
 SHOWN = (*OURS, *NECKS)
 OUT = Path("build/baseline")
 TESTS = ("steps", "sine", "rotation")
-# Kinds of model; `srivc` finds what `oe` does here.
-MODELS = ("rls", "oe", "subspace", "nlsm", "play", "greybox", "nss", "nn")
+# Kinds of model.
+MODELS = ("rls", "oe", "nlsm", "play", "greybox", "nss", "nn")
 
 
 @dataclass(frozen=True, slots=True)

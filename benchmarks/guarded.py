@@ -72,7 +72,7 @@ def of_auto(neck: str, kinds: list[str]) -> None:
     train, hold_out = log.split(0.7)
     begin = time.process_time()
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=False), 0)
-    for kind in (kind for kind in kinds_to_try() if kind != "srivc"):
+    for kind in kinds_to_try():
         race.screen(kind)
     race.examine()
     screened = time.process_time() - begin

@@ -33,8 +33,7 @@ from softneck.identification import INFINITE, GreyBox, Model, Network, NeuralSta
 from softneck.identification.models._arrays import members
 from softneck.identification.models._model import WARM_UP
 from softneck.identification.models._validity import TRUST, grounded, tolerance_of
-from softneck.identification.uncertainty._guarded import Guarded
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import Block

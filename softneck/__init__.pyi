@@ -21,7 +21,7 @@ from .cosim.studies._run_study import study as study
 from .design._design import design_controller as design_controller
 from .estimation._observer import observer as observer
 from .fmu.python._build import build_fmu as build_fmu
-from .identification._calibrate import calibrate as calibrate
+from .identification._identify import calibrate as calibrate
 from .identification._identify import family as family
 from .identification._identify import identify as identify
 from .identification.uncertainty._frf_fit import frequency_response as frequency_response

@@ -19,8 +19,6 @@ from softneck.identification import (
     Play,
     Rls,
     SetMembership,
-    Srivc,
-    Subspace,
 )
 from softneck.signals import Recording
 
@@ -61,8 +59,7 @@ def models() -> dict[str, Model]:
         "rls": Rls(max_delay=0.12).fit(recording),
         "mimo": Rls(structure="mimo", delay=0.06).fit(recording),
         "oe": OutputError(delay=0.06, source="positions").fit(recording),
-        "srivc": Srivc(order=2, delay=0.06, resamples=0).fit(recording),
-        "subspace": Subspace(order=3, delay=0.06).fit(recording),
+        "oe2": OutputError(nf=2, nb=2, delay=0.06).fit(recording),
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),

@@ -12,8 +12,7 @@ import pytest
 
 from softneck.core import Matrix, Vector
 from softneck.identification import Model
-from softneck.identification.uncertainty._guarded import Guarded
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.signals import SET_POINTS, Recording, signal
 from softneck.signals.recording._channels import MOTOR_POSITIONS
 

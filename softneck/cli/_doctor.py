@@ -19,7 +19,6 @@ from .shared._options import common_options
 # Extra -> the module it brings, and what for.
 _EXTRAS = {
     "slycot": ("slycot", "H-infinity by SLICOT"),
-    "sklearn": ("sklearn", "set membership as a scikit-learn regressor"),
     "dask": ("distributed", "studies on a cluster"),
 }
 

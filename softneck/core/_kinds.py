@@ -20,7 +20,7 @@ class Kind:
 
     Attributes:
         name: what users type and what a file's header says.
-        role: "model", "observer", "controller", "family", "frequency response" or "state".
+        role: "model", "observer", "controller" or "family".
         settings: dotted path of the settings class whose `fit` or `design` makes it, or of the function.
         result: dotted path of the class that a file becomes, by its `from_archive`.
         runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
@@ -45,46 +45,31 @@ KINDS: dict[str, Kind] = {
     for kind in (
         Kind("rls", "model", "softneck.identification:Rls", _MODEL, f"{_IDENT}.linear._rls_runtime",
              "recursive least squares over the redefined inputs, with dead time (Eq. 23-30)",
-             f"{_IDENT}.linear._arrays:check_rls"),
+             f"{_IDENT}.linear._regression:check_linear"),
         Kind("oe", "model", "softneck.identification:OutputError", _MODEL, f"{_IDENT}.linear._oe_runtime",
              "output error: transfer functions with dead time that simulate best (Gauss-Newton)",
-             f"{_IDENT}.linear._arrays:check_oe"),
-        Kind("srivc", "model", "softneck.identification:Srivc", _MODEL, f"{_IDENT}.linear._oe_runtime",
-             "continuous-time K exp(-L s)/(s + p) by refined instrumental variables, with confidence intervals",
-             f"{_IDENT}.linear._arrays:check_oe"),
-        Kind("subspace", "model", "softneck.identification:Subspace", _MODEL, f"{_IDENT}.linear._state_space_runtime",
-             "state space from the three motors to both angles (N4SID), without redefinition",
-             f"{_IDENT}.linear._arrays:check_state_space"),
+             f"{_IDENT}.linear._regression:check_linear"),
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, f"{_IDENT}.set_membership._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)",
-             f"{_IDENT}.set_membership._arrays:check_nlsm"),
+             f"{_IDENT}.set_membership._trees:check_nlsm"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, f"{_IDENT}.networks._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)",
-             f"{_IDENT}.networks._arrays:check_nn"),
+             f"{_IDENT}.networks._network:check_nn"),
         Kind("play", "model", "softneck.identification:Play", _MODEL, f"{_IDENT}.structured._play_runtime",
              "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run",
-             f"{_IDENT}.structured._arrays:check_play"),
+             f"{_IDENT}.structured._play:check_play"),
         Kind("nss", "model", "softneck.identification:NeuralStateSpace", _MODEL, f"{_IDENT}.networks._nss_runtime",
              "neural state space over play operators, contracting; trained over its whole free run",
-             f"{_IDENT}.networks._arrays:check_nss"),
+             f"{_IDENT}.networks._state_space_network:check_nss"),
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
              "equations of a tendon-driven neck, their numbers fitted by the error of its free run",
-             f"{_IDENT}.structured._arrays:check_greybox"),
+             f"{_IDENT}.structured._greybox:check_greybox"),
         Kind("guarded", "model", f"{_IDENT}.uncertainty._guarded:Guarded", _MODEL,
              f"{_IDENT}.uncertainty._guarded_runtime",
              "several of one learned kind, fading to a base where they part or leave what was seen",
-             f"{_IDENT}.uncertainty._arrays:check_guarded"),
-        Kind("rls_state", "state", "softneck.identification:Recursion",
-             f"{_IDENT}.linear._recursion:RecursionState",
-             "", "what a recursive least squares remembers"),
-        Kind("rls_online", "state", "softneck.identification:OnlineRls",
-             f"{_IDENT}.linear._online_rls:OnlineState",
-             "", "what a neck identified sample by sample has learnt"),
+             f"{_IDENT}.uncertainty._guarded:check_guarded"),
         Kind("family", "family", "softneck.identification:FamilySettings", "softneck.identification:Family", "",
              "uncertain linear plant: nominal, box, samples and a weight over them"),
-        Kind("frf", "frequency response", "softneck.identification:frequency_response",
-             "softneck.identification:FrequencyResponse", "",
-             "nonparametric frequency response with confidence and coherence"),
         Kind("kalman", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:KalmanObserver",
              "softneck.estimation._kalman_runtime",
              "Kalman filter over an identified linear model with a disturbance state"),
@@ -131,6 +116,11 @@ REMOVED: dict[str, str] = {
     "residual": "nlsm --set form=residual",
     "ensemble": "guarded",
     "scheduled": "pi",
+    "srivc": "oe --set intervals=true",
+    "subspace": "rls --set structure=mimo",
+    "rls_state": "Recursion in Python",
+    "rls_online": "OnlineRls in Python",
+    "frf": "softneck.frequency_response in Python",
 }
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 

@@ -18,7 +18,7 @@ from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._linear_systems import KINDS as LINEAR
-from softneck.identification.models._nested import nested, nested_model
+from softneck.identification.models._model import nested, nested_model
 from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State

@@ -150,13 +150,6 @@ def remarks(r: Validation) -> list[str]:
     lines += [f"the free run of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
     if INFINITE in r.fits:
         lines.append(f"free run {_cell(r.cold_fits, 1)} % from the first row only (cold, as an FMU starts)")
-    lines += [
-        f"free run {_cell(table, 1)} % over {what} of these rows, least..largest"
-        for what, table in r.spread.items()
-        if any(table.values()) and not lost
-    ]
-    if any(fit is not None for fit in r.noise_ceiling.values()):
-        lines.append(f"repeats allow a perfect model {_cell(r.noise_ceiling, 1)} % (noise ceiling)")
     lines.append(_residuals_said(r))
     if lost:
         return lines

@@ -32,8 +32,7 @@ from softneck.identification import (
     Rls,
     SetMembership,
 )
-from softneck.identification.uncertainty._guarded import Guarded
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import Block
 from softneck.signals import Recording, signal

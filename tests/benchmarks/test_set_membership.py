@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from softneck.identification import PAPER_EQ21, Cones, ConeSet, gamma_curve
-from softneck.identification.linear._arrays import no_base
-from softneck.identification.set_membership._regressor import set_arrays
+from softneck.identification import PAPER_EQ21
+from softneck.identification.linear._regression import no_base
+from softneck.identification.set_membership._regressor import all_pairs_gammas, least_gammas, set_arrays
 from softneck.runtime import load_functions, load_runtime
 
 RUNTIME = "softneck.identification.set_membership._nlsm_runtime"
@@ -181,47 +181,27 @@ def test_tree_beside_numpy(benchmark: BenchmarkFixture) -> None:
     assert best["tree"] < 5e-6
 
 
-@pytest.mark.benchmark(group="20,000 queries of a set of 7,000")
-@pytest.mark.parametrize("workers", [1, 2])
-def test_batch(benchmark: BenchmarkFixture, workers: int) -> None:
-    arrays = arrays_of(7_000)
-    cones = Cones(epsilon=EPSILON).fit(arrays[4][0].T, arrays[5][0])
-    X = np.tile(arrays[4][0].T, (3, 1))[:20_000] + 0.01
-    low, _ = benchmark.pedantic(cones.bounds, (X,), {"workers": workers}, rounds=5)
-    np.testing.assert_array_equal(low, cones.bounds(X, workers=1)[0])
-
-
 @pytest.mark.benchmark(group="building")
 def test_building_a_million(benchmark: BenchmarkFixture) -> None:
     arrays = arrays_of(1_000_000)
-    X, y = np.ascontiguousarray(arrays[4][0].T), arrays[5][0]
-    size = X.nbytes + y.nbytes
-    cones = Cones(gamma=GAMMA, epsilon=2.0 * EPSILON)
+    points, y = arrays[4][0], arrays[5][0]
+    size = points.nbytes + y.nbytes
 
-    def build() -> ConeSet:
-        return cones.fit(X, y)
+    def build() -> dict[str, np.ndarray]:
+        return set_arrays([(points, y)], np.array([GAMMA]), np.array([EPSILON]))
 
-    built = benchmark.pedantic(build, rounds=1)
-    kept = sum(array.nbytes for array in (built.points.points, built.points.values, built.points.nodes))
-    del built
+    benchmark.pedantic(build, rounds=1)
     tracemalloc.start()
     started = time.perf_counter()
-    tree = set_arrays([(arrays[4][0], y)], np.array([GAMMA]), np.array([EPSILON]))
+    tree = build()
     assert time.perf_counter() - started < 15.0
-    model_peak = tracemalloc.get_traced_memory()[1]
-    del tree
-    tracemalloc.reset_peak()
-    build()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    benchmark.extra_info |= {
-        "kept over data": round(kept / size, 2),
-        "peak over data, Cones.fit": round(1 + peak / size, 2),
-        "peak over data, SetMembership": round(1 + model_peak / size, 2),
-    }
+    del tree
+    benchmark.extra_info["peak over data"] = round(1 + peak / size, 2)
     print(f"\n{benchmark.extra_info}", end="")
     # Issue 5: with the data it is made from.
-    assert size + max(peak, model_peak) < 3 * size
+    assert size + peak < 3 * size
 
 
 @pytest.mark.benchmark(group="gamma over all pairs")
@@ -235,12 +215,10 @@ def test_gamma_curve_of_7000(benchmark: BenchmarkFixture, scaling: str) -> None:
         points /= points.std(axis=1, keepdims=True)
     elif scaling == "noise only":
         points = np.random.default_rng(0).standard_normal(points.shape)
-    curve = benchmark.pedantic(gamma_curve, (points, values), rounds=3, warmup_rounds=1)
-    assert curve.epsilon.size == 32
+    epsilon = np.geomspace(3e-4, 0.5, 32) * np.ptp(values)
+    gamma, _ = benchmark.pedantic(least_gammas, (points, values, epsilon), rounds=3, warmup_rounds=1)
     started = time.perf_counter()
-    expected = load_functions("softneck.identification.set_membership._cones_runtime", compiled=False).least_gammas(
-        points, values, curve.epsilon[::15], np.zeros((3, 2))
-    )
+    expected = all_pairs_gammas(points, values, epsilon[::15])[0]
     benchmark.extra_info["numpy, 3 of 32 steps [s]"] = round(time.perf_counter() - started, 2)
     # Distances in another order of sums, and what rise - epsilon cancels.
-    np.testing.assert_allclose(curve.gamma[::15], expected, rtol=1e-9)
+    np.testing.assert_allclose(gamma[::15], expected, rtol=1e-9)

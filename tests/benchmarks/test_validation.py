@@ -14,7 +14,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.cli._main import run
 from softneck.identification import Network, Rls, SetMembership
-from softneck.identification.validation._bootstrap import fit_intervals
+from softneck.identification.validation._score_tables import fit_intervals
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal, write_recording
 

@@ -22,7 +22,7 @@ from ..data import ROOT, neck_recording
 
 def test_each_extra_named_is_one_that_installs_the_package() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
-    distributions = {"can": "python-can", "serial": "pyserial", "sklearn": "scikit-learn",
+    distributions = {"can": "python-can", "serial": "pyserial",
                      "python_calamine": "python-calamine", "mcap_ros2": "mcap-ros2-support"}  # fmt: skip
     for package, (extra, _) in EXTRAS.items():
         name = distributions.get(package, package)

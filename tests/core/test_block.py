@@ -12,7 +12,7 @@ from softneck.core import DataError, SettingsError
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, load_runtime
 
-KINDS = ("rls", "mimo", "oe", "srivc", "subspace", "nlsm", "residual", "nn", "neck")
+KINDS = ("rls", "mimo", "oe", "oe2", "nlsm", "residual", "nn", "neck")
 
 
 @pytest.fixture(scope="session")
@@ -79,7 +79,7 @@ def test_compiled_and_plain_python_agree(block_of: Callable[[str], Block], kind:
     np.testing.assert_allclose(results[1], results[0], rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.parametrize("kind", ["rls", "mimo", "oe", "subspace", "nlsm", "residual", "nn"])
+@pytest.mark.parametrize("kind", ["rls", "mimo", "oe", "nlsm", "residual", "nn"])
 @pytest.mark.parametrize("horizon", [1, 2, 5, 100])
 def test_a_horizon_is_a_restart_from_every_row(block_of: Callable[[str], Block], kind: str, horizon: int) -> None:
     block = block_of(kind)

@@ -15,7 +15,7 @@ from softneck.design.linear._linear_parts_runtime import LinearArrays
 from softneck.design.linear._rise import rise_time
 from softneck.design.plants._coupled import CoupledPlant, coupled_plant
 from softneck.design.plants._coupled_axis import closed, responses, times
-from softneck.identification import Subspace
+from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import redefinition_matrix, signal
 
@@ -168,17 +168,19 @@ def test_a_controller_of_ones_own_is_taken_with_its_plant() -> None:
 
 
 @pytest.fixture(scope="module")
-def subspace() -> Any:
+def mimo() -> Any:
     excitation = signal("eq22", duration=40.0)
-    return Subspace(order=4).fit(record(excitation, VirtualNeck(NeckParameters.preset("paper")), seed=1))
+    return Rls(structure="mimo", na=2, nb=2).fit(
+        record(excitation, VirtualNeck(NeckParameters.preset("paper")), seed=1)
+    )
 
 
 @pytest.mark.parametrize(
     "settings", [LqgSettings(coupled=True), MpcSettings(coupled=True, bandwidth=5.0)], ids=["lqg", "mpc"]
 )
-def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, subspace: Any) -> None:
-    controller = settings.design(subspace)
-    plants = taken(subspace, asked=True).own_rows
+def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, mimo: Any) -> None:
+    controller = settings.design(mimo)
+    plants = taken(mimo, asked=True).own_rows
     late = tuple(row.delayed(settings.least_delay) for row in plants)
     made = controller.ss()
     A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)

@@ -8,7 +8,7 @@ import pytest
 
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings, axis_plant
-from softneck.identification import Model, OutputError, Rls, Srivc, Subspace
+from softneck.identification import Model, OutputError, Rls
 
 from ..data import neck_recording, slow_but
 
@@ -17,12 +17,11 @@ KINDS = {
     "miso": Rls(structure="miso", nb=2, max_delay=0.12),
     "oe": OutputError(max_delay=0.12),
     "oe2": OutputError(nf=2, nb=2, delay=0.06),
-    "srivc": Srivc(resamples=0, max_delay=0.12),
-    "subspace": Subspace(order=2, delay=0.06),
+    "mimo": Rls(structure="mimo", delay=0.06),
 }
 
 
-@pytest.fixture(scope="module", params=slow_but(KINDS, ["oe", "subspace"]))
+@pytest.fixture(scope="module", params=slow_but(KINDS, ["oe", "mimo"]))
 def model(request: pytest.FixtureRequest) -> Model:
     return KINDS[request.param].fit(neck_recording(1500, noise=1e-3))
 

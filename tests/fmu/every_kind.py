@@ -31,11 +31,8 @@ from softneck.identification import (
     Play,
     Rls,
     SetMembership,
-    Srivc,
-    Subspace,
 )
-from softneck.identification.uncertainty._guarded import Guarded
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
@@ -76,12 +73,8 @@ def _oe() -> Block:
     return OutputError(max_delay=0.1).fit(recording()).block()
 
 
-def _srivc() -> Block:
-    return Srivc(order=2, resamples=0, max_delay=0.1).fit(recording()).block()
-
-
-def _subspace() -> Block:
-    return Subspace(delay=0.0).fit(recording()).block()
+def _oe2() -> Block:
+    return OutputError(nf=2, nb=2, max_delay=0.1).fit(recording()).block()
 
 
 def _nlsm() -> Block:
@@ -195,8 +188,7 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
     "rls": (_rls, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
     "miso": (_miso, MOTORS, ["pitch", "roll", "motor_position_2", "validity"], _MODEL),
     "oe": (_oe, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
-    "srivc": (_srivc, MOTORS, ["pitch", "roll", "motor_position_2", "validity"], _MODEL),
-    "subspace": (_subspace, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
+    "oe2": (_oe2, MOTORS, ["pitch", "roll", "motor_position_2", "validity"], _MODEL),
     "nlsm": (
         _nlsm,
         MOTORS,
@@ -278,7 +270,7 @@ HEAVY = ("guarded", "nmpc")
 # controller, the neck.
 SHORT = ("rls", "nlsm", "kalman", "pi", "neck")
 # One of each family of runtimes.
-FAMILIES = (*SHORT, "subspace", "nn", "play", "greybox", "mpc", "adaptive")
+FAMILIES = (*SHORT, "miso", "nn", "play", "greybox", "mpc", "adaptive")
 
 
 @cache

@@ -10,17 +10,16 @@ import numpy as np
 import pytest
 
 from softneck import identify, load
+from softneck.core import kinds_of
 from softneck.cosim.parts._free_run import drive_fmu
 from softneck.fmu import build_fmu
-from softneck.identification.models._fitting import ANY_ROBOT
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.signals import Recording, signal
 
 ROBOTS = ("arm", "antagonist", "finger", "trunk4")
 # As few numbers, starts and steps as beat a straight line: a minute or two for each robot.
-SETTINGS: dict[str, dict[str, Any]] = {kind: {} for kind in ANY_ROBOT} | {
-    "srivc": {"resamples": 0},
+SETTINGS: dict[str, dict[str, Any]] = {kind: {} for kind in kinds_of("model")} | {
     "nss": {"neurons": 4, "starts": 1, "iterations": 60},
     "nn": {"hidden": (8, 8), "iterations": 150},
     "greybox": {"evaluations": 40},
@@ -39,7 +38,7 @@ def recorded(name: str, seed: int) -> Recording:
 @pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("kind", ANY_ROBOT)
+@pytest.mark.parametrize("kind", kinds_of("model"))
 def test_every_kind_takes_every_robot(kind: str, name: str, tmp_path: Path) -> None:
     train, test = recorded(name, 1), recorded(name, 2)
     model = identify(kind, train, train=1.0, **SETTINGS[kind])

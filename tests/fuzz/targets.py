@@ -204,7 +204,7 @@ def runs_beside(path: Path) -> Any:
 
 GOLDEN = ("tests", "golden")
 TARGETS: dict[str, Target] = {
-    "npz": Target(".npz", load, [copy(*GOLDEN, f"{name}.npz") for name in ("pi", "rls", "frf", "kalman")], zipped=True),
+    "npz": Target(".npz", load, [copy(*GOLDEN, f"{name}.npz") for name in ("pi", "rls", "kalman")], zipped=True),
     "csv": Target(".csv", read_recording, [lambda path: write_recording(path, neck_recording(30))]),
     "parquet": Target(".parquet", read_recording, [lambda path: write_recording(path, neck_recording(30))]),
     "log": Target(

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from softneck import identify, load, validate
-from softneck.core import KINDS, DataError, FileFormatError, Matrix, SettingsError
+from softneck.core import DataError, FileFormatError, Matrix, SettingsError
 from softneck.identification import FamilySettings, choose
 from softneck.identification.models._directions import directions_of
-from softneck.identification.models._fitting import ANY_ROBOT
 from softneck.identification.networks._nss_problem import sensor_limits
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -35,8 +34,6 @@ ROBOTS = {name: Robot.preset(name) for name in ("finger", "antagonist", "trunk4"
 KINDS_AND_SETTINGS = {
     "rls": {"delay": 0.06},
     "oe": {"delay": 0.06},
-    "srivc": {"delay": 0.06, "resamples": 0},
-    "subspace": {"delay": 0.06, "horizon": 8},
 }
 
 
@@ -64,10 +61,9 @@ def recorded(
 @pytest.mark.parametrize("kind", KINDS_AND_SETTINGS)
 def test_the_truth_behind_a_record_is_recovered(kind: str, name: str, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], noise=1e-5, rest=0.3)
-    order: dict[str, Any] = {"order": len(recording.robot.outputs.names) + 1} if kind == "subspace" else {}
-    model = identify(kind, recording, train=1.0, **KINDS_AND_SETTINGS[kind], **order)
+    model = identify(kind, recording, train=1.0, **KINDS_AND_SETTINGS[kind])
     free = model.simulate(recording)[25:, : recording.outputs.shape[1]]
-    # Noise of 1e-5 in a motion of 0.1: what is left is a few times that, also for the many numbers of `subspace`.
+    # Noise of 1e-5 in a motion of 0.1: what is left is a few times that.
     assert np.abs(free - recording.outputs[25:]).max() < 2e-3
     system = model.ss()
     np.testing.assert_allclose(system.dcgain(), GAIN * weights_of(ROBOTS[name]), atol=2e-3)
@@ -89,13 +85,11 @@ def test_directions_that_nobody_gave_are_learned_with_the_time_constant() -> Non
     assert found.findings()["directions_from"] == "data"
 
 
-@pytest.mark.parametrize("kind", ["rls", "oe", "srivc"])
+@pytest.mark.parametrize("kind", ["rls", "oe"])
 def test_the_same_rows_at_another_sample_time_give_the_same_model(kind: str) -> None:
     """Nothing is in seconds: a tank sampled every 4 s is identified as well as a finger every 20 ms."""
-    # Seconds of the two: a search over dead times is in seconds by itself, and shorter where it is told.
-    settings: dict[str, Any] = {"resamples": 0} if kind == "srivc" else {}
     fast, slow = (recorded(ROBOTS["finger"], sample_time=s, rows=300, noise=1e-3) for s in (0.02, 4.0))
-    model, other = identify(kind, fast, train=1.0, **settings), identify(kind, slow, train=1.0, **settings)
+    model, other = identify(kind, fast, train=1.0), identify(kind, slow, train=1.0)
     assert other.findings["time_constants_s"] == pytest.approx(200.0 * np.array(model.findings["time_constants_s"]))
     # The searches take the same steps but for rounding.
     np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-6)
@@ -331,4 +325,3 @@ def test_a_file_whose_arrays_do_not_fit_its_robot_is_refused(tmp_path: Path) -> 
     replace(model, robot=ROBOTS["trunk4"]).save(tmp_path / "m.npz")
     with pytest.raises(FileFormatError):
         load(tmp_path / "m.npz")
-    assert set(ANY_ROBOT) <= set(KINDS)

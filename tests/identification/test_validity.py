@@ -23,8 +23,6 @@ GOLDEN = ROOT / "tests" / "golden"
 PLANTS = (
     "rls",
     "oe",
-    "srivc",
-    "subspace",
     "nlsm",
     "play",
     "greybox",

@@ -61,28 +61,16 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
     linear = estimation.LinearNeck(pitch=tf, roll=tf)
     ident, kalman = identification, estimation.KalmanSettings
     play = ident.Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4)
-    online = ident.OnlineRls(settings=ident.Rls(delay=0.06), sample_time=TS)
-
-    def learnt() -> Any:
-        state = online.initial_state()
-        for u, y in zip(few.set_points, few.outputs, strict=True):
-            state = online.step(state, u, y)
-        return state
-
     return {
         "rls": lambda: ident.Rls(max_delay=0.12).fit(few),
         "rls_mimo": lambda: ident.Rls(structure="mimo", delay=0.06).fit(few),
         "oe": lambda: ident.OutputError(delay=0.06, source="positions").fit(few),
-        "srivc": lambda: ident.Srivc(order=2, delay=0.06, resamples=0).fit(few),
-        "subspace": lambda: ident.Subspace(order=3, delay=0.06).fit(few),
         "nlsm": lambda: ident.SetMembership(epsilon=0.01, output_weight=10.0).fit(fewer),
         "nlsm_residual": lambda: ident.SetMembership(form="residual", epsilon=0.01, output_weight=10.0).fit(fewer),
         "play": lambda: play.fit(few),
         "nss": lambda: ident.NeuralStateSpace(order=1, neurons=3, starts=1, iterations=4).fit(few),
         "nn": lambda: ident.Network(hidden=(4, 3), iterations=8).fit(few),
         "greybox": lambda: ident.GreyBox(evaluations=4, sensor_delay=2).fit(few),
-        "rls_online": learnt,
-        "rls_state": lambda: made["rls_online"].recursions[0],
         "family": lambda: ident.FamilySettings(window=6.0).fit(whole),
         "kalman": lambda: kalman().design(linear),
         "kalman_gyro": lambda: kalman(form="gyro", sensor_delay=0.03).design(linear),

@@ -31,8 +31,6 @@ KINDS = (
     "rls",
     "rls_mimo",
     "oe",
-    "srivc",
-    "subspace",
     "nn",
     "play",
     "nss",

@@ -175,8 +175,7 @@ def record_next(
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the set-points of the next recording, and as outputs what the members of the model expect."""
-    from softneck.identification.selection._candidate_motions import Bounds
-    from softneck.identification.selection._experiment_design import next_experiment
+    from softneck.identification.selection._experiment_design import Bounds, next_experiment
     from softneck.signals import write_recording
 
     known = _known(source, robot)

@@ -37,7 +37,7 @@ _NOW = {
     "record --ramp": "softneck.signals.prepare(signal, limits, ramp_s=S) in Python; `drives record` ramps by itself",
     "record --max-speed": "[motors] rate_limit of the robot file",
     "record --max-slack": "[motors] setpoint_min of the robot file",
-    "validate --initial": 'cold_fits of --json; Rules(initial="cold") in Python',
+    "validate --initial": "cold_fits of --json",
     "validate --training": "leave it out: `validity` says how far a model is beyond its training",
     "observer --sensor": "--set sensor=NAME",
     "observer --gyro": "--set form=gyro",

@@ -34,8 +34,8 @@ class LqgSettings(AxisSettings):
             the largest whose loops keep `max_sensitivity` on all samples.
         control_weight: weight of the input against the angle, in units of the plant's static gain.
         input_noise: white noise on the input against that of the angle, in the same units.
-        coupled: whether an identified model (`subspace`) is taken with all that each motor does to each output: one
-            filter and one regulator for all. A `control` system of any size is always.
+        coupled: whether an identified model (`rls` with structure "mimo") is taken with all that each motor does to
+            each output: one filter and one regulator for all. A `control` system of any size is always.
     """
 
     KIND: ClassVar[str] = "lqg"

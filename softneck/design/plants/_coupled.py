@@ -93,7 +93,7 @@ def coupled_plant(source: Any, *, asked: bool = False) -> CoupledPlant | None:
     if not hasattr(source, "ss"):
         raise SettingsError(
             f"`coupled` needs one model with a state space, or a control.StateSpace; got {type(source).__name__}. "
-            "Identify `subspace`, or leave `coupled` out."
+            "Identify `rls` with `structure=mimo`, or leave `coupled` out."
         )
     robot = robot_of(source)
     return _coupled(source.ss(), robot, None if robot.is_neck else directions_of(source))

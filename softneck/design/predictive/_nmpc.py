@@ -28,7 +28,7 @@ from softneck.estimation._settings import ORDERS
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._linear_systems import weights_of
-from softneck.identification.models._nested import nested, nested_model
+from softneck.identification.models._model import nested, nested_model
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._redefined import redefinition_of

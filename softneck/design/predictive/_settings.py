@@ -128,7 +128,8 @@ class MpcSettings(Shown):
             fast as this [1/s], its static gain the largest of its family. 0 for as identified. Slack tendons make fits
             slow and low. A `LinearNeck` of one's own is taken as it is.
         look_ahead: by how much the observer of the loop runs ahead of its sensor [s]: so much dead time is behind it.
-        coupled: whether an identified model (`subspace`) is predicted with all that each motor does to each output.
+        coupled: whether an identified model (`rls` with structure "mimo") is predicted with all that each motor does
+            to each output.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         observer: whether the loop will have an observer.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, SettingsError, require_positive, require_whole
-from softneck.identification.uncertainty._envelope import envelope_weight
+from softneck.identification.uncertainty._family_fit import envelope_weight
 
 from ._bilinear import drawn_out, to_discrete
 

@@ -170,7 +170,7 @@ class AdaptiveSettings(LoopSettings):
         if plant.order != 1 or plant.denominator[1] >= 0.0:
             raise SettingsError(
                 f"{axis}: adaptive control takes a plant of one pole and a dead time; this one is of order "
-                f"{plant.order}. Identify `rls`, or `srivc` or `oe` of order 1."
+                f"{plant.order}. Identify `rls` or `oe` of order 1."
             )
         late = plant.delayed(self.least_delay)
         return late.faster(self.small_move_pole) if self.small_move_pole > 0.0 else late

@@ -1,26 +1,288 @@
 """A model that follows a neck that changed: a warm refit on the latest data, held to the old model elsewhere.
 
 Strength and blocks are chosen on necks that were left out: `benchmarks/adaptation.py choose`.
+
+The cost of an adaptation: errors of the free run over the window, and how far it leads the old free run elsewhere.
+
+    V(theta) = sum |y - yhat(theta)|^2 / rows + strength * sum |J (theta - theta_0)|^2 / rows of the reference
+
+J are the derivatives of the old model's free run along a reference motion over all set-points that it was trained on:
+with the noise's variance J'J is the information that a fit along that motion has, and depends on no measurement. So
+the second term is the Gaussian prior that such a fit leaves behind (Ljung 1999, sec. 9.2 and 11.2), in the mean of its
+rows, and `strength` its weight beside the mean of the window's.
+
+Which numbers of each kind of model an adaptation moves, and what it moves with them.
+
+Of a network those are the weights to and from its states: a change of the neck is a change of its gains, rests and
+rates, while what was learnt of its shape stays. `nss` keeps its contraction, whatever these are.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector, require_positive
+from softneck.core import FileFormatError, Matrix, SettingsError, Vector, require_positive
 from softneck.core._blas_threads import one_blas_thread
-from softneck.signals import Recording, concatenate
+from softneck.signals import Recording, concatenate, signal
 
+from ..models._arrays import check_arrays
 from ..models._fitting import row_hashes
 from ..models._model import WARM_UP, Model
-from ..models._ports import trained_set_points
+from ..models._ports import trained_range, trained_set_points
 from ..models._scores import nrmse_fit
+from ..models._unrecorded import on_motors
 from ..models._validity import doubted
-from ._free import Free, require_adapting
-from ._problem import Problem, free_run, information, reference, scored
+from ..structured._greybox import NUMBERS
+
+# Kind -> the arrays that are moved; entries that are zero are structure and stay.
+_MOVED = {
+    "oe": ("a", "b", "A", "B", "offset"),
+    "play": ("weights",),
+    "nn": ("w3", "b3"),
+    "nss": ("B", "h", "C", "c"),
+    "greybox": ("neck",),
+}
+#: Kinds that can adapt.
+ADAPTING = tuple(_MOVED)
+
+
+def require_adapting(model: Model) -> None:
+    """Raise SettingsError for a kind that cannot adapt."""
+    if model.kind not in ADAPTING:
+        raise SettingsError(
+            f"a model of kind `{model.kind}` cannot adapt; {', '.join(ADAPTING)} can. Identify it again on new data."
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Free:
+    """The numbers of one model as one vector.
+
+    Attributes:
+        model: whose they are.
+        places: array and mask of the entries in it that are moved.
+    """
+
+    model: Model
+    places: tuple[tuple[str, np.ndarray], ...]
+
+    @classmethod
+    def of(cls, model: Model) -> Free:
+        """Find them."""
+        if model.kind == "greybox":
+            mask = np.arange(model.arrays["neck"].size) < len(NUMBERS)  # its tendons stand behind its numbers
+            return cls(model, (("neck", mask),))
+        found = [(name, model.arrays[name]) for name in _MOVED[model.kind] if name in model.arrays]
+        return cls(model, tuple((name, array != 0.0) for name, array in found))
+
+    def start(self) -> Vector:
+        """Return where they are."""
+        if self.model.kind == "greybox":
+            values = self.model.arrays["neck"]
+            return np.array([number.encode(float(value)) for number, value in zip(NUMBERS, values, strict=False)])
+        return np.concatenate([self.model.arrays[name][mask] for name, mask in self.places])
+
+    def sizes(self) -> Vector:
+        """Return by how much each is usefully moved: its size, or that of its neighbours where it is small."""
+        if self.model.kind == "greybox":
+            return np.array([number.spread for number in NUMBERS])
+        parts = [self.model.arrays[name][mask] for name, mask in self.places]
+        return np.concatenate([np.maximum(np.abs(part), np.median(np.abs(part))) for part in parts if part.size])
+
+    @property
+    def linear(self) -> bool:
+        """Whether the free run is linear in them, but for its limits: one step is all."""
+        return self.model.kind == "play"
+
+    def groups(self) -> list[list[tuple[int, int | None]]]:
+        """Return the places (number, output) that can be moved at once: each moves its own output, None all of them."""
+        count = len(self.model.robot.outputs.names)
+        if self.model.kind not in ("play", "nn") and "a" not in self.model.arrays:
+            return [[(place, None)] for place in range(self.start().size)]
+        first, lines = 0, [[] for _ in range(count)]
+        for _, mask in self.places:
+            for axis, row in enumerate(mask):
+                size = int(np.sum(row))
+                lines[axis] += [(place, axis) for place in range(first, first + size)]
+                first += size
+        return [[line[i] for line in lines if i < len(line)] for i in range(max(map(len, lines)))]
+
+    def at(self, x: Vector) -> Model:
+        """Return the model with other numbers."""
+        if self.model.kind == "greybox":
+            numbers = [number.decode(float(np.clip(v, number.encode(number.low), number.encode(number.high))))
+                       for number, v in zip(NUMBERS, x, strict=True)]  # fmt: skip
+            neck = np.concatenate([numbers, self.model.arrays["neck"][len(NUMBERS) :]])
+            # Its drives lag by the same number.
+            drive = self.model.arrays["drive"].copy()
+            drive[:, 0] = np.exp(-neck[0] * self.model.arrays["sensor"][1])
+            return self._with({"neck": neck, "drive": drive})
+        moved: dict[str, Matrix] = {}
+        edges = np.cumsum([int(mask.sum()) for _, mask in self.places])
+        for (name, mask), part in zip(self.places, np.split(x, edges[:-1]), strict=True):
+            moved[name] = self.model.arrays[name].copy()
+            moved[name][mask] = part
+        return self._with(moved)
+
+    def _with(self, moved: Mapping[str, Matrix]) -> Model:
+        return replace(self.model, arrays={**self.model.arrays, **moved})
+
+    def sound(self, x: Vector) -> bool:
+        """Return whether the numbers make a model that a file may hold, and one that does not drift."""
+        try:
+            model = self.at(x)
+            check_arrays(model.kind, model.arrays)
+        except FileFormatError:
+            return False
+        if "a" in model.arrays:
+            poles = [np.abs(np.roots([1.0, *row])).max(initial=0.0) for row in model.arrays["a"]]
+        else:
+            A = model.arrays.get("A", np.zeros((1, 1)))
+            poles = np.abs(np.linalg.eigvals(A)) if model.kind == "oe" else [0.0]
+        # As the fit of `oe` does: a pole slower than some 20 s at 20 ms is a drift.
+        return bool(max(poles) < 0.999)
+
+
+# A derivative by differences: far above rounding, far below what bends.
+_STEP = 1e-4
+# Of each number against the reference [parts of its size]: what moves nothing at all stays where it is.
+_STAY = 1e-6
+_STEPS, _MOST_DAMPING, _ENOUGH = 8, 1e4, 0.01
+# Derivatives cost a free run for each number: so many in all, which bounds the time whatever the kind.
+_RUNS = 160
+# The reference lasts so long [s of a neck]: all of `mixed`'s motions, each for two seconds.
+_REFERENCE = 20.0
+_RAMP = 1.0
+
+
+def reference(model: Model) -> Recording:
+    """Return a motion over all set-points that a model was trained on, from rest; outputs are unknown but for rest."""
+    trained, Ts = trained_range(model.findings), model.sample_time
+    motors, outputs = len(model.robot.motors.names), model.robot.outputs.names
+    low, high = trained if trained is not None else (np.full(motors, -1.0), np.full(motors, 1.0))
+    own = signal("mixed", duration=_REFERENCE, seed=0)
+    P = on_motors(own.set_points, motors)
+    P = low + (P - P.min(axis=0)) / np.ptp(P, axis=0) * (high - low)
+    seconds = np.array(model.findings.get("time_constants_s", [0.2]))
+    # As many samples for another robot, each of its own time constant.
+    stretch = float(np.exp(np.mean(np.log(np.maximum(seconds, 1e-9))))) / 0.2
+    at = np.arange(0.0, len(P) - 1.0, max(Ts / (own.sample_time * stretch), 0.2))
+    P = np.column_stack([np.interp(at, np.arange(len(P)), column) for column in P.T])
+    P *= np.minimum(1.0, np.arange(len(P)) / max(_RAMP * len(P) / _REFERENCE, 1.0))[:, None]
+    Y = np.full((len(P), len(outputs)), np.nan)
+    Y[0] = model.block().initial_state().outputs[: len(outputs)]
+    channels = dict(zip((*model.robot.set_points, *outputs), (*P.T, *Y.T), strict=True))
+    return Recording(np.arange(len(P)) * Ts, Ts, channels, robot=model.robot)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """One adaptation, its free runs along the window and along the reference.
+
+    Attributes:
+        free: the numbers.
+        window: to learn from.
+        learnt: (time, outputs) which entries count.
+        target: (time, outputs) what was measured.
+        information: (n, n) J'J / rows of the reference, by sizes.
+        strength: of the prior.
+    """
+
+    free: Free
+    window: Recording
+    learnt: np.ndarray
+    target: Matrix
+    information: Matrix
+    strength: float
+
+    def errors(self, z: Vector) -> Vector:
+        """Return the errors that count, by numbers counted from the old ones in their sizes."""
+        return (self.target - free_run(self.free.at(self.numbers(z)), self.window))[self.learnt]
+
+    def numbers(self, z: Vector) -> Vector:
+        """Return the numbers."""
+        return self.free.start() + self.free.sizes() * z
+
+    def cost(self, z: Vector, e: Vector) -> float:
+        """Return V."""
+        return float(e @ e / e.size + z @ self.prior @ z)
+
+    @property
+    def prior(self) -> Matrix:
+        """(n, n) of the second term."""
+        return self.strength * self.information
+
+    def solve(self) -> Vector:
+        """Return z of the least cost near zero: Gauss-Newton, damped where a step does not help."""
+        z = np.zeros(self.free.start().size)
+        e = self.errors(z)
+        cost, damping = self.cost(z, e), 1e-3
+        for _ in range(int(np.clip(_RUNS // len(self.free.groups()), 1, _STEPS))):
+            J = derivatives(self.free, self.numbers(z), lambda model: free_run(model, self.window))[:, self.learnt].T
+            A, g = J.T @ J / e.size + self.prior, J.T @ e / e.size - self.prior @ z
+            found = self._step(z, cost, damping, A, g)
+            if found is None:
+                break
+            gained = cost - found[1]
+            z, cost, e, damping = found
+            if gained < _ENOUGH * cost or self.free.linear:
+                break
+        return z
+
+    def _step(
+        self, z: Vector, cost: float, damping: float, A: Matrix, g: Vector
+    ) -> tuple[Vector, float, Vector, float] | None:
+        """Return the step that lowers the cost, None where none does."""
+        while damping < _MOST_DAMPING:
+            trial = z + np.linalg.solve(A + damping * np.diag(np.diag(A)), g)
+            if self.free.sound(self.numbers(trial)):
+                e = self.errors(trial)
+                value = self.cost(trial, e)
+                if value < cost:
+                    return trial, value, e, damping / 10.0
+            damping *= 10.0
+        return None
+
+
+def information(free: Free, motion: Recording) -> Matrix:
+    """Return J'J (n, n) / entries of the old free run along `motion`, by sizes of the numbers, positive definite."""
+    J = derivatives(free, free.start(), lambda model: free_run(model, motion))
+    J = J.reshape(len(J), -1)
+    H = J @ J.T / J.shape[1]
+    return H + _STAY * max(np.trace(H) / len(H), 1e-12) * np.eye(len(H))
+
+
+def free_run(model: Model, recording: Recording) -> Matrix:
+    """Return the free run (time, outputs)."""
+    return model.simulate(recording)[:, : recording.outputs.shape[1]]
+
+
+def derivatives(free: Free, numbers: Vector, run: Callable[[Model], Matrix]) -> np.ndarray:
+    """Return the derivatives (n, time, outputs) of a free run by each number over its size."""
+    now, sizes = run(free.at(numbers)), free.sizes()
+    J = np.zeros((numbers.size, *now.shape))
+    for group in free.groups():
+        moved = numbers.copy()
+        for place, _ in group:
+            moved[place] += _STEP * sizes[place]
+        change = (run(free.at(moved)) - now) / _STEP
+        for place, axis in group:
+            if axis is None:
+                J[place] = change
+            else:
+                J[place, :, axis] = change[:, axis]
+    return np.nan_to_num(J, posinf=0.0, neginf=0.0)
+
+
+def scored(recording: Recording) -> np.ndarray:
+    """Return (time, outputs) which entries say something: measured, and not among those that align a run."""
+    late = np.concatenate([np.arange(len(run)) > WARM_UP for run in recording.runs()])
+    return np.isfinite(recording.outputs) & late[:, None]
+
 
 #: The latest data that are looked at [s].
 WINDOW = 30.0

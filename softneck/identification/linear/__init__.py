@@ -1,4 +1,4 @@
-"""Linear kinds: recursive least squares, output error, continuous-time instrumental variables, subspaces.
+"""Linear kinds: recursive least squares and output error, with confidence intervals in continuous time.
 
 Sections 2 and 4 of the paper, and Ljung 1999.
 May import `identification.models`.

@@ -1,8 +1,15 @@
-"""Output error: transfer functions with dead time whose free run fits best."""
+"""Output error: transfer functions with dead time whose free run fits best.
+
+Output error of one axis by variable projection: only the poles are searched, all else is linear in them.
+
+`y(k) = B(q) / F(q) u(k - d) + c(q) / F(q) pulse(k) + e(k)`: B by least squares for each F, and c, the start of each
+run, projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivatives are exact, by filters.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +18,7 @@ from softneck.core import (
     DataError,
     Matrix,
     Progress,
+    SettingsError,
     Vector,
     require_between,
     require_one_of,
@@ -26,11 +34,221 @@ from ..models._drive import fit_drive
 from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
 from ..models._model import Model
 from ..models._state_space import axes_system, lss_arrays
-from ._oe_fit import OutputErrorFit, default_starts, fit_output_error, largest_radius, pole_radius
-from ._operating_point import about, operating_point, with_offset
-from ._regression import arx_rows, require_excitation
+from ._regression import about, arx_rows, operating_point, require_excitation, with_offset
+from ._srivc_fit import SrivcFitOptions, deviations
+
+# A time constant beyond a third of the longest run is no more than a drift that each run's start makes up for.
+_RUNS_PER_TIME_CONSTANT = 3.0
+_ITERATIONS = 50
+# A step that changes the sum of squares by less than this part changes no digit that noise leaves.
+_TOLERANCE = 1e-10
+# Time constants [s] from which the search starts, beside that of least squares: a neck has 0.2 s.
+_TIME_CONSTANTS = (0.05, 0.2, 0.8)
+
+# -log of the rounding of a double.
+_ROUNDING = 36.0
+
+Runs = Sequence[tuple[Vector, Vector]]
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class OutputErrorFit:
+    """One axis at one dead time.
+
+    Attributes:
+        f: (nf,) denominator without its leading one.
+        b: (nb,) numerator.
+        cost: sum of squared errors.
+        covariance: (nf + nb, nf + nb) of (f, b), if the output noise is white.
+        rows: measured samples.
+    """
+
+    f: Vector
+    b: Vector
+    cost: float
+    covariance: Matrix
+    rows: int
+
+
+def fit_output_error(runs: Runs, nf: int, nb: int, d: int, starts: Sequence[Vector]) -> OutputErrorFit | None:
+    """Return the best fit over all `starts` (nf,); None where none is stable."""
+    best: tuple[float, Vector] | None = None
+    radius = largest_radius(runs)
+    for start in starts:
+        found = _search(runs, nb, d, _inside(start, radius), radius)
+        if best is None or found[0] < best[0]:
+            best = found
+    if best is None or not np.isfinite(best[0]):
+        return None
+    return _finish(runs, nf, nb, d, best[1])
+
+
+def default_starts(nf: int, sample_time: float, least_squares: Vector | None) -> list[Vector]:
+    """Return denominators to start from: that of least squares, and poles at spread time constants."""
+    starts = [] if least_squares is None else [least_squares]
+    for tau in _TIME_CONSTANTS:
+        poles = np.exp(-sample_time / (tau * np.geomspace(1.0, 0.3, nf)))
+        starts.append(np.poly(poles)[1:])
+    return starts
+
+
+def largest_radius(runs: Runs) -> float:
+    """Return the bound on the poles: they must settle within a run."""
+    return float(np.exp(-_RUNS_PER_TIME_CONSTANT / max(u.size for u, _ in runs)))
+
+
+def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[float, Vector]:
+    """Levenberg-Marquardt over f on the projected problem (Kaufman's derivative)."""
+    cost, r, J = _projected(runs, f, nb, d)
+    damping = 1e-3
+    for _ in range(_ITERATIONS):
+        H, g = J.T @ J, J.T @ r
+        gained = 0.0
+        while damping < 1e8:
+            step = np.linalg.solve(H + damping * np.diag(np.maximum(np.diag(H), 1e-300)), g)
+            trial = f + step
+            if pole_radius(trial) <= radius:
+                new = _projected(runs, trial, nb, d)
+                if new[0] < cost:
+                    gained = cost - new[0]
+                    f, (cost, r, J) = trial, new
+                    damping = max(damping / 10.0, 1e-12)
+                    break
+            damping *= 10.0
+        if gained <= _TOLERANCE * cost:
+            break
+    return cost, f
+
+
+def _projected(runs: Runs, f: Vector, nb: int, d: int) -> tuple[float, Vector, Matrix]:
+    """Return cost, residual and derivative of the prediction by f, b and the starts eliminated."""
+    X, y, starts = _columns(runs, f, nb, d)
+    Q = _basis(X)
+    r = y - Q @ (Q.T @ y)
+    b = np.linalg.lstsq(X, y)[0]
+    S = _pole_columns(runs, f, b, d, starts)
+    return float(r @ r), r, S - Q @ (Q.T @ S)
+
+
+def _columns(runs: Runs, f: Vector, nb: int, d: int) -> tuple[Matrix, Vector, list[Matrix]]:
+    """Return regressors of b (rows, nb) and outputs (rows,), the starts projected out, and each run's projector."""
+    parts, targets, bases = [], [], []
+    for u, y in runs:
+        there = np.isfinite(y)
+        Q = _start_basis(f, u.size, there)
+        parts.append(_without(Q, _input_columns(u, f, nb, d)[there]))
+        targets.append(_without(Q, y[there]))
+        bases.append(Q)
+    return np.concatenate(parts), np.concatenate(targets), bases
+
+
+def _pole_columns(runs: Runs, f: Vector, b: Vector, d: int, bases: list[Matrix]) -> Matrix:
+    """Return the derivative of the output by f, `-q^-i / F y`, the starts projected out."""
+    F = np.concatenate([[1.0], f])
+    parts = []
+    for (u, y), Q in zip(runs, bases, strict=True):
+        there = np.isfinite(y)
+        forced = _input_columns(u, f, b.size, d) @ b
+        # The whole output, with its own start, is what F filters.
+        left = y[there] - forced[there]
+        response = _start_responses(f, u.size)
+        n = len(response)
+        output = forced
+        output[:n] += response @ np.linalg.lstsq(response[there[:n]], left[: int(there[:n].sum())])[0]
+        S = np.column_stack([_late(-_filtered(F, output), i) for i in range(1, f.size + 1)])[there]
+        parts.append(_without(Q, S))
+    return np.concatenate(parts)
+
+
+def _finish(runs: Runs, nf: int, nb: int, d: int, f: Vector) -> OutputErrorFit:
+    X, y, bases = _columns(runs, f, nb, d)
+    b = np.linalg.lstsq(X, y)[0]
+    r = y - X @ b
+    J = np.column_stack([_pole_columns(runs, f, b, d, bases), X])
+    rows = y.size
+    free = max(rows - nf - nb - nf * len(runs), 1)
+    cost = float(r @ r)
+    covariance = cost / free * np.linalg.pinv(J.T @ J, hermitian=True)
+    return OutputErrorFit(f=f, b=b, cost=cost, covariance=covariance, rows=rows)
+
+
+def _input_columns(u: Vector, f: Vector, nb: int, d: int) -> Matrix:
+    """Return `u(k - d - j) / F` for j = 1..nb as (time, nb), u(0) held before the record."""
+    from scipy.signal import lfilter
+
+    F = np.concatenate([[1.0], f])
+    gain = u[0] / F.sum()
+    # From equilibrium with the held input; the start of the run takes up whatever else it was.
+    z0 = np.zeros(f.size)
+    for i in range(f.size - 1, -1, -1):
+        z0[i] = -f[i] * gain + (z0[i + 1] if i + 1 < f.size else 0.0)
+    columns = []
+    for j in range(1, nb + 1):
+        late = min(d + j, u.size)
+        delayed = np.concatenate([np.full(late, u[0]), u[: u.size - late]])
+        columns.append(lfilter([1.0], F, delayed, zi=z0)[0])
+    return np.column_stack(columns)
+
+
+def _start_responses(f: Vector, size: int) -> Matrix:
+    """Return `q^-i / F` of a pulse at the first sample, (up to size, nf): all that a start can be."""
+    # What has died away below rounding is left out: a second or two of a long run.
+    pulse = np.zeros(min(size, int(_ROUNDING / -np.log(max(pole_radius(f), 0.1))) + f.size + 1))
+    pulse[0] = 1.0
+    first = _filtered(np.concatenate([[1.0], f]), pulse)
+    return np.column_stack([_late(first, i) for i in range(f.size)])
+
+
+def _start_basis(f: Vector, size: int, there: np.ndarray) -> Matrix:
+    response = _start_responses(f, size)
+    return _basis(response[there[: len(response)]])
+
+
+def _without(Q: Matrix, X: Matrix) -> Matrix:
+    """Return `X` with its first rows projected off the basis of a start."""
+    rest = X.copy()
+    n = len(Q)
+    rest[:n] -= Q @ (Q.T @ X[:n])
+    return rest
+
+
+def _filtered(F: Vector, x: Vector) -> Vector:
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], F, x))
+
+
+def _basis(X: Matrix) -> Matrix:
+    """Return an orthonormal basis of the columns, those left out that add nothing."""
+    U, s, _ = np.linalg.svd(X, full_matrices=False)
+    return U[:, s > 1e-12 * max(float(s.max(initial=0.0)), 1e-300)]
+
+
+def _late(x: Vector, samples: int) -> Vector:
+    return np.concatenate([np.zeros(samples), x[: x.size - samples]]) if samples else x
+
+
+def pole_radius(f: Vector) -> float:
+    """Return the size of the largest root of z^n + f_1 z^(n-1) + ..."""
+    return float(np.abs(np.roots(np.concatenate([[1.0], f]))).max(initial=0.0))
+
+
+def _inside(f: Vector, radius: float) -> Vector:
+    """Return `f` with its poles drawn within `radius`."""
+    poles = np.roots(np.concatenate([[1.0], f]))
+    size = np.abs(poles)
+    if size.max(initial=0.0) <= radius:
+        return f
+    return np.real(np.poly(np.where(size <= radius, poles, 0.99 * radius * poles / np.maximum(size, 1e-300))))[1:]
+
 
 SOURCES = ("set_points", "positions")
+# Of a standard normal 95 % lie within.
+_NORMAL = 1.959964
+_CAUTION = (
+    "intervals say how far noise moves the estimate of one linear system; on a neck that is nonlinear they do not "
+    "hold its gain, pole and dead time elsewhere in its range: take a `family` for that"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,6 +265,7 @@ class OutputError:
         max_delay: end of that search [s], of another robot by its time constant over the neck's 0.2 s.
         source: what drives the model: "set_points", or "positions" of the motors, which in free run the drive model
             makes from the set-points.
+        intervals: find 95 % intervals of K, pole, dead time and static gain as well, in the findings (one pole only).
     """
 
     nf: int = 1
@@ -54,6 +273,7 @@ class OutputError:
     delay: float | None = None
     max_delay: float = 0.3
     source: str = "set_points"
+    intervals: bool = False
 
     def __post_init__(self) -> None:
         require_whole("nf", self.nf, 1, 10)
@@ -62,6 +282,8 @@ class OutputError:
             require_between("delay", self.delay, 0.0, 2.0, "s")
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
+        if self.intervals and (self.nf, self.nb) != (1, 1):
+            raise SettingsError("`intervals` are those of one pole; set `nf` and `nb` to 1 with it.")
 
     @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
@@ -70,7 +292,7 @@ class OutputError:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings)
         point = operating_point(recording)
         directions, inputs = axis_runs(about(recording, point), self.source)
         found, delays, curves, beside = [], [], {}, {}
@@ -83,6 +305,13 @@ class OutputError:
             recording, directions, [fit.f for fit in found], [fit.b for fit in found], delays, self.source
         )
         arrays = with_offset("oe", arrays, recording, point)
+        said = {}
+        if self.intervals:
+            each = [
+                self._intervals(recording.sample_time, *one, directions.stretch)
+                for one in zip(inputs, found, delays, strict=True)
+            ]
+            said = {"intervals": dict(zip(directions.names, each, strict=True)), "caution": _CAUTION}
         progress(1.0, "done")
         return fitted_model(
             "oe",
@@ -96,6 +325,7 @@ class OutputError:
                 "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
                 "least_squares_beside": beside,
                 **_warnings(directions.names, inputs, found),
+                **said,
             },
         )
 
@@ -131,6 +361,30 @@ class OutputError:
         again = fit_output_error(runs, self.nf, self.nb, d, [best[0].f, *default_starts(self.nf, necks, None)])
         fit = again if again is not None and again.cost < best[0].cost else best[0]
         return fit, d, curve, _beside(columns, self.nf, self.nb, d, sample_time)
+
+    def _intervals(
+        self, sample_time: float, runs: list[tuple[Vector, Vector]], fit: OutputErrorFit, delay: float, stretch: float
+    ) -> dict[str, list[float]]:
+        """Return name -> [low, high] in SI, by the continuous-time model that ends nearest to the one found."""
+        if not -1.0 < fit.f[0] < 0.0:
+            return {}
+        search = SrivcFitOptions(
+            sample_time=sample_time, max_delay=self.max_delay * stretch, free_delay=self.delay is None
+        )
+        search = replace(search, fastest=search.fastest / stretch)
+        pole, late = -float(np.log(-fit.f[0])) / sample_time, delay * sample_time
+        # The cost has a kink at each sample of dead time: from the middle of those on both sides as well.
+        starts = (
+            [late, *(max(late + side * sample_time, 0.0) for side in (-0.5, 0.5))] if self.delay is None else [late]
+        )
+        tried = [near for start in starts if (near := search.start(runs, pole, start)) is not None]
+        if not tried:
+            return {}
+        best = min(tried, key=lambda near: near.cost)
+        K, p, L = float(best.model.b[0]), float(best.model.a[0]), best.model.delay
+        gain, a, late, b = _NORMAL * deviations(search, runs, best, stretch)[0]
+        found = {"K": [K - b, K + b], "pole": [p - a, p + a], "static_gain": [K / p - gain, K / p + gain]}
+        return found if self.delay is not None else {**found, "delay_s": [max(L - late, 0.0), L + late]}
 
 
 def axis_runs(recording: Recording, source: str) -> tuple[Directions, list[list[tuple[Vector, Vector]]]]:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, require_positive, write_archive
+from softneck.core import DataError, Matrix, SettingsError, Vector, require_positive
 from softneck.core._checks import finite_vector
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..models._model import Model
-from ._recursion import RecursionState
-from ._rls import Rls, motor_arrays
+from ._rls import RecursionState, Rls, motor_arrays
 
 _PARTS = ("theta", "factor", "scale", "tally")
 _AXES = ("pitch", "roll")
@@ -34,29 +31,6 @@ class OnlineState:
     recursions: tuple[RecursionState, RecursionState]
     inputs: Matrix
     outputs: Matrix
-
-    def save(self, path: str | Path, *, force: bool = False) -> None:
-        """Write the state to an `.npz` file."""
-        arrays: dict[str, np.ndarray] = {"inputs": self.inputs, "outputs": self.outputs}
-        for name, recursion in zip(_AXES, self.recursions, strict=True):
-            arrays |= {f"{name}_{part}": getattr(recursion, part) for part in _PARTS}
-        write_archive(path, {"kind": "rls_online"}, arrays, force=force)
-
-    def summary(self) -> str:
-        """Return the parameters of both axes with their standard deviations."""
-        lines = [f"{name} {r.summary()}" for name, r in zip(_AXES, self.recursions, strict=True)]
-        return "\n".join(lines)
-
-    @classmethod
-    def from_archive(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> OnlineState:
-        """Return the state that `save` wrote."""
-        parts = [
-            RecursionState.from_archive(header, {part: arrays[f"{name}_{part}"] for part in _PARTS}) for name in _AXES
-        ]
-        inputs, outputs = arrays["inputs"], arrays["outputs"]
-        if inputs.ndim != 2 or inputs.shape[1] != 3 or outputs.ndim != 2 or outputs.shape[1] != 2:
-            raise FileFormatError(f"its histories have shapes {inputs.shape} and {outputs.shape}.")
-        return cls(recursions=(parts[0], parts[1]), inputs=inputs, outputs=outputs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

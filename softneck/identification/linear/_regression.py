@@ -2,11 +2,74 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from softneck.core import DataError, Matrix
+from softneck.core import DataError, Matrix, Vector
+from softneck.signals import Recording
+
+from ..models._arrays import within
+from ..models._model import WARM_UP, Model
+from ..models._state_space import system_of
+
+Point = tuple[Vector, Vector]
+
+
+def operating_point(recording: Recording) -> Point:
+    """Return the means (motors,) of the set-points and (outputs,) of the outputs; zero of a neck, which rests there."""
+    motors, outputs = recording.set_points.mean(axis=0), np.nanmean(recording.outputs, axis=0)
+    return (0.0 * motors, 0.0 * outputs) if recording.robot.is_neck else (motors, outputs)
+
+
+def about(recording: Recording, point: Point) -> Recording:
+    """Return the recording with set-points, motor positions and outputs counted from `point`; a neck's as it is."""
+    if recording.robot.is_neck:
+        return recording
+    robot = recording.robot
+    zero = dict(zip(robot.set_points, point[0], strict=True)) | dict(zip(robot.outputs.names, point[1], strict=True))
+    zero |= dict(zip(robot.motor_positions, point[0], strict=True))
+    moved = {name: recording.channels[name] - level for name, level in zero.items() if name in recording.channels}
+    return recording.with_channels(**moved)
+
+
+def with_offset(kind: str, arrays: Mapping[str, Matrix], recording: Recording, point: Point) -> dict[str, Matrix]:
+    """Return the arrays of a state space identified about `point` with its offset; a neck's as they are.
+
+    The offset follows from the static gain; what the free run is off on the mean is put right beside it.
+    """
+    if recording.robot.is_neck:
+        return dict(arrays)
+    A, B, C, _ = system_of(arrays)
+    gain = C @ np.linalg.pinv(np.eye(len(A)) - A) @ B
+    offset = point[1] - gain @ point[0]
+    for _ in range(2):  # the start of the free run depends on the offset a little
+        model = Model(kind=kind, sample_time=recording.sample_time, arrays={**arrays, "offset": offset},
+                      robot=recording.robot)  # fmt: skip
+        free = model.simulate(recording)[:, : offset.size]
+        late = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
+        error = (recording.outputs - free)[late]
+        offset = offset + (np.nanmean(error, axis=0) if np.isfinite(error).any(axis=0).all() else 0.0)
+    return {**arrays, "offset": offset}
+
+
+def no_base(motors: int = 3, outputs: int = 2) -> dict[str, Matrix]:
+    """Return the arrays of a set that stands alone."""
+    empty = np.zeros((outputs, 0))
+    return {"redefinition": np.zeros((3, motors)), "a": empty, "b": empty, "delay": np.zeros(outputs)}
+
+
+def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, least: int = 1) -> None:
+    """Raise FileFormatError unless orders, at least `least`, dead times and source are within the histories."""
+    if "A" in arrays:
+        within(np.array([sizes["n"]]), sizes["outputs"], sizes["outputs"] * sizes["H"], "the order")
+        within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
+        within(arrays["delay"][1:], 0, 1, "the source")
+        return
+    within(arrays["delay"], 0, sizes["H"] - sizes["nb"], "a dead time")
+    within(np.array([sizes["na"]]), least, sizes["H"], "the order")
+    within(arrays.get("source", np.zeros(1)), 0, 1, "the source")
+
 
 # Columns of unit length: above it rounding and noise decide the parameters; a real record stays below 1e4.
 _WORST_CONDITION = 1e8

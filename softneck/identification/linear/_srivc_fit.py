@@ -9,7 +9,7 @@ derivative, `-yhat'`. At the solution the errors are orthogonal to the instrumen
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -90,7 +90,6 @@ class SrivcFitOptions:
     Attributes:
         sample_time: [s].
         order: poles n.
-        zeros: zeros, below n.
         offset: estimate a constant on the output of each run as well (for windows around an operating point).
         max_delay: bound on the dead time [s].
         free_delay: take the dead time along; otherwise it stays.
@@ -101,7 +100,6 @@ class SrivcFitOptions:
 
     sample_time: float
     order: int = 1
-    zeros: int = 0
     offset: bool = False
     max_delay: float = 0.3
     free_delay: bool = True
@@ -111,17 +109,15 @@ class SrivcFitOptions:
     def start(self, runs: Runs, pole: float, delay: float) -> SrivcFit | None:
         """Return a fit from A = (s + pole)^n: one step of least squares, then `improve`."""
         a = np.real(np.poly(np.full(self.order, -pole)))[1:]
-        first = Continuous(a=a, b=np.zeros(self.zeros + 1), delay=delay)
+        first = Continuous(a=a, b=np.zeros(1), delay=delay)
         starts = [np.zeros(self.order + self.offset) for _ in runs]
         return self.improve(runs, first, starts)
 
-    def improve(
-        self, runs: Runs, model: Continuous, starts: Sequence[Vector], *, iterations: int = _ITERATIONS
-    ) -> SrivcFit | None:
+    def improve(self, runs: Runs, model: Continuous, starts: Sequence[Vector]) -> SrivcFit | None:
         """Return the fit that the iteration ends in; None where there is no stable one."""
         fit, moves = self._step(runs, model, starts)
         longest = max(u.size for u, _ in runs) * self.sample_time
-        for _ in range(iterations):
+        for _ in range(_ITERATIONS):
             better = self._line(runs, fit, moves, self.runs_per_time_constant / longest)
             if better is None:
                 break
@@ -202,7 +198,7 @@ class SrivcFitOptions:
         functions.ct_filter(*_joined(A, e, self.sample_time), errors, filtered)
         late = np.concatenate([np.full(min(d + 1, u.size), u[0]), u[: max(u.size - d - 1, 0)]])
         slope = -(states[:, :n] @ (C @ A) + C[-1] * late)
-        columns = np.column_stack([states[:, : self.zeros + 1][:, ::-1], slope])
+        columns = np.column_stack([states[:, :1], slope])
         own = -states[:, 2 * n :][:, ::-1]
         nuisance = _free_responses(A, u.size, self.sample_time)
         if self.offset:
@@ -280,6 +276,35 @@ def _free_responses(A: Matrix, size: int, sample_time: float) -> Matrix:
     return rows
 
 
-def with_delay(model: Continuous, delay: float) -> Continuous:
-    """Return the model with another dead time."""
-    return replace(model, delay=delay)
+def deviations(search: SrivcFitOptions, runs: Runs, fit: SrivcFit, stretch: float) -> tuple[Vector, float]:
+    """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean.
+
+    Args:
+        search: how `fit` was found; with one pole.
+        runs: that it was fitted to.
+        fit: the model and what it leaves over.
+        stretch: by how much the robot is slower than a neck.
+    """
+    errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
+    spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)
+    e = np.concatenate(errors)
+    # Errors that stay for n samples count as one in n.
+    variance = float(np.mean(e**2)) * _correlation_time(errors, round(stretch / search.sample_time))
+    covariance = variance * np.linalg.pinv(fit.information, hermitian=True)
+    p, K = fit.model.a[0], fit.model.b[0]
+    slope = np.array([-K / p**2, 1.0 / p, 0.0])
+    gain = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+    a, b, L = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return np.array([gain, a, L, b]), 100.0 * (1.0 - float(np.sqrt(fit.cost / max(spread, 1e-300))))
+
+
+def _correlation_time(errors: Sequence[Vector], lags: int) -> float:
+    """Return the sum of the autocorrelation over both sides, while it is positive, at least 1."""
+    power = sum(float(e @ e) for e in errors)
+    total = 1.0
+    for k in range(1, lags + 1):
+        r = sum(float(e[k:] @ e[:-k]) for e in errors if e.size > k) / max(power, 1e-300)
+        if r <= 0.05:
+            break
+        total += 2.0 * r
+    return total

@@ -171,12 +171,10 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     if kind in COMPOSED:
         _check_composed(kind, arrays)
         return
-    # `rls` over the motors and more than one pole are state spaces as well.
-    form = "subspace" if kind in ("rls", "oe", "srivc") and "A" in arrays else kind
     names = declared(runtime_of(kind, arrays), Arrays).names()
     if not _named(arrays, names):
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
-    _check_numbers(form, runtime_arrays(kind, arrays), runtime_of(kind, arrays))
+    _check_numbers(kind, runtime_arrays(kind, arrays), runtime_of(kind, arrays))
 
 
 def _named(arrays: Mapping[str, Matrix], names: tuple[str, ...]) -> bool:

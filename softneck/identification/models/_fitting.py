@@ -24,11 +24,6 @@ from ._validity import grounded
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-# Kinds that take any robot.
-ANY_ROBOT = (
-    "rls", "oe", "srivc", "subspace", "play", "nss", "nn", "nlsm", "greybox",
-    "guarded",
-)  # fmt: skip
 # Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
 MIN_ROWS = 100
 
@@ -149,23 +144,17 @@ def one_recording(recordings: Recording | list[Recording]) -> Recording:
     return concatenate(recordings if isinstance(recordings, list) else [recordings])
 
 
-def training_recording(
-    recordings: Recording | list[Recording], *, any_robot: bool = False, all_motors: bool = False
-) -> Recording:
+def training_recording(recordings: Recording | list[Recording], *, all_motors: bool = False) -> Recording:
     """Return all runs as one recording to identify from.
 
     Args:
         recordings: of one robot and sample time.
-        any_robot: whether the kind takes other robots than the neck.
         all_motors: whether the kind learns what each motor does, and so cannot cope with motors that move as one.
 
     Raises:
         DataError: too short, without excitation, or with an output that never moves.
-        SettingsError: a robot other than the neck where the kind does not take it.
     """
     recording = one_recording(recordings)
-    if not any_robot:
-        recording.robot.require_neck(f"this kind of model ({', '.join(ANY_ROBOT)} take any robot)")
     check_training(recording)
     outputs, motions = len(recording.robot.outputs.names), independent_motions(recording)
     if all_motors and motions < min(outputs, len(recording.robot.motors.names)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import control
 
 
-KINDS = ("rls", "oe", "srivc", "subspace")
+KINDS = ("rls", "oe")
 STATE_SPACE = "softneck.identification.linear._state_space_runtime"
 AFFINE = "softneck.identification.linear._affine_runtime"
 _OUTPUTS = ("pitch", "roll")
@@ -26,36 +26,7 @@ _REDEFINED = ("theta_i", "phi_i", "delta_i")
 _MOTORS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3")
 
 
-class Linear(Protocol):
-    """What is asked of a model here."""
-
-    @property
-    def kind(self) -> str:
-        """Its name in the table of kinds."""
-        ...
-
-    @property
-    def sample_time(self) -> float:
-        """[s]."""
-        ...
-
-    @property
-    def arrays(self) -> Mapping[str, Matrix]:
-        """What its runtime reads."""
-        ...
-
-    @property
-    def findings(self) -> Mapping[str, Any]:
-        """What its estimator found."""
-        ...
-
-    @property
-    def robot(self) -> Robot:
-        """Whose plant it is."""
-        ...
-
-
-def transfer_function(model: Linear, output: str, input: str | None, angle_unit: str) -> control.TransferFunction:
+def transfer_function(model: Any, output: str, input: str | None, angle_unit: str) -> control.TransferFunction:
     """Return the discrete transfer function from `input` to `output`, with its delay in full.
 
     Raises:
@@ -84,7 +55,7 @@ def transfer_function(model: Linear, output: str, input: str | None, angle_unit:
     )
 
 
-def state_space(model: Linear) -> control.StateSpace:
+def state_space(model: Any) -> control.StateSpace:
     """Return both outputs as one discrete state space, from the motors where the model has them as inputs."""
     import control
 
@@ -104,7 +75,7 @@ def state_space(model: Linear) -> control.StateSpace:
 
 
 def continuous_function(
-    model: Linear, output: str, input: str | None, angle_unit: str, pade: int
+    model: Any, output: str, input: str | None, angle_unit: str, pade: int
 ) -> control.TransferFunction:
     """Return the continuous-time transfer function behind samples held by a zero-order hold.
 
@@ -115,18 +86,14 @@ def continuous_function(
 
     name, scale = _checked(model, output, input, angle_unit)
     require_whole("pade", pade, 0, 12)
-    found = model.findings.get("continuous")
-    if found is not None and name in _REDEFINED and output == dict(zip(_REDEFINED, _OUTPUTS, strict=False)).get(name):
-        b, a, delay = found[output]["b"], found[output]["a"], float(found[output]["delay_s"])
-    else:
-        b, a, delay = _continuous(model, output, name)
-    G = control.TransferFunction(scale * np.asarray(b), np.asarray(a))
+    b, a, delay = _continuous(model, output, name)
+    G = control.TransferFunction(scale * b, a)
     if pade > 0 and delay > 0.0:
         G = G * control.TransferFunction(*control.pade(delay, pade))
     return control.TransferFunction(G.num, G.den, inputs=[name], outputs=[output], name=f"G_{output}")
 
 
-def describe(model: Linear) -> list[str]:
+def describe(model: Any) -> list[str]:
     """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in degrees, where it has one real pole."""
     if not model.robot.is_neck or ("A" in model.arrays and "transfer_functions" not in model.findings):
         poles = np.linalg.eigvals(model.arrays["A"])
@@ -135,12 +102,9 @@ def describe(model: Linear) -> list[str]:
     return [_describe_axis(model, axis) for axis in (0, 1)]
 
 
-def _describe_axis(model: Linear, axis: int) -> str:
+def _describe_axis(model: Any, axis: int) -> str:
     name = _OUTPUTS[axis]
     numbers = continuous_parameters(model.sample_time, model.arrays, axis)
-    found = model.findings.get("continuous")
-    if found is not None and len(found[name]["a"]) == 2:
-        numbers = (found[name]["b"][0], found[name]["a"][1], found[name]["delay_s"])
     if numbers is None:
         G: Any = transfer_function(model, name, None, "deg")
         poles = np.roots(np.trim_zeros(np.asarray(G.den[0][0]), "b"))
@@ -168,7 +132,7 @@ def continuous_parameters(
     return float(b[0] * p / (1.0 + a[0])), float(p), float(arrays["delay"][axis] * sample_time)
 
 
-def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, float]:
+def _continuous(model: Any, output: str, name: str) -> tuple[Vector, Vector, float]:
     """Undo the zero-order hold: return numerator, denominator and dead time [s]."""
     import control
     from scipy.linalg import logm
@@ -180,8 +144,7 @@ def _continuous(model: Linear, output: str, name: str) -> tuple[Vector, Vector, 
     poles = np.linalg.eigvals(S.A)
     if (np.abs(poles) < 1e-9).any() or ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
         raise SettingsError(
-            f"{output} has no continuous-time form: a pole at zero or on the negative real axis. Lower its order, "
-            "or identify `srivc`."
+            f"{output} has no continuous-time form: a pole at zero or on the negative real axis. Lower its order."
         )
     n = S.A.shape[0]
     joint = np.eye(n + 1)
@@ -203,7 +166,7 @@ def redefined_input(robot: Robot, output: str) -> str:
     return _REDEFINED[_OUTPUTS.index(output)] if robot.is_neck else f"{output}_input"
 
 
-def weights_of(model: Linear) -> Matrix:
+def weights_of(model: Any) -> Matrix:
     """Return the weights (outputs, motors) of the motors in each output's direction, given or learned.
 
     Raises:
@@ -221,7 +184,7 @@ def weights_of(model: Linear) -> Matrix:
     return weights
 
 
-def _of_robot(model: Linear, output: str, name: str) -> tuple[Vector, Vector, int]:
+def _of_robot(model: Any, output: str, name: str) -> tuple[Vector, Vector, int]:
     """Return numerator, denominator and dead time to an output from a motor, or from its own redefined input."""
     axis = model.robot.outputs.names.index(output)
     if name in model.robot.set_points:
@@ -288,7 +251,7 @@ def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matri
     return F, G, H
 
 
-def _checked(model: Linear, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
+def _checked(model: Any, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
     _require_linear(model.kind)
     robot = model.robot
     require_one_of("output", output, robot.outputs.names)

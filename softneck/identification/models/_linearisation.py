@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,25 +37,12 @@ class Jacobian(NamedTuple):
     D: Matrix
 
 
-class Stepped(Protocol):
-    """What is asked of a model here."""
-
-    @property
-    def kind(self) -> str:
-        """Its name in the table of kinds."""
-        ...
-
-    def block(self) -> Block:
-        """Its block."""
-        ...
-
-
 def _motor_count(block: Block) -> int:
     """Return the number of motors: their set-points stand first among a plant's inputs."""
     return sum(port.name.startswith("motor_setpoint_") for port in block.inputs)
 
 
-def jacobian(model: Stepped, state: State, inputs: ArrayLike) -> Jacobian:
+def jacobian(model: Any, state: State, inputs: ArrayLike) -> Jacobian:
     """Return the derivatives of `model.step(state, inputs)`; see `Model.jacobian`."""
     block = model.block()
     motors = _motor_count(block)
@@ -71,7 +58,7 @@ def jacobian(model: Stepped, state: State, inputs: ArrayLike) -> Jacobian:
     return Jacobian(X[:, :n], X[:, n:], Y[:, :n], Y[:, n:])
 
 
-def linearised(model: Stepped, at: State | Mapping[str, float] | ArrayLike | None) -> control.StateSpace:
+def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None) -> control.StateSpace:
     """Return the linear system that `model` is near a state; see `Model.linearize`."""
     import control
 
@@ -115,7 +102,7 @@ def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None) -> Vec
     return finite_vector("at", at, motors)
 
 
-def _rest(model: Stepped, block: Block, u: Vector) -> State:
+def _rest(model: Any, block: Block, u: Vector) -> State:
     """Return the state in which the model stands under the set-points `u`, run free until it does."""
     state = block.initial_state(use_measurement=0.0)
     rows = np.full((_SETTLE, len(block.inputs)), np.nan)

@@ -330,16 +330,15 @@ class Model(Shown):
         Raises:
             OutputError: the file exists (and not `force`) or cannot be written.
         """
-        header = {
-            "kind": self.kind,
-            "sample_time": self.sample_time,
-            "channels": {"inputs": list(self.robot.set_points), "unit": to_si(self.robot.motors.unit)[1]},
-            "arrays": list(self.arrays),
-            "settings": dict(self.settings),
-            "findings": dict(self.findings),
-            **self.robot.in_header(),
-        }
+        channels = {"inputs": list(self.robot.set_points), "unit": to_si(self.robot.motors.unit)[1]}
+        header = {**self._header(), "channels": channels}
         write_archive(path, header, {**self.arrays, "training_rows": self.training_rows}, force=force)
+
+    def _header(self) -> dict[str, Any]:
+        return {
+            "kind": self.kind, "sample_time": self.sample_time, "arrays": list(self.arrays),
+            "settings": dict(self.settings), "findings": dict(self.findings), **self.robot.in_header(),
+        }  # fmt: skip
 
     @classmethod
     def from_archive(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Model:
@@ -442,3 +441,15 @@ def _short(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(_short(item) for item in value)
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def nested(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Return what the header of a controller or an observer says of its model, and its arrays by their names there."""
+    arrays = {f"model_{name}": array for name, array in model.arrays.items()}
+    return model._header(), {**arrays, "model_training_rows": model.training_rows}
+
+
+def nested_model(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Model:
+    """Return the model of which the file's header says `header`."""
+    names = [*header["arrays"], "training_rows"]
+    return Model.from_archive(dict(header), {name: arrays[f"model_{name}"] for name in names})

@@ -45,9 +45,6 @@ def lag_table(
         motors: lags of M_i.
         both_outputs: all outputs for each of them, as form `residual` takes them from its base.
         sizes: numbers of motors and outputs.
-
-    Raises:
-        SettingsError: no lag at all.
     """
     own = (
         [[3, c, lag] for lag in outputs for c in range(sizes[1])] if both_outputs else [[0, 0, lag] for lag in outputs]
@@ -57,8 +54,6 @@ def lag_table(
         + [[1, c, lag] for c in range(sizes[0]) for lag in set_points]
         + [[2, c, lag] for lag in motors for c in range(sizes[0])]
     )
-    if not rows:
-        raise SettingsError("the regressor is empty: give lags of outputs, set-points or motors.")
     return np.array(rows, dtype=np.float64)
 
 

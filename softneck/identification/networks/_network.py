@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from softneck.core import (
     DataError,
+    FileFormatError,
     Matrix,
     Progress,
     SettingsError,
@@ -24,6 +26,7 @@ from softneck.runtime import load_functions
 from softneck.signals import Recording, concatenate
 
 from ..linear._oe import OutputError
+from ..models._arrays import check_table
 from ..models._directions import directions_of
 from ..models._drive import LoadedDrive, drive_start, fit_loaded_drive
 from ..models._error_feedback import fit_correction
@@ -32,8 +35,7 @@ from ..models._model import Model
 from ..models._regressors import PAPER_EQ21, regression, scaled_table
 from ..models._state_space import history_array
 from ..models._unrecorded import unrecorded
-from ._levenberg import Layers, random_layers
-from ._nn_training import FUNCTIONS, AxisData, Best, axis_data, train_axis
+from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_layers, train_axis
 
 # Of the starts: from hardly any to one that smooths; the hold-out decides between them.
 _DECAYS = (0.03, 0.1, 0.01)
@@ -147,7 +149,7 @@ class Network:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        recording = training_recording(recordings, any_robot=True, all_motors=True)
+        recording = training_recording(recordings, all_motors=True)
         drive = fit_loaded_drive(recording)
         directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
         # In the time of a neck: windows and memories go by the robot's time constant.
@@ -270,3 +272,9 @@ def _report(jobs: list[Future], told: list[tuple[float, str]], progress: Progres
     wait(jobs, timeout=0.1)
     slower = min(told)
     progress(slower[0], slower[1])
+
+
+def check_nn(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    check_table(arrays["table"], sizes)
+    if (arrays["correction"] < 0).any() or (arrays["correction"] >= 1).any():
+        raise FileFormatError("its correction's memory and gain are not from 0 to 1, so that it would not die out.")

@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, require_positive, require_whole, silent
+from softneck.core import DataError, FileFormatError, Matrix, Progress, require_positive, require_whole, silent
 from softneck.core._blas_threads import one_blas_thread
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
-from ..models._arrays import memory_array
+from ..models._arrays import check_payloads, memory_array, within
 from ..models._directions import directions_of
 from ..models._drive import drive_start, fit_loaded_drive
 from ..models._error_feedback import BEYOND, fit_echo
 from ..models._fitting import SAME_EXCITATION, fitted_model, payload_of, training_recording
 from ..models._model import Model
 from ..models._state_space import history_array
-from ._contraction import Contraction
 from ._nss_problem import FUNCTIONS, Inputs, Records, Shape, free_run, sensor_limits
-from ._nss_training import BestMap, Training, largest_rate, linear_start, random_start, train_start, whitened
+from ._nss_training import (
+    BestMap,
+    Contraction,
+    Training,
+    largest_rate,
+    linear_start,
+    random_start,
+    train_start,
+    whitened,
+)
 
 # Steps of each start over windows of 1 sample, 0.2, 1 and 5 s; the whole free run takes what `iterations` says.
 _WINDOW_STEPS = (3, 3, 5, 5)
@@ -95,7 +104,7 @@ class NeuralStateSpace:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        recording = training_recording(recordings, any_robot=True, all_motors=True)
+        recording = training_recording(recordings, all_motors=True)
         progress(0.0, "drives and linear model")
         drive = fit_loaded_drive(recording)
         directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
@@ -280,3 +289,12 @@ def _arrays(
     runs = np.split(errors, np.flatnonzero(records.first)[1:])
     echo = np.array([fit_echo([run[:, axis] for run in runs], order, beyond=BEYOND) for axis in range(shape.outputs)])
     return {**arrays, "echo": echo}
+
+
+def check_nss(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    within(arrays["delay"], 0, sizes["H"] - 1, "a dead time")
+    within(np.array([sizes["p"]]), 1, sizes["H"], "the length of the echo")
+    if np.abs(np.linalg.eigvals(arrays["A"])).max(initial=0.0) >= 1.0:
+        raise FileFormatError("its linear part is not stable, so that a free run could diverge.")
+    if "payload" in arrays:
+        check_payloads(*arrays["payload"])

@@ -15,28 +15,22 @@ from softneck.core._shown import Shown
 from softneck.signals import Recording
 from softneck.signals.quality._poor_excitation import poor_excitation
 
-from ..models._fitting import ANY_ROBOT, one_recording
+from ..models._fitting import one_recording
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
 from ..set_membership._set_membership import noise_levels
-from ..uncertainty._guarded import OF, Guarded
-from ..uncertainty._guarded_base import BASES, fitted_base
+from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._choice_words import ALIKE, guarded_why, reasons, remarks, why, word
-from ._exam import agreement, exams, free_runs
-from ._kind_trial import EXAM, HOLD_OUT, KindTrial
-from ._left_out import Fold, everything, folds
+from ._kind_trial import ALIKE, EXAM, HOLD_OUT, KindTrial, guarded_why, reasons, remarks, why, word
+from ._left_out import Fold, agreement, everything, exams, folds, free_runs
 
-# From what can be read to what cannot: of kinds that hold as many numbers the first is taken. `srivc` is tried where
-# it is named: it has the model of `oe`.
-_SIMPLE_FIRST = ("rls", "oe", "srivc", "subspace", "greybox", "play", "nlsm", "nn", "nss")
-_NAMED_ONLY = ("srivc",)
+# From what can be read to what cannot: of kinds that hold as many numbers the first is taken.
+_SIMPLE_FIRST = ("rls", "oe", "greybox", "play", "nlsm", "nn", "nss")
 # Settings other than the default: that form of set membership which can run free.
 _SETTINGS: dict[str, dict[str, Any]] = {"nlsm": {"form": "residual"}}
-# Cheaper settings of the same method, by which kinds are compared: fewer starts and steps, no intervals.
+# Cheaper settings of the same method, by which kinds are compared: fewer starts and steps.
 _SCREENED: dict[str, dict[str, Any]] = {
-    "srivc": {"resamples": 0},
     "greybox": {"evaluations": 15, "sensor_delay": 2},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
     "nlsm": {"output_weight": 5.0}, "nss": {"starts": 4, "iterations": 4},
@@ -99,7 +93,7 @@ def choose(
     Args:
         train: to identify from.
         hold_out: never shown to the model that is chosen.
-        kinds: all where empty, those that take the robot where it is not a neck.
+        kinds: all where empty.
         other_excitation: whether `hold_out` is another experiment than `train`.
         seed: of kinds that start at random.
         progress: called with the part done and a word on it.
@@ -107,7 +101,7 @@ def choose(
     Raises:
         DataError: no kind could be identified.
     """
-    wanted = _wanted(train, kinds)
+    wanted = _wanted(kinds)
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
     for number, kind in enumerate(wanted):
         progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
@@ -143,38 +137,19 @@ def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: 
     return replace(model, findings={**model.findings, "refit": said})
 
 
-def _wanted(train: Recording, kinds: Sequence[str]) -> list[str]:
+def _wanted(kinds: Sequence[str]) -> list[str]:
     known = kinds_to_try()
-    usual = [kind for kind in known if kind not in _NAMED_ONLY and (train.robot.is_neck or kind in ANY_ROBOT)]
     unknown = [kind for kind in kinds if kind not in known]
     if unknown:
         raise SettingsError(f"`{unknown[0]}` cannot be tried; known: {', '.join(known)}.")
-    return sorted(kinds or usual, key=_SIMPLE_FIRST.index)
+    return sorted(kinds or known, key=_SIMPLE_FIRST.index)
 
 
 def best_others(ranking: Sequence[KindTrial], chosen: KindTrial) -> dict[str, KindTrial]:
-    """Return the best "linear" kind where the chosen one cannot stand for it, and the best "nonlinear" one likewise.
-
-    A linear one is to have a transfer function for each output, which most designs ask for: `subspace` of a robot
-    without directions has none.
-    """
-    free = [one for one in ranking if one.fit > float("-inf")]
-    sought = {
-        "linear": [] if _has_axes(chosen) else [one for one in free if _has_axes(one)],
-        "nonlinear": [one for one in free if one.kind not in LINEAR] if chosen.kind in LINEAR else [],
-    }
-    return {sort: max(known, key=lambda one: one.fit) for sort, known in sought.items() if known}
-
-
-def _has_axes(one: KindTrial) -> bool:
-    """Return whether a kind is linear, and each output answers to an input of its own."""
-    if one.kind not in LINEAR or one.model is None:
-        return False
-    try:
-        one.model.tf(one.model.robot.outputs.names[0])
-    except SoftneckError:
-        return False
-    return True
+    """Return the best "nonlinear" kind where the chosen one is linear, and the best "linear" one where it is not."""
+    linear = chosen.kind in LINEAR
+    others = [one for one in ranking if one.fit > float("-inf") and (one.kind in LINEAR) is not linear]
+    return {"nonlinear" if linear else "linear": max(others, key=lambda one: one.fit)} if others else {}
 
 
 class _Race:

@@ -14,9 +14,9 @@ know.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,16 +25,110 @@ from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, re
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.robot import Robot
-from softneck.signals import Recording
+from softneck.signals import Excitation, Recording, SetPointLimits, prepare, signal
 
 from ..models._arrays import members, own_arrays
-from ..models._fitting import in_display_unit, training_recording
-from ..models._jobs import Job, done
+from ..models._fitting import in_display_unit
 from ..models._model import Model
-from ..networks._state_space_network import NeuralStateSpace
-from ..uncertainty._guarded import Guarded, covering
-from ..uncertainty._left_out import left_out
-from ._candidate_motions import RAMP, Bounds, Motion, motions
+
+# Of what each signal asks for: small motions show friction, large ones what bends.
+_SIZES = (0.5, 0.75, 1.0)
+# Of the signals' own pace; `rotation`, `aprbs` and `multisine` are as fast as the paper's at 1.
+_SPEEDS = (0.5, 1.0, 2.0)
+_PLAYED = ("eq22", "aprbs", "multisine", "rotation")
+# Parts of `mixed` in which one motor moves at a time, and all alike: from which to which part of its length.
+_OF_MIXED = {"single_tendon": (0.88, 0.95), "cocontraction": (0.95, 1.0)}
+# How long that is [s]: each part of it is played again and again.
+_MIXED = 120.0
+# [s] from rest into each motion and back.
+RAMP = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Bounds:
+    """What set-points may do, in SI.
+
+    Attributes:
+        lowest, highest: (motors,) set-points.
+        speed: largest change by the time, of any motor.
+    """
+
+    lowest: Vector
+    highest: Vector
+    speed: float
+
+    @classmethod
+    def of(cls, robot: Robot, limits: SetPointLimits | None = None) -> Bounds:
+        """Return the bounds of a robot, and `limits` within them.
+
+        Raises:
+            SettingsError: nothing is left between them.
+        """
+        motors, scale, inside = robot.motors, to_si(robot.motors.unit)[0], limits or SetPointLimits(position=math.inf)
+        count = len(motors.names)
+        low, high = (
+            scale * np.array(given) if given is not None else np.full(count, side)
+            for given, side in ((motors.setpoint_min, -math.inf), (motors.setpoint_max, math.inf))
+        )
+        speed = min(inside.speed, scale * min(motors.rate_limit) if motors.rate_limit else math.inf)
+        low, high = np.maximum(low, inside.lowest), np.minimum(high, inside.position)
+        if (low >= high).any():
+            j = int(np.argmax(low >= high))
+            raise SettingsError(f"motor {j + 1} may move from {low[j]:g} to {high[j]:g} only; widen its limits.")
+        return cls(lowest=low, highest=high, speed=speed)
+
+    @property
+    def rest(self) -> Vector:
+        """Where motors begin and end (motors,): zero, or what is nearest to it."""
+        return np.clip(0.0, self.lowest, self.highest)
+
+    def within(self, P: Matrix, sample_time: float) -> Matrix:
+        """Return set-points (time, motors) that begin and end at rest and keep the bounds."""
+        moved = Excitation("", np.arange(len(P)) * sample_time, np.clip(P, self.lowest, self.highest) - self.rest,
+                           sample_time)  # fmt: skip
+        return (
+            prepare(moved, SetPointLimits(position=math.inf, speed=self.speed), ramp_s=RAMP)[0].set_points + self.rest
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """One motion: a signal, how large and how fast of what it is by itself, and its set-points (time, motors)."""
+
+    signal: str
+    size: float
+    speed: float
+    set_points: Matrix
+
+    def __str__(self) -> str:
+        return f"{self.signal}, {self.size:g} of its size at {self.speed:g} times its speed"
+
+
+def motions(robot: Robot, sample_time: float, rows: int, bounds: Bounds, seed: int) -> list[Motion]:
+    """Return motions of `rows` rows each: every signal in every size and speed."""
+    found = []
+    for name, speed, P in _signals(robot, sample_time, rows, seed):
+        found += [Motion(name, size, speed, bounds.within(size * P, sample_time)) for size in _SIZES]
+    return found
+
+
+def _signals(robot: Robot, sample_time: float, rows: int, seed: int) -> Iterator[tuple[str, float, Matrix]]:
+    """Yield name, speed and set-points (rows, motors)."""
+    # At the sample time of the data, which a robot file need not give.
+    robot = replace(robot, sample_time_s=sample_time)
+    longest = (rows * max(_SPEEDS) + 1) * sample_time
+    mixed = signal("mixed", duration=_MIXED, seed=seed, robot=robot).set_points
+    for number, speed in enumerate(_SPEEDS):
+        # Slower or faster: read at other instants.
+        at = np.arange(rows) * speed
+        for name in _PLAYED:
+            # Other levels and phases at each speed.
+            P = signal(name, duration=longest, seed=seed + number, robot=robot).set_points
+            yield name, speed, np.column_stack([np.interp(at, np.arange(len(P)), column) for column in P.T])
+        for name, share in _OF_MIXED.items():
+            start, stop = (round(part * len(mixed)) for part in share)
+            yield name, speed, mixed[start + (at.astype(int) % (stop - start))]
+
 
 # Of a motion, ramps included [s]; a sequence has whole ones.
 _SECONDS = 10.0
@@ -43,10 +137,6 @@ _LEAST, _MOST = 4.0 * RAMP, 3600.0
 _EVERY, _CHANGE = 0.2, 0.4
 # Of the kernel, in standard deviations of set-points and changes over all motions.
 _LENGTH = 0.5
-# Of a record: so many quick models, steps of each over its whole free run, and set-points that stand for all.
-_MEMBERS, _STEPS, _SEEN = 4, 4, 200
-# The doubt beyond what was seen, as of guarded models.
-_UNSEEN = Guarded().unseen
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -54,8 +144,8 @@ class Known:
     """What is there before the experiment.
 
     Attributes:
-        models: members that run free; none where none could be trained.
-        seen: (points, motors) set-points that stand for all that were seen; None where a model does not say.
+        models: members that run free.
+        seen: (points, motors) set-points that stand for all that were seen.
         reach: how far any was from the nearest of them.
         slope: (outputs,) how the doubt grows with the distance from them.
         sample_time: [s].
@@ -64,7 +154,7 @@ class Known:
     """
 
     models: tuple[Model, ...]
-    seen: Matrix | None
+    seen: Matrix
     reach: float
     slope: Vector
     sample_time: float
@@ -78,53 +168,25 @@ class Known:
         Raises:
             SettingsError: a model of one piece.
         """
+        if model.kind != "guarded":
+            raise SettingsError(
+                f"a model of kind `{model.kind}` has no members that could part; give one of kind `guarded`."
+            )
+        # The first is the base: it is another kind, and parts from the others everywhere.
         parts = [
             Model(kind=kind, sample_time=model.sample_time, arrays=arrays, robot=model.robot)
-            for kind, arrays in members(model.arrays)
+            for kind, arrays in members(model.arrays)[1:]
         ]
-        # Of a guarded model the first is the base: it is another kind, and parts from the others everywhere.
-        parts = parts[1:] if model.kind == "guarded" else parts
-        if len(parts) < 2:
-            raise SettingsError(
-                f"a model of kind `{model.kind}` has no members that could part; give one of kind `guarded`, "
-                "or the recording."
-            )
-        own, outputs = own_arrays(model.arrays), len(model.robot.outputs.names)
+        own = own_arrays(model.arrays)
         return cls(
             models=tuple(parts),
-            seen=own.get("seen"),
-            reach=float(own["reach"][0]) if "reach" in own else 0.0,
-            slope=own.get("slope", np.zeros(outputs)),
+            seen=own["seen"],
+            reach=float(own["reach"][0]),
+            slope=own["slope"],
             sample_time=model.sample_time,
             robot=model.robot,
             said=f"{len(parts)} members of {model.kind}",
         )
-
-    @classmethod
-    def of_recording(cls, recording: Recording, *, seed: int = 0, progress: Progress = silent) -> Known:
-        """Train neural state spaces quickly, and return what they know; of poor data where it was alone.
-
-        Raises:
-            DataError: a record that nothing can be trained on.
-        """
-        whole = training_recording(recording, any_robot=True)
-        seen, reach = covering(whole.set_points, _SEEN)
-        moved = np.sqrt(np.mean(whole.set_points.var(axis=0)))
-        parts = enumerate(left_out(whole, _MEMBERS))
-        jobs = [Job(f"member {i + 1}", _member, (seed + i, rest, part)) for i, (rest, part) in parts]
-        try:
-            training_recording(whole, any_robot=True, all_motors=True)  # before processes are started
-            models, said = done(jobs, min(os.cpu_count() or 1, _MEMBERS), progress), f"{_MEMBERS} quick models"
-        except DataError as error:
-            models, said = [], f"no models ({error})"
-        return cls(
-            models=tuple(models), seen=seen, reach=reach, slope=_UNSEEN * np.nanstd(whole.outputs, axis=0) / moved,
-            sample_time=whole.sample_time, robot=whole.robot, said=said,
-        )  # fmt: skip
-
-
-def _member(seed: int, rest: Recording, part: Recording) -> Model:
-    return NeuralStateSpace(seed=seed, starts=1, iterations=_STEPS).fit(rest, hold_out=part)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,20 +308,20 @@ class _Tried:
     @classmethod
     def of(cls, motion: Motion, known: Known) -> _Tried:
         """Run the members over a motion."""
+        from scipy.spatial import KDTree
+
         robot, Ts, P = known.robot, known.sample_time, motion.set_points
         outputs = len(robot.outputs.names)
         blank = _recording(robot, Ts, P, np.zeros((len(P), outputs)))
         runs = np.array([model.simulate(blank, warm_up=1)[:, :outputs] for model in known.models])
-        expected, variance = np.zeros((len(P), outputs)), np.zeros((len(P), outputs))
-        if len(runs):
-            runs = np.where(np.isfinite(runs), runs, np.inf)
-            expected = np.median(runs, axis=0)
-            if not np.isfinite(expected).all():
-                raise DataError("most members diverge; record with `mixed`, or train others.")
-            # One that diverges is as wrong as the motion is large.
-            apart = np.minimum(np.abs(runs - expected), max(float(np.ptp(expected, axis=0).max()), 1e-9))
-            variance = np.mean(apart**2, axis=0)
-        distance = _distance(P, known)
+        runs = np.where(np.isfinite(runs), runs, np.inf)
+        expected = np.median(runs, axis=0)
+        if not np.isfinite(expected).all():
+            raise DataError("most members diverge; record with `mixed`, or train others.")
+        # One that diverges is as wrong as the motion is large.
+        apart = np.minimum(np.abs(runs - expected), max(float(np.ptp(expected, axis=0).max()), 1e-9))
+        variance = np.mean(apart**2, axis=0)
+        distance = np.maximum(KDTree(known.seen).query(P)[0] - known.reach, 0.0)
         unseen = (distance[:, None] * known.slope) ** 2
         every = slice(None, None, max(round(_EVERY / Ts), 1))
         back = max(round(_CHANGE / Ts), 1)
@@ -274,15 +336,6 @@ class _Tried:
             float(np.sqrt(variance.mean())), float(np.sqrt(unseen.mean())), float(distance.max()),
             bool((expected >= scale * low).all() and (expected <= scale * high).all()),
         )  # fmt: skip
-
-
-def _distance(P: Matrix, known: Known) -> Vector:
-    """Return how far set-points are beyond the reach of all that were seen (time,)."""
-    from scipy.spatial import KDTree
-
-    if known.seen is None:
-        return np.zeros(len(P))
-    return np.maximum(KDTree(known.seen).query(P)[0] - known.reach, 0.0)
 
 
 def _coverage(features: Sequence[Matrix]) -> Matrix:

@@ -14,10 +14,24 @@ import math
 
 import numpy as np
 
-from softneck.identification.set_membership._tree_runtime import tree_cones
-
 # Times n + 8, beyond what so many rounded operations on numbers of one size make wrong: 2^-50, where one makes 2^-53.
 SLANT_ROUNDING = 8.881784197001252e-16
+
+
+def tree_cones(points: np.ndarray, first: int, count: int, gamma: float, x: np.ndarray, cones: np.ndarray) -> None:
+    """Fill `cones` with gamma times the distance of x (n,) from `count` points from column `first` on, side by side.
+
+    The sum of each point goes over its sides in their order, as a box's does.
+    """
+    for k in range(count):
+        cones[k] = 0.0
+    for i in range(x.shape[0]):
+        value = x[i]
+        for k in range(count):
+            gap = points[i, first + k] - value
+            cones[k] += gap * gap
+    for k in range(count):
+        cones[k] = gamma * math.sqrt(cones[k])
 
 
 def slant_children(

@@ -1,44 +1,109 @@
-"""Many queries of one set: bounds, and the slopes that its points need, row by row on one thread (nogil)."""
+"""Many queries of one set: bounds, row by row on one thread (nogil).
+
+Exact bounds by branch and bound over a kd-tree (see `_trees`): node j of level l is row 2^l + j of `nodes`.
+
+A cone's value at a box is no better than its ymin (ymax) at the box's nearest point. Rounding keeps that
+order: gaps, squares, their sums in one order, roots and products all rise with their arguments, so a node
+that is left out holds no better cone to the last bit, and the bounds are those of all points to the bit.
+"""
 
 import math
 
 import numpy as np
 
-from softneck.identification.set_membership._tree_runtime import tree_children, tree_distance, tree_tighten
+from softneck.identification.set_membership._principal_tree_runtime import tree_cones
 
 
-def set_home(nodes: np.ndarray, regions: int, x: np.ndarray) -> int:
-    """Return the node of the region (a power of two of them) that x falls to, nearest child first."""
-    node = 1
-    while node < regions:
-        left, right = tree_children(nodes, node, x)
-        node = 2 * node if left <= right else 2 * node + 1
-    return node
+def tree_children(nodes: np.ndarray, node: int, x: np.ndarray) -> tuple[float, float]:
+    """Return the distances of x (n,) from the boxes of both children of a node, 0 within, side by side."""
+    a = 2 * node
+    b = 2 * node + 1
+    left = 0.0
+    right = 0.0
+    for i in range(x.shape[0]):
+        below = nodes[a, 2 * i] - x[i]
+        above = x[i] - nodes[a, 2 * i + 1]
+        gap = below if below > above else above
+        gap = gap if gap > 0.0 else 0.0
+        left += gap * gap
+        below = nodes[b, 2 * i] - x[i]
+        above = x[i] - nodes[b, 2 * i + 1]
+        gap = below if below > above else above
+        gap = gap if gap > 0.0 else 0.0
+        right += gap * gap
+    return math.sqrt(left), math.sqrt(right)
 
 
-def set_bounds(
+def tree_tighten(
     tree: tuple[np.ndarray, np.ndarray, np.ndarray],
-    column: int,
-    gammas: np.ndarray,
+    gamma: float,
     x: np.ndarray,
     bounds: tuple[float, float],
     hidden: tuple[np.ndarray, float, float],
 ) -> tuple[float, float]:
-    """Return `bounds` tightened by the cones of all regions, each with its own slope; see `tree_tighten`."""
-    regions = gammas.shape[0]
-    home = set_home(tree[2], regions, x)
-    # The region that x lies in comes first: with its bounds the others are soon left out.
-    bounds = tree_tighten(tree, (home, column), float(gammas[home - regions]), x, bounds, hidden)
-    for region in range(regions):
-        if regions + region != home:
-            bounds = tree_tighten(tree, (regions + region, column), float(gammas[region]), x, bounds, hidden)
-    return bounds
+    """Return `bounds` (low, high) tightened by max(y - gamma d) and min(y + gamma d) over all points.
+
+    Args:
+        tree: points (n, N) in tree order, their values (N,), nodes.
+        gamma: slope of the cones.
+        x: (n,) where.
+        bounds: what is known already; (-inf, inf) at first.
+        hidden: ages (N,), start, stop: points with `start <= age < stop` do not count.
+    """
+    points, values, nodes = tree
+    column = 2 * x.shape[0]  # the values' ymin; ymax is behind it
+    low, high = bounds
+    ages, start, stop = hidden
+    rows = values.shape[0]
+    leaves = nodes.shape[0] // 2
+    # Left for later: one node a level at most, and 2^64 nodes are more than any memory holds.
+    waiting = np.empty(64, dtype=np.int64)
+    later = np.empty(64)
+    # Leaves share the points evenly: none has more than one above the mean.
+    cones = np.empty(rows // leaves + 1)
+    waiting[0] = 1
+    later[0] = 0.0
+    top = 1
+    while top > 0:
+        top -= 1
+        node = waiting[top]
+        cone = later[top]
+        # Eq. 19 and 20 with the best value and the nearest place that the box allows: no cone in it does better.
+        while nodes[node, column] + cone < high or nodes[node, column + 1] - cone > low:
+            if node >= leaves:
+                first = (node - leaves) * rows // leaves
+                count = (node + 1 - leaves) * rows // leaves - first
+                tree_cones(points, first, count, gamma, x, cones)
+                for k in range(count):
+                    if start < stop and start <= ages[first + k] < stop:
+                        continue
+                    value = values[first + k]
+                    high = min(high, value + cones[k])
+                    low = max(low, value - cones[k])
+                break
+            left, right = tree_children(nodes, node, x)
+            # The nearer child now, the other one later, if ever.
+            if left <= right:
+                node = 2 * node
+                other = node + 1
+                cone = gamma * left
+                far = gamma * right
+            else:
+                other = 2 * node
+                node = other + 1
+                cone = gamma * right
+                far = gamma * left
+            # Bounds only get tighter: what cannot help now never will.
+            if nodes[other, column] + far < high or nodes[other, column + 1] - far > low:
+                waiting[top] = other
+                later[top] = far
+                top += 1
+    return low, high
 
 
 def set_batch(
     tree: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-    column: int,
-    gammas: np.ndarray,
+    gamma: float,
     queries: np.ndarray,
     windows: np.ndarray,
     bounds: np.ndarray,
@@ -47,81 +112,13 @@ def set_batch(
 
     Args:
         tree: points (n, N) in tree order, values (N,), nodes, ages (N,).
-        column: of `nodes`, with the values' ymin.
-        gammas: (2^l,) slopes of the nodes of level l.
+        gamma: slope of the cones.
         queries: (m, n).
-        windows: (m, 2) or (1, 2) for all rows: points with `start <= age < stop` do not count.
+        windows: (m, 2): points with `start <= age < stop` do not count.
         bounds: (m, 2) low and high, tightened in place.
     """
     points, values, nodes, ages = tree
     for k in range(queries.shape[0]):
-        # One window for each query, or one for all.
-        w = min(k, windows.shape[0] - 1)
+        hidden = (ages, windows[k, 0], windows[k, 1])
         known = (bounds[k, 0], bounds[k, 1])
-        hidden = (ages, windows[w, 0], windows[w, 1])
-        bounds[k, 0], bounds[k, 1] = set_bounds((points, values, nodes), column, gammas, queries[k], known, hidden)
-
-
-def set_need(
-    tree: tuple[np.ndarray, np.ndarray, np.ndarray],
-    column: int,
-    gamma: float,
-    slack: float,
-    x: np.ndarray,
-    y: float,
-    hidden: tuple[np.ndarray, float, float],
-) -> tuple[float, int]:
-    """Return the gamma that one more point (x, y) needs, at least `gamma`, and the column that asks for it, or -1."""
-    points, values, nodes = tree
-    ages, start, stop = hidden
-    rows = values.shape[0]
-    leaves = nodes.shape[0] // 2
-    worst = -1
-    waiting = np.empty(64, dtype=np.int64)
-    waiting[0] = 1
-    top = 1
-    while top > 0:
-        top -= 1
-        node = waiting[top]
-        distance = tree_distance(nodes, node, x)
-        # Less some rounding, so that what is left out needs no more to the last bit.
-        while max(nodes[node, column + 1] - y, y - nodes[node, column]) > (1.0 - 1e-14) * (slack + gamma * distance):
-            if node >= leaves:
-                for k in range((node - leaves) * rows // leaves, (node + 1 - leaves) * rows // leaves):
-                    if start < stop and start <= ages[k] < stop:
-                        continue
-                    squared = 0.0
-                    for i in range(x.shape[0]):
-                        gap = points[i, k] - x[i]
-                        squared += gap * gap
-                    # As `gamma_need`: equal points ask for a huge but finite gamma.
-                    needed = min((abs(values[k] - y) - slack) / max(math.sqrt(squared), 1e-300), 1e300)
-                    if needed > gamma:
-                        gamma = needed
-                        worst = k
-                break
-            left, right = tree_children(nodes, node, x)
-            node = 2 * node if left <= right else 2 * node + 1
-            distance = min(left, right)
-            # The sibling: 2j and 2j + 1 differ in the last bit.
-            waiting[top] = node ^ 1
-            top += 1
-    return gamma, worst
-
-
-def set_regions(
-    tree: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], column: int, slack: float, gammas: np.ndarray
-) -> None:
-    """Raise `gammas` (2^l,) to what the points of each region need beside all points."""
-    points, values, nodes, ages = tree
-    rows = values.shape[0]
-    regions = gammas.shape[0]
-    x = np.empty(points.shape[0])
-    for region in range(regions):
-        for j in range(region * rows // regions, (region + 1) * rows // regions):
-            for i in range(points.shape[0]):
-                x[i] = points[i, j]
-            # All points count, j itself too: its own rise of 0 asks for nothing.
-            gammas[region], _ = set_need(
-                (points, values, nodes), column, gammas[region], slack, x, values[j], (ages, 0.0, 0.0)
-            )
+        bounds[k, 0], bounds[k, 1] = tree_tighten((points, values, nodes), gamma, queries[k], known, hidden)

@@ -13,17 +13,111 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.robot import Robot
+from softneck.runtime import load_functions
+from softneck.runtime._compile import have_numba
 from softneck.signals import Recording
 
-from ..linear._arrays import no_base
+from ..linear._regression import no_base
 from ..models._drive import DriveModel
 from ..models._fitting import in_display_unit
 from ..models._model import WARM_UP, Model
 from ..models._regressors import history_length, motor_signals, regression
 from ..models._scores import nrmse_fit
 from ..models._state_space import history_array
-from ._gamma import least_gammas
-from ._trees import slant_frames, slant_nodes, slant_order
+from ._trees import slant_frames, slant_nodes, slant_order, tree_nodes, tree_order
+
+_TREE_SEARCH = "softneck.identification.set_membership._gamma_runtime"
+
+
+def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector, np.ndarray]:
+    """Return for each slack the least gamma (m,) with `|y_j - y_k| <= slack + gamma |w_j - w_k|`, and its pair (m, 2).
+
+    Compiled by branch and bound; without numba over all pairs by numpy, some hundred times slower.
+    A gamma beyond 1e200 says that equal regressors have outputs further apart than the slack.
+    """
+    rising = np.argsort(slacks, kind="stable")
+    gammas, found = np.zeros(slacks.size), np.zeros((slacks.size, 2), dtype=np.int64)
+    if not have_numba():
+        return all_pairs_gammas(points, values, slacks)
+    order = tree_order(points)
+    points, values = np.ascontiguousarray(points[:, order]), values[order]
+    nodes = tree_nodes(points, values)
+    search = load_functions(_TREE_SEARCH).gamma_search
+    search(points, values, nodes, np.ascontiguousarray(slacks[rising]), gammas, found)
+    back = np.argsort(rising)
+    return gammas[back], order[found[back]]
+
+
+def all_pairs_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector, np.ndarray]:
+    """Return what `least_gammas` does, by numpy."""
+    n, worst = values.shape[0], np.zeros((slacks.size, 2), dtype=np.int64)
+    gammas = np.zeros(slacks.shape[0])
+    for i in range(n - 1):
+        squared = np.zeros(n - 1 - i)
+        for c in range(points.shape[0]):
+            gap = points[c, i + 1 :] - points[c, i]
+            squared += gap * gap
+        distance = np.sqrt(squared)
+        rise = np.abs(values[i + 1 :] - values[i])
+        for m in range(slacks.shape[0]):
+            # 1e-300 and 1e300 keep equal regressors from making 0/0 or infinity; `argmax` would stumble over a NaN.
+            needed = np.minimum(np.maximum(rise - slacks[m], 0.0) / np.maximum(distance, 1e-300), 1e300)
+            j = int(np.argmax(needed))
+            if needed[j] > gammas[m]:
+                gammas[m] = needed[j]
+                worst[m] = i, i + 1 + j
+    return gammas, worst
+
+
+def require_feasible(
+    recording: Recording, table: Matrix, data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector
+) -> None:
+    """Raise DataError, naming two samples of the recording, where equal regressors deny epsilon whatever gamma is.
+
+    Args:
+        recording: what the set was made of.
+        table: the regressor, rows (source, channel, lag).
+        data: scaled regressors (n, N) and targets (N,) of each axis, in the recording's order.
+        gamma: (outputs,) the least; beyond 1e100 there is none.
+        epsilon: (outputs,) [rad].
+    """
+    if gamma.max() <= 1e100:
+        return
+    axis = int(np.argmax(gamma))
+    points, values = data[axis]
+    j, k = sorted(least_gammas(points, values, epsilon[axis : axis + 1])[1][0].tolist())
+    rows = _rows_of(recording, table, axis, values.size)
+    name, unit = recording.robot.outputs.names[axis], recording.robot.outputs.display_unit
+    tried = in_display_unit(recording.robot, epsilon)
+    rise = float(in_display_unit(recording.robot, np.abs(values[j] - values[k])))
+    where = f"samples {j} and {k} of the set"
+    if rows is not None:
+        where = " and ".join(
+            f"row {row} (run {recording.run[row]}, {recording.time[row]:.6g} s)" for row in (rows[j], rows[k])
+        )
+    raise DataError(
+        f"epsilon {tried.round(4).tolist()} {unit} is below the noise: equal regressors have outputs "
+        f"further apart, so no function fits the data. {where} differ by {rise:.4g} {unit} in {name} and by nothing in "
+        "the regressor. Set `epsilon` higher."
+    )
+
+
+def _rows_of(recording: Recording, table: Matrix, axis: int, count: int) -> np.ndarray | None:
+    """Return the recording's row (count,) of each sample of the set, or None where that cannot be told."""
+    lags = table[:, 2].astype(int)
+    # Form `residual` (source 3) waits for its base to settle.
+    skip = (2 if (table[:, 0] == 3).any() else 1) * int(lags.max())
+    runs, start, found = recording.runs(), 0, []
+    for run in runs:
+        own = sorted({0, *lags[table[:, 0] == 0]})
+        there = np.array(
+            [all(np.isfinite(run.outputs[k - lag, axis]) for lag in own) for k in range(skip, len(run))], dtype=bool
+        )
+        found.append(start + skip + np.flatnonzero(there))
+        start += len(run)
+    rows = np.concatenate(found)
+    return rows if rows.size == count else None
+
 
 # How far back the neck's state shows in its inputs [s]: the newest sample, then about one, two and four of its
 # time constants of 0.2 s. Denser or longer ones moved no free run by more than 2 points (virtual neck, `paper`).

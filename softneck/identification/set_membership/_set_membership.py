@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,32 +31,133 @@ from ..models._drive import DriveModel, fit_drive
 from ..models._fitting import fitted_model, in_display_unit, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._regressors import lag_table
-from ._cones import usual_width
-from ._forest import all_cores, plant
-from ._gamma import require_feasible
-from ._regressor import Ground, gammas, residual_lags, scaled, widened, widening
-from ._scaling import RULES, HoldOut, ScaleTrial, grouped_scale, ruled_scale
+from ._regressor import Data, Ground, gammas, require_feasible, residual_lags, scaled, widened, widening
+from ._trees import usual_width
+
+# Sources of a regressor's rows (`_narx_runtime`): own output or both of the base, set-points, motors.
+_OUTPUTS, _MOTORS = (0, 3), 2
+# Half a percent of fit an axis is less than the scores of two hold-outs differ by; narrower bounds are worth more.
+AS_GOOD = 1.0
+# Issue 5 asks it of the bounds on data like those they were made of.
+COVERAGE = 0.97
+_THREADS = 2
+
+
+def grouped_scale(table: Matrix, output_weight: float, motor_weight: float = 1.0) -> Vector:
+    """Return one weight for all outputs, one for all motor positions, and 1 for all set-points."""
+    source = table[:, 0]
+    return np.where(np.isin(source, _OUTPUTS), output_weight, np.where(source == _MOTORS, motor_weight, 1.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaleTrial:
+    """One scale and epsilon (outputs,), and what the free run over the hold-out says of them.
+
+    Attributes:
+        output_weight, motor_weight: of the scale, or None.
+        scale: (n,).
+        epsilon: (outputs,) [rad].
+        score: sum of all axes' fits [%]; -inf where it left all bounds.
+        coverage: part of the samples within f_l and f_u.
+        width: mean of f_u - f_l [rad].
+        slope: the least gamma of all axes; 0: the set is a constant, as epsilon swallowed all there was to learn.
+    """
+
+    output_weight: float | None
+    motor_weight: float | None
+    scale: Vector
+    epsilon: Vector
+    score: float
+    coverage: float
+    width: float
+    slope: float
+
+    def row(self, robot: Robot) -> list[float | None]:
+        """Weights, first epsilon, score, coverage and width as JSON values in the unit shown; None for none."""
+        epsilon, width = in_display_unit(robot, np.array([self.epsilon[0], self.width])).tolist()
+        judged = [value if np.isfinite(value) else None for value in (self.score, self.coverage, width)]
+        return [self.output_weight, self.motor_weight, epsilon, *judged]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HoldOut:
+    """Free runs over the last part of the training rows, of sets made of the part before.
+
+    Attributes:
+        ground, data: of the first part.
+        tail: the last part.
+        epsilons: (outputs,) each, tried with every scale.
+        narrow: among equally good ones take the narrowest bounds that cover the hold-out.
+    """
+
+    ground: Ground
+    data: Data
+    tail: Recording
+    epsilons: Sequence[Vector]
+    narrow: bool = False
+
+    def choose(self, outputs: Sequence[float], motors: Sequence[float], progress: Progress) -> list[ScaleTrial]:
+        """Return all that was tried, the best first: weights of outputs, then of motors beside the best of those."""
+        tried = self._try([(weight, 1.0) for weight in outputs], progress)
+        if not tried:  # no function fits with any: equal regressors have unequal outputs, so that all are widened
+            return replace(self, epsilons=[2.0 * epsilon for epsilon in self.epsilons]).choose(
+                outputs, motors, progress
+            )
+        best = self.best_first(tried)[0]
+        tried += self._try([(best.output_weight or 1.0, weight) for weight in motors], progress)
+        return self.best_first(tried)
+
+    def best_first(self, tried: list[ScaleTrial]) -> list[ScaleTrial]:
+        """Return them by falling score."""
+        ranked = sorted(tried, key=lambda one: -one.score)
+        if self.narrow:
+            as_good = [t for t in ranked if t.score >= ranked[0].score - AS_GOOD and t.coverage >= COVERAGE]
+            chosen = min((t for t in as_good if t.slope > 0.0), key=lambda one: one.width, default=ranked[0])
+            ranked = [chosen, *(one for one in ranked if one is not chosen)]
+        return ranked
+
+    def _try(self, weights: Sequence[tuple[float, float]], progress: Progress) -> list[ScaleTrial]:
+        tried: list[ScaleTrial] = []
+        # Queries and the search for gamma are compiled and let go of Python's lock.
+        with ThreadPoolExecutor(_THREADS) as pool:
+            for number, part in enumerate(pool.map(self._weights, weights), start=1):
+                progress(number / (len(weights) + 1), f"weights of outputs and motors {weights[number - 1]}")
+                tried += part
+        return tried
+
+    def _weights(self, weights: tuple[float, float]) -> list[ScaleTrial]:
+        scale = grouped_scale(self.ground.table, *weights) * self.ground.units
+        return list(self._scale(scale, *weights))
+
+    def _scale(self, scale: Vector, output: float | None, motor: float | None) -> Iterator[ScaleTrial]:
+        for epsilon, gamma in zip(self.epsilons, gammas(self.data, scale, self.epsilons), strict=True):
+            if gamma.max() > 1e100:
+                continue
+            arrays = self.ground.arrays(self.data, scale, gamma, epsilon)
+            yield ScaleTrial(
+                output, motor, scale, epsilon, *self.ground.free_run(arrays, self.tail), float(gamma.min())
+            )
+
 
 _FINDING = "usual_half_width"
-# As `Cones.usual`.
+# Of the training rows' widths, themselves left out.
 _QUANTILE = 0.99
 
 
 def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> Vector:
-    """Return each axis' half-width [rad] that 99 % of the training rows stay below, see `Cones.usual`.
+    """Return each axis' half-width [rad] that 99 % of the training rows stay below.
 
     Args:
         data: scaled regressors (n, N) and targets (N,) of each axis, in order of time.
         gamma: (outputs,).
         epsilon: (outputs,) [rad].
     """
-    widths = []
-    for axis, (points, values) in enumerate(data):
-        tree = plant(np.array(points, order="C"), values[None].copy(), np.arange(values.size, dtype=np.float64))
-        # Half a second on either side is the same motion; less where there is hardly more than that.
-        usual = (min(WARM_UP, values.size // 8), _QUANTILE)
-        widths.append(epsilon[axis] + usual_width(tree, 0, gamma[axis : axis + 1], usual, all_cores()))
-    return np.array(widths)
+    # Half a second on either side is the same motion; less where there is hardly more than that.
+    widths = [
+        usual_width(points, values, float(gamma[axis]), min(WARM_UP, values.size // 8), _QUANTILE)
+        for axis, (points, values) in enumerate(data)
+    ]
+    return epsilon + np.array(widths)
 
 
 def knows_what_it_saw(model: Model) -> bool:
@@ -88,13 +190,11 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
     return in_display_unit(model.robot, half) > np.array(model.findings[usual_finding(model.robot)])
 
 
-FORMS = ("paper_eq21", "lags", "residual")
+FORMS = ("paper_eq21", "residual")
 # Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
 _BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
 # Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3) at the neck's 20 ms; of another robot u and M so far apart by its time.
 _EQ21_APART = 0.02
-# A lag is a sample; a minute at 1 ms is the longest history a file may hold.
-_LONGEST_LAG = 60_000
 # Free run of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
 # 0.8 s leave unexplained, gamma and the width grow a hundredfold.
 _RESIDUAL_SIGMAS = (4.0, 8.0, 16.0, 32.0)
@@ -119,44 +219,28 @@ class SetMembership:
     """The estimator of Eq. 12-20 and Algorithm 1, one set for each axis, over the regressor of Eq. 21 or another.
 
     Attributes:
-        form: "paper_eq21"; "lags", the same estimator over other lags; or "residual": set membership over simulated
-            signals on what the free run of a linear base leaves over, where nothing is fed back and so nothing drifts.
-        output_lags, setpoint_lags, motor_lags: lags [samples] in the regressor, of the output (both outputs of the
-            base in form "residual"), of all set-points and of all motor positions; None takes the form's own. Not
-            for "paper_eq21", whose lags are Eq. 21's; those of u and M go by another robot's time constant.
-        scale: weights of the regressor's components in the norm of Eq. 16: "auto" chooses one for outputs and one
-            for motors by free run on the last fifth of the training rows; "none" takes SI units as they are; "std"
-            divides each by its standard deviation (a trap, see docs); or a vector as long as the regressor. Weights
-            of another robot are for components that move as much as a neck's.
-        output_weight: weight of the outputs, all others having 1: the scale without a choice.
+        form: "paper_eq21", the lags of Eq. 21 (of another robot by its time constant); or "residual": set membership
+            over simulated signals on what the free run of a linear base leaves over, where nothing is fed back and so
+            nothing drifts.
+        output_weight: weight of the outputs in the norm of Eq. 16, all other components having 1; None chooses it, and
+            one of the motors, by free run on the last fifth of the training rows. Weights of another robot are for
+            components that move as much as a neck's.
         epsilon: noise bound of Eq. 15 [rad, or the SI unit of the outputs]; None chooses it by the same free run
             (form "residual": so that the bounds are narrowest among equal fits).
         base: linear kind of one pole that form "residual" stands on.
     """
 
     form: str = "paper_eq21"
-    output_lags: tuple[int, ...] | None = None
-    setpoint_lags: tuple[int, ...] | None = None
-    motor_lags: tuple[int, ...] | None = None
-    scale: str | tuple[float, ...] = "auto"
     output_weight: float | None = None
     epsilon: float | None = None
     base: str = "oe"
 
     def __post_init__(self) -> None:
         require_one_of("form", self.form, FORMS)
-        for name in ("output_lags", "setpoint_lags", "motor_lags"):
-            object.__setattr__(self, name, self._checked_lags(name))
-        if isinstance(self.scale, str):
-            require_one_of("scale", self.scale, RULES)
-        else:
-            object.__setattr__(self, "scale", _checked_scale(self.scale))
         if self.epsilon is not None:
             require_positive("epsilon", self.epsilon, "rad")
         if self.output_weight is not None:
             require_positive("output_weight", self.output_weight)
-            if self.scale != "auto":
-                raise SettingsError("`output_weight` is a scale of its own; leave `scale` at auto beside it.")
         require_one_of("base", self.base, _BASES)
 
     @one_blas_thread
@@ -167,9 +251,8 @@ class SetMembership:
 
         Raises:
             DataError: too short, constant, or `epsilon` so small that no function fits the data.
-            SettingsError: a `scale` of another length than the regressor.
         """
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings)
         robot = recording.robot
         noise = noise_levels(recording)
         drive = fit_drive(recording)
@@ -179,7 +262,7 @@ class SetMembership:
         ground = self._ground(recording, drive, necks)
         data = ground.data(recording)
         chosen, tried = self._choose(ground, recording, noise, necks, progress)
-        scale = chosen.scale if chosen.scale.size else ruled_scale(self.scale, ground.table, data)
+        scale = chosen.scale
         sets = [(scaled(X, scale), y) for X, y in data]
         # An epsilon that was asked for is kept or refused.
         if self.epsilon is None:
@@ -212,12 +295,10 @@ class SetMembership:
         residual = self.form == "residual"
         if residual:
             own = residual_lags(necks, recording)
-            preset = (own, (), own)
+            lags = (own, (), own)
         else:
             apart = 1 if recording.robot.is_neck else max(round(_EQ21_APART / necks), 1)
-            preset = ((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,))
-        given = (self.output_lags, self.setpoint_lags, self.motor_lags)
-        lags = [known if lag is None else lag for lag, known in zip(given, preset, strict=True)]
+            lags = ((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,))
         sizes = len(drive.pole), recording.outputs.shape[1]
         table = lag_table(*lags, both_outputs=residual, sizes=sizes)
         return Ground(
@@ -232,19 +313,15 @@ class SetMembership:
     def _choose(
         self, ground: Ground, recording: Recording, noise: Vector, necks: float, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
-        """Return scale and epsilon, and all that were tried; an empty scale is left to `ruled_scale`."""
-        table = ground.table
+        """Return scale and epsilon, and all that were tried."""
         if self.epsilon is not None:
             epsilons = [np.full(noise.size, self.epsilon)]
         elif self.form == "residual":
             epsilons = [sigmas * noise for sigmas in _RESIDUAL_SIGMAS]
         else:
             epsilons = [sigmas * noise for sigmas in _EPSILON_SIGMAS]
-        weighted = self.output_weight is not None
-        if len(epsilons) == 1 and (weighted or self.scale != "auto"):
-            scale = np.zeros(0)
-            if self.output_weight is not None:
-                scale = grouped_scale(table, self.output_weight) * ground.units
+        if self.epsilon is not None and self.output_weight is not None:
+            scale = grouped_scale(ground.table, self.output_weight) * ground.units
             return ScaleTrial(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
         head, tail = recording.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
@@ -255,45 +332,14 @@ class SetMembership:
         # The drives are known from all rows: they are no part of what is chosen.
         first = self._ground(head, ground.drive, necks)
         hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
-        if self.scale != "auto":
-            tried = hold_out.fixed(ruled_scale(self.scale, table, hold_out.data))
-            return replace(tried[0], scale=np.zeros(0)), tried
-        outputs, motors = self._weights(table)
+        if self.output_weight is not None:
+            outputs, motors = (self.output_weight,), ()
+        elif self.form == "residual":
+            outputs, motors = _ANGLE_WEIGHTS, ()
+        else:
+            outputs, motors = _OUTPUT_WEIGHTS, _MOTOR_WEIGHTS
         tried = hold_out.choose(outputs, motors, progress)
         return tried[0], tried
-
-    def _weights(self, table: np.ndarray) -> tuple[Sequence[float], Sequence[float]]:
-        """Return the weights to try of outputs and of motors beside 1; what the regressor lacks has none."""
-        sources = set(table[:, 0].astype(int).tolist())
-        if self.output_weight is not None:
-            return (self.output_weight,), ()
-        if self.form == "residual":
-            return (_ANGLE_WEIGHTS if 3 in sources else (1.0,)), ()
-        # Without set-points, a weight of motors is that of outputs upside down.
-        motors = _MOTOR_WEIGHTS if {1, 2} <= sources else ()
-        return (_OUTPUT_WEIGHTS if 0 in sources else (1.0,)), motors
-
-    def _checked_lags(self, name: str) -> tuple[int, ...] | None:
-        lags: Any = getattr(self, name)
-        if lags is None:
-            return None
-        if self.form == "paper_eq21":
-            raise SettingsError(f"form `paper_eq21` has the lags of Eq. 21; take form `lags` to set `{name}`.")
-        lags = (lags,) if isinstance(lags, int) else tuple(lags)
-        whole = all(isinstance(lag, int) and not isinstance(lag, bool) and 1 <= lag <= _LONGEST_LAG for lag in lags)
-        if not whole or len(set(lags)) != len(lags):
-            raise SettingsError(f"`{name}` must be different whole numbers of samples from 1 on; got {list(lags)}.")
-        return tuple(sorted(lags))
-
-
-def _checked_scale(scale: Any) -> tuple[float, ...]:
-    try:
-        values = np.asarray(scale, dtype=np.float64)
-    except (TypeError, ValueError):
-        values = np.zeros(0)
-    if values.ndim != 1 or not values.size or not (np.isfinite(values) & (values > 0.0)).all():
-        raise SettingsError(f"`scale` must be one of {', '.join(RULES)}, or a list of positive numbers; got {scale!r}.")
-    return tuple(values.tolist())
 
 
 def noise_levels(recording: Recording) -> Vector:

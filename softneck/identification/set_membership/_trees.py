@@ -8,11 +8,19 @@ values do.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import FileFormatError, Matrix, Vector
+from softneck.runtime import load_functions
+from softneck.runtime._compile import have_numba
+
+from ..linear._regression import check_linear
+from ..models._arrays import check_table, within
 
 # The last level has at most so many points in a node, and (of more than one node) at least half as many.
 LEAF = 16
@@ -42,20 +50,17 @@ def tree_order(points: Matrix) -> np.ndarray:
     return order
 
 
-def tree_nodes(points: Matrix, values: Vector | Matrix) -> Matrix:
+def tree_nodes(points: Matrix, values: Vector) -> Matrix:
     """Return the nodes (2^(depth+1), 2 n + 2) over points (n, N) in tree order: low and high a side, ymin, ymax.
-
-    Several outputs, `values` (m, N), have a ymin and a ymax each.
 
     Node j of level l is row 2^l + j and holds the columns from `j N >> l` on; row 0 is unused and zero.
     """
     n, rows = points.shape
     depth = depth_of(rows)
-    values = np.atleast_2d(values)
-    nodes = np.zeros((2 << depth, 2 * n + 2 * len(values)))
+    nodes = np.zeros((2 << depth, 2 * n + 2))
     for level in range(depth + 1):
         cuts = borders(rows, level)
-        for i, row in enumerate((*points, *values)):
+        for i, row in enumerate((*points, values)):
             nodes[1 << level : 2 << level, 2 * i : 2 * i + 2] = low_high(row, cuts).T
     return nodes
 
@@ -178,3 +183,99 @@ def slant_nodes(frame: Matrix, slope: float, points: Matrix, values: Vector) -> 
             for numbers, low, high in columns:
                 there[:, low], there[:, high] = low_high(numbers, cuts)
     return nodes
+
+
+# Below this, starting a thread (50 us) costs more than it saves.
+_ROWS_PER_THREAD = 200
+# At most so many rows tell how wide the bounds are between the data: a quantile needs no more.
+_WIDTHS = 5000
+
+
+def usual_width(points: Matrix, values: Vector, gamma: float, correlated: int, quantile: float) -> float:
+    """Return the half-width, without epsilon, that a quantile of the rows stays below, themselves left out.
+
+    Args:
+        points, values: scaled regressors (n, N) and targets (N,), in order of time.
+        gamma: slope of the cones.
+        correlated: rows before and after a row that are left out with it.
+        quantile: of the rows.
+    """
+    order, rows = tree_order(points), values.size
+    points, values = np.ascontiguousarray(points[:, order]), values[order]
+    ages = order.astype(np.float64)
+    some = np.unique(np.linspace(0, rows - 1, min(rows, _WIDTHS)).astype(np.int64))
+    windows = np.column_stack([ages[some] - correlated, ages[some] + correlated + 1])
+    queries = np.ascontiguousarray(points[:, some].T)
+    bounds = tighten((points, values, tree_nodes(points, values), ages), gamma, queries, windows)
+    return float(np.quantile(0.5 * (bounds[:, 1] - bounds[:, 0]), quantile))
+
+
+def tighten(
+    tree: tuple[Matrix, Vector, Matrix, Vector], gamma: float, queries: Matrix, windows: Matrix, workers: int = 0
+) -> Matrix:
+    """Return max(y - gamma d) and min(y + gamma d) (rows, 2) at `queries`: compiled and on all cores, or by numpy.
+
+    Args:
+        tree: points (n, N) in tree order, values (N,), nodes, ages (N,).
+        gamma: slope of the cones.
+        queries: (rows, n), each computed alone, so that the number of threads changes nothing.
+        windows: (rows, 2): points with `start <= age < stop` do not count for a query.
+        workers: threads; 0 takes all cores.
+    """
+    bounds = np.tile([-np.inf, np.inf], (len(queries), 1))
+    if not have_numba():
+        _tighten_by_numpy(tree, gamma, queries, windows, bounds)
+        return bounds
+    batch = load_functions("softneck.identification.set_membership._queries_runtime").set_batch
+    parts = min(workers or all_cores(), max(len(queries) // _ROWS_PER_THREAD, 1))
+    # Four stretches a thread, as some queries visit more than others; the compiled loops hold no lock.
+    edges = pairwise(np.linspace(0, len(queries), 4 * parts + 1).astype(int).tolist())
+    rows = [slice(*edge) for edge in edges]
+    with ThreadPoolExecutor(parts) as pool:
+        list(pool.map(lambda at: batch(tree, gamma, queries[at], windows[at], bounds[at]), rows))
+    return bounds
+
+
+def _tighten_by_numpy(
+    tree: tuple[Matrix, Vector, Matrix, Vector], gamma: float, queries: Matrix, windows: Matrix, bounds: Matrix
+) -> None:
+    points, values, _, ages = tree
+    for k, (x, (start, stop)) in enumerate(zip(queries, windows, strict=True)):
+        squared = np.zeros(points.shape[1])
+        for row, coordinate in zip(points, x, strict=True):
+            gap = row - coordinate
+            squared += gap * gap
+        cone = gamma * np.sqrt(squared)
+        counts = (ages < start) | (ages >= stop)
+        bounds[k, 0] = np.max(values - cone, initial=bounds[k, 0], where=counts)
+        bounds[k, 1] = np.min(values + cone, initial=bounds[k, 1], where=counts)
+
+
+def all_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def check_nlsm(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    """Raise FileFormatError unless the set has its tree, and its base fits the histories."""
+    check_table(arrays["table"], sizes)
+    within(np.array([sizes["rows"]]), 1, np.inf, "the number of points")
+    frame, slopes = arrays["frame"], _slopes(arrays)
+    if not all(is_frame(rows) for rows in frame):
+        raise FileFormatError("the directions in its array `frame` are not orthogonal; identify the model again.")
+    parts = zip(frame, slopes, arrays["points"], arrays["values"], strict=True)
+    nodes = np.array([slant_nodes(*axis) for axis in parts])
+    # A tree of another shape would be read beyond its end, and one of other numbers would leave points out.
+    if not np.array_equal(arrays["nodes"], nodes):
+        raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
+    check_linear(arrays, sizes, least=0)
+
+
+def _slopes(arrays: Mapping[str, Matrix]) -> Vector:
+    """Return the climb (outputs,) of the values' plane of each axis, less than the cones'."""
+    nodes = arrays["nodes"]
+    axes = len(arrays["bounds"])
+    slopes = nodes[:, 0, 0] if nodes.ndim == 3 and len(nodes) == axes and nodes.size else np.full(axes, -1.0)
+    if not ((slopes >= 0.0) & ((slopes < arrays["bounds"][:, 0]) | (slopes == 0.0))).all():
+        raise FileFormatError("its array `nodes` is not the tree over its points; identify the model again.")
+    return slopes

@@ -17,7 +17,7 @@ from softneck.signals.recording._recording import require_same_robot
 
 from ..linear._srivc_fit import Continuous
 from ..models._directions import Directions
-from ._frf import SUPPORTED
+from ._frf_fit import SUPPORTED
 from ._measured import (
     AxisMeasured,
     axis_points,

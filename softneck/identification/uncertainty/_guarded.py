@@ -3,37 +3,186 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from softneck.core import (
+    KINDS,
     DataError,
+    FileFormatError,
     Matrix,
     Progress,
     SettingsError,
+    SoftneckError,
+    Vector,
     find_kind,
     require_one_of,
     require_positive,
     require_whole,
+    resolve,
     silent,
 )
 from softneck.core._blas_threads import one_blas_thread
-from softneck.signals import Recording
+from softneck.signals import Recording, concatenate
 
-from ..models._arrays import COMPOSED, memory_of, prefixed_arrays
+from ..models._arrays import COMPOSED, memory_of, prefixed_arrays, within
 from ..models._fitting import row_hashes, training_recording
-from ..models._jobs import Job, done
-from ..models._model import Model
+from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
 from ..models._validity import grounded
 from ..networks._network import Network
 from ..networks._state_space_network import NeuralStateSpace
 from ..set_membership._set_membership import SetMembership
 from ..structured._play import Play
-from ._guarded_base import BASES, Base, base_or_reason, fitted_base
-from ._left_out import left_out
+
+# One thread for each matrix product: the processes share the cores already.
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Job:
+    """A function of a module and what to call it with; `name` is for people."""
+
+    name: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+
+
+def done(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Any]:
+    """Return what each job returns; in so many processes, or here for 1.
+
+    Raises whatever a job raises; the others are ended then, as they are by Ctrl-C.
+    """
+    if workers < 2:
+        found = []
+        for number, job in enumerate(jobs):
+            progress(number / len(jobs), job.name)
+            found.append(job.function(*job.arguments))
+        return found
+    from loky import ProcessPoolExecutor, as_completed
+
+    pool = ProcessPoolExecutor(workers, timeout=None, initializer=_begin_worker, env=_ENVIRONMENT)
+    try:
+        futures = [pool.submit(job.function, *job.arguments) for job in jobs]
+        progress(0.0, f"{len(jobs)} models in {workers} processes")
+        for number, future in enumerate(as_completed(futures), start=1):
+            future.result()
+            progress(number / len(jobs), f"{number} of {len(jobs)} models")
+    except BaseException:
+        pool.shutdown(wait=True, kill_workers=True)
+        raise
+    pool.shutdown(wait=True)
+    return [future.result() for future in futures]
+
+
+def _begin_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+
+
+# What is left of a run is worth training on, or judging by, from here on [rows].
+_LEAST = 3 * WARM_UP
+
+
+def left_out(recording: Recording, parts: int) -> list[tuple[Recording, Recording]]:
+    """Return (rest, part) for each part: whole runs where there are as many, else as many blocks of each run.
+
+    What stands before and behind a block are runs of their own, never joined.
+    """
+    runs = recording.runs()
+    if len(runs) >= parts:
+        return [
+            (concatenate([run for n, run in enumerate(runs) if n % parts != i]),
+             concatenate([run for n, run in enumerate(runs) if n % parts == i]))
+            for i in range(parts)
+        ]  # fmt: skip
+    return [_block(runs, i, parts) for i in range(parts)]
+
+
+def _block(runs: Sequence[Recording], i: int, parts: int) -> tuple[Recording, Recording]:
+    rest, part = [], []
+    for run in runs:
+        low, high = (round(len(run) * edge / parts) for edge in (i, i + 1))
+        rest += [run.rows(a, b) for a, b in ((0, low), (high, len(run))) if b - a >= _LEAST]
+        if high - low >= _LEAST:
+            part.append(run.rows(low, high))
+    # Too short to be cut: trained on and judged by all of it, as the kinds do themselves.
+    return concatenate(rest or list(runs)), concatenate(part or list(runs))
+
+
+def left_out_error(fit: Callable[[Recording], Model], parts: Sequence[tuple[Recording, Recording]]) -> Vector:
+    """Return the rms error (outputs,) of free runs over parts that were left out in turn; inf where one diverges."""
+    errors = np.concatenate([_missed(fit(rest), part) for rest, part in parts])
+    return np.sqrt(np.nanmean(errors**2, axis=0))
+
+
+def _missed(model: Model, recording: Recording) -> Matrix:
+    """Return the errors (rows, outputs) of a free run, without the samples that set its initial state."""
+    Y = model.simulate(recording)[:, : recording.outputs.shape[1]]
+    errors = np.where(np.isfinite(Y), recording.outputs - Y, np.where(np.isfinite(recording.outputs), np.inf, np.nan))
+    starts = np.concatenate([np.arange(len(run)) < WARM_UP for run in recording.runs()])
+    return errors[~starts]
+
+
+# What a base may be where none is named: equations where they fit, else a line.
+BASES = ("greybox", "oe")
+# Of so many parts these are left out in turn to judge a base by: two say how much it misses, five would take longer.
+_PARTS, _JUDGED = 5, (1, 3)
+# Of the outputs' spread: a base that misses more than this of it saves nothing.
+_POOR = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Base:
+    """A base and what it misses.
+
+    Attributes:
+        model: trained on all rows.
+        error: (outputs,) rms of its free run on rows left out, in the outputs' unit.
+        fit: (outputs,) the same as a fit [%].
+    """
+
+    model: Model
+    error: Vector
+    fit: Vector
+
+    @property
+    def remark(self) -> str:
+        """Return a warning about a poor base, or nothing."""
+        if self.fit.min() >= 100.0 * (1.0 - _POOR):
+            return ""
+        return (
+            f"the base `{self.model.kind}` itself reaches {self.fit.min():.0f} % only on rows left out: where the "
+            "members part, this model is no better than that"
+        )
+
+
+def fitted_base(kind: str, recording: Recording, settings: Any = None) -> Base:
+    """Return a base of that kind, with the kind's defaults where no settings are given.
+
+    Raises:
+        DataError: what the kind raises.
+    """
+    settings = resolve(KINDS[kind].settings)() if settings is None else settings
+    model = settings.fit(recording)
+    parts = left_out(recording, _PARTS)
+    # Its dead time is a property of the sensor: known once, it need not be searched for again.
+    again = replace(settings, sensor_delay=int(model.findings["sensor_delay"])) if kind == "greybox" else settings
+    error = left_out_error(again.fit, [parts[i] for i in _JUDGED])
+    spread = np.nanstd(recording.outputs, axis=0)
+    return Base(model, error, 100.0 * (1.0 - error / spread))
+
+
+def base_or_reason(kind: str, recording: Recording) -> Base | str:
+    """Return a base of that kind, or why there is none."""
+    try:
+        return fitted_base(kind, recording)
+    except SoftneckError as error:
+        return f"{kind}: {error}"
+
 
 OF = ("nn", "nss", "play", "nlsm")
 # Those that take long enough for processes of their own to be worth starting.
@@ -94,7 +243,7 @@ class Guarded:
         Raises:
             DataError: what a member raises, or no base that fits.
         """
-        recording = training_recording(recordings, any_robot=True)
+        recording = training_recording(recordings)
         jobs = [Job("base", base_or_reason, (kind, recording)) for kind in BASES]
         if self.base is not None:
             jobs = [Job("base", fitted_base, (self.base, recording))]
@@ -176,3 +325,11 @@ def covering(points: Matrix, most: int) -> tuple[Matrix, float]:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
     return np.ascontiguousarray(points[chosen]), float(distance.max())
+
+
+def check_guarded(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    within(np.array([sizes["points"]]), 1, np.inf, "the number of points that were seen")
+    low = {"sigma": np.nextafter(0.0, 1.0), "slope": 0.0, "fading": np.nextafter(0.0, 1.0), "reach": 0.0}
+    for name, least in low.items():
+        if (arrays[name] < least).any():
+            raise FileFormatError(f"its array `{name}` must be {'positive' if least else '0 or positive'}.")

@@ -12,20 +12,48 @@ import math
 
 import numpy as np
 
-from softneck.identification.uncertainty._composed_runtime import ComposedArrays, composed_median, composed_validity
-from softneck.runtime._layout import StateVector, array, cells, rest
+from softneck.identification.models._histories_runtime import narx_outputs
+from softneck.identification.models._validity_runtime import GroundArrays, ground_outside
+from softneck.runtime._layout import StateVector, array, cells, rest, value
 from softneck.runtime._members_runtime import member_count, member_initialise, member_size, member_step
 from softneck.runtime._random_runtime import random_normal, random_seed
 
 
-class GuardedArrays(ComposedArrays):
+def guarded_motors(history: np.ndarray) -> int:
+    """Return the number of motors: the neck's three where none is said."""
+    return int(history[2]) if history.shape[0] > 2 else 3
+
+
+class GuardedArrays(GroundArrays):
     """Those of the base follow, then those of the members."""
 
+    history = array("sizes", "H: how many samples of each signal are kept; and outputs and motors, if not a neck's")
+    memory = array("1", "samples after which a held start has settled")
     sigma = array("outputs", "the base's error on rows that it was not trained on [rad]")
     slope = array("outputs", "how the members' error grows with the distance from what was seen [rad/rad]")
     fading = array("2", "agreement: weight of the members' spread; most that w moves in a sample")
     seen = array("points, motors", "motor positions of the training: each was within `reach` of one of them [rad]")
     reach = array("1", "[rad]")
+    outputs = value("history", function=narx_outputs, written=True)
+    motors = value("history", function=guarded_motors, written=True)
+
+
+def guarded_median(inorder: np.ndarray) -> float:
+    """Return the median of numbers in order; of an even number of them the mean of the middle two."""
+    count = inorder.shape[0]
+    return float(0.5 * (inorder[(count - 1) // 2] + inorder[count // 2]))
+
+
+def guarded_validity(p: GroundArrays, motors: np.ndarray, slow: np.ndarray, spread: np.ndarray) -> float:
+    """Return the validity of outputs whose members are apart by `spread` (outputs,); 0 where it is not known."""
+    if p.ground.shape[0] == 0:
+        return 0.0
+    outside = ground_outside(p, motors, slow)
+    worst = 0.0
+    for axis in range(spread.shape[0]):
+        apart = spread[axis]
+        worst = max(worst, p.doubt[axis, 0] + p.doubt[axis, 1] * outside + p.doubt[axis, 2] * apart * apart)
+    return 1.0 / (1.0 + worst)
 
 
 class GuardedState(StateVector):
@@ -64,7 +92,7 @@ def initialise(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, output
         at += size
     for i in range(bounds):
         outputs[i] = own[i]
-    outputs[bounds] = composed_validity(p, own[p.outputs : bounds], x.slow, x.spread)
+    outputs[bounds] = guarded_validity(p, own[p.outputs : bounds], x.slow, x.spread)
 
 
 def guarded_distance(seen: np.ndarray, reach: float, motors: np.ndarray) -> float:
@@ -117,7 +145,7 @@ def step(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, inputs: np.n
     agreed = np.empty(p.outputs)
     for axis in range(p.outputs):
         inorder = np.sort(angles[axis])
-        agreed[axis] = composed_median(inorder)
+        agreed[axis] = guarded_median(inorder)
         total = 0.0
         for i in range(count):
             total += abs(inorder[i] - agreed[axis])
@@ -129,4 +157,4 @@ def step(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, inputs: np.n
         outputs[axis] = (1.0 - x.weight) * outputs[axis] + x.weight * agreed[axis]
         if parameters[p.outputs + 1] > 0.0:
             outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)
-    outputs[bounds] = composed_validity(p, outputs[p.outputs : bounds], x.slow, x.spread)
+    outputs[bounds] = guarded_validity(p, outputs[p.outputs : bounds], x.slow, x.spread)

@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, redefine
 
-from ..linear._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions
+from ..linear._srivc_fit import Continuous, Runs, SrivcFitOptions, deviations
 from ..models._directions import Directions
 
 # Below this spread of its input a window says nothing of an axis [rad]: 0.05 rad move the neck by 0.3 deg.
@@ -183,7 +183,7 @@ def fit_local(
     if not there:
         return None
     best = min(there, key=lambda fit: fit.cost)
-    std, percent = _quality(search, runs, best, stretch)
+    std, percent = deviations(search, runs, best, stretch)
     model = best.model
     gain, pole = model.b[0] / model.a[0], model.a[0]
     sure = std[0] < _WORST_GAIN * abs(gain) and std[1] < _WORST_POLE * pole and percent > _LEAST_FIT
@@ -204,33 +204,6 @@ def fit_local(
         std=std,
         fit=percent,
     )
-
-
-def _quality(search: SrivcFitOptions, runs: Runs, fit: SrivcFit, stretch: float) -> tuple[Vector, float]:
-    """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean."""
-    errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
-    spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)
-    e = np.concatenate(errors)
-    # Errors that stay for n samples count as one in n.
-    variance = float(np.mean(e**2)) * _correlation_time(errors, round(stretch / search.sample_time))
-    covariance = variance * np.linalg.pinv(fit.information, hermitian=True)
-    p, K = fit.model.a[0], fit.model.b[0]
-    slope = np.array([-K / p**2, 1.0 / p, 0.0])
-    gain = float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
-    a, b, L = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return np.array([gain, a, L, b]), 100.0 * (1.0 - float(np.sqrt(fit.cost / max(spread, 1e-300))))
-
-
-def _correlation_time(errors: Sequence[Vector], lags: int) -> float:
-    """Return the sum of the autocorrelation over both sides, while it is positive, at least 1."""
-    power = sum(float(e @ e) for e in errors)
-    total = 1.0
-    for k in range(1, lags + 1):
-        r = sum(float(e[k:] @ e[:-k]) for e in errors if e.size > k) / max(power, 1e-300)
-        if r <= 0.05:
-            break
-        total += 2.0 * r
-    return total
 
 
 def fit_compression(recordings: Sequence[Recording], search: SrivcFitOptions, source: str) -> Continuous | None:

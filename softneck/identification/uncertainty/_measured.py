@@ -1,4 +1,11 @@
-"""A family against its recordings: measured responses, the weight that covers them, their band, and invalidation."""
+"""A family against its recordings: measured responses, the weight that covers them, their band, and invalidation.
+
+Model invalidation: the least uncertainty with which a whole record is consistent, in one band of frequencies.
+
+`y = G0 (1 + D W) u + v` with `|D| <= d` and a bound on the noise v: a record whose transforms leave over more than
+d allows invalidates it (Smith and Doyle 1992, IEEE Trans. Automatic Control 37:942; Poolla et al. 1994, ibid. 39:951).
+The energies over a band are compared, so d is a lower bound: what is not invalidated is not thereby explained.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +19,138 @@ import numpy as np
 from softneck.core import DataError, FileFormatError, Matrix, Vector
 from softneck.signals import Recording
 
-from ..linear._srivc_fit import Continuous
+from ..linear._srivc_fit import Continuous, Runs, SrivcFit, SrivcFitOptions
 from ..models._directions import Directions
-from ._frf import SUPPORTED, FrequencyResponse
-from ._frf_fit import frequency_response
-from ._invalidation import least_uncertainty
+from ._frf_fit import SUPPORTED, FrequencyResponse, frequency_response
 from ._local_models import axis_inputs
-from ._spectra import ComplexArray
+from ._local_polynomial import ComplexArray
+
+ORDERS = (1, 2, 3)
+# The last part of each run is held out, as `softneck identify --train 0.7` does.
+_TRAINED = 0.7
+# Stretches of what is held out of each run: their scatter is the standard error of a difference.
+_STRETCHES = 5
+
+
+def choose_order(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[Continuous | None, Vector]:
+    """Return the model of the order chosen, fitted to all rows, and the rms errors of each order on what is held out.
+
+    The lowest order whose error is within one standard error of the least is taken (Breiman et al. 1984, 3.4.3), as
+    stretches of the runs differ: one pole more must be worth it on all of them.
+
+    Args:
+        search: how to fit; its order is overridden.
+        runs: input and output of every run.
+        near: one pole and dead time to start from.
+
+    Returns:
+        the model, None where no order can be fitted; (3,) rms errors in the output's unit, NaN where one cannot.
+    """
+    squares = {n: found for n in ORDERS if (found := _held_out(replace(search, order=n), runs, near)) is not None}
+    errors = {n: error for n, (_, error) in squares.items()}
+    rms = np.array([np.sqrt(errors[n].mean()) if n in errors else np.nan for n in ORDERS])
+    if not errors:
+        return None, rms
+    best = min(errors, key=lambda n: float(errors[n].mean()))
+    order = next(n for n in sorted(errors) if n == best or _as_good(errors[n] - errors[best]))
+    start = squares[order][0]
+    fit = replace(search, order=order).improve(runs, start.model, start.starts)
+    return (start if fit is None else fit).model, rms
+
+
+def _as_good(worse: Vector) -> bool:
+    """Return whether errors are larger by no more than one standard error of the difference."""
+    return bool(worse.mean() <= worse.std(ddof=1) / np.sqrt(worse.size))
+
+
+def _held_out(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[SrivcFit, Vector] | None:
+    """Return a fit and its mean squared errors in free run over stretches that it did not see; None without a fit."""
+    trained = []
+    for u, y in runs:
+        seen = y.copy()
+        seen[round(_TRAINED * y.size) :] = np.nan
+        trained.append((u, seen))
+    # As many poles of n times the speed lag as much as one; others leave valleys where dead time is a pole.
+    speeds = (1.0, 0.3, 3.0) if search.order > 1 else (1.0,)
+    tried = [search.start(trained, search.order * k * float(near.a[0]), near.delay) for k in speeds]
+    there = [fit for fit in tried if fit is not None and fit.model.a[-1] * fit.model.b[0] > 0.0]
+    if not there:
+        return None
+    fit = min(there, key=lambda fit: fit.cost)
+    squares = []
+    for (_, y), simulated in zip(runs, fit.simulated, strict=True):
+        late = slice(round(_TRAINED * y.size), None)
+        squares += [float(np.nanmean(part)) for part in np.array_split((y - simulated)[late] ** 2, _STRETCHES)
+                    if np.isfinite(part).any()]  # fmt: skip
+    return fit, np.array(squares)
+
+
+# Time constants after which a run's start is forgotten: exp(-5) is below 1 %.
+_FORGOTTEN = 5.0
+# The noise is white, and seen above this part of the Nyquist frequency, where nothing else is.
+_NOISE_ABOVE = 0.7
+
+
+def least_uncertainty(
+    runs: Sequence[tuple[Vector, Vector]],
+    model: Continuous,
+    frequency: Vector,
+    weight: Vector,
+    band: tuple[float, float],
+    sample_time: float,
+) -> float:
+    """Return the least norm of the uncertainty, in parts of the weight, that a record needs in a band.
+
+    Args:
+        runs: input (time,) and output (time,) of each; missing outputs are filled by straight lines.
+        model: nominal.
+        frequency, weight: (m,) of W.
+        band: its ends [rad/s].
+        sample_time: [s].
+
+    Returns:
+        at least 0; NaN where no run has three frequencies in the band.
+    """
+    left, noise, allowed, lines = 0.0, 0.0, 0.0, 0
+    for u, y in runs:
+        w, E, Y0, floor = _transformed(u, y, model, sample_time)
+        there = (w >= band[0]) & (w <= band[1])
+        W = np.interp(np.log(np.maximum(w[there], 1e-9)), np.log(frequency), weight)
+        left += float(np.sum(np.abs(E[there]) ** 2))
+        allowed += float(np.sum((W * np.abs(Y0[there])) ** 2))
+        noise += floor * int(there.sum())
+        lines += int(there.sum())
+    if lines < 3 or allowed <= 0.0:
+        return float("nan")
+    return max(0.0, float(np.sqrt(left) - np.sqrt(noise))) / float(np.sqrt(allowed))
+
+
+def _transformed(
+    u: Vector, y: Vector, model: Continuous, sample_time: float
+) -> tuple[Vector, ComplexArray, ComplexArray, float]:
+    """Return frequencies [rad/s], transforms of what the nominal leaves over and of its output, power of the noise."""
+    from scipy.signal import detrend
+
+    y0 = nominal_output(model, u, sample_time)
+    there = np.isfinite(y)
+    y = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
+    slowest = float(-np.roots(np.concatenate([[1.0], model.a])).real.max())
+    first = min(round((_FORGOTTEN / slowest + model.delay) / sample_time), u.size // 3)
+    window = np.hanning(u.size - first)
+    E, Y0, Y = (np.fft.rfft(window * detrend(part[first:], type="constant")) for part in (y - y0, y0, y))
+    w = 2.0 * np.pi * np.fft.rfftfreq(window.size, sample_time)
+    return w, E, Y0, float(np.median(np.abs(Y[w > _NOISE_ABOVE * w[-1]]) ** 2)) / np.log(2.0)
+
+
+def nominal_output(model: Continuous, u: Vector, sample_time: float) -> Vector:
+    """Return what the model answers to `u` (time,), which was held at its first value before."""
+    from scipy.signal import lfilter
+
+    a, b, d = model.sampled(sample_time)
+    late = np.concatenate([np.zeros(d + 1), u - u[0]])[: u.size]
+    below = np.concatenate([[1.0], a])
+    return np.asarray(lfilter(b, below, late)) + u[0] * model.b[-1] / model.a[-1]
+
 
 # Frequencies of the weight, and the ratio of the ends of each band that whole records are judged in; by definition.
 _FREQUENCIES, _BAND_RATIO = 60, 1.5

@@ -1,4 +1,4 @@
-"""What stands beside every model: persistence, the best linear one, and the noise ceiling.
+"""What stands beside every model: persistence and the best linear one.
 
 Persistence repeats what was measured. At 20 ms it fits 97 %, so nothing below it has predicted anything.
 
@@ -21,7 +21,6 @@ from softneck.core import Matrix
 from softneck.signals import Recording
 
 from ..models._scores import nrmse_fit
-from ._noise_ceiling import noise_ceiling
 from ._scored_rows import Rows, ScoredStretch
 
 
@@ -144,21 +143,18 @@ def _late(x: Matrix, lag: int) -> Matrix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Baselines:
-    """Fits [%] of persistence and the best linear model, horizon -> axis -> fit; of a perfect one, axis -> fit."""
+    """Fits [%] of persistence and the best linear model, horizon -> axis -> fit."""
 
     persistence: dict[str, dict[str, float | None]]
     best_linear: dict[str, dict[str, float | None]]
-    noise_ceiling: dict[str, float | None]
 
 
-def baselines(
-    recording: Recording, stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | str]
-) -> Baselines:
-    """Return the baselines of the stretches judged; repeats are looked for in all of the recording.
+def baselines(stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | str]) -> Baselines:
+    """Return the baselines of the stretches judged.
 
-    The best linear model and the noise ceiling look for what lasts as long as on a neck: of other robots there is none.
+    The best linear model looks for what lasts as long as on a neck: of other robots there is none.
     """
-    axes, neck = rows.names, recording.robot.is_neck
+    axes, neck = rows.names, rows.robot.is_neck
     nothing: list[float | None] = [None] * len(axes)
     names = [str(h) for h in horizons]
     steps = [None if h == "inf" else int(h) for h in horizons]
@@ -172,7 +168,6 @@ def baselines(
     return Baselines(
         persistence=held,
         best_linear={name: _by_axis(axes, fits) for name, fits in zip(names, bounds, strict=True)},
-        noise_ceiling=_by_axis(axes, noise_ceiling(recording, rows.measured) if neck else nothing),
     )
 
 

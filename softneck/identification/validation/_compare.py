@@ -31,8 +31,8 @@ class Comparison(Shown):
     def frame(self) -> pd.DataFrame:
         """Return one row for each model, data set, horizon and axis, ready to pivot.
 
-        Columns: model, data, horizon, axis, fit, low, high (95 % interval), persistence, best_linear, noise_ceiling
-        [%], rmse_deg, worst_deg, worst_time_s, r2, rows_scored, diverged_s; NaN where there is none.
+        Columns: model, data, horizon, axis, fit, low, high (95 % interval), persistence, best_linear [%],
+        rmse_deg, worst_deg, worst_time_s, r2, rows_scored, diverged_s; NaN where there is none.
         """
         import pandas as pd
 
@@ -45,7 +45,7 @@ class Comparison(Shown):
 
 
 _NUMBERS = (
-    "fit", "low", "high", "persistence", "best_linear", "noise_ceiling", "rmse_deg", "worst_deg", "worst_time_s", "r2",
+    "fit", "low", "high", "persistence", "best_linear", "rmse_deg", "worst_deg", "worst_time_s", "r2",
     "diverged_s",
 )  # fmt: skip
 
@@ -113,7 +113,6 @@ def _rows(v: Validation) -> list[dict[str, Any]]:
                     "high": high,
                     "persistence": v.persistence.get(horizon, {}).get(axis),
                     "best_linear": v.best_linear[horizon][axis],
-                    "noise_ceiling": v.noise_ceiling[axis],
                     "rmse_deg": v.rmse_deg[horizon][axis],
                     "worst_deg": v.worst_deg[horizon][axis],
                     "worst_time_s": v.worst_time[horizon][axis],

@@ -17,11 +17,10 @@ from softneck.robot._opened import opened
 from softneck.signals import Recording
 from softneck.signals.recording._files import RecordingLike, opened_recording
 
-from ..models._model import WARM_UP, Model
+from ..models._model import Model
 from ..models._validity import with_tolerance
 from ._baselines import Baselines, baselines
-from ._bounds import calibrated_bounds, judged_bounds, useful_parts
-from ._horizons import predict
+from ._bounds import calibrated_bounds, judged_bounds, judged_validity, useful_parts
 from ._residual_tests import ResidualTests, residual_tests
 from ._score_tables import (
     INFINITE,
@@ -32,10 +31,8 @@ from ._score_tables import (
     outside_table,
     run_tables,
     score_tables,
-    spread_tables,
 )
-from ._scored_rows import Rows, ScoredStretch, pooled, unseen_stretches
-from ._validity import judged_validity
+from ._scored_rows import Rows, ScoredStretch, pooled, predict, unseen_stretches
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,13 +60,10 @@ class Validation(Shown):
         worst_deg, worst_time: largest absolute error [deg] and when it was [s].
         intervals: 95 % interval [low, high] of `fits` by a bootstrap over blocks.
         best_linear: fit [%] that no linear model of the set-points beats on these rows (see `best_linear`).
-        noise_ceiling: axis -> fit [%] of a perfect model; None where no set-points were repeated.
         per_run: the same scores for each stretch of rows that follow each other, with its `stretch`, `run`,
             `start_s`, `rows_scored` and `diverged`.
         cold_fits: fit [%] of a free run that knows the first row only, as an FMU starts, on the same rows; None where
             it diverged.
-        spread: "runs" and "blocks" -> axis -> least and largest fit [%] of the free run over stretches of rows, and
-            over up to eight blocks of equal length; None where there is one alone.
         diverged: time [s] at which the first free run left the data's range, or None.
         residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
         coverage_pct, mean_width_deg: of kinds with bounds in free run: axis -> measured samples within them [%], and
@@ -100,10 +94,8 @@ class Validation(Shown):
     worst_time: Scores
     intervals: dict[str, dict[str, list[float] | None]]
     best_linear: Scores
-    noise_ceiling: dict[str, float | None]
     per_run: list[dict[str, Any]]
     cold_fits: dict[str, float | None]
-    spread: dict[str, dict[str, list[float] | None]]
     diverged: float | None
     residual_tests: ResidualTests
     coverage_pct: dict[str, float] | None
@@ -166,7 +158,6 @@ class Validation(Shown):
                 "persistence": self.persistence,
                 "model": self.fits,
                 "best_linear": self.best_linear,
-                "noise_ceiling": self.noise_ceiling,
             },
             "intervals": self.intervals,
             "rmse_deg": self.rmse_deg,
@@ -175,7 +166,6 @@ class Validation(Shown):
             "r2": self.r2,
             "diverged": self.diverged,
             "cold_fits": self.cold_fits,
-            "spread": self.spread,
             "residuals": {
                 "white": self.white,
                 "uncorrelated_with_inputs": self.uncorrelated,
@@ -202,12 +192,10 @@ class Rules:
     horizons: tuple[int | str, ...] = _HORIZONS
     motors: str = "simulated"
     include_training: bool = False
-    initial: str = "warm"
     tolerance: float | None = None
 
     def __post_init__(self) -> None:
         require_one_of("motors", self.motors, ("simulated", "measured"))
-        require_one_of("initial", self.initial, ("warm", "cold"))
         for horizon in self.horizons:
             if horizon != INFINITE and (not isinstance(horizon, int) or horizon < 1):
                 raise DataError(f"a horizon is a number of samples from 1, or `inf`; got {horizon!r}.")
@@ -222,7 +210,6 @@ def validate(
     horizons: Sequence[int | str] = _HORIZONS,
     motors: str = "simulated",
     include_training: bool = False,
-    initial: str = "warm",
     tolerance: float | None = None,
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
@@ -238,7 +225,6 @@ def validate(
         horizons: samples ahead; "inf" is the free run.
         motors: "simulated" or "measured".
         include_training: whether rows that the model was trained on are judged too.
-        initial: "warm", or "cold": then the free run itself has the first row only.
         tolerance: error that `validity` is to allow, in the unit in which people see the outputs; None: the model's.
 
     Raises:
@@ -257,7 +243,7 @@ def validate(
         >>> bool(found.fits["inf"]["pitch"] > 50.0)  # free run [%]
         True
     """
-    rules = Rules(tuple(horizons), motors, include_training, initial, tolerance)
+    rules = Rules(tuple(horizons), motors, include_training, tolerance)
     if names is None:
         model_name, data_name = (str(of) if isinstance(of, str | Path) else None for of in (model, recording))
         names = (model_name or "model", data_name or "data")
@@ -301,7 +287,7 @@ def judged_parts(
     key = np.isfinite(rows.measured).tobytes() + rows.stretch.tobytes() + rows.time.tobytes()
     known = {} if known is None else known
     if key not in known:
-        known[key] = baselines(recording, stretches, rows, rules.horizons)
+        known[key] = baselines(stretches, rows, rules.horizons)
     return Parts(stretches, left_out, rows, known[key])
 
 
@@ -340,10 +326,8 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
         **scores,
         intervals=interval_tables(rows, measured, predicted, model.sample_time, lost=first is not None),
         best_linear=parts.baselines.best_linear,
-        noise_ceiling=parts.baselines.noise_ceiling,
         per_run=per_run,
         cold_fits=_cold_fits(model, parts, rules) if INFINITE in outputs else dict.fromkeys(rows.names),
-        spread=spread_tables(rows, free[:, :axes], per_run) if INFINITE in outputs else {},
         diverged=first,
         residual_tests=tests,
         coverage_pct=coverage,
@@ -380,8 +364,7 @@ def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
     result: dict[str, Matrix] = {}
     for horizon in dict.fromkeys((1, *rules.horizons)):
         if horizon == INFINITE:
-            warm_up = WARM_UP if rules.initial == "warm" else 0
-            free = [model.simulate(run, motors=rules.motors, warm_up=warm_up) for run in runs]
+            free = [model.simulate(run, motors=rules.motors) for run in runs]
             result[INFINITE] = np.concatenate(free)
         else:
             k = int(horizon)

@@ -20,9 +20,7 @@ from softneck.identification import (
     load_model,
     nrmse_fit,
 )
-from softneck.identification.adaptation._adapt import Adaptation
-from softneck.identification.adaptation._free import ADAPTING, Free
-from softneck.identification.adaptation._problem import derivatives, free_run, reference
+from softneck.identification.adaptation._adapt import ADAPTING, Adaptation, Free, derivatives, free_run, reference
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 

@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import OutputError, Rls, load_model, validate
-from softneck.identification.linear._oe_fit import fit_output_error
+from softneck.identification.linear._oe import fit_output_error
 from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.signals import Recording, concatenate, import_log, read_layout, redefine, signal
 

@@ -1,17 +1,14 @@
-"""The recursion in Bierman's form: equal to batch least squares, safe without excitation, saved and restored."""
+"""The recursion in Bierman's form: equal to batch least squares, safe without excitation."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, load
+from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.identification import Recursion
-from softneck.identification.linear._recursion import RecursionState
 from softneck.runtime import load_functions
 
 UD = "softneck.identification.linear._ud_runtime"
@@ -71,7 +68,7 @@ def test_the_fast_loop_and_the_guarded_one_agree_to_the_bit() -> None:
         np.testing.assert_allclose(fast.theta, state.theta, rtol=0, atol=1e-13)
 
 
-def test_a_step_for_each_sample_is_the_run(tmp_path: Path) -> None:
+def test_a_step_for_each_sample_is_the_run() -> None:
     Phi, y = rows(3, 80)
     settings = Recursion(parameters=3, forgetting=0.98, covariance_bound=1e4, dead_zone=0.05, poles=1)
     whole, course = settings.run(settings.initial_state(), Phi, y, keep=True)
@@ -80,10 +77,6 @@ def test_a_step_for_each_sample_is_the_run(tmp_path: Path) -> None:
         state = settings.step(state, Phi[k], y[k])
         np.testing.assert_array_equal(state.theta, course.theta[k])
         np.testing.assert_allclose(np.diag(state.covariance), course.covariance[k], rtol=1e-9)
-        if k == 40:  # saved, and restored by whoever goes on
-            state.save(tmp_path / "s.npz")
-            state = load(tmp_path / "s.npz", role="state")
-            assert isinstance(state, RecursionState)
     assert state.theta.tobytes() == whole.theta.tobytes()
     assert state.tally.tobytes() == whole.tally.tobytes()
     assert f"{state.theta[0]:.6g}" in state.summary()
@@ -172,7 +165,7 @@ def test_rows_that_were_missed_change_nothing() -> None:
     )
 
 
-def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+def test_what_is_wrong_is_named() -> None:
     for value in (0.0, -0.5, 1.01):
         with pytest.raises(SettingsError, match="`forgetting` must be"):
             Recursion(parameters=2, forgetting=value)
@@ -181,12 +174,6 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         settings.run(settings.initial_state(), np.zeros((5, 3)), np.zeros(5))
     with pytest.raises(DataError, match="`theta` must have 2 entries"):
         Recursion(parameters=2).initial_state([1.0])
-    state = Recursion(parameters=2).initial_state()
-    RecursionState(theta=state.theta, factor=state.factor[:1], scale=state.scale, tally=state.tally).save(
-        tmp_path / "s.npz"
-    )
-    with pytest.raises(FileFormatError, match="`factor` is not of finite floats of shape"):
-        load(tmp_path / "s.npz")
 
 
 def test_it_is_the_course_of_statsmodels() -> None:

@@ -12,8 +12,8 @@ import pytest
 from softneck.core import DataError, SettingsError, silent
 from softneck.identification import PAPER_EQ21, Network
 from softneck.identification.models._drive import fit_loaded_drive
-from softneck.identification.networks._levenberg import Layers, jacobian, random_layers, train
 from softneck.identification.networks._network import _hints, _Problem
+from softneck.identification.networks._nn_training import Layers, jacobian, random_layers, train
 
 from ...data import neck_recording, short_neck
 

@@ -9,9 +9,16 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, NeuralStateSpace, validate
 from softneck.identification.models._directions import directions_of
 from softneck.identification.models._drive import fit_loaded_drive
-from softneck.identification.networks._contraction import Contraction, whitening
 from softneck.identification.networks._nss_problem import FUNCTIONS, Inputs, Records, Shape, free_run
-from softneck.identification.networks._nss_training import BestMap, Training, linear_start, random_start, whitened
+from softneck.identification.networks._nss_training import (
+    BestMap,
+    Contraction,
+    Training,
+    linear_start,
+    random_start,
+    whitened,
+    whitening,
+)
 from softneck.identification.networks._state_space_network import INTERRUPTED
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import load_functions
@@ -37,7 +44,9 @@ def test_any_parameters_give_a_map_that_contracts(size: float) -> None:
     rng = np.random.default_rng(0)
     for _ in range(100):
         theta = size * rng.standard_normal(MAP.size)
-        arrays, W = MAP.matrices(theta), MAP.metric(theta)
+        arrays, (H, M) = MAP.matrices(theta), MAP._blocks(theta)
+        # The metric in which distances fall: M' H33^-1 M.
+        W = M.T @ np.linalg.solve(H[-MAP.states :, -MAP.states :], M)
         for _ in range(5):
             a, b, into = rng.standard_normal(3), rng.standard_normal(3), 3.0 * rng.standard_normal(2)
             before, after = a - b, step(arrays, a, into) - step(arrays, b, into)

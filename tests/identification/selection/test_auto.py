@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,13 +13,10 @@ from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
 from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, best_others, kinds_to_try
-from softneck.identification.selection._choice_words import guarded_why
-from softneck.identification.selection._exam import agreement, exams, weighted_median
-from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, numbers_of
-from softneck.identification.selection._left_out import folds
+from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, guarded_why, numbers_of
+from softneck.identification.selection._left_out import agreement, exams, folds, weighted_median
 from softneck.identification.uncertainty import _guarded
-from softneck.identification.uncertainty._guarded import Guarded
-from softneck.identification.uncertainty._guarded_base import Base
+from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.signals import Recording, concatenate
 
 from ...data import ROOT, neck_recording, slow_but
@@ -128,24 +123,6 @@ def test_the_best_of_the_other_sort_ran_free() -> None:
         assert {name: one.kind for name, one in found.items()} == {sort: other}
     assert best_others(ranking[:2], trials["rls"]) == {}
     assert best_others(ranking[-1:], trials["rls"]) == {}, "what diverged is no plant"
-
-
-def test_a_linear_kind_without_transfer_functions_has_one_that_has_them_beside_it() -> None:
-    """`subspace` of a robot whose directions nobody knows: most designs refuse it."""
-    oe = load(ROOT / "tests" / "golden" / "oe.npz")
-
-    def tf(_: str) -> None:
-        raise SettingsError("no directions")
-
-    blind: Any = SimpleNamespace(robot=oe.robot, tf=tf)
-    ranking = [
-        KindTrial(kind, 0.0, left_out={"hold-out": fit}, model=model)
-        for kind, fit, model in (("subspace", 90.0, blind), ("nss", 88.0, None), ("oe", 80.0, oe), ("rls", 70.0, oe))
-    ]
-    assert {sort: one.kind for sort, one in best_others(ranking, ranking[0]).items()} == {
-        "linear": "oe", "nonlinear": "nss"
-    }  # fmt: skip
-    assert {sort: one.kind for sort, one in best_others(ranking, ranking[1]).items()} == {"linear": "oe"}
 
 
 def test_what_a_fold_judges_is_missing_from_its_training_and_no_set_point_is() -> None:

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError
-from softneck.identification import PAPER_EQ21, Model, SetMembership, gamma_curve, offending_pair, outside_seen
+from softneck.identification import PAPER_EQ21, Model, SetMembership, outside_seen
 from softneck.identification.models._regressors import regression
-from softneck.identification.set_membership._gamma import least_gammas
+from softneck.identification.set_membership._regressor import all_pairs_gammas, least_gammas
 from softneck.identification.set_membership._set_membership import noise_level
 from softneck.identification.set_membership._trees import (
     LEAF,
@@ -20,6 +20,7 @@ from softneck.identification.set_membership._trees import (
     slant_frames,
     slant_nodes,
     slant_order,
+    tighten,
     tree_nodes,
     tree_order,
 )
@@ -30,7 +31,6 @@ from .hard_sets import algorithm_1, hard_sets
 
 BOUNDS = load_functions("softneck.identification.set_membership._nlsm_runtime")
 SLANT = load_functions("softneck.identification.set_membership._principal_tree_runtime")
-CONES = load_functions("softneck.identification.set_membership._cones_runtime")
 
 
 @st.composite
@@ -128,7 +128,7 @@ def test_gamma_by_branch_and_bound_is_that_of_all_pairs(data: tuple[np.ndarray, 
     points, slacks = np.ascontiguousarray(omega.T), np.array([slack, 0.3, 3.0])
     if len(y) < 2:
         return
-    expected = CONES.least_gammas(points, y, slacks, np.zeros((3, 2)))
+    expected = all_pairs_gammas(points, y, slacks)[0]
     got, pairs = least_gammas(points, y, slacks)
     for m in range(3):
         if expected[m] > 1e200:
@@ -141,35 +141,65 @@ def test_gamma_by_branch_and_bound_is_that_of_all_pairs(data: tuple[np.ndarray, 
             assert abs(y[j] - y[k]) - slacks[m] == pytest.approx(got[m] * spread, rel=1e-12, abs=1e-15)
 
 
-def test_the_gamma_curve_falls_is_convex_and_knows_both_rules() -> None:
+def test_gamma_falls_with_epsilon_and_is_convex_in_it() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-2, 2, (2, 1500))
-    clean = np.sin(points[0]) + 0.5 * points[1]
     sigma = 0.01
-    values = clean + sigma * rng.standard_normal(1500)
-    curve = gamma_curve(points, values)
-    assert (np.diff(curve.gamma) <= 0).all()
-    slopes = np.diff(curve.gamma) / np.diff(curve.epsilon)
+    values = np.sin(points[0]) + 0.5 * points[1] + sigma * rng.standard_normal(1500)
+    epsilon = np.geomspace(3e-4, 0.5, 32) * np.ptp(values)
+    gamma, pairs = least_gammas(points, values, epsilon)
+    assert (np.diff(gamma) <= 0).all()
+    slopes = np.diff(gamma) / np.diff(epsilon)
     # A maximum of falling straight lines; 1e-9 of the steepest slope is rounding.
     assert (np.diff(slopes) >= -1e-9 * np.abs(slopes).max()).all()
-    # Milanese and Novara's 2 epsilon is the paper's curve at twice the epsilon.
-    other = gamma_curve(points, values, curve.epsilon / 2, rule="milanese_novara")
-    np.testing.assert_array_equal(other.gamma, curve.gamma)
-    gamma, epsilon = curve.recommended
-    # The knee stands where the noise ends: the function's own slope is sqrt(1 + 0.25) = 1.118.
-    assert 2 * sigma < epsilon < 10 * sigma
-    assert 0.9 < gamma < 1.5
+    # Where the noise ends the function's own slope is left, sqrt(1 + 0.25) = 1.118.
+    assert 0.9 < np.interp(5 * sigma, epsilon, gamma) < 1.5
+    # The pair that decides lies on its line.
+    j, k = pairs[10]
+    assert abs(values[j] - values[k]) - epsilon[10] == pytest.approx(
+        gamma[10] * np.linalg.norm(points[:, j] - points[:, k]), rel=1e-12
+    )
 
 
 def test_the_pair_that_denies_gamma_is_named() -> None:
     points = np.array([[0.0, 1.0, 2.0, 3.0]])
     values = np.array([0.0, 1.0, 4.0, 4.5])
-    assert offending_pair(points, values, 3.0, 0.0) is None
-    assert sorted(offending_pair(points, values, 2.9, 0.0) or ()) == [1, 2]
-    # |4 - 1| <= epsilon + gamma: 2.5 passes with 0.5 by the paper's rule and with 0.25 by Milanese and Novara's.
-    assert offending_pair(points, values, 2.5, 0.5) is None
-    assert offending_pair(points, values, 2.5, 0.25) is not None
-    assert offending_pair(points, values, 2.5, 0.25, rule="milanese_novara") is None
+    gamma, pairs = least_gammas(points, values, np.array([0.0, 0.5]))
+    # Of samples 1 and 2: |4 - 1| <= epsilon + gamma.
+    assert gamma.tolist() == [3.0, 2.5]
+    assert sorted(pairs[0].tolist()) == [1, 2]
+
+
+@given(data=hard_sets(least=2), slope=st.sampled_from([0.0, 0.1, 1.0, 50.0]), hidden=st.sampled_from([0, 1, 25]))
+def test_bounds_of_many_queries_are_those_of_algorithm_1_without_what_does_not_count(
+    data: tuple[np.ndarray, np.ndarray], slope: float, hidden: int
+) -> None:
+    omega, y = data
+    gamma = slope / max(float(np.abs(omega).max()), 1e-300)
+    order = tree_order(np.ascontiguousarray(omega.T))
+    points, values, nodes = in_tree_order(omega, y)
+    ages = order.astype(float)
+    queries = np.ascontiguousarray(omega)
+    windows = np.column_stack([np.arange(len(y)) - float(hidden), np.arange(len(y)) + hidden + 1.0])
+    bounds = tighten((points, values, nodes, ages), gamma, queries, windows, workers=1)
+    for k in range(len(y)):
+        counts = np.abs(np.arange(len(y)) - k) > hidden
+        expected = algorithm_1(omega[k], omega[counts], y[counts], gamma, 0.0)
+        # Squares by ** or *, roots by ** or sqrt: some ulp of cones up to 1,000.
+        np.testing.assert_allclose(bounds[k], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_threads_and_numpy_give_the_same_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(3)
+    omega, y = rng.standard_normal((1000, 4)), rng.standard_normal(1000)
+    points, values, nodes = in_tree_order(omega, y)
+    tree = (points, values, nodes, tree_order(np.ascontiguousarray(omega.T)).astype(float))
+    windows = np.column_stack([np.arange(1000) - 5.0, np.arange(1000) + 6.0])
+    one, four = (tighten(tree, 1.5, omega, windows, workers=workers) for workers in (1, 4))
+    np.testing.assert_array_equal(one, four)
+    monkeypatch.setattr("softneck.identification.set_membership._trees.have_numba", lambda: False)
+    # Its sums go over the sides in the same order.
+    np.testing.assert_array_equal(tighten(tree, 1.5, omega, windows), one)
 
 
 def test_without_the_compiler_gamma_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,24 +207,10 @@ def test_without_the_compiler_gamma_is_the_same(monkeypatch: pytest.MonkeyPatch)
     points, values = rng.standard_normal((4, 300)), rng.standard_normal(300)
     slacks = np.array([0.5, 0.0, 1.0])
     fast, fast_pairs = least_gammas(points, values, slacks)
-    monkeypatch.setattr("softneck.identification.set_membership._gamma.have_numba", lambda: False)
+    monkeypatch.setattr("softneck.identification.set_membership._regressor.have_numba", lambda: False)
     slow, slow_pairs = least_gammas(points, values, slacks)
     np.testing.assert_allclose(fast, slow, rtol=1e-12)
     np.testing.assert_array_equal(np.sort(fast_pairs), np.sort(slow_pairs))
-
-
-@pytest.mark.parametrize(
-    ("points", "values", "message"),
-    [
-        (np.zeros((2, 1)), np.zeros(1), "a set needs at least 2 points; got 1"),
-        (np.zeros((2, 3)), np.zeros(4), r"got \(2, 3\) and \(4,\)"),
-        (np.full((1, 3), np.nan), np.zeros(3), "must be finite"),
-        (np.zeros((1, 3)), np.zeros(3), "the outputs are constant"),
-    ],
-)
-def test_a_curve_over_bad_data_is_refused(points: np.ndarray, values: np.ndarray, message: str) -> None:
-    with pytest.raises(DataError, match=message):
-        gamma_curve(points, values)
 
 
 @given(data=data_sets(), slack=st.sampled_from([0.0, 0.1, 1.0]))
@@ -206,7 +222,7 @@ def test_gamma_is_the_least_over_all_pairs(data: tuple[np.ndarray, np.ndarray], 
             rise, distance = y[i] - y[k] - slack, np.linalg.norm(omega[i] - omega[k])
             if rise > 0:
                 least = max(least, rise / distance if distance > 0 else np.inf)
-    got = CONES.least_gammas(np.ascontiguousarray(omega.T), y, np.array([slack]), np.zeros((1, 2)))[0]
+    got = all_pairs_gammas(np.ascontiguousarray(omega.T), y, np.array([slack]))[0][0]
     if np.isinf(least):
         assert got > 1e200
     else:
@@ -349,7 +365,7 @@ def test_epsilon_and_weight_are_chosen_on_the_data_and_told() -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [({"epsilon": 0.0}, "`epsilon` must be positive"), ({"output_weight": -1.0}, "`output_weight` must be positive"),
-     ({"form": "magic"}, "`form` must be one of paper_eq21, lags, residual; got 'magic'")],
+     ({"form": "magic"}, "`form` must be one of paper_eq21, residual; got 'magic'")],
 )  # fmt: skip
 def test_wrong_settings_are_refused(settings: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):

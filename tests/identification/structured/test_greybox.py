@@ -12,8 +12,7 @@ import statsmodels.api as sm
 
 from softneck.core import load
 from softneck.identification import INFINITE, GreyBox, Model, validate
-from softneck.identification.structured._arrays import NUMBERS
-from softneck.identification.structured._greybox import INTERRUPTED, _table
+from softneck.identification.structured._greybox import INTERRUPTED, NUMBERS, _table
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.runtime import load_functions

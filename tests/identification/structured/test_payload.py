@@ -10,7 +10,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import GreyBox, Model
-from softneck.identification.structured._arrays import NUMBERS
+from softneck.identification.structured._greybox import NUMBERS
 from softneck.identification.structured._loaded_greybox_runtime import loaded_neck
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, concatenate, signal

@@ -10,7 +10,7 @@ from softneck.identification import INFINITE, Model, Play, validate
 from softneck.identification.models._directions import directions_of
 from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
 from softneck.identification.models._error_feedback import fit_echo
-from softneck.identification.structured._play_terms import Data, PlayStructure, ridge, scores
+from softneck.identification.structured._play import Data, PlayStructure, ridge, scores
 from softneck.runtime import load_functions
 from softneck.signals import Recording, redefinition_matrix
 from softneck.signals.recording._channels import MOTOR_POSITIONS

@@ -15,7 +15,7 @@ from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.identification import Family, FamilySettings
-from softneck.identification.uncertainty._envelope import envelope_weight
+from softneck.identification.uncertainty._family_fit import envelope_weight
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 

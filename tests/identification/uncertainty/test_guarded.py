@@ -12,10 +12,18 @@ import softneck
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError, silent
 from softneck.identification import Model, Network, OutputError, Rls
 from softneck.identification.models._arrays import check_arrays
-from softneck.identification.models._jobs import Job, done
-from softneck.identification.uncertainty._guarded import Guarded, _least_missing, covering
-from softneck.identification.uncertainty._guarded_base import Base, base_or_reason, fitted_base
-from softneck.identification.uncertainty._left_out import left_out, left_out_error
+from softneck.identification.uncertainty._guarded import (
+    Base,
+    Guarded,
+    Job,
+    _least_missing,
+    base_or_reason,
+    covering,
+    done,
+    fitted_base,
+    left_out,
+    left_out_error,
+)
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import bundle, load_runtime
@@ -165,11 +173,11 @@ def test_the_base_is_the_one_that_misses_least_and_a_poor_one_is_named() -> None
     good = Base(line(1.0), np.full(2, 0.01), np.array([92.0, 90.0]))
     poor = Base(line(0.5), np.full(2, 0.1), np.array([50.0, 60.0]))
     diverged = Base(line(0.5), np.full(2, np.inf), np.full(2, -np.inf))
-    assert _least_missing([poor, good, diverged, "srivc: no"]) is good
+    assert _least_missing([poor, good, diverged, "play: no"]) is good
     assert not good.remark
     assert "reaches 50 % only" in poor.remark
-    with pytest.raises(DataError, match="no base to fall back to: oe diverges; srivc: no"):
-        _least_missing([diverged, "srivc: no"])
+    with pytest.raises(DataError, match="no base to fall back to: oe diverges; play: no"):
+        _least_missing([diverged, "play: no"])
 
 
 def test_parts_left_out_are_whole_runs_where_there_are_enough_and_blocks_else() -> None:

@@ -13,22 +13,23 @@ from softneck.core import DataError, FileFormatError, load
 from softneck.identification import Family
 from softneck.identification.linear._srivc_fit import Continuous, SrivcFitOptions
 from softneck.identification.models._directions import Directions
-from softneck.identification.uncertainty._invalidation import least_uncertainty, nominal_output
 from softneck.identification.uncertainty._measured import (
     AxisMeasured,
     axis_points,
     axis_runs,
     band_borders,
+    choose_order,
     covering_weight,
     judge_records,
+    least_uncertainty,
     measured_responses,
     middle_model,
     needed_lines,
+    nominal_output,
     raised,
     response_of,
     unheard,
 )
-from softneck.identification.uncertainty._order import choose_order
 from softneck.signals import SET_POINTS, Recording, concatenate, multisine_experiments, redefinition_matrix
 
 TS = 0.02

@@ -36,7 +36,6 @@ def test_the_frame_has_a_row_for_each_horizon_and_axis(models: dict[str, Model])
     assert [row["low"], row["high"]] == v.intervals["inf"]["roll"]
     assert row["best_linear"] == v.best_linear["inf"]["roll"]
     assert np.isnan(row["persistence"])
-    assert np.isnan(row["noise_ceiling"])
     fits = frame.pivot_table(index="model", columns=["data", "horizon", "axis"], values="fit")
     assert fits.loc["a", ("short", "1", "pitch")] == result.validations[0].fits["1"]["pitch"]
 

@@ -10,7 +10,7 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import WARM_UP, Model, Rls, nrmse_fit, validate
 from softneck.identification.models._fitting import row_hashes
 from softneck.identification.models._scores import r_squared, rmse, worst_error
-from softneck.identification.validation._horizons import predict
+from softneck.identification.validation._scored_rows import predict
 from softneck.signals import concatenate, signal
 
 from ...data import neck_recording, recording_from, short_neck
@@ -67,7 +67,7 @@ def test_rows_shared_out_to_threads_are_predicted_as_by_one(
     run = neck_recording(90, seed=77)
     for workers in (2, 3, 7):
         monkeypatch.setattr("os.cpu_count", lambda n=workers: n)
-        monkeypatch.setattr("softneck.identification.validation._horizons._WORTH_A_THREAD", 0)
+        monkeypatch.setattr("softneck.identification.validation._scored_rows._WORTH_A_THREAD", 0)
         for horizon in (2, 25, 60):
             shared = predict(models[kind], [run, run], horizon, motors="simulated")
             alone = models[kind].predict(run, horizon)

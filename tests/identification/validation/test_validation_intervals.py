@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from softneck.identification import Rls, nrmse_fit, validate
-from softneck.identification.validation._bootstrap import _block_sums, block_length, fit_intervals
+from softneck.identification.validation._score_tables import _block_sums, block_length, fit_intervals
 
 from ...data import neck_recording
 from ._numbers import number, span

@@ -146,28 +146,8 @@ def test_a_cold_start_knows_the_first_row_only_and_is_scored_on_the_same_rows(mo
     # The same sums in another order.
     np.testing.assert_allclose(np.array(list(result.cold_fits.values()), dtype=float), 100.0 * (1.0 - error), atol=1e-9)
     assert result.as_dict()["cold_fits"] == result.cold_fits
-    asked = validate(model, recording, initial="cold")
-    assert asked.fits["inf"] == result.cold_fits
-    assert asked.fits["1"] == result.fits["1"]
     # A start that is wrong by 0.3 rad costs a cold run, as much as is left of it after the 25 rows that are not scored.
     wrong = validate(model, with_outputs(recording, slice(0, 1), 0.3))
     drops = np.array(list(result.cold_fits.values())) - list(wrong.cold_fits.values())
     warm = np.abs(np.array(list(result.fits["inf"].values())) - list(wrong.fits["inf"].values()))
     assert (drops > 10.0 * warm).all()
-
-
-def test_the_spread_over_blocks_shows_where_a_free_run_goes_wrong(models: dict[str, Model]) -> None:
-    recording = neck_recording(WARM_UP + 800, seed=15, noise=1e-3)
-    fine = validate(models["rls"], recording).spread["blocks"]["pitch"]
-    # One of eight blocks of 100 rows is off by 0.1 rad; the others are as they were.
-    rows = slice(WARM_UP + 300, WARM_UP + 400)
-    result = validate(models["rls"], with_outputs(recording, rows, 0.1))
-    assert fine is not None
-    assert result.spread["blocks"]["pitch"] is not None
-    low, high = result.spread["blocks"]["pitch"]
-    assert low < fine[0] - 30.0
-    assert high > fine[1] - 5.0  # the motion that errors are divided by grows a little
-    assert result.spread["runs"] == {"pitch": None, "roll": None}  # there is one run
-    two = validate(models["rls"], concatenate([recording, neck_recording(200, seed=16, noise=1e-3)]))
-    pitch = [part["fits"]["inf"]["pitch"] for part in two.per_run]
-    assert two.spread["runs"]["pitch"] == [min(pitch), max(pitch)]
