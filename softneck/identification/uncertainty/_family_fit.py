@@ -191,7 +191,7 @@ _CAUTION = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FamilySettings:
-    """Local models `K exp(-L s)/(s + p)` by `srivc`, and the uncertain plant over them.
+    """Local models `K exp(-L s)/(s + p)` by instrumental variables, and the uncertain plant over them.
 
     Of another robot one for each output, from its direction, given or learned; what is in seconds here goes by its time
     constant over a neck's 0.2 s.
