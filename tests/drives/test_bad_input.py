@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from softneck.core import FileFormatError, SettingsError, SoftneckError
 from softneck.drives import DrivesFile, default_drives, load_drives, open_bus, preflight, simulated_neck
 from softneck.drives.bus._link import VirtualLink
+from softneck.drives.bus._read import _GONE, drives_table
 from softneck.drives.bus._sdo import NUMBERS, Objects, SdoError
 from softneck.drives.master import Frame
 from softneck.drives.running._stop import disarm, stop
@@ -48,7 +49,7 @@ def test_the_example_states_the_defaults() -> None:
         assert getattr(file, name) == getattr(plain, name), name
     assert [drive.node for drive in file.drives] == [1, 2, 3]
     # Angles stand there in rounded degrees, the gear and Eq. 31 with as many digits as one reads.
-    assert file.sensor.angle == pytest.approx(plain.sensor.angle, rel=1e-3)
+    assert file.sensor_angle == pytest.approx(plain.sensor_angle, rel=1e-3)
     assert file.watch.gain == pytest.approx(plain.watch.gain, rel=1e-3)
     assert file.drives[0].scale.gear == pytest.approx(plain.drives[0].scale.gear, rel=1e-6)
 
@@ -67,7 +68,12 @@ def test_the_example_states_the_defaults() -> None:
         ("time_s = 0.1 ", "time_s = 0.5 ", r"\[guarding\]: `time_s` must be between 0.02 and 0.1 \[s\]"),
         ("reversed = false", "reversed = 1", r"\[\[drive\]\] 1 reversed must be true or false"),
         ('profile = "ipos2015"', 'profile = "epos"', "`profile` must be one of ipos2015, ds402"),
-        ("dropout_s = 0.08", "dropout_s = 0.3", r"`dropout` must be between 0\.01 and 0\.09"),
+        ("angle_deg = 68.75", "angle_deg = 100.0", r"`angle` must be between 0\.1 and 1\.6"),
+        (
+            "angle_deg = 68.75",
+            "dropout_s = 0.3",
+            r"\[sensor\] dropout_s is no setting any more, but always 0\.08; leave",
+        ),
         ("[bus]", "[bus", "is not valid TOML"),
     ],
 )
@@ -76,6 +82,22 @@ def test_a_drives_file_with_a_typo(tmp_path: Path, old: str, new: str, message: 
     with pytest.raises((SettingsError, FileFormatError), match=message) as error:
         load_drives(path)
     assert str(error.value).startswith(str(path))
+
+
+def test_a_file_with_what_is_no_setting_any_more_says_what_holds_and_is_read_where_it_says_the_same(
+    tmp_path: Path,
+) -> None:
+    for table, keys in _GONE.items():
+        for key, constant in keys.items():
+            for value, reads in ((constant, True), (2.0 * constant, False), ("x", False)):
+                said = repr(value).replace("'", '"')
+                path = written(tmp_path, lambda text, said=said, table=table, key=key: text.replace(
+                    f"[{table}]\n", f"[{table}]\n{key} = {said}\n"))  # fmt: skip
+                if reads:
+                    assert drives_table(load_drives(path)) == drives_table(load_drives(EXAMPLE))
+                    continue
+                with pytest.raises(SettingsError, match=rf"\[{table}\] {key} is no setting any more"):
+                    load_drives(path)
 
 
 def test_two_drives_are_not_enough(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from softneck.signals.recording._channels import NECK
 
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
-from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ..master._settings import LimitSettings, RampSettings, WatchSettings
 from ..supervision._baseline import Baseline
 from ._robot import channels_of, count_word, ranges, require_signs
 from ._sensor_source import SENSORS, SensorSource, axes_of
@@ -123,25 +123,16 @@ class ZeroSettings:
         current: of the motor while it pulls [A]; by default 3.25 N with [neck]'s radius, constant and efficiency, the
             pretension of the virtual neck, so that its rest is the zero. At 3.8 N Eq. 22 leaves the motors behind.
         speed: of the winch while it pulls [rad/s].
-        still: slower than this it has come to a stop [rad/s].
-        still_time: for this long [s].
-        timeout: for each tendon [s].
         tilt: the neck must be upright within this then [rad].
     """
 
     current: float = 0.0151
     speed: float = 1.0
-    still: float = 0.2
-    still_time: float = 0.3
-    timeout: float = 10.0
     tilt: float = math.radians(5.0)
 
     def __post_init__(self) -> None:
         require_positive("current_A", self.current, "A")
-        require_between("speed_rad_s", self.speed, 0.05, 5.0, "rad/s")
-        require_between("still_rad_s", self.still, 0.001, self.speed * 0.9, "rad/s")
-        require_between("still_s", self.still_time, 0.05, 10.0, "s")
-        require_between("timeout_s", self.timeout, 0.5, 120.0, "s")
+        require_between("speed_rad_s", self.speed, 0.25, 5.0, "rad/s")
         require_between("tilt_deg", math.degrees(self.tilt), 0.1, 45.0, "deg")
 
 
@@ -174,13 +165,14 @@ class DrivesFile(Shown):
         drives: of the motors, in their order.
         cycle: bus period [s].
         bit_rate: [bit/s].
-        guarding, zero, neck, limits, sensor, watch, ramps: the tables of those names.
+        guarding, zero, neck, limits, watch, ramps: the tables of those names.
         sensor_kind, sensor_node: "simulated", or "can" for a CiA 410 inclinometer at that node; others need
             `sensor_source`.
         sensor_axes: which of the sensor's own axes each output is, "-" before one that is reversed; () where it sits
             as it should.
+        sensor_angle: what is measured beyond it is none of what the drives move [rad].
         quick_stop: deceleration of a quick stop (6085h) [rad/s^2].
-        following: window (6065h) [rad]; following_time: its time-out (6066h) [s].
+        following: window (6065h) [rad].
         robot: what the drives move; None: the neck, with no limits beside those here.
         baseline: undisturbed motion, by which plausibility is judged; None: it is not.
     """
@@ -193,16 +185,15 @@ class DrivesFile(Shown):
     zero: ZeroSettings = field(default_factory=ZeroSettings)
     neck: Neck = field(default_factory=Neck)
     limits: LimitSettings = field(default_factory=LimitSettings)
-    sensor: SensorSettings = field(default_factory=SensorSettings)
     watch: WatchSettings = field(default_factory=WatchSettings)
     ramps: RampSettings = field(default_factory=RampSettings)
     sensor_kind: str = "simulated"
     sensor_node: int = 10
+    sensor_angle: float = 1.2
     sensor_source: SensorSource = field(default_factory=SensorSource)
     sensor_axes: tuple[str, ...] = ()
     quick_stop: float = 200.0
     following: float = 2.0
-    following_time: float = 0.2
     robot: Robot | None = None
     baseline: Baseline | None = None
 
@@ -212,7 +203,7 @@ class DrivesFile(Shown):
         require_whole("bit_rate", self.bit_rate, 10_000, 1_000_000)
         require_between("quick_stop_rad_s2", self.quick_stop, 1.0, 1e5, "rad/s^2")
         require_between("following_rad", self.following, 0.01, 20.0, "rad")
-        require_between("following_s", self.following_time, 0.01, 0.2, "s")
+        require_between("angle", self.sensor_angle, 0.1, 1.6, "rad")
         require_one_of("kind", self.sensor_kind, SENSORS)
         require_whole("node", self.sensor_node, 1, 126)
         nodes, motors = self.nodes, len(self.moves.motors.names)
@@ -325,7 +316,7 @@ class DrivesFile(Shown):
             sample_cycles=round(ratio),
             bus=bus,
             limits=self.limits,
-            sensor=self.sensor,
+            angle=self.sensor_angle,
             watch=self.watch,
             ramps=self.ramps,
             channels=channels_of(self.robot, self.limits),

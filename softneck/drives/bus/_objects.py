@@ -18,6 +18,8 @@ from ._units import (
 # the zero.
 HOMED_MARK = 1
 CSP = 8
+# How long a drive may be beyond its window (6066h) [ms]: the fault table's 200 ms.
+_FOLLOWING_TIME = 200
 # Our own node number, for heartbeats.
 MASTER_NODE = 127
 # Speeds of the profile ds402: counts per second.
@@ -101,7 +103,7 @@ def limit_writes(file: DrivesFile, entry: DriveEntry) -> list[Write]:
         Write(0x6083, 0, _acceleration(file.quick_stop, entry, file.profile), "limits"),
         Write(0x6085, 0, _acceleration(file.quick_stop, entry, file.profile), "limits"),
         Write(0x6065, 0, window, "limits"),
-        Write(0x6066, 0, round(1000.0 * file.following_time), "limits"),
+        Write(0x6066, 0, _FOLLOWING_TIME, "limits"),
         current_write(entry.current_limit, entry, file.profile, "limits"),
     ]
 

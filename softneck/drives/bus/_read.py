@@ -15,7 +15,7 @@ from softneck.core._budget import settings_text
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
-from ..master._settings import LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ..master._settings import LimitSettings, RampSettings, WatchSettings
 from ..supervision._baseline import load_baseline
 from ._file import PROFILES, DriveEntry, DrivesFile, Guarding, Neck, ZeroSettings
 from ._robot import count_word, require_table, robot_of
@@ -53,8 +53,7 @@ def load_drives(path: str | Path, robot: str | Path | Robot | None = None) -> Dr
 _KEYS: dict[str, dict[str, tuple[str, float]]] = {
     "guarding": {"kind": ("kind", 0.0), "time_s": ("time", 1.0)},
     "zero": {
-        "current_A": ("current", 1.0), "speed_rad_s": ("speed", 1.0), "still_rad_s": ("still", 1.0),
-        "still_s": ("still_time", 1.0), "timeout_s": ("timeout", 1.0), "tilt_deg": ("tilt", math.radians(1.0)),
+        "current_A": ("current", 1.0), "speed_rad_s": ("speed", 1.0), "tilt_deg": ("tilt", math.radians(1.0)),
     },
     "neck": {
         "winch_radius_m": ("winch_radius", 1.0), "torque_constant_Nm_A": ("torque_constant", 1.0),
@@ -62,26 +61,19 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
     },
     "limits": {
         "position_rad": ("position", 1.0), "speed_rad_s": ("speed", 1.0), "acceleration_rad_s2": ("acceleration", 1.0),
-        "persistent_s": ("persistent", 1.0), "tension_N": ("tension", 1.0), "slack_N": ("slack", 1.0),
-        "slack_unwind_rad": ("slack_unwind", 1.0),
+        "tension_N": ("tension", 1.0), "slack_N": ("slack", 1.0), "slack_unwind_rad": ("slack_unwind", 1.0),
     },
-    "sensor": {
-        "dropout_s": ("dropout", 1.0), "frozen_samples": ("frozen_samples", 0.0), "bad_samples": ("bad_samples", 0.0),
-        "angle_deg": ("angle", math.radians(1.0)), "rate_deg_s": ("rate", math.radians(1.0)),
-        "margin_deg": ("margin", math.radians(1.0)),
-    },
+    "sensor": {"angle_deg": ("sensor_angle", math.radians(1.0))},
     "watch": {
         "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),
         "pole_per_s": ("pole", 1.0), "pushed_N": ("pushed", 1.0),
     },
     "ramp": {
         "speed_rad_s": ("speed", 1.0), "settle_s": ("settle", 1.0), "tolerance_rad": ("tolerance", 1.0),
-        "enable_timeout_s": ("enable_timeout", 1.0), "timeout_s": ("timeout", 1.0),
     },
     "bus": {"period_s": ("cycle", 1.0), "bit_rate": ("bit_rate", 0.0)},
     "quick": {
         "quick_stop_rad_s2": ("quick_stop", 1.0), "following_rad": ("following", 1.0),
-        "following_s": ("following_time", 1.0),
     },
     "scale": {
         "peak_current_A": ("peak_current", 1.0), "gear": ("gear", 1.0), "encoder_counts": ("counts_per_turn", 1.0),
@@ -94,8 +86,16 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
 }  # fmt: skip
 _TOP = ("profile", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
         "supervision")  # fmt: skip
+# Table -> keys that files have had and nobody set -> what they are now, always.
+_GONE: dict[str, dict[str, float]] = {
+    "zero": {"still_rad_s": 0.2, "still_s": 0.3, "timeout_s": 10.0},
+    "limits": {"persistent_s": 0.3},
+    "sensor": {"dropout_s": 0.08, "frozen_samples": 20, "bad_samples": 3, "rate_deg_s": 458.4, "margin_deg": 3.0},
+    "ramp": {"enable_timeout_s": 1.0, "timeout_s": 30.0},
+    "stop": {"following_s": 0.2},
+}
 _CLASSES = {
-    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings, "sensor": SensorSettings,
+    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings,
     "watch": WatchSettings, "ramp": RampSettings,
 }  # fmt: skip
 _FIELDS = {"ramp": "ramps"}
@@ -120,14 +120,9 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
     for name, setting in _CLASSES.items():
         if name not in table:
             continue
-        content = dict(_table(name, table[name]))
-        if name == "sensor":
-            values |= {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
-            if "axes" in content:
-                values["sensor_axes"] = _texts("[sensor] axes", content.pop("axes"))
-            kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
-            values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
-        values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, content)
+        values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, _table(name, table[name]))
+    if "sensor" in table:
+        values |= _sensor(dict(_table("sensor", table["sensor"])), folder)
     values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
     values |= _values("[stop]", "quick", _table("stop", table.get("stop", {})))
     if "supervision" in table:
@@ -139,6 +134,15 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
             )
         values["baseline"] = load_baseline(folder / content["baseline"])
     return DrivesFile(**values)
+
+
+def _sensor(content: dict[str, Any], folder: Path) -> dict[str, Any]:
+    values = {f"sensor_{key}": content.pop(key) for key in ("kind", "node") if key in content}
+    if "axes" in content:
+        values["sensor_axes"] = _texts("[sensor] axes", content.pop("axes"))
+    kind, own = values.get("sensor_kind", "simulated"), [key for key in content if key in SOURCE_KEYS]
+    values["sensor_source"] = make_source(kind, {key: content.pop(key) for key in own}, folder)
+    return values | _values("[sensor]", "sensor", content)
 
 
 def _drive(number: int, entry: Any) -> DriveEntry:
@@ -172,7 +176,7 @@ def _values(where: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]
     return {keys[key][0]: _value(f"{where} {key}", value, keys[key][1]) for key, value in content.items()}
 
 
-_WHOLE = ("node", "vendor", "product", "serial", "bit_rate", "frozen_samples", "bad_samples")
+_WHOLE = ("node", "vendor", "product", "serial", "bit_rate")
 
 
 def _value(where: str, value: Any, factor: float) -> Any:
@@ -198,7 +202,12 @@ def _texts(where: str, value: Any) -> tuple[str, ...]:
 def _table(name: str, value: Any) -> Mapping[str, Any]:
     if not isinstance(value, dict):
         raise SettingsError(f"`{name}` must be a table.")
-    return value
+    for key, constant in _GONE.get(name, {}).items():
+        if key in value and not (
+            isinstance(value[key], int | float) and math.isclose(value[key], constant, rel_tol=1e-3)
+        ):
+            raise SettingsError(f"[{name}] {key} is no setting any more, but always {constant:g}; leave it out.")
+    return {key: setting for key, setting in value.items() if key not in _GONE.get(name, {})}
 
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: tuple[str, ...]) -> None:
@@ -215,7 +224,8 @@ def drives_table(file: DrivesFile) -> dict[str, Any]:
     table["drive"] = [_said_values(entry, "drive") | _said_values(entry.scale, "scale") for entry in file.drives]
     for name in _CLASSES:
         table[name] = _said_values(getattr(file, _FIELDS.get(name, name)), name)
-    table["sensor"] = {"kind": file.sensor_kind, "node": file.sensor_node, **_source(file), **table["sensor"]}
+    own = _said_values(file, "sensor")
+    table["sensor"] = {"kind": file.sensor_kind, "node": file.sensor_node, **_source(file), **own}
     if file.sensor_axes:
         table["sensor"]["axes"] = list(file.sensor_axes)
     return table

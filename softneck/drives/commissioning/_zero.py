@@ -31,6 +31,8 @@ from ..running._timing import Operator
 _MODE, _VELOCITY, _HOMING, _HERE = 0x6060, 3, 6, 35
 # A winch that holds is slower [rad/s], and moves less between two looks [rad].
 _UNMOVED = 0.01
+# A winch that turns more slowly has come to a stop [rad/s] if it does for this long, and each has to in this time [s].
+_STILL, _STILL_TIME, _TIME = 0.2, 0.3, 10.0
 # Between two looks at a drive [s].
 _LOOK = 0.02
 # Speeds of 606Ch and of 6064h differ by less than this part, or the slow loop is not what the drives file says.
@@ -212,15 +214,15 @@ def _tension(link: Link, motor: _Motor, operator: Operator | None) -> None:
         if abs(moved) > _FAST_ENOUGH and abs(speed) > 0.01:
             ratios.append(speed / moved)
         before, before_at = position, now
-        if abs(speed) > zero.still or now - begin < 2.0 * _LOOK:
+        if abs(speed) > _STILL or now - begin < 2.0 * _LOOK:
             still_since = None
         elif still_since is None:
             still_since = now
-        elif now - still_since >= zero.still_time:
+        elif now - still_since >= _STILL_TIME:
             break
-        if now - begin > zero.timeout:
+        if now - begin > _TIME:
             raise CheckFailedError(
-                f"node {node}: the tendon of this motor did not get tight within {zero.timeout:g} s; "
+                f"node {node}: the tendon of this motor did not get tight within {_TIME:g} s; "
                 "is it attached, does the winch turn the right way (`reversed`)?"
             )
         if motor.state() is not DriveState.ENABLED:
@@ -253,7 +255,7 @@ def _upright(file: DrivesFile, look: Look) -> dict[str, float]:
 
 
 def _set_zero(link: Link, motor: _Motor) -> None:
-    objects, still = motor.objects, motor.file.zero.still
+    objects = motor.objects
     before = _creep(link, motor)
     # The drive holds while its mode changes: its speed is zero and the tendon is tight.
     objects.write(0x60FF, 0, 0)
@@ -272,10 +274,10 @@ def _set_zero(link: Link, motor: _Motor) -> None:
     # The zero was taken between `begin` and `told`, the position after `asked`: what a winch, pulled on by its small
     # current, creeps meanwhile, and what one that counts as still turns between two looks.
     ways = [speed * time for speed in speeds for time in (asked - told, passed)]
-    off, slack = counts_to_position(counts - HOMED_MARK, motor.entry.scale), still * _LOOK
+    off, slack = counts_to_position(counts - HOMED_MARK, motor.entry.scale), _STILL * _LOOK
     attained = word & 0x3000 == 0x1000  # bit 13: an error
     near = min(ways) - slack <= off <= max(ways) + slack
-    if not (attained and near and max(map(abs, speeds)) <= still):
+    if not (attained and near and max(map(abs, speeds)) <= _STILL):
         raise CheckFailedError(
             f"node {motor.entry.node}: homing did not end (status {word:04X}h, position {counts}, "
             f"{speeds[1]:.3f} rad/s). Is its tendon tight still? Zero again."

@@ -22,7 +22,7 @@ from softneck.signals.recording._channels import NECK
 
 from ..master import Frame, MasterSettings
 from ..master._fieldbus import BusSettings
-from ..master._settings import ChannelSettings, LimitSettings, RampSettings, SensorSettings, WatchSettings
+from ..master._settings import ChannelSettings, LimitSettings, RampSettings, WatchSettings
 from ..supervision._baseline import Baseline
 from ._cycle import Cycle, decode_cycle, frame_of
 from ._result import recording_of, signal_units
@@ -32,7 +32,6 @@ from ._run_log import LOG_VERSION, METADATA
 _PARTS: dict[str, type] = {
     "bus": BusSettings,
     "limits": LimitSettings,
-    "sensor": SensorSettings,
     "watch": WatchSettings,
     "ramps": RampSettings,
     "channels": ChannelSettings,

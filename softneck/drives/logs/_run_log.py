@@ -21,7 +21,7 @@ from ..master._gate import Reading
 from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle, frame_text
 
 RUN_LOG = ".mcap"
-LOG_VERSION = 1
+LOG_VERSION = 2
 METADATA = "softneck.run"
 # Files are handed to the operating system this often [s]: what a killed process may lose beside a piece of a file.
 _FLUSH = 0.25

@@ -7,7 +7,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from ._events import Event
-from ._settings import SensorSettings
+
+# Without a valid sample for this long the sensor counts as lost [s]: the fault table allows 100 ms. So many identical
+# raw samples in a row are of a frozen one, and so many in a row that are no angles stop.
+DROPOUT, FROZEN, BAD = 0.08, 20, 3
+# No neck turns faster than this [rad/s], beside what noise may add [rad].
+_RATE, _MARGIN = 8.0, math.radians(3.0)
 
 
 class Reading(NamedTuple):
@@ -48,9 +53,9 @@ class Gate:
         last: last believed sample.
     """
 
-    def __init__(self, settings: SensorSettings) -> None:
-        """Believe nothing yet."""
-        self._settings = settings
+    def __init__(self, angle: float) -> None:
+        """Believe nothing yet, and never what is beyond `angle` [rad]."""
+        self._angle = angle
         self.last: Reading | None = None
         self._raw: tuple[float, ...] | None = None
         self._same = self._bad = 0
@@ -59,7 +64,6 @@ class Gate:
 
     def step(self, now: float, sample: Reading | None, events: list[Event]) -> bool:
         """Take the sample that is due, None if none came; return whether it is believed."""
-        s = self._settings
         if self._first is None:
             self._first = now
         good = sample is not None and sample.valid
@@ -72,29 +76,28 @@ class Gate:
                 good = False
                 self._bad += 1
                 events.append(Event(now, "sample_discarded", 0, reason))
-                if self._bad >= s.bad_samples:
+                if self._bad >= BAD:
                     events.append(Event(now, "sensor_bad", 0, reason))
             else:
                 self._bad = 0
                 self.last, self._good_at = sample, now
-            if self._same >= s.frozen_samples:
+            if self._same >= FROZEN:
                 events.append(Event(now, "sensor_frozen", 0, f"{self._same} identical samples"))
                 good = False
         since = now - (self._first if self._good_at is None else self._good_at)
-        if not good and since >= s.dropout - 1e-9:
+        if not good and since >= DROPOUT - 1e-9:
             events.append(Event(now, "sensor_lost", 0, f"no valid sample for {since * 1e3:.0f} ms"))
         return good
 
     def _reason(self, now: float, sample: Reading) -> str:
         """Return why `sample` is not valid, "" if it may be."""
-        s = self._settings
         values = sample.values
         if not all(map(math.isfinite, values)):
             return "not finite"
-        if max(map(abs, values)) > s.angle:
+        if max(map(abs, values)) > self._angle:
             return "beyond what the neck can bend"
         if self.last is not None and self._good_at is not None:
-            most = s.rate * (now - self._good_at) + s.margin
+            most = _RATE * (now - self._good_at) + _MARGIN
             if any(abs(new - old) > most for new, old in zip(values, self.last.values, strict=True)):
                 return "an outlier"
         return ""

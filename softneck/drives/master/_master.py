@@ -59,6 +59,10 @@ def reference_of(pilot: Pilot) -> tuple[float, ...]:
     return tuple(getattr(pilot, "reference", ()))
 
 
+# Clamped for longer than this stops [s]; time without a clamp takes a tenth of itself off.
+_PERSISTENT = 0.3
+# For each drive to be enabled, and for a ramp [s]: half of what the fault table allows.
+_ENABLE_TIME, _RAMP_TIME = 1.0, 30.0
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
 _LOST = 5
 # Drives get this long for their stop ramp before they lose their voltage [s].
@@ -91,7 +95,7 @@ class Master:
         self.settings, self.pilot = settings, pilot
         self.bus = Fieldbus(settings.bus)
         self.supervisor = Supervisor(settings.bus.off)
-        self._gate = Gate(settings.sensor)
+        self._gate = Gate(settings.angle)
         count = len(self.bus.drives)
         channels = settings.channels
         self._watches = Watches(
@@ -101,7 +105,7 @@ class Master:
         self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle, own) for own in ranges)
         scales = (settings.counts_per_radian, settings.newton_per_unit, settings.zeros)
         self._scales = tuple(zip(self.bus.drives, *scales, strict=True))
-        self._clamped = Leaky(settings.limits.persistent, settings.bus.cycle)
+        self._clamped = Leaky(_PERSISTENT, settings.bus.cycle)
         self.positions: Motors = (0.0,) * count
         self.tensions = self.setpoints = self.wanted = self._from = self.positions
         self.reference: Motors = ()
@@ -278,7 +282,7 @@ class Master:
                 self._enabling -= 1
                 if self._gate.last is not None:
                     self._change(now, Signal.ENABLED)
-        elif now - self._enabling_since > self.settings.ramps.enable_timeout:
+        elif now - self._enabling_since > _ENABLE_TIME:
             why = " and does not take mode 8" if view.mode == "asked" else ""
             events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}{why}"))
 
@@ -294,7 +298,7 @@ class Master:
         )
         if not there:
             self._arrived_at = _NEVER
-            most = ramps.timeout
+            most = _RAMP_TIME
             if self.supervisor.phase is Phase.RETREAT:
                 # Without a sensor no longer than the way from the farthest set-point takes.
                 most = min(most, self.settings.limits.position / ramps.speed + ramps.settle + 1.0)

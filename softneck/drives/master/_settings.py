@@ -20,7 +20,6 @@ class LimitSettings:
         position: |P| of each motor [rad].
         speed: [rad/s].
         acceleration: [rad/s^2].
-        persistent: clamped for longer than this stops [s]; time without a clamp takes a tenth of itself off.
         tension: of a tendon, as estimated from the motor's current [N]; nearer than a fifth it may not be pulled
             further, above it for 150 ms stops.
         slack: a tendon below this hangs [N].
@@ -30,7 +29,6 @@ class LimitSettings:
     position: float = 6.0
     speed: float = 15.6
     acceleration: float = 1000.0
-    persistent: float = 0.3
     tension: float = 12.0
     slack: float = 0.2
     slack_unwind: float = 3.0
@@ -39,39 +37,9 @@ class LimitSettings:
         require_between("position", self.position, 0.01, 100.0, "rad")
         require_between("speed", self.speed, 0.01, 100.0, "rad/s")
         require_between("acceleration", self.acceleration, 0.1, 1e5, "rad/s^2")
-        require_between("persistent", self.persistent, 0.02, 1.0, "s")
         require_between("tension", self.tension, 0.1, 200.0, "N")
         require_between("slack", self.slack, 0.0, 50.0, "N")
         require_between("slack_unwind", self.slack_unwind, 0.0, 20.0, "rad")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SensorSettings:
-    """The inclinometer's gate.
-
-    Attributes:
-        dropout: without a valid sample for this long the sensor counts as lost [s].
-        frozen_samples: identical raw samples in a row until it counts as frozen.
-        bad_samples: samples in a row that are not angles until it stops.
-        angle: |pitch|, |roll| beyond this are not angles of this neck [rad].
-        rate: faster changes are outliers [rad/s].
-        margin: change that is always allowed: noise [rad].
-    """
-
-    dropout: float = 0.08
-    frozen_samples: int = 20
-    bad_samples: int = 3
-    angle: float = 1.2
-    rate: float = 8.0
-    margin: float = math.radians(3.0)
-
-    def __post_init__(self) -> None:
-        require_between("dropout", self.dropout, 0.01, 0.09, "s")
-        require_whole("frozen_samples", self.frozen_samples, 2, 20)
-        require_whole("bad_samples", self.bad_samples, 1, 3)
-        require_between("angle", self.angle, 0.1, 1.6, "rad")
-        require_between("rate", self.rate, 0.1, 100.0, "rad/s")
-        require_between("margin", self.margin, 0.0, 0.5, "rad")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,22 +85,16 @@ class RampSettings:
         speed: of ramps [rad/s].
         settle: time at the end of a ramp before what follows [s].
         tolerance: of the motors to their rest there [rad].
-        enable_timeout: for each drive [s].
-        timeout: for a ramp [s].
     """
 
     speed: float = 1.0
     settle: float = 1.0
     tolerance: float = 0.05
-    enable_timeout: float = 1.0
-    timeout: float = 30.0
 
     def __post_init__(self) -> None:
         require_between("speed", self.speed, 0.01, 10.0, "rad/s")
         require_between("settle", self.settle, 0.0, 60.0, "s")
         require_between("tolerance", self.tolerance, 1e-3, 1.0, "rad")
-        require_between("enable_timeout", self.enable_timeout, 0.1, 2.0, "s")
-        require_between("timeout", self.timeout, 1.0, 60.0, "s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,7 +123,8 @@ class MasterSettings(Shown):
             drives commission --only zero`).
         newton_per_unit: tension for one unit of each drive's current, with sign.
         sample_cycles: bus cycles for one sample of the controller.
-        bus, limits, sensor, watch, ramps: as their classes say.
+        angle: what is measured beyond it is none of what the motors move [rad].
+        bus, limits, watch, ramps: as their classes say.
         channels: of the robot; None: the neck, with no limits beside `limits`.
         baseline: undisturbed motion, which plausibility is judged by; None: it is not.
     """
@@ -170,9 +133,9 @@ class MasterSettings(Shown):
     newton_per_unit: tuple[float, ...] = (0.0, 0.0, 0.0)
     zero_counts: int | tuple[int, ...] = 1
     sample_cycles: int = 2
+    angle: float = 1.2
     bus: BusSettings = field(default_factory=BusSettings)
     limits: LimitSettings = field(default_factory=LimitSettings)
-    sensor: SensorSettings = field(default_factory=SensorSettings)
     watch: WatchSettings = field(default_factory=WatchSettings)
     ramps: RampSettings = field(default_factory=RampSettings)
     channels: ChannelSettings | None = None
@@ -180,6 +143,7 @@ class MasterSettings(Shown):
 
     def __post_init__(self) -> None:
         require_whole("sample_cycles", self.sample_cycles, 1, 20)
+        require_between("angle", self.angle, 0.1, 1.6, "rad")
 
     @property
     def zeros(self) -> tuple[int, ...]:

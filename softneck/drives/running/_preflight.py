@@ -333,7 +333,7 @@ def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -
     advice = "Is it on, is `node` of [sensor] right?" if on_bus else "Is it plugged in and does it send?"
     if tilt is not None:
         angles = [math.degrees(angle) for angle in tilt.values]
-        holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor.angle) for angle in angles)
+        holds = tilt.valid and all(abs(angle) <= math.degrees(file.sensor_angle) for angle in angles)
         named = zip(file.moves.outputs.names, angles, strict=True)
         found = ", ".join(f"{name} {angle:.2f}" for name, angle in named) + " deg"
         advice = "The neck cannot have that angle: is it mounted upright, is it the right sensor?"

@@ -11,7 +11,7 @@ from softneck.drives.master import Tilt
 from softneck.drives.master._events import Event
 from softneck.drives.master._gate import Gate
 from softneck.drives.master._limiter import Limiter
-from softneck.drives.master._settings import LimitSettings, SensorSettings, WatchSettings
+from softneck.drives.master._settings import LimitSettings, WatchSettings
 from softneck.drives.master._watches import Watches
 
 T, TS = 0.01, 0.02
@@ -34,7 +34,7 @@ def moving(count: int) -> list[Tilt | None]:
 
 
 def test_a_lost_sensor_is_told_when_its_time_is_over() -> None:
-    gate = Gate(SensorSettings(dropout=0.08))
+    gate = Gate(1.2)
     assert feed(gate, moving(3)) == [(True, [])] * 3
     # The last good one was at 40 ms: at 120 ms the 80 ms are over, and then in each sample until one comes.
     assert feed(gate, [None] * 5, first=3) == [(False, [])] * 3 + [(False, ["sensor_lost"])] * 2
@@ -44,19 +44,17 @@ def test_a_lost_sensor_is_told_when_its_time_is_over() -> None:
 
 
 def test_a_sensor_that_never_came_is_lost_from_its_first_sample_on() -> None:
-    assert feed(Gate(SensorSettings(dropout=0.08)), [None] * 5, first=100) == [(False, [])] * 4 + [
-        (False, ["sensor_lost"])
-    ]
+    assert feed(Gate(1.2), [None] * 5, first=100) == [(False, [])] * 4 + [(False, ["sensor_lost"])]
 
 
 def test_identical_samples_are_frozen_when_there_are_as_many() -> None:
-    gate = Gate(SensorSettings(frozen_samples=5))
+    gate = Gate(1.2)
     same = Tilt(0.1, 0.2)
-    rows = feed(gate, [same] * 6)
-    assert [told for _, told in rows] == [[]] * 4 + [["sensor_frozen"]] * 2
-    assert [good for good, _ in rows] == [True] * 4 + [False] * 2
+    rows = feed(gate, [same] * 21)
+    assert [told for _, told in rows] == [[]] * 19 + [["sensor_frozen"]] * 2
+    assert [good for good, _ in rows] == [True] * 19 + [False] * 2
     # One axis that moves is enough, and counting begins anew.
-    assert feed(gate, [Tilt(0.1, 0.2001), *[Tilt(0.1, 0.2)] * 4], first=6) == [(True, [])] * 5
+    assert feed(gate, [Tilt(0.1, 0.2001), *[Tilt(0.1, 0.2)] * 19], first=21) == [(True, [])] * 20
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -67,25 +65,24 @@ def test_angles_beyond_the_neck_and_jumps_are_no_samples_and_three_in_a_row_stop
         values[axis] = sign * angle + 1e-7 * k
         return Tilt(values[0], values[1])
 
-    settings = SensorSettings(angle=1.0, rate=5.0, margin=0.02, bad_samples=3)
-    assert feed(Gate(settings), [tilt(0.999)]) == [(True, [])]
-    rows = feed(Gate(settings), [tilt(1.001 + 0.01 * k) for k in range(3)])
+    assert feed(Gate(1.0), [tilt(0.999)]) == [(True, [])]
+    rows = feed(Gate(1.0), [tilt(1.001 + 0.01 * k) for k in range(3)])
     assert [told[:2] for _, told in rows] == [["sample_discarded"]] * 2 + [["sample_discarded", "sensor_bad"]]
-    # 20 ms at 5 rad/s and the margin make 0.12 rad; after a sample that did not count it is 40 ms.
-    for jump, good in ((0.119, True), (0.121, False)):
-        gate = Gate(settings)
+    # 20 ms at 8 rad/s and the 3 deg make 0.2124 rad; after a sample that did not count it is 40 ms.
+    for jump, good in ((0.212, True), (0.213, False)):
+        gate = Gate(1.0)
         assert feed(gate, [tilt(0.0), tilt(jump)])[1][0] is good
         assert gate.last == (tilt(jump) if good else tilt(0.0))
-    gate = Gate(settings)
-    assert [good for good, _ in feed(gate, [tilt(0.0), tilt(0.5), tilt(0.219, 1)])] == [True, False, True]
+    gate = Gate(1.0)
+    assert [good for good, _ in feed(gate, [tilt(0.0), tilt(0.5), tilt(0.372, 1)])] == [True, False, True]
     # A good one between two bad ones begins the count anew.
-    names = feed(gate, [tilt(0.9), tilt(0.9, 1), tilt(0.22, 2), tilt(0.9, 3), tilt(0.9, 4)], first=3)
+    names = feed(gate, [tilt(0.95), tilt(0.95, 1), tilt(0.373, 2), tilt(0.95, 3), tilt(0.95, 4)], first=3)
     assert "sensor_bad" not in {name for _, told in names for name in told}
 
 
 def test_what_is_no_number_is_no_sample() -> None:
     for wrong in (Tilt(math.nan, 0.0), Tilt(0.0, math.inf)):
-        assert feed(Gate(SensorSettings()), [wrong])[0] == (False, ["sample_discarded"])
+        assert feed(Gate(1.2), [wrong])[0] == (False, ["sample_discarded"])
 
 
 # -- the limiter ------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from softneck.drives.master import Frame, Master, MasterSettings, Phase, Tilt
+from softneck.drives.master import Frame, Master, MasterSettings, Phase, Tilt, _master
 from softneck.drives.master._cia402 import DriveState, Goal, control_word, state_of
 from softneck.drives.master._events import RULES
 from softneck.drives.master._limiter import Limiter
@@ -160,9 +160,11 @@ def test_a_drive_that_cannot_be_enabled_ends_the_run() -> None:
     assert bench.now < 2.0
 
 
-def test_a_ramp_that_does_not_end_ends_the_run() -> None:
+def test_a_ramp_that_does_not_end_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_master, "_RAMP_TIME", 1.0)
+
     def short(given: MasterSettings) -> MasterSettings:
-        return replace(given, ramps=replace(given.ramps, timeout=1.0, tolerance=0.001))
+        return replace(given, ramps=replace(given.ramps, tolerance=0.001))
 
     bench = Bench(change=short)
     bench.neck.block(3)

@@ -15,7 +15,6 @@ from softneck.drives.master._settings import (
     LimitSettings,
     MasterSettings,
     RampSettings,
-    SensorSettings,
     WatchSettings,
 )
 from softneck.drives.master._supervisor import ACTIVE, FINAL, GOALS, NEXT, Signal, Supervisor
@@ -25,16 +24,9 @@ RANGES = [
     (LimitSettings, "position", 6.0, 0.01, 100.0),
     (LimitSettings, "speed", 15.6, 0.01, 100.0),
     (LimitSettings, "acceleration", 1000.0, 0.1, 1e5),
-    (LimitSettings, "persistent", 0.3, 0.02, 1.0),
     (LimitSettings, "tension", 12.0, 0.1, 200.0),
     (LimitSettings, "slack", 0.2, 0.0, 50.0),
     (LimitSettings, "slack_unwind", 3.0, 0.0, 20.0),
-    (SensorSettings, "dropout", 0.08, 0.01, 0.09),
-    (SensorSettings, "frozen_samples", 20, 2, 20),
-    (SensorSettings, "bad_samples", 3, 1, 3),
-    (SensorSettings, "angle", 1.2, 0.1, 1.6),
-    (SensorSettings, "rate", 8.0, 0.1, 100.0),
-    (SensorSettings, "margin", math.radians(3.0), 0.0, 0.5),
     (WatchSettings, "following", 1.5, 0.01, 20.0),
     (WatchSettings, "tilt", math.radians(12.0), 0.01, 1.6),
     (WatchSettings, "gain", 0.483 / 5.293, 0.001, 2.0),
@@ -43,8 +35,6 @@ RANGES = [
     (RampSettings, "speed", 1.0, 0.01, 10.0),
     (RampSettings, "settle", 1.0, 0.0, 60.0),
     (RampSettings, "tolerance", 0.05, 1e-3, 1.0),
-    (RampSettings, "enable_timeout", 1.0, 0.1, 2.0),
-    (RampSettings, "timeout", 30.0, 1.0, 60.0),
     (BusSettings, "cycle", 0.01, 0.005, 0.05),
 ]
 
@@ -72,6 +62,10 @@ def test_the_settings_without_a_range_have_their_defaults() -> None:
     assert (bus.silent_cycles, bus.missing_cycles, bus.answer_time, bus.stalled_cycles) == (3, 5, 0.25, 5)
     for cycles in (1, 20):
         MasterSettings(counts_per_radian=(1.0, 1.0, 1.0), sample_cycles=cycles)
+    assert made.angle == 1.2
+    for angle in (0.0999, 1.601, math.nan):
+        with pytest.raises(SettingsError, match="`angle`"):
+            MasterSettings(counts_per_radian=(1.0, 1.0, 1.0), angle=angle)
     for cycles in (0, 21):
         with pytest.raises(SettingsError, match="sample_cycles"):
             MasterSettings(counts_per_radian=(1.0, 1.0, 1.0), sample_cycles=cycles)
