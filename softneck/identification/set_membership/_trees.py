@@ -8,16 +8,11 @@ values do.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import numpy as np
 
 from softneck.core import FileFormatError, Matrix, Vector
-from softneck.runtime import load_functions
-from softneck.runtime._compile import have_numba
 
 from ..linear._regression import check_linear
 from ..models._arrays import check_table, within
@@ -185,8 +180,6 @@ def slant_nodes(frame: Matrix, slope: float, points: Matrix, values: Vector) -> 
     return nodes
 
 
-# Below this, starting a thread (50 us) costs more than it saves.
-_ROWS_PER_THREAD = 200
 # At most so many rows tell how wide the bounds are between the data: a quantile needs no more.
 _WIDTHS = 5000
 
@@ -200,60 +193,16 @@ def usual_width(points: Matrix, values: Vector, gamma: float, correlated: int, q
         correlated: rows before and after a row that are left out with it.
         quantile: of the rows.
     """
-    order, rows = tree_order(points), values.size
-    points, values = np.ascontiguousarray(points[:, order]), values[order]
-    ages = order.astype(np.float64)
-    some = np.unique(np.linspace(0, rows - 1, min(rows, _WIDTHS)).astype(np.int64))
-    windows = np.column_stack([ages[some] - correlated, ages[some] + correlated + 1])
-    queries = np.ascontiguousarray(points[:, some].T)
-    bounds = tighten((points, values, tree_nodes(points, values), ages), gamma, queries, windows)
-    return float(np.quantile(0.5 * (bounds[:, 1] - bounds[:, 0]), quantile))
-
-
-def tighten(
-    tree: tuple[Matrix, Vector, Matrix, Vector], gamma: float, queries: Matrix, windows: Matrix, workers: int = 0
-) -> Matrix:
-    """Return max(y - gamma d) and min(y + gamma d) (rows, 2) at `queries`: compiled and on all cores, or by numpy.
-
-    Args:
-        tree: points (n, N) in tree order, values (N,), nodes, ages (N,).
-        gamma: slope of the cones.
-        queries: (rows, n), each computed alone, so that the number of threads changes nothing.
-        windows: (rows, 2): points with `start <= age < stop` do not count for a query.
-        workers: threads; 0 takes all cores.
-    """
-    bounds = np.tile([-np.inf, np.inf], (len(queries), 1))
-    if not have_numba():
-        _tighten_by_numpy(tree, gamma, queries, windows, bounds)
-        return bounds
-    batch = load_functions("softneck.identification.set_membership._queries_runtime").set_batch
-    parts = min(workers or all_cores(), max(len(queries) // _ROWS_PER_THREAD, 1))
-    # Four stretches a thread, as some queries visit more than others; the compiled loops hold no lock.
-    edges = pairwise(np.linspace(0, len(queries), 4 * parts + 1).astype(int).tolist())
-    rows = [slice(*edge) for edge in edges]
-    with ThreadPoolExecutor(parts) as pool:
-        list(pool.map(lambda at: batch(tree, gamma, queries[at], windows[at], bounds[at]), rows))
-    return bounds
-
-
-def _tighten_by_numpy(
-    tree: tuple[Matrix, Vector, Matrix, Vector], gamma: float, queries: Matrix, windows: Matrix, bounds: Matrix
-) -> None:
-    points, values, _, ages = tree
-    for k, (x, (start, stop)) in enumerate(zip(queries, windows, strict=True)):
-        squared = np.zeros(points.shape[1])
-        for row, coordinate in zip(points, x, strict=True):
-            gap = row - coordinate
+    rows, halves = np.arange(values.size), []
+    # Spread over the tree, and so over all places.
+    for k in tree_order(points)[np.unique(np.linspace(0, rows.size - 1, min(rows.size, _WIDTHS)).astype(np.int64))]:
+        squared = np.zeros(rows.size)
+        for row in points:
+            gap = row - row[k]
             squared += gap * gap
-        cone = gamma * np.sqrt(squared)
-        counts = (ages < start) | (ages >= stop)
-        bounds[k, 0] = np.max(values - cone, initial=bounds[k, 0], where=counts)
-        bounds[k, 1] = np.min(values + cone, initial=bounds[k, 1], where=counts)
-
-
-def all_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        cone, counts = gamma * np.sqrt(squared), np.abs(rows - k) > correlated
+        halves.append(0.5 * (np.min((values + cone)[counts]) - np.max((values - cone)[counts])))
+    return float(np.quantile(halves, quantile))
 
 
 def check_nlsm(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
