@@ -16,7 +16,7 @@ from .shared._options import target
 
 if TYPE_CHECKING:
     from softneck.identification import Choice, Model, Validation
-    from softneck.identification.selection._kind_trial import KindTrial
+    from softneck.identification.selection._auto import KindTrial
     from softneck.robot import Robot
 
 
@@ -123,7 +123,7 @@ def _rows(choice: Choice) -> list[list[str]]:
 
 
 def _row(one: KindTrial, chosen: bool) -> list[str]:
-    from softneck.identification.selection._kind_trial import COLD, HOLD_OUT
+    from softneck.identification.selection._auto import COLD, HOLD_OUT
 
     if one.model is None:
         return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", one.failure[:60]]

@@ -23,8 +23,8 @@ from .uncertainty._family import Family as Family
 from .uncertainty._family_fit import FamilySettings as FamilySettings
 from .uncertainty._frf_fit import FrequencyResponse as FrequencyResponse
 from .uncertainty._frf_fit import frequency_response as frequency_response
-from .validation._compare import compare as compare
 from .validation._score_tables import INFINITE as INFINITE
 from .validation._validation import Rules as Rules
 from .validation._validation import Validation as Validation
+from .validation._validation import compare as compare
 from .validation._validation import validate as validate

@@ -12,7 +12,7 @@ import pytest
 from softneck.design import FopiSettings, PiSettings, mu_bounds
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
-from softneck.identification.models._linearisation import moved_through
+from softneck.identification.models._linear_systems import moved_through
 from softneck.verification._linear import LinearLaw, judged, margins, radii
 from softneck.verification._plants import (
     AxisBox,

@@ -20,7 +20,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, require_between
 from softneck.fmu.describe._describe import Buildable, buildable
-from softneck.identification.models._linearisation import moved_through
+from softneck.identification.models._linear_systems import moved_through
 from softneck.loop import BlockPart
 from softneck.runtime import Block, Port, State
 from softneck.runtime._compile import load_tangent

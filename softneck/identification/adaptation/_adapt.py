@@ -30,11 +30,11 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate, signal
 
 from ..models._arrays import check_arrays
+from ..models._directions import on_motors
 from ..models._fitting import row_hashes
 from ..models._model import WARM_UP, Model
 from ..models._ports import trained_range, trained_set_points
 from ..models._scores import nrmse_fit
-from ..models._unrecorded import on_motors
 from ..models._validity import doubted
 from ..structured._greybox import NUMBERS
 

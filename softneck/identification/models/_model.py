@@ -34,7 +34,7 @@ from softneck.signals.recording._labelled import Labelled
 from softneck.signals.recording._recording import require_same_robot
 
 from . import _linear_systems as _linear
-from . import _linearisation, _ports
+from . import _ports
 from ._arrays import check_arrays, members, memory_of, runtime_arrays, runtime_of, set_now
 from ._scores import r_squared
 
@@ -143,7 +143,7 @@ class Model(Shown):
             u[motors : motors + values.size] = values
         return self.block().step(state, u)
 
-    def jacobian(self, state: State, inputs: ArrayLike) -> _linearisation.Jacobian:
+    def jacobian(self, state: State, inputs: ArrayLike) -> _linear.Jacobian:
         """Return the derivatives A (n, n), B (n, 3), C (n_out, n), D (n_out, 3) of `step(state, inputs)`.
 
         They are exact, from the text of the step itself. Rows and columns of the state are in the order of
@@ -156,7 +156,7 @@ class Model(Shown):
         Raises:
             SettingsError: a kind without derivative.
         """
-        return _linearisation.jacobian(self, state, inputs)
+        return _linear.jacobian(self, state, inputs)
 
     def linearize(self, at: State | Mapping[str, float] | ArrayLike | None = None) -> control.StateSpace:
         """Return the linear system from the motors' set-points to the outputs that the model is near a state.
@@ -170,7 +170,7 @@ class Model(Shown):
         Raises:
             SettingsError: a kind without derivative, or a model that does not come to rest.
         """
-        return _linearisation.linearised(self, at)
+        return _linear.linearised(self, at)
 
     def simulate(self, recording: RecordingLike, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
         """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.

@@ -27,14 +27,12 @@ from softneck.signals import Recording, concatenate
 
 from ..linear._oe import OutputError
 from ..models._arrays import check_table
-from ..models._directions import directions_of
-from ..models._drive import LoadedDrive, drive_start, fit_loaded_drive
-from ..models._error_feedback import fit_correction
+from ..models._directions import directions_of, unrecorded
+from ..models._drive import LoadedDrive, drive_start, fit_correction, fit_loaded_drive
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ..models._model import Model
 from ..models._regressors import PAPER_EQ21, regression, scaled_table
 from ..models._state_space import history_array
-from ..models._unrecorded import unrecorded
 from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_layers, train_axis
 
 # Of the starts: from hardly any to one that smooths; the hold-out decides between them.

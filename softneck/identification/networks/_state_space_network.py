@@ -17,8 +17,7 @@ from softneck.signals import Recording
 
 from ..models._arrays import check_payloads, memory_array, within
 from ..models._directions import directions_of
-from ..models._drive import drive_start, fit_loaded_drive
-from ..models._error_feedback import BEYOND, fit_echo
+from ..models._drive import BEYOND, drive_start, fit_echo, fit_loaded_drive
 from ..models._fitting import SAME_EXCITATION, fitted_model, payload_of, training_recording
 from ..models._model import Model
 from ..models._state_space import history_array

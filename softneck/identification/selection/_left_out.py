@@ -24,10 +24,10 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, concatenate
 
+from ..models._directions import unrecorded
 from ..models._fitting import MIN_ROWS
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
-from ..models._unrecorded import unrecorded
 
 _SECONDS = 30.0
 # A model that is right to a percent weighs no more than that.

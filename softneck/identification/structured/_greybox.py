@@ -22,8 +22,7 @@ from softneck.signals import Recording
 
 from ..models._arrays import check_payloads, memory_array, within
 from ..models._directions import Directions, directions_of
-from ..models._drive import drive_start, fit_loaded_drive
-from ..models._error_feedback import fit_echo
+from ..models._drive import drive_start, fit_echo, fit_loaded_drive
 from ..models._fitting import payload_of, row_hashes, training_recording
 from ..models._model import Model
 from ..models._ports import trained_set_points

@@ -15,8 +15,7 @@ from softneck.signals import Recording
 
 from ..models._arrays import memory_array, within
 from ..models._directions import Directions, directions_of
-from ..models._drive import FUNCTIONS, LoadedDrive, drive_start, fit_loaded_drive
-from ..models._error_feedback import BEYOND, fit_echo
+from ..models._drive import BEYOND, FUNCTIONS, LoadedDrive, drive_start, fit_echo, fit_loaded_drive
 from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit

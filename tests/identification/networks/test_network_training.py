@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softneck.identification import Model, Network
-from softneck.identification.models._error_feedback import fit_correction
+from softneck.identification.models._drive import fit_correction
 from softneck.identification.networks._network import INTERRUPTED
 from softneck.identification.networks._nn_training import jacobian, levenberg, random_layers
 from softneck.runtime import load_functions

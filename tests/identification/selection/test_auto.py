@@ -12,8 +12,19 @@ from softneck.identification import Choice, Model, Network, OutputError, Play, R
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
-from softneck.identification.selection._auto import ALIKE, REFITTED, _Race, best_others, kinds_to_try
-from softneck.identification.selection._kind_trial import COLD, EXAM, HOLD_OUT, KindTrial, guarded_why, numbers_of
+from softneck.identification.selection._auto import (
+    ALIKE,
+    COLD,
+    EXAM,
+    HOLD_OUT,
+    REFITTED,
+    KindTrial,
+    _Race,
+    best_others,
+    guarded_why,
+    kinds_to_try,
+    numbers_of,
+)
 from softneck.identification.selection._left_out import agreement, exams, folds, weighted_median
 from softneck.identification.uncertainty import _guarded
 from softneck.identification.uncertainty._guarded import Base, Guarded

@@ -8,8 +8,7 @@ import pytest
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
 from softneck.identification.models._directions import directions_of
-from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive
-from softneck.identification.models._error_feedback import fit_echo
+from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_echo, fit_loaded_drive
 from softneck.identification.structured._play import Data, PlayStructure, ridge, scores
 from softneck.runtime import load_functions
 from softneck.signals import Recording, redefinition_matrix
