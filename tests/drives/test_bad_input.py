@@ -65,7 +65,7 @@ def test_the_example_states_the_defaults() -> None:
         ("current_limit_A = 0.0299", "current_limit_A = 29.9", "beyond the drive's peak current 10 A"),
         ("current_limit_A = 0.0299", "current_limit_A = 0.00001", "less than one unit"),
         ("position_rad = 6.0", 'position_rad = "6"', r"\[limits\] position_rad must be a number"),
-        ("time_s = 0.1 ", "time_s = 0.5 ", r"\[guarding\]: `time_s` must be between 0.02 and 0.1 \[s\]"),
+        ("time_s = 0.1 ", "time_s = 0.5 ", r"\[guarding\]: `time_s` must be between 0.02 and 0.1; got 0.5"),
         ("reversed = false", "reversed = 1", r"\[\[drive\]\] 1 reversed must be true or false"),
         ('profile = "ipos2015"', 'profile = "epos"', "`profile` must be one of ipos2015, ds402"),
         ("angle_deg = 68.75", "angle_deg = 100.0", r"`angle` must be between 0\.1 and 1\.6"),

@@ -20,7 +20,7 @@ from softneck.signals.recording._channels import NECK
 
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings
-from ..master._settings import LimitSettings, RampSettings, WatchSettings
+from ..master._settings import LimitSettings, RampSettings, Ranged, WatchSettings, setting
 from ..supervision._baseline import Baseline
 from ._robot import channels_of, count_word, ranges, require_signs
 from ._sensor_source import SENSORS, SensorSource, axes_of
@@ -99,7 +99,7 @@ class DriveEntry:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Guarding:
+class Guarding(Ranged):
     """How drives notice that the master is gone.
 
     Attributes:
@@ -107,16 +107,16 @@ class Guarding:
         time: after which they act [s].
     """
 
-    kind: str = "auto"
-    time: float = 0.1
+    kind: str = field(default="auto", metadata={"key": "kind"})
+    time: float = setting("time_s", 0.1, 0.02, _LONGEST_LIFE)
 
     def __post_init__(self) -> None:
+        Ranged.__post_init__(self)
         require_one_of("kind", self.kind, ("auto", "life", "heartbeat"))
-        require_between("time_s", self.time, 0.02, _LONGEST_LIFE, "s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ZeroSettings:
+class ZeroSettings(Ranged):
     """How `softneck drives commission --only zero` tensions the tendons.
 
     Attributes:
@@ -126,18 +126,13 @@ class ZeroSettings:
         tilt: the neck must be upright within this then [rad].
     """
 
-    current: float = 0.0151
-    speed: float = 1.0
-    tilt: float = math.radians(5.0)
-
-    def __post_init__(self) -> None:
-        require_positive("current_A", self.current, "A")
-        require_between("speed_rad_s", self.speed, 0.25, 5.0, "rad/s")
-        require_between("tilt_deg", math.degrees(self.tilt), 0.1, 45.0, "deg")
+    current: float = setting("current_A", 0.0151, 1e-6, 100.0)
+    speed: float = setting("speed_rad_s", 1.0, 0.25, 5.0)
+    tilt: float = setting("tilt_deg", math.radians(5.0), math.radians(0.1), math.radians(45.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Neck:
+class Neck(Ranged):
     """What turns motor current into tension.
 
     Attributes:
@@ -146,14 +141,9 @@ class Neck:
         efficiency: of the gear.
     """
 
-    winch_radius: float = 0.0075
-    torque_constant: float = 0.0839
-    efficiency: float = 0.81
-
-    def __post_init__(self) -> None:
-        require_positive("winch_radius_m", self.winch_radius, "m")
-        require_positive("torque_constant_Nm_A", self.torque_constant, "N m/A")
-        require_between("gear_efficiency", self.efficiency, 0.1, 1.0)
+    winch_radius: float = setting("winch_radius_m", 0.0075, 1e-6, 10.0)
+    torque_constant: float = setting("torque_constant_Nm_A", 0.0839, 1e-6, 100.0)
+    efficiency: float = setting("gear_efficiency", 0.81, 0.1, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

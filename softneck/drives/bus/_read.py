@@ -15,7 +15,7 @@ from softneck.core._budget import settings_text
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
-from ..master._settings import LimitSettings, RampSettings, WatchSettings
+from ..master._settings import LimitSettings, RampSettings, WatchSettings, factor_of
 from ..supervision._baseline import load_baseline
 from ._file import PROFILES, DriveEntry, DrivesFile, Guarding, Neck, ZeroSettings
 from ._robot import count_word, require_table, robot_of
@@ -49,32 +49,16 @@ def load_drives(path: str | Path, robot: str | Path | Robot | None = None) -> Dr
         raise type(error)(f"{source}: {error}") from error
 
 
-# Table -> key in the file -> (field, factor to SI).
+_CLASSES: dict[str, type] = {
+    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings,
+    "watch": WatchSettings, "ramp": RampSettings,
+}  # fmt: skip
+_FIELDS = {"ramp": "ramps"}
+# Table -> key in the file -> (field, factor to SI; 0 of what is no number that may have a fraction).
 _KEYS: dict[str, dict[str, tuple[str, float]]] = {
-    "guarding": {"kind": ("kind", 0.0), "time_s": ("time", 1.0)},
-    "zero": {
-        "current_A": ("current", 1.0), "speed_rad_s": ("speed", 1.0), "tilt_deg": ("tilt", math.radians(1.0)),
-    },
-    "neck": {
-        "winch_radius_m": ("winch_radius", 1.0), "torque_constant_Nm_A": ("torque_constant", 1.0),
-        "gear_efficiency": ("efficiency", 1.0),
-    },
-    "limits": {
-        "position_rad": ("position", 1.0), "speed_rad_s": ("speed", 1.0), "acceleration_rad_s2": ("acceleration", 1.0),
-        "tension_N": ("tension", 1.0), "slack_N": ("slack", 1.0), "slack_unwind_rad": ("slack_unwind", 1.0),
-    },
     "sensor": {"angle_deg": ("sensor_angle", math.radians(1.0))},
-    "watch": {
-        "following_rad": ("following", 1.0), "tilt_deg": ("tilt", math.radians(1.0)), "gain": ("gain", 1.0),
-        "pole_per_s": ("pole", 1.0), "pushed_N": ("pushed", 1.0),
-    },
-    "ramp": {
-        "speed_rad_s": ("speed", 1.0), "settle_s": ("settle", 1.0), "tolerance_rad": ("tolerance", 1.0),
-    },
     "bus": {"period_s": ("cycle", 1.0), "bit_rate": ("bit_rate", 0.0)},
-    "quick": {
-        "quick_stop_rad_s2": ("quick_stop", 1.0), "following_rad": ("following", 1.0),
-    },
+    "quick": {"quick_stop_rad_s2": ("quick_stop", 1.0), "following_rad": ("following", 1.0)},
     "scale": {
         "peak_current_A": ("peak_current", 1.0), "gear": ("gear", 1.0), "encoder_counts": ("counts_per_turn", 1.0),
         "slow_loop_s": ("slow_loop", 1.0), "reversed": ("reversed", 0.0),
@@ -82,6 +66,13 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
     "drive": {
         "node": ("node", 0.0), "current_limit_A": ("current_limit", 1.0), "vendor": ("vendor", 0.0),
         "product": ("product", 0.0), "serial": ("serial", 0.0), "firmware": ("firmware", 0.0),
+    },
+    **{
+        name: {
+            item.metadata["key"]: (item.name, factor_of(item.metadata["key"]) if "range" in item.metadata else 0.0)
+            for item in dataclasses.fields(kind) if "key" in item.metadata
+        }
+        for name, kind in _CLASSES.items()
     },
 }  # fmt: skip
 _TOP = ("profile", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
@@ -94,11 +85,6 @@ _GONE: dict[str, dict[str, float]] = {
     "ramp": {"enable_timeout_s": 1.0, "timeout_s": 30.0},
     "stop": {"following_s": 0.2},
 }
-_CLASSES = {
-    "guarding": Guarding, "zero": ZeroSettings, "neck": Neck, "limits": LimitSettings,
-    "watch": WatchSettings, "ramp": RampSettings,
-}  # fmt: skip
-_FIELDS = {"ramp": "ramps"}
 
 
 def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | None = None) -> DrivesFile:

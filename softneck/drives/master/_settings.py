@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from softneck.core import require_between, require_whole
 from softneck.core._shown import Shown
@@ -12,8 +13,31 @@ from ..supervision._baseline import Baseline
 from ._fieldbus import BusSettings
 
 
+def setting(key: str, default: float, least: float, most: float) -> Any:
+    """Return the field of a number that the drives file calls `key`; default and range are in SI."""
+    return field(default=default, metadata={"key": key, "range": (least, most)})
+
+
+def factor_of(key: str) -> float:
+    """Return what turns a number of the drives file into SI."""
+    return math.radians(1.0) if key.endswith("_deg") else 1.0
+
+
+class Ranged:
+    """Settings whose numbers are within their ranges."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for item in fields(self):  # pyright: ignore[reportArgumentType]
+            if "range" in item.metadata:
+                key, unit = item.metadata["key"], factor_of(item.metadata["key"])
+                least, most = item.metadata["range"]
+                require_between(key, getattr(self, item.name) / unit, least / unit, most / unit)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LimitSettings:
+class LimitSettings(Ranged):
     """What set-points may be; beyond it they are clamped and counted.
 
     Attributes:
@@ -26,24 +50,16 @@ class LimitSettings:
         slack_unwind: how far a hanging tendon may still be let out, beyond what the outputs lean away from it [rad].
     """
 
-    position: float = 6.0
-    speed: float = 15.6
-    acceleration: float = 1000.0
-    tension: float = 12.0
-    slack: float = 0.2
-    slack_unwind: float = 3.0
-
-    def __post_init__(self) -> None:
-        require_between("position", self.position, 0.01, 100.0, "rad")
-        require_between("speed", self.speed, 0.01, 100.0, "rad/s")
-        require_between("acceleration", self.acceleration, 0.1, 1e5, "rad/s^2")
-        require_between("tension", self.tension, 0.1, 200.0, "N")
-        require_between("slack", self.slack, 0.0, 50.0, "N")
-        require_between("slack_unwind", self.slack_unwind, 0.0, 20.0, "rad")
+    position: float = setting("position_rad", 6.0, 0.01, 100.0)
+    speed: float = setting("speed_rad_s", 15.6, 0.01, 100.0)
+    acceleration: float = setting("acceleration_rad_s2", 1000.0, 0.1, 1e5)
+    tension: float = setting("tension_N", 12.0, 0.1, 200.0)
+    slack: float = setting("slack_N", 0.2, 0.0, 50.0)
+    slack_unwind: float = setting("slack_unwind_rad", 3.0, 0.0, 20.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WatchSettings:
+class WatchSettings(Ranged):
     """Model against measurement; both watches stop after 150 ms beyond their tolerance.
 
     Attributes:
@@ -56,19 +72,12 @@ class WatchSettings:
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
-    following: float = 1.5
-    tilt: float = math.radians(12.0)
-    gain: float = 0.483 / 5.293
-    pole: float = 5.293
-    pushed: float = 0.5
+    following: float = setting("following_rad", 1.5, 0.01, 20.0)
+    tilt: float = setting("tilt_deg", math.radians(12.0), 0.01, 1.6)
+    gain: float = setting("gain", 0.483 / 5.293, 0.001, 2.0)
+    pole: float = setting("pole_per_s", 5.293, 0.1, 100.0)
+    pushed: float = setting("pushed_N", 0.5, 0.05, 200.0)
     tendon_angles: tuple[float, float, float] = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
-
-    def __post_init__(self) -> None:
-        require_between("following", self.following, 0.01, 20.0, "rad")
-        require_between("tilt", self.tilt, 0.01, 1.6, "rad")
-        require_between("gain", self.gain, 0.001, 2.0, "rad/rad")
-        require_between("pole", self.pole, 0.1, 100.0, "1/s")
-        require_between("pushed", self.pushed, 0.05, 200.0, "N")
 
     @property
     def weights(self) -> tuple[tuple[float, ...], ...]:
@@ -78,7 +87,7 @@ class WatchSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RampSettings:
+class RampSettings(Ranged):
     """How a run begins and ends.
 
     Attributes:
@@ -87,14 +96,9 @@ class RampSettings:
         tolerance: of the motors to their rest there [rad].
     """
 
-    speed: float = 1.0
-    settle: float = 1.0
-    tolerance: float = 0.05
-
-    def __post_init__(self) -> None:
-        require_between("speed", self.speed, 0.01, 10.0, "rad/s")
-        require_between("settle", self.settle, 0.0, 60.0, "s")
-        require_between("tolerance", self.tolerance, 1e-3, 1.0, "rad")
+    speed: float = setting("speed_rad_s", 1.0, 0.01, 10.0)
+    settle: float = setting("settle_s", 1.0, 0.0, 60.0)
+    tolerance: float = setting("tolerance_rad", 0.05, 1e-3, 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -111,6 +111,10 @@ class SimulatedDrives(abc.ABC):
         """Set what acts from outside, by name."""
 
     @abc.abstractmethod
+    def tear(self, tendon: int) -> None:
+        """Let a tendon, from 1 on, hang."""
+
+    @abc.abstractmethod
     def move(self) -> None:
         """Let one cycle of time pass for drives and what they turn."""
 

@@ -48,7 +48,7 @@ def test_each_setting_has_its_default_and_its_range(kind: Any, name: str, defaul
     assert getattr(kind(**{name: most}), name) == most
     step = 1 if isinstance(default, int) else 1e-6
     for wrong in (least - step, most + step, math.nan):
-        with pytest.raises(SettingsError, match=f"`{name}`"):
+        with pytest.raises(SettingsError, match=f"`{name}"):
             kind(**{name: wrong})
 
 
