@@ -12,17 +12,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO
 
-# Above the loop's own priority: the simulated drives stand for hardware, which no other process holds up.
-PRIORITY = 41
 IMPORTED = ["softneck.cli", "softneck.drives", "softneck.cosim", "can.interfaces.socketcan", "warmed"]
 
 
-def _run(words: tuple[str, ...], environment: dict[str, str], first: bool, out: Connection, error: Connection) -> None:
+def _run(words: tuple[str, ...], environment: dict[str, str], first: int, out: Connection, error: Connection) -> None:
     """Be `python WORDS`, with -m or with the command line's -c."""
     os.environ.clear()
     os.environ.update(environment)
     if first:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(first))
     os.dup2(out.fileno(), 1)
     os.dup2(error.fileno(), 2)
     if words[0] == "-m":
@@ -44,8 +42,8 @@ def imports_in(project: Path) -> None:
 class Forked:
     """What `subprocess.Popen(..., stdout=PIPE, stderr=PIPE)` offers, as far as `processes.py` uses it."""
 
-    def __init__(self, words: tuple[str, ...], *, first: bool = False) -> None:
-        """Start `python WORDS`; `first`: before all ordinary processes."""
+    def __init__(self, words: tuple[str, ...], *, first: int = 0) -> None:
+        """Start `python WORDS`; `first`: its priority before all ordinary processes."""
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(IMPORTED)
         pairs = [context.Pipe(duplex=False) for _ in range(2)]

@@ -91,18 +91,20 @@ class World:
         words = ["drives", "run", str(self.folder / "pi.npz"), "--bus", self.bus, "--json", *(["--arm"] if arm else [])]
         # On SocketCAN a run is logged unasked, into the folder of whoever plays this.
         words += [] if "--log" in self.extra else ["--log", "none"]
-        words += ["--override", "certificate", *self.extra, *(["--realtime"] if self.realtime and realtime else [])]
+        words += ["--override", "certificate", *self.extra]
         for option, name in files.items():
             words += [option, str(self.folder / name)]
-        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, first=40 * realtime)
 
-    def _spawn(self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL) -> Any:
+    def _spawn(
+        self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL, first: int = 41
+    ) -> Any:
+        """Start a process; above the loop the simulated drives, which stand for hardware that no process holds up."""
+        first *= self.realtime
         if self.forking:
-            self.children.append(Forked(arguments, first=self.realtime and arguments[0] == "-m"))
+            self.children.append(Forked(arguments, first=first))
             return self.children[-1]
-        # The simulated drives stand for hardware, which no other process holds up.
-        first = ["chrt", "-f", "41"] if self.realtime and arguments[0] == "-m" else []
-        command = [*first, sys.executable, *arguments]
+        command = [*(["chrt", "-f", str(first)] if first else []), sys.executable, *arguments]
         child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
         self.children.append(child)
         return child

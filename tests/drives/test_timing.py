@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError
 from softneck.drives.logs._result import CycleTimes
-from softneck.drives.running import _timing as timing
 from softneck.drives.running._keyboard import Keyboard
 from softneck.drives.running._timing import Ask, Notifier, steady
 
@@ -186,31 +185,6 @@ def test_nothing_is_collected_in_a_run_and_all_is_as_before_after_it(enabled: bo
         assert gc.get_freeze_count() == 0
     finally:
         (gc.enable if was else gc.disable)()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux")
-def test_real_time_that_is_not_permitted_is_one_line_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuses(*_: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    class Libc:
-        locked = 0
-
-        def mlockall(self, _flags: int) -> int:
-            Libc.locked += 1
-            return 0
-
-        def munlockall(self) -> int:
-            Libc.locked -= 1
-            return 0
-
-    monkeypatch.setattr(os, "sched_setscheduler", refuses)
-    monkeypatch.setattr(timing.ctypes, "CDLL", lambda *_, **__: Libc())
-    enabled = gc.isenabled()
-    message = r"--realtime is not permitted here \(Operation not permitted\); run as root.*Nothing was sent\."
-    with pytest.raises(SettingsError, match=message), steady(realtime=True):
-        pass
-    assert (Libc.locked, gc.isenabled()) == (0, enabled)
 
 
 # -- cycle times ------------------------------------------------------------------------------------------------------

@@ -85,14 +85,11 @@ def _show(report: Report, *, as_json: bool) -> None:
               help="Certificate of `softneck verify`, or of `simulate`: both are needed. [default: CONTROLLER and LOOP "
               "with .certificate.json]")  # fmt: skip
 @drives_options("override", "pace", "log")
-@click.option(
-    "--realtime", is_flag=True, help="On a bus: run ahead of all ordinary processes (SCHED_FIFO), with memory locked."
-)
 @output_option("recording of the run", "REC")
 @trust_option
 @common_options("force")
 def run_command(
-    asked: Asked, controller: Path, loop_file: Path, certificates: tuple[Path, ...], realtime: bool,
+    asked: Asked, controller: Path, loop_file: Path, certificates: tuple[Path, ...],
     output: Path | None, trust: bool, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Run CONTROLLER in the loop of LOOP.toml on the drives: enable, ramp in, control, ramp out, switch off.
@@ -148,7 +145,7 @@ def run_command(
             else:
                 result = run_on_bus(
                     deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=keyboard,
-                    realtime=realtime, log=log, files=files,
+                    log=log, files=files,
                 )  # fmt: skip
         # Before the log is closed: a full disk must not cost the recording and the result as well.
         if len(result.signals.time) > 1:

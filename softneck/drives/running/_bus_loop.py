@@ -53,7 +53,6 @@ class Session:
         log: where frames and cycles are written; whoever opened it closes it.
         files: role -> path of what acts in the run, for the log.
         facts: what else the log says about the run; `replay` computes an experiment or a jog again from it.
-        realtime: on a bus, run before all ordinary processes (SCHED_FIFO), with memory locked.
     """
 
     file: DrivesFile
@@ -67,7 +66,6 @@ class Session:
     log: RunLogger | None = None
     files: Mapping[str, str | Path] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
-    realtime: bool = False
 
     @property
     def simulated(self) -> bool:
@@ -135,11 +133,10 @@ def run_session(
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
-        SettingsError: real time is asked for and not permitted; nothing was sent.
     """
     if session.simulated:
         return _run_session(session, pilot, sample_time, most, begin, Notifier({}))
-    with steady(realtime=session.realtime), Notifier() as notifier, contextlib.ExitStack() as stack:
+    with steady(), Notifier() as notifier, contextlib.ExitStack() as stack:
         operator = session.operator or stack.enter_context(Keyboard())
         return _run_session(replace(session, operator=operator), pilot, sample_time, most, begin, notifier)
 

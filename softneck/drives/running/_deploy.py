@@ -149,7 +149,6 @@ def run_on_bus(
 
     Raises:
         CheckFailedError: the pre-flight failed; nothing moved.
-        SettingsError: `realtime` is not permitted; nothing was sent.
     """
     pilot = LoopPilot(deployed.loop, file.moves)
     pilot.warm()
