@@ -28,7 +28,7 @@ from softneck.identification import (
     validate,
 )
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.report._experiments import record_experiments
+from softneck.report._packaging import record_experiments
 from softneck.signals import Recording, signal
 
 

@@ -172,19 +172,16 @@ def _finite(fit: float) -> float | None:
 
 def _page(choice: Choice) -> str:
     from softneck.plots import Section, Table, page
+    from softneck.report._validation_page import curves
 
     table = Table(_title(_model(choice).robot), _HEAD, _rows(choice))
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
     each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
     all_scores = Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)
-    figures, found = [], []
-    for one in choice.ranking:
-        if one.judged is None or one is not choice.chosen:
-            continue
-        figures.append((f"{one.kind}: free run beside what was measured", one.judged.plot(one.kind)))
-        found += one.model.summary().splitlines() if one.model else []
+    charts = [] if choice.chosen.judged is None else [curves(choice.chosen.judged)]
+    found = _model(choice).summary().splitlines()
     sections = [
-        Section("Which kind of model", figures=figures, tables=[table, all_scores], text=choice.remarks, method=found)
+        Section("Which kind of model", charts=charts, tables=[table, all_scores], text=choice.remarks, method=found)
     ]
     return page(
         "Models of all kinds, ranked", sections, verdict=choice.why, footer="Written by softneck identify auto."

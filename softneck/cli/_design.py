@@ -12,8 +12,7 @@ from softneck.robot._opened import opened
 
 from .shared._console import note, print_json, progress
 from .shared._groups import kinds_complete
-from .shared._kind_help import kind_command
-from .shared._options import apply_settings, common_options, output_option, set_option, target
+from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 

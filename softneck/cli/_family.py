@@ -9,17 +9,13 @@ from typing import TYPE_CHECKING, Any
 import click
 import numpy as np
 
-from softneck.core import CheckFailedError, refuse_existing
+from softneck.core import CheckFailedError, refuse_existing, to_si
 
 from .shared._console import print_json, progress
-from .shared._kind_help import kind_command
-from .shared._options import apply_settings, common_options, output_option, set_option, target
+from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
 
 if TYPE_CHECKING:
     from softneck.identification import Family
-
-
-_SCOPES = ("windows", "operating points", "recordings")
 
 
 @click.command(
@@ -71,7 +67,7 @@ def command(
     lines, needed = family.invalidated_by(judges, [str(source) for source in tests]) if judges else ([], {})
     family.save(path, force=replace)
     if html is not None:
-        write_page(html, _page(family, [source.stem for source in recordings]), force=force)
+        write_page(html, _page(family), force=force)
     if as_json:
         print_json({**_facts(path, family), **({"test": {"lines": lines, "needed": needed}} if judges else {})})
     else:
@@ -123,28 +119,19 @@ def _named(numbers: np.ndarray) -> dict[str, float]:
     return dict(zip(("static_gain", "pole", "delay_s"), numbers.tolist(), strict=True))
 
 
-def _page(family: Family, names: list[str]) -> str:
-    from softneck.plots import Section, Table, cover_figure, local_map_figure, page
-    from softneck.plots._identification_figures import shown_gain
+def _page(family: Family) -> str:
+    from softneck.plots import Section, Table, page
+    from softneck.plots._charts import cover_chart
 
-    unit, gain, _ = shown_gain(family.robot)
+    outputs, motors = family.robot.outputs, family.robot.motors
+    unit, gain = f"{outputs.display_unit}/{motors.unit}", to_si(motors.unit)[0] / to_si(outputs.display_unit)[0]
     sections = []
     for name, axis in family.axes.items():
-        title = f"{name}: the weight over its samples"
-        figures = [(title, cover_figure(family.frequency, *_cover(family, name), title))]
-        for number, what in enumerate(_SCOPES):
-            groups = {}
-            for index, recording in enumerate([*names, "several"]):
-                row = (axis.where[:, 0] == number) & (axis.where[:, 1] == (index if index < len(names) else -1))
-                if row.any():
-                    groups[recording] = (axis.where[row, 3], axis.samples[row], axis.std[row])
-            if groups:
-                title = f"{name}: {what}"
-                figures.append((title, local_map_figure(groups, title, family.robot)))
+        chart = cover_chart(family.frequency, *_cover(family, name), f"{name}: the weight over its samples")
         head = ["", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
-        rows = [[label, *_numbers(row, gain)] for label, row in zip(("least", "largest"), axis.box, strict=True)]
-        rows.append(["nominal", *_numbers(axis.nominal, gain)])
-        sections.append(Section(name, tables=[Table("Box", head, rows)], figures=figures))
+        parts = {"least": axis.box[0], "largest": axis.box[1], "nominal": axis.nominal}
+        rows = [[label, *_numbers(row, gain)] for label, row in parts.items()]
+        sections.append(Section(name, tables=[Table("Box", head, rows)], charts=[chart]))
     sections.append(Section("In numbers", text=family.summary().splitlines()))
     verdict = " ".join(_verdict(family, name, gain, unit) for name in family.axes)
     return page("Family of linear models", sections, verdict=verdict, footer="Written by softneck family.")

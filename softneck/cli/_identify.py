@@ -17,10 +17,10 @@ from softneck.robot._opened import opened
 from ._auto import identify_auto
 from .shared._console import left_out, percent, print_json, progress, useless
 from .shared._groups import kinds_complete
-from .shared._kind_help import kind_command
 from .shared._options import (
     apply_settings,
     common_options,
+    kind_command,
     output_option,
     set_option,
     target,

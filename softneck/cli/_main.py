@@ -27,7 +27,7 @@ _COMMANDS = {
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
     "robot": ("_robot", "Show and check a robot.toml, or start one."),
-    "record": ("experiments._record", "Record a signal on the virtual neck, or design what to record next."),
+    "record": ("_record", "Record a signal on the virtual neck, or design what to record next."),
     "import": ("_import", "Turn any logger's table into a recording, or bring one to another sample time."),
     "identify": ("_identify", "Identify a model from recordings."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),

@@ -10,10 +10,10 @@ import click
 from softneck.core import find_kind, refuse_existing, resolve, to_si
 
 from .shared._console import print_json
-from .shared._kind_help import kind_command
 from .shared._options import (
     apply_settings,
     common_options,
+    kind_command,
     output_option,
     set_option,
     target,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +13,11 @@ from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
-from ._chart import Chart, Curve, Level, Panel
+from ._chart import Chart, Curve, Level, Panel, chart_figure
 from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, MOTOR_COLOURS, ORANGE, RED, SKY, looks, shown
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Of the whole time: the space between two runs that both start at zero.
 _SPACE = 0.03
@@ -316,3 +320,176 @@ def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
         levels += [Level(bound, _BOUND), Level(-bound)]
     edge = 1.15 * max(float(np.nan_to_num(bound)), float(np.nan_to_num(np.abs(values)).max(initial=0.0)), 1e-3)
     return Panel(curves, "correlation", levels=levels, title=title, legend=False, y_range=(-edge, edge))
+
+
+def cover_chart(frequency: Vector, errors: Matrix, weight: Vector, title: str) -> Chart:
+    """Describe relative errors of all samples (n, m) under the weight (m,) over `frequency` (m,) [rad/s]."""
+    curves = [
+        Curve(frequency, np.maximum(row, 1e-4), "" if number else "samples", GREY, width=0.6)
+        for number, row in enumerate(errors)
+    ]
+    curves.append(Curve(frequency, weight, "|W|", RED, width=1.6))
+    panel = Panel(curves, "|G/G0 - 1|", log_x=True, log_y=True)
+    return Chart(title, [panel], "frequency [rad/s]", row_height=4.0)
+
+
+def frequency_response_chart(
+    frequency: Vector, response: np.ndarray, radius: Vector, coherence: Vector, title: str, *, unit: str,
+    models: Mapping[str, np.ndarray],
+) -> Chart:  # fmt: skip
+    """Describe gain, phase and coherence of one entry of a frequency response, models beside it.
+
+    Args:
+        frequency: (n,) [rad/s].
+        response: (n,) complex, NaN where it is not known.
+        radius: (n,) of the circles in which it lies with 95 %.
+        coherence: (n,) 0 to 1.
+        title: of the chart.
+        unit: of `response`.
+        models: name -> (n,) complex.
+    """
+    size = np.abs(response)
+    # What reaches zero has no end on a logarithmic axis, and the phase of a circle that holds zero is anything.
+    low, known = np.maximum(size - radius, 1e-3 * size), radius < size
+    phase = np.full(response.shape, np.nan)
+    phase[known] = np.degrees(np.unwrap(np.angle(response[known])))
+    reach = np.degrees(np.arcsin(np.where(known, radius / size, 0.0)))
+    gains = [
+        Curve(frequency, low, "95 %", SKY, "band", upper=size + radius),
+        Curve(frequency, size, "data", BLUE, "marked"),
+    ]
+    phases = [
+        Curve(frequency, phase - reach, "95 %", SKY, "band", upper=phase + reach),
+        Curve(frequency, phase, "data", BLUE, "marked"),
+    ]
+    for (name, values), colour in zip(models.items(), (ORANGE, GREEN, RED, GREY), strict=False):
+        gains.append(Curve(frequency, np.abs(values), name, colour))
+        phases.append(Curve(frequency, np.degrees(np.unwrap(np.angle(values))), name, colour))
+    # Frequencies at which nothing is known would flatten what is.
+    y_range = (0.3 * float(size[known].min()), 3.0 * float(size[known].max())) if known.any() else None
+    panels = [
+        Panel(gains, f"gain [{unit}]", log_x=True, log_y=True, y_range=y_range),
+        Panel(phases, "phase [deg]", log_x=True, legend=False),
+        Panel([Curve(frequency, coherence)], "coherence", log_x=True, y_range=(-0.05, 1.05), legend=False),
+    ]
+    return Chart(title, panels, "frequency [rad/s]")
+
+
+def validation_figure(
+    time: Vector,
+    measured: Matrix,
+    predictions: Mapping[str, Matrix],
+    title: str,
+    *,
+    bounds: tuple[Matrix, Matrix] | None = None,
+    run: np.ndarray | None = None,
+    robot: Robot = NECK,
+) -> Figure:
+    """Draw `validation_chart`: measured and predicted outputs, of a neck (time, 2) [rad], each with its error below."""
+    return chart_figure(validation_chart(time, measured, predictions, title, bounds=bounds, run=run, robot=robot))
+
+
+_POINT = 1.6
+_BINS = 40
+
+
+def pareto_chart(
+    groups: Mapping[str, tuple[Vector, Vector]],
+    front: tuple[Vector, Vector],
+    labels: tuple[str, str],
+    title: str,
+    *,
+    caption: str = "",
+) -> Chart:
+    """Describe runs by two metrics, and the front that no run beats in both.
+
+    Args:
+        groups: name -> (x, y) of its runs; runs that are not finite are left out.
+        front: (x, y) of the front, by rising x.
+        labels: of the axes.
+        title: of the chart.
+        caption: for under the chart.
+
+    Raises:
+        DataError: no run has both metrics.
+    """
+    curves = []
+    for (name, (x, y)), (colour, _) in zip(groups.items(), looks(), strict=False):
+        known = np.isfinite(x) & np.isfinite(y)
+        if known.any():
+            curves.append(Curve(np.asarray(x)[known], np.asarray(y)[known], name, colour, "points", _POINT))
+    if not curves:
+        raise DataError(f"no run has both {labels[0]} and {labels[1]}.")
+    curves.append(Curve(front[0], front[1], "Pareto front", RED, "marked", 1.4))
+    return Chart(title, [Panel(curves, labels[1])], labels[0], caption=caption, row_height=4.0)
+
+
+def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *, caption: str = "") -> Chart:
+    """Describe how metrics are spread over the runs: a panel for each metric, a line for each group.
+
+    Args:
+        values: metric -> name of a group -> (n,); values that are not finite are left out.
+        title: of the chart.
+        caption: for under the chart.
+
+    Raises:
+        DataError: no value is finite.
+    """
+    panels = []
+    for metric, groups in values.items():
+        known = {name: np.asarray(v, float)[np.isfinite(np.asarray(v, float))] for name, v in groups.items()}
+        known = {name: v for name, v in known.items() if v.size}
+        if known:
+            panels.append(_shares(metric, known, legend=not panels))
+    if not panels:
+        raise DataError("no run has a metric to show.")
+    return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
+
+
+def influence_chart(
+    inputs: Mapping[str, Vector], metric: tuple[str, Vector], failed: np.ndarray, title: str, *, caption: str = ""
+) -> Chart:
+    """Describe what a metric depends on: a panel for each number that varied, a point for each run.
+
+    Args:
+        inputs: key -> (n,) what was put in.
+        metric: its label and (n,) values.
+        failed: (n,) whether a run broke a limit; such are drawn in another colour.
+        title: of the chart.
+        caption: for under the chart.
+    """
+    label, y = metric
+    bad = np.asarray(failed, dtype=bool)
+    panels = []
+    for key, x in inputs.items():
+        curves = []
+        for mask, name, colour in ((~bad, "holds", BLUE), (bad, "breaks a limit", RED)):
+            known = mask & np.isfinite(y) & np.isfinite(x)
+            if known.any():
+                curves.append(Curve(np.asarray(x, float)[known], y[known], name, colour, "points", _POINT))
+        curves = curves or [Curve(np.zeros(0), np.zeros(0), "", GREY, "points")]
+        panels.append(Panel(curves, label, x_label=key, legend=not panels))
+    return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
+
+
+def pareto_figure(
+    groups: Mapping[str, tuple[Vector, Vector]], front: tuple[Vector, Vector], labels: tuple[str, str], title: str
+) -> Figure:
+    """Draw `pareto_chart`: runs by two metrics and their Pareto front."""
+    return chart_figure(pareto_chart(groups, front, labels, title))
+
+
+def _shares(metric: str, groups: Mapping[str, Vector], *, legend: bool) -> Panel:
+    """Return the share of each group's runs in each of the bins that all groups have in common."""
+    every = np.concatenate(list(groups.values()))
+    low, high = float(every.min()), float(every.max())
+    if high - low <= 1e-12 * max(1.0, abs(high)):
+        low, high = low - 0.5, high + 0.5
+    edges = np.linspace(low, high, int(np.clip(np.sqrt(every.size), 8, _BINS)) + 1)
+    middles = 0.5 * (edges[:-1] + edges[1:])
+    curves = []
+    for (name, values), (colour, _) in zip(groups.items(), looks(), strict=False):
+        share = 100.0 * np.histogram(values, edges)[0] / values.size
+        single = len(groups) == 1
+        curves.append(Curve(middles, share, name, colour, "bars" if single else "marked"))
+    return Panel(curves, "share of runs [%]", x_label=metric, legend=legend and len(groups) > 1)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -19,9 +17,6 @@ from softneck.core._shown import Shown
 
 from ._chart import Chart, Curve
 from ._interactive import LICENCE, compressed, draw, library
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -49,27 +44,23 @@ class Section(Shown):
         title: of the part.
         text: paragraphs.
         tables: under the pictures.
-        figures: captions and matplotlib figures.
         charts: interactive ones.
         findings: severity (ok, note, warning) and a sentence of each; a numbered list.
         method: paragraphs at the end: how the numbers are defined and made.
-        cards: what leads elsewhere: title, link and a line of text.
     """
 
     title: str
     text: Sequence[str] = ()
     tables: Sequence[Table] = ()
-    figures: Sequence[tuple[str, Figure]] = field(default=())
     charts: Sequence[Chart] = ()
     findings: Sequence[tuple[str, str]] = ()
     method: Sequence[str] = ()
-    cards: Sequence[tuple[str, str, str]] = ()
 
 
 def page(
     title: str, sections: Sequence[Section], *, verdict: str = "", holds: bool | None = None, footer: str = ""
 ) -> str:
-    """Return the HTML text of a page; all text is escaped, figures, charts and what draws them are inside.
+    """Return the HTML text of a page; all text is escaped, charts and what draws them are inside.
 
     The page forbids itself every request, by its content security policy.
 
@@ -101,10 +92,8 @@ def _part(number: int, section: Section, charts: Iterator[Chart], drawn: dict[st
         chart, name = next(charts), f"c{number}-{k}"
         drawn[name], height = draw(chart)
         shown.append({"id": name, "title": chart.title, "caption": chart.caption, "height": height})
-    figures = [{"caption": caption, "data": figure_png(figure)} for caption, figure in section.figures]
-    cards = [{"title": a, "link": b, "text": c} for a, b, c in section.cards]
     taken = {name: getattr(section, name) for name in ("title", "text", "tables", "findings", "method")}
-    return {**taken, "charts": shown, "figures": figures, "cards": cards}
+    return {**taken, "charts": shown}
 
 
 def _file(name: str) -> str:
@@ -115,13 +104,6 @@ def write_page(path: str | Path, html: str, *, force: bool = False) -> None:
     """Write a page in one piece; raises OutputFileError if it exists (and not `force`) or cannot be written."""
     with atomic_write(path, force=force) as temporary:
         temporary.write_text(html, encoding="utf-8")
-
-
-def figure_png(figure: Figure) -> str:
-    """Return a figure as base64 text of a PNG."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": None})
-    return base64.b64encode(buffer.getvalue()).decode()
 
 
 # Samples of a page: compressed, about three bytes each, and a third more as text.

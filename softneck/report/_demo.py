@@ -19,8 +19,22 @@ from softneck.plots import Chart, Section, Table, neck_view, page, write_page
 from softneck.plots._charts import loop_chart, recording_chart, validation_chart
 from softneck.signals import Recording, write_recording
 
-from ._experiments import Experiments, Tell, ValidationPair, identify, judge, on_rough, record_experiments
-from ._packaging import TOLERANCE, DemoDesign, PackagedFmu, close_loops, design, limits_of, package
+from ._packaging import (
+    TOLERANCE,
+    DemoDesign,
+    Experiments,
+    PackagedFmu,
+    Tell,
+    ValidationPair,
+    close_loops,
+    design,
+    identify,
+    judge,
+    limits_of,
+    on_rough,
+    package,
+    record_experiments,
+)
 from ._paper_tables import FREE_RUN, FREE_RUN_MEASURED, ONE_STEP
 
 FULL_DURATION = 200.0

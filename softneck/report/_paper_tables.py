@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from softneck.identification import INFINITE
@@ -71,8 +71,8 @@ class Entry:
         persistence: of the same rows one step ahead [%], where the figure is one step ahead.
         paper, ours: fits [%]; ours is None where the free run diverged.
         rough: the same on the preset `rough` [%]; None where it diverged, or the preset is not among the other necks.
-        span: least and largest fit over the other necks [%], or None.
-        scaling: ours with the other scaling of the regressor [%], or None.
+        other_necks: least and largest fit over the other necks [%], or None.
+        other_scaling: ours with the other scaling of the regressor [%], or None.
     """
 
     where: str
@@ -84,8 +84,8 @@ class Entry:
     paper: float
     ours: float | None
     rough: float | None
-    span: tuple[float, float] | None
-    scaling: float | None
+    other_necks: tuple[float, float] | None
+    other_scaling: float | None
 
     @property
     def verdict(self) -> str:
@@ -94,35 +94,23 @@ class Entry:
             return "ours diverged"
         if abs(self.ours - self.paper) <= _SAME:
             return "none"
-        fits = [self.ours, *(self.span or ())]
+        fits = [self.ours, *(self.other_necks or ())]
         if min(fits) <= self.paper <= max(fits):
             return "the plant's: within necks"
-        if self.scaling is not None and min(*fits, self.scaling) <= self.paper <= max(*fits, self.scaling):
+        fits += [] if self.other_scaling is None else [self.other_scaling]
+        if min(fits) <= self.paper <= max(fits):
             return "plant and scaling"
         return f"unexplained: ours {'higher' if self.ours > self.paper else 'lower'}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the entry of the JSON."""
-        return {
-            "where": self.where,
-            "model": self.model,
-            "data": self.data,
-            "axis": self.axis,
-            "configuration": self.configuration,
-            "persistence": self.persistence,
-            "paper": self.paper,
-            "ours": self.ours,
-            "rough": self.rough,
-            "other_necks": None if self.span is None else list(self.span),
-            "other_scaling": self.scaling,
-            "difference": self.verdict,
-        }
+        return {**asdict(self), "difference": self.verdict}
 
     def row(self) -> list[str]:
         """Return the cells under `PAPER_HEAD`."""
-        span = "-" if self.span is None else f"{self.span[0]:.1f} to {self.span[1]:.1f}"
-        if self.scaling is not None:
-            span += f"; scaling {self.scaling:.1f}"
+        span = "-" if self.other_necks is None else f"{self.other_necks[0]:.1f} to {self.other_necks[1]:.1f}"
+        if self.other_scaling is not None:
+            span += f"; scaling {self.other_scaling:.1f}"
         held = "" if self.persistence is None else _number(self.persistence)
         return [
             self.where,
@@ -162,8 +150,8 @@ def _entries(found: Reproduction) -> Iterator[Entry]:
                     paper=figure,
                     ours=_fit(found.judged, key, axis, configuration),
                     rough=_fit(found.others[ROUGH], key, axis, configuration) if ROUGH in found.others else None,
-                    span=_span(found.others, key, axis, configuration),
-                    scaling=_fit(found.rescaled, key, axis, configuration) if key in found.rescaled else None,
+                    other_necks=_span(found.others, key, axis, configuration),
+                    other_scaling=_fit(found.rescaled, key, axis, configuration) if key in found.rescaled else None,
                 )
 
 

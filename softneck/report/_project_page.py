@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from textwrap import shorten
 from typing import Any
 
 from softneck.core import Progress, SoftneckError, file_hash, silent
@@ -27,8 +26,6 @@ from ._validation_page import drawable
 _MOST_CHARTS = 4
 # Recordings on which each model is judged.
 _MOST_DATA = 6
-# Thumbnails of one sort.
-_MOST_CARDS = 12
 _HORIZONS: tuple[int | str, ...] = (1, 25, INFINITE)
 _RULES = Rules(horizons=_HORIZONS)
 
@@ -40,10 +37,9 @@ def project_page(project: Project, *, progress: Progress = silent) -> str:
     sections += [_uncertain(project), _design(project), _fmus(project), *_studies(project), _problems(project)]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     kept = [section for section in sections if section is not None]
-    places = {section.title: f"#s{number}" for number, section in enumerate(kept, start=2)}
     sentence, holds = _sentence(project)
     return page(
-        title, [_overview(project, places), *kept], verdict=sentence, holds=holds,
+        title, [_overview(project), *kept], verdict=sentence, holds=holds,
         footer=f"softneck report, {now}. All plots and tables are in this file.",
     )  # fmt: skip
 
@@ -79,23 +75,7 @@ def _shortly(doubts: Sequence[str]) -> str:
     return f"{doubts[0].partition(' sure): ')[0]} sure){more}"
 
 
-def _cards(project: Project, places: Mapping[str, str]) -> list[tuple[str, str, str]]:
-    """Return a card for each thing of the project: a small picture, a line, and the way to its section."""
-    groups = {
-        "Loops": project.loops, "Data": {name: recording for name, (recording, _) in project.recordings.items()},
-        "Models": project.models, "Uncertain plant": project.families,
-        "Observers and controllers": {**project.observers, **project.controllers},
-    }  # fmt: skip
-    cards = []
-    for title, things in groups.items():
-        for name, thing in list(things.items())[:_MOST_CARDS]:
-            lines = _lines(thing)
-            said = lines[1] if title == "Loops" and len(lines) > 1 else lines[0]
-            cards.append((name, places[title], shorten(said, 90, placeholder=" ...")))
-    return cards
-
-
-def _overview(project: Project, places: Mapping[str, str]) -> Section:
+def _overview(project: Project) -> Section:
     loops = [result for result in project.loops.values() if result.limits]
     held = sum(result.holds for result in loops)
     certified = sum(_certifies(content) for content in project.certificates.values())
@@ -112,7 +92,7 @@ def _overview(project: Project, places: Mapping[str, str]) -> Section:
     ]
     rows = [[name, str(count), verdict] for name, count, verdict in lines]
     table = Table("What is there", ["", "number", "verdict"], rows)
-    return Section("Overview", cards=_cards(project, places), tables=[table])
+    return Section("Overview", tables=[table])
 
 
 def _verdict(held: int, of: int) -> str:

@@ -12,7 +12,7 @@ from softneck.core import require_whole
 from softneck.identification import Model, Network, Rls, SetMembership
 from softneck.plant import NeckParameters
 
-from ._experiments import Experiments, Tell, ValidationPair, judge, record_experiments
+from ._packaging import Experiments, Tell, ValidationPair, judge, record_experiments
 
 # The paper's norm (Eq. 16) has no weights, and its logs have motors in radians and angles in degrees: taken as they
 # are, an angle weighs 180/pi times a motor.

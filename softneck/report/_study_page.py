@@ -9,7 +9,7 @@ import numpy as np
 
 from softneck.cosim import grouped, pareto_front, rank, worst_runs
 from softneck.plots import Chart, Section, Table, page
-from softneck.plots._study_charts import correlations, distribution_chart, influence_chart, pareto_chart
+from softneck.plots._charts import distribution_chart, influence_chart, pareto_chart
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -142,8 +142,12 @@ def _spread(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) 
 
 
 def _influence(runs: pd.DataFrame, inputs: dict[str, np.ndarray], metric: str) -> Section:
+    import pandas as pd
+
     y = runs[metric].to_numpy(float)
-    found = correlations(inputs, y)
+    # Spearman's rank correlation, NaN where one does not vary.
+    ranked = pd.DataFrame({**inputs, metric: y}).corr(method="spearman", min_periods=3)[metric]
+    found = dict(zip(inputs, np.asarray(ranked, dtype=np.float64).tolist(), strict=False))
     order = sorted(found, key=lambda key: -abs(np.nan_to_num(found[key])))
     rows = [[short(key), _text(found[key])] for key in order]
     broken = np.array(failures(runs)) | np.array([value is False for value in runs["holds"].tolist()])

@@ -1,18 +1,15 @@
-"""The page of a tuning: the best, what binds, the front in parallel coordinates, and its steps."""
+"""The page of a tuning: the best, what binds, the front, and its steps."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from softneck.design.linear._controller import assumed_lines
-from softneck.plots import Chart, Curve, Level, Panel, Section, Table, page
-from softneck.plots._style import GREY, RED, looks
+from softneck.plots import Chart, Curve, Panel, Section, Table, page
+from softneck.plots._style import GREY, looks
 from softneck.tuning._responses import step_response
-from softneck.tuning._result import in_words, ratio_of
+from softneck.tuning._result import in_words
 
 if TYPE_CHECKING:
     from softneck.tuning._search import Candidate
@@ -29,7 +26,7 @@ def tune_page(found: Tuned) -> str:
     items = [found.best, *(item for item in found.front if item is not found.best)]
     return page(
         f"Controller for {found.task.robot.label()}, tuned",
-        [_result(found, _steps(found, items)), _coordinates(found, items), _front(found), _asked(found)],
+        [_result(found, _steps(found, items)), _front(found), _asked(found)],
         verdict=said_of(found) if found.holds else f"Not all requirements hold. {stands_in_the_way(found)}",
         holds=found.holds,
         footer="Written by softneck tune.",
@@ -115,32 +112,6 @@ def _result(found: Tuned, steps: Chart) -> Section:
 
 def _asked(found: Tuned) -> Section:
     return Section("What was asked", text=["; ".join(found.task.asked.lines()) + "."])
-
-
-def _coordinates(found: Tuned, items: Sequence[Candidate]) -> Section:
-    bounds = {b.metric: b for b in found.task.asked.bounds}
-    names = [name for name in found.objectives if name in bounds] + [
-        b.metric for b in found.task.asked.bounds
-        if b.metric not in found.objectives and b.metric in found.best.metrics
-        and b.metric.startswith(("neck", "track", "axes", "step.load"))
-    ]  # fmt: skip
-    names = list(dict.fromkeys(names))
-    curves = []
-    for item, (colour, style) in zip(items[:_DRAWN], looks(), strict=False):
-        y = [ratio_of(item, bounds[name]) for name in names]
-        y = np.array([math.nan if value is None else min(value, _MOST) for value in y])
-        style, width = ("marked", 2.4) if item is found.best else (style, 1.0)
-        curves.append(Curve(np.arange(len(names), dtype=float), y, _label(found, item), colour, style, width))
-    if not names or not curves:
-        return Section("Parallel coordinates", text=["No requirement has a value."])
-    highest = min(_MOST, 1.1 * max(1.1, *(float(np.nanmax(curve.y, initial=0.0)) for curve in curves)))
-    ticks = [name.partition(".")[2] if name.partition(".")[0] != "step" else name for name in names]
-    panel = Panel(curves, "value / limit", levels=[Level(1.0, "limit", RED)], y_range=(0.0, highest), ticks=ticks)
-    chart = Chart(
-        "Each requirement in parts of its limit: below 1 it holds", [panel], "requirement", row_height=4.4,
-        caption=f"Of a least value the limit over it; what is beyond {_MOST:g} is drawn there.",
-    )  # fmt: skip
-    return Section("Parallel coordinates", charts=[chart])
 
 
 def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:

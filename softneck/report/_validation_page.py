@@ -43,7 +43,7 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
         title: of the page.
     """
     together = _comparisons(results)
-    sections = [_overview(results, together or [_curves(results[0])])]
+    sections = [_overview(results, together or [curves(results[0])])]
     sections += [_section(r, drawn=not together and r is results[0]) for r in results]
     return page(title, sections, verdict=_verdict(results), footer="Written by softneck validate.")
 
@@ -116,7 +116,8 @@ def _predictions(r: Validation) -> dict[str, Matrix]:
     return predictions
 
 
-def _curves(r: Validation) -> Chart:
+def curves(r: Validation) -> Chart:
+    """Return what was measured and predicted, with the bounds of the free run."""
     bounds = _bounds_of(r)
     caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
     return validation_chart(
@@ -127,7 +128,7 @@ def _curves(r: Validation) -> Chart:
 
 def _section(r: Validation, *, drawn: bool) -> Section:
     """Return all on one result; its curves unless they are `drawn` already."""
-    charts = [*([] if drawn else [_curves(r)]), _residuals(r)]
+    charts = [*([] if drawn else [curves(r)]), _residuals(r)]
     text = [f"{said[0].upper()}{said[1:]}." for said in remarks(r)]
     return Section(_name(r), text=text, tables=_run_tables(r), charts=charts)
 

@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.cli.shared import _settle
+from softneck.cli import _import
 from softneck.signals import read_recording, write_recording
 
 from ..data import ROOT, neck_recording
@@ -51,7 +51,7 @@ def test_in_a_terminal_a_doubt_is_asked(call: Call, tmp_path: Path, monkeypatch:
         asked.append(text)
         return "deg"
 
-    monkeypatch.setattr(_settle.click, "prompt", answer)
+    monkeypatch.setattr(_import.click, "prompt", answer)
     said = call("import", "log.csv", "--guess", "-o", "r.csv")
     assert said.code == 0, said.err
     assert asked == ["unit of motor set-points"]
@@ -104,7 +104,7 @@ def test_columns_that_are_said_to_be_wrong_import_nothing(
     table = {name: c for name, c in columns().items() if name[0] != "s"}
     pd.DataFrame(table).rename(columns={f"x{j}": f"encoder{j}" for j in (1, 2, 3)}).to_csv("log.csv", index=False)
     monkeypatch.setattr("softneck.cli._import.is_terminal", lambda: True)
-    monkeypatch.setattr(_settle.click, "confirm", lambda *_args, **_more: False)
+    monkeypatch.setattr(_import.click, "confirm", lambda *_args, **_more: False)
     said = call("import", "log.csv", "--guess", "-o", "r.csv")
     assert said.code == 2
     assert "motor set-points: column 'encoder1'" in said.err.splitlines()[-1]

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from softneck.cli.shared._kind_help import meanings_in, settings_of
+from softneck.cli.shared._options import meanings_in, settings_of
 from softneck.core import KINDS, resolve
 from softneck.core._kinds import kinds_of
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import re
 from pathlib import Path
 
 import numpy as np
@@ -15,31 +13,10 @@ from softneck.plots import (
     Table,
     chart_figure,
     page,
-    validation_figure,
 )
 from softneck.plots import write_page as write
 from softneck.plots._charts import loop_chart
 from softneck.robot import Robot
-from softneck.signals import Recording
-
-
-def _wave(columns: int) -> np.ndarray:
-    t = np.arange(100) * 0.02
-    return np.column_stack([np.sin(t + j) for j in range(columns)])
-
-
-@pytest.mark.slow
-def test_a_page_needs_nothing_from_outside_and_holds_its_pictures() -> None:
-    t = np.arange(100) * 0.02
-    figures = [
-        ("experiment", Recording.from_arrays(_wave(3), _wave(2)).plot("experiment")),
-        ("validation", validation_figure(t, _wave(2), {"model": 0.9 * _wave(2)}, "validation")),
-    ]
-    html = page("Title", [Section("First", figures=figures)])
-    assert not re.search(r"(src|href)=\"(?!data:|#)", html)
-    pictures = re.findall(r"base64,([^\"]+)", html)
-    assert len(pictures) == len(figures)
-    assert all(base64.b64decode(picture).startswith(b"\x89PNG") for picture in pictures)
 
 
 def test_text_is_escaped_and_verdicts_are_marked() -> None:

@@ -71,7 +71,6 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
             findings=[("ok", "good"), ("note", "so so"), ("warning", "bad")], method=["how " * 60],
             tables=[Table("narrow", ["metric", "value", ""], [["rise_s", "0.62", "holds"], ["b", "2", "fails"]]), wide],
         ),
-        Section("Cards", cards=[(f"card {k}", "#s1", "words") for k in range(5)]),
         Section("More", text=["words"]),
     ]  # fmt: skip
     found = tmp_path_factory.mktemp("pages") / "page.html"
@@ -135,10 +134,10 @@ def test_the_verdict_comes_first_then_a_picture_then_numbers_then_method(view: S
 
 def test_the_tab_key_goes_down_the_page(view: Shown) -> None:
     places = []
-    while len(places) < 60 and sum(tag == "A" for tag, _, _ in places) < 8:
+    while len(places) < 60 and sum(tag == "A" for tag, _, _ in places) < 2:
         view.page.keyboard.press("Tab")
         places.append(view.page.evaluate(_FOCUS))
-    # The tools beside the plots come first (their plot has the focus then), then contents and cards.
+    # The tools beside the plots come first (their plot has the focus then), then contents.
     stops = [(round(top), left) for _, top, left in places]
-    assert sum(tag == "A" for tag, _, _ in places) == 8
+    assert sum(tag == "A" for tag, _, _ in places) == 2
     assert stops == sorted(stops)

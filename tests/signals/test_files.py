@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
 from softneck.identification.models._fitting import row_hashes
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
-from softneck.signals.recording import _files
 from softneck.signals.recording._channels import known_channels
 from softneck.signals.recording._files import read_plain_csv
 
@@ -69,20 +68,6 @@ def test_a_plain_table_is_read_as_by_pandas_or_left_to_it(tmp_path: Path, rows: 
         for title, column in plain.items():
             # To the bit: rows are known by hashes of what was read.
             np.testing.assert_array_equal(column, by_pandas[title].to_numpy(dtype=np.float64))
-
-
-def test_a_recording_written_without_arrow_holds_the_same_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recording = neck_recording(200)
-    recording.channels["pitch"][7] = np.nan
-    write_recording(tmp_path / "arrow.csv", recording)
-    monkeypatch.setattr(_files, "find_spec", lambda _: None)
-    write_recording(tmp_path / "plain.csv", recording)
-    arrow, plain = read_recording(tmp_path / "arrow.csv"), read_recording(tmp_path / "plain.csv")
-    assert arrow.channels.keys() == plain.channels.keys()
-    for name, values in arrow.channels.items():
-        np.testing.assert_array_equal(plain.channels[name], values)
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

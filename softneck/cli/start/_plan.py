@@ -15,8 +15,7 @@ from softneck.core._budget import MOST_TOML, settings_text
 from softneck.robot import Robot
 
 from ..shared._console import note
-from ._possible import FILE, backend, kinds_here, lacking, possible, require_known
-from ._sensor import propose_sensor
+from ._possible import FILE, backend, lacking, possible, propose_sensor, require_known
 
 #: In the order of the work, as they are counted for the user.
 STAGES = ("import", "robot", "quality", "identification", "observer", "tune", "verify", "FMUs", "loop", "study",
@@ -240,7 +239,7 @@ def _controller(asked: Asked) -> Iterator[Step]:
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
-    kinds = asked.kinds or kinds_here(_KINDS if family else _KINDS + _UNCERTIFIED)
+    kinds = asked.kinds or (_KINDS if family else _KINDS + _UNCERTIFIED)
     # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
     finding = possible(plants) if asked.requirements is None else ""
     stated = FILE if finding else asked.requirements

@@ -22,9 +22,9 @@ from softneck.core import (
 from softneck.core._budget import MOST_JSON, settings_text
 from softneck.core._files import require_file
 
+from .._import import is_terminal
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import columns_options, common_options
-from ..shared._settle import is_terminal
 from ._plan import BEST, PI, STAGES, Asked, Step, linear_model, nonlinear_model, steps
 from ._possible import backend, has_pytest, require_disk
 from ._sitting import FILE, Sitting

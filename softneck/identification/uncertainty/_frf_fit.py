@@ -172,17 +172,18 @@ class FrequencyResponse(Shown):
         Raises:
             DataError: a model that is not linear, or of another sample time.
         """
-        from softneck.plots import frequency_response_figure
+        from softneck.plots import chart_figure
+        from softneck.plots._charts import frequency_response_chart
 
         output = self.outputs[0] if output is None else output
         source = self.own_input(output)
         i, a = self._entry(output, source)
         scale, _, unit = self.shown()
-        return frequency_response_figure(
+        return chart_figure(frequency_response_chart(
             self.frequency, scale * self.response[:, i, a], scale * np.nan_to_num(self.radius()[:, i, a]),
             self.coherence[:, i], f"{source} to {output}", unit=unit,
             models={name: scale * self._curve(model, name, output) for name, model in (models or {}).items()},
-        )  # fmt: skip
+        ))  # fmt: skip
 
     def _curve(self, model: Any, name: str, output: str) -> np.ndarray:
         """Return a model's response of `output` to the input that is meant for it [SI]."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from softneck.core import SettingsError
 
@@ -49,10 +49,7 @@ class Doubt:
 
     def as_dict(self) -> dict[str, object]:
         """Return it for JSON."""
-        return {
-            "about": self.about, "channels": list(self.channels), "taken": self.taken,
-            "confidence": round(self.confidence, 3), "why": self.why, "choices": list(self.choices),
-        }  # fmt: skip
+        return {**asdict(self), "confidence": round(self.confidence, 3)}
 
 
 def percent(confidence: float) -> str:

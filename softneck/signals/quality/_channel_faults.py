@@ -142,7 +142,6 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
     outliers: tuple[Stretch, ...] = ()
     if is_command(name):
         quantum = None
-        clipped = _rests_at_limit(y, equal, recording)
     elif y[good].min() < y[good].max():
         flats = _flats(equal)
         long = flats[flats[:, 1] - flats[:, 0] >= FROZEN_SAMPLES]
@@ -260,17 +259,6 @@ def _speed(y: Vector, row: int, direction: int) -> float:
     if not 0 <= other < y.size or not np.isfinite(y[other]):
         return 0.0
     return abs(float(y[row] - y[other])) / 2.0
-
-
-def _rests_at_limit(y: Vector, equal: np.ndarray, recording: Recording) -> tuple[Stretch, ...]:
-    """Return where a command rests at its highest or lowest value, if it does so again and again; 0 is rest."""
-    flats = _flats(equal)
-    found: list[Stretch] = []
-    for level in (y.max(), y.min()):
-        here = [_stretch(recording, *flat) for flat in flats if y[flat[0]] == level and level != 0.0]
-        if len(here) >= 3:
-            found += here
-    return tuple(sorted(found, key=lambda stretch: stretch.start))
 
 
 def _outliers(recording: Recording, y: Vector, quantum: float, noise: float) -> tuple[Stretch, ...]:

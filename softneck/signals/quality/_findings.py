@@ -242,10 +242,7 @@ def _dropouts(channel: ChannelQuality, quality: Quality) -> Finding:
 
 
 def _clipping(channel: ChannelQuality) -> Finding:
-    rows, time = count_rows(channel.clipped), channel.clipped[0].time
-    if channel.command:
-        message = f"rests at its own extreme again and again ({100 * rows / channel.rows:.2g} % of the rows)."
-        return Finding("note", "clipping", channel.name, message, "Check whether a limit cut it off.", time)
+    time = channel.clipped[0].time
     message = f"has flat tops at the edge of its range, {_places(channel.clipped)}."
     advice = "Widen the sensor's range or move less; leave those rows empty."
     return Finding("warning", "clipping", channel.name, message, advice, time)

@@ -185,7 +185,7 @@ class Recording(Shown):
     def plot(self, title: str = "") -> Figure:
         """Return a matplotlib figure of set-points and outputs, in the units that people see."""
         chart, figure = (
-            resolve(f"softneck.plots.{name}") for name in ("_charts:recording_chart", "_figures:chart_figure")
+            resolve(f"softneck.plots.{name}") for name in ("_charts:recording_chart", "_chart:chart_figure")
         )
         return figure(chart(self.time, self.set_points, self.outputs, title, run=self.run, robot=self.robot))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.cli.start import _possible, _start
-from softneck.cli.start._sensor import propose_sensor
+from softneck.cli.start._possible import propose_sensor
 from softneck.core import OutputFileError
 from softneck.fmu.compiled import _library
 from softneck.robot import Robot
@@ -91,14 +91,6 @@ def test_without_a_compiler_and_without_pytest_it_goes_on_and_says_so(
     assert "no C compiler was found: the FMUs are written with the Python backend" in said.err
     assert "not run: test: pytest is not installed" in said.err
     assert "not run: pytest is not installed" in said.out
-
-
-def test_kinds_whose_package_is_absent_are_not_searched(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(_possible, "find_spec", lambda name: None if name == "casadi" else object())
-    assert _possible.kinds_here("pi,mpc,nmpc") == "pi,mpc"
-    assert "not searched: nmpc: casadi is not installed" in capsys.readouterr().err
 
 
 def test_a_disk_that_is_nearly_full_is_said_before_anything_is_made(

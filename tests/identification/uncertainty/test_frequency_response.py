@@ -310,7 +310,7 @@ def test_a_response_of_files_is_drawn_and_described(tmp_path: Path) -> None:
     assert 1.0 <= low < high <= 12.1
     figure = found.plot(models={"oe": OutputError().fit(concatenate(parts))})
     assert figure.get_suptitle() == "theta_i to pitch"
-    assert figure.axes[0].get_legend_handles_labels()[1] == ["data, 95 %", "oe"]
+    assert figure.axes[0].get_legend_handles_labels()[1] == ["95 %", "data", "oe"]
     assert "supported from" in found.summary()
     with pytest.raises(DataError, match="f: only a linear model or a family has a response to draw"):
         found.plot(models={"f": found})

@@ -25,8 +25,8 @@ from softneck.signals import (
 )
 from softneck.signals.recording._recording import require_same_robot
 
-from ..shared._console import print_json, print_table, progress
-from ..shared._options import common_options, output_option
+from .shared._console import print_json, print_table, progress
+from .shared._options import common_options, output_option
 
 if TYPE_CHECKING:
     from softneck.identification.selection._experiment_design import Known
