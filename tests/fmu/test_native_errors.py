@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import dataclasses
 import json
@@ -20,19 +19,16 @@ from typing import Any
 import fmpy
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from softneck.cli import main
-from softneck.core import FileFormatError, SettingsError, load
+from softneck.core import FileFormatError, SettingsError
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.fmu.compiled import _library
 from softneck.fmu.compiled._build import next_outputs
-from softneck.fmu.compiled._model_file import model_bytes, read_model
+from softneck.fmu.compiled._model_file import model_bytes
 from softneck.fmu.compiled._sources import Sources, c_sources
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 
-from ..data import ROOT
 from .every_kind import NATIVE, block_of
 
 pytestmark = pytest.mark.skipif(
@@ -296,26 +292,3 @@ def test_the_command_line_builds_one_and_refuses_what_python_cannot(
     assert code.value.code == 2
     assert "add `--backend compiled`" in capsys.readouterr().err
     assert build_fmu(block_of("pi"), tmp_path / "Pi.fmu").is_file()
-
-
-# Reading one back
-
-
-@pytest.mark.parametrize("kind", ["rls", "guarded"])
-def test_a_model_file_is_read_as_it_was_written(kind: str) -> None:
-    block = load(ROOT / "tests" / "golden" / f"{kind}.npz").block()
-    data = model_bytes(block, kind, "guid")
-    back = read_model(data, block.kind, block.role)
-    assert model_bytes(back, kind, "guid") == data
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.data())
-def test_wrong_bytes_in_a_model_file_are_refused_or_read(data: st.DataObject) -> None:
-    block = load(ROOT / "tests" / "golden" / "guarded.npz").block()
-    whole = bytearray(model_bytes(block, "x", "guid"))
-    for _ in range(data.draw(st.integers(1, 4))):
-        whole[data.draw(st.integers(32, len(whole) - 1))] = data.draw(st.integers(0, 255))
-    cut = data.draw(st.sampled_from([len(whole), len(whole) // 2, 40, 3]))
-    with contextlib.suppress(FileFormatError):
-        read_model(_mended(bytes(whole[:cut])) if cut > 32 else bytes(whole[:cut]), block.kind, block.role)

@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.fmu import unpacked
-from softneck.fmu.compiled._model_file import node_of, read_model
+from softneck.fmu.compiled._model_file import node_of
 from softneck.runtime import Block, bundle
 from softneck.runtime._compile import compiled_name
 
@@ -18,23 +18,15 @@ from ._variables import Description, read_description
 
 
 def block_of(path: Path) -> Block | None:
-    """Return the block in an FMU of ours, of both backends; None for an FMU of others or of another softneck.
-
-    A compiled FMU runs its own library: whether it computes what the block does is for the caller to see.
+    """Return the block in an FMU of this softneck that runs Python; None for any other.
 
     Raises:
-        FileFormatError: no FMU.
+        FileFormatError: no FMU, or what lies in it is damaged.
     """
     with unpacked(path) as folder:
-        description = read_description(path, folder, {})
-        if not description.annotation.role:
-            return None
-        model = folder / "resources" / "model.bin"
         try:
-            if model.is_file():
-                return read_model(model.read_bytes(), description.annotation.kind, description.annotation.role)
-            return python_block(path, folder, description)
-        except (SettingsError, FileFormatError):
+            return python_block(path, folder, read_description(path, folder, {}))
+        except SettingsError:
             return None
 
 

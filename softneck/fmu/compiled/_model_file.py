@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix, SettingsError
+from softneck.core import Matrix, SettingsError
 from softneck.runtime import Block, Port
 from softneck.runtime._bundle import split_members
 from softneck.runtime._own import PREFIX
@@ -93,75 +93,6 @@ def model_bytes(block: Block, name: str, guid: str, *, ahead: int = 0) -> bytes:
     body = b"".join(writer.parts)
     head = _MAGIC + struct.pack("<IIQII", FORMAT, _MARK, _HEAD + len(body), zlib.crc32(body), 0)
     return head + body
-
-
-def read_model(data: bytes, kind: str, role: str) -> Block:
-    """Return the block that `model_bytes` wrote; the file says neither kind nor role. Display units are not in it.
-
-    Raises:
-        FileFormatError: damaged, of another format, or of a kind that is not in the table.
-    """
-    try:
-        head = struct.unpack_from("<8sIIQI", data)
-        if head != (_MAGIC, FORMAT, _MARK, len(data), zlib.crc32(data[_HEAD:])):
-            raise FileFormatError("the model file is damaged, or of another softneck.")
-        reader = _Reader(data)
-        _name, _guid = reader.text(), reader.text()
-        [sample_time] = reader.plain("<d")
-        _, *counts, ahead = reader.plain("<5I")
-        inputs, outputs, parameters = (tuple(reader.port() for _ in range(count)) for count in counts)
-        runtime, arrays = reader.node()
-        node_of(runtime, tuple(arrays))
-    except (struct.error, ValueError, OverflowError, RecursionError, SettingsError) as error:
-        raise FileFormatError(f"the model file is damaged, or of another softneck ({error}).") from error
-    return Block(
-        kind=kind, role=role, runtime=runtime, sample_time=sample_time, arrays=tuple(arrays),
-        inputs=inputs, outputs=outputs[: len(outputs) - ahead], parameters=parameters,
-    )  # fmt: skip
-
-
-class _Reader:
-    def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, _HEAD
-
-    def plain(self, form: str) -> tuple:
-        """Return numbers."""
-        found = struct.unpack_from(form, self._data, self._at)
-        self._at += struct.calcsize(form)
-        return found
-
-    def text(self) -> str:
-        """Return a text."""
-        [size] = self.plain("<I")
-        self._at += size
-        return self._data[self._at - size : self._at - 1].decode()
-
-    def port(self) -> Port:
-        """Return a port."""
-        name, unit = self.text(), self.text()
-        start, low, high, flags = self.plain("<3dI")
-        return Port(
-            name=name, unit=unit, start=start,
-            minimum=low if np.isfinite(low) else None, maximum=high if np.isfinite(high) else None,
-            boolean=bool(flags & _BOOLEAN), missing=bool(flags & _MISSING), integer=bool(flags & _INTEGER),
-        )  # fmt: skip
-
-    def node(self) -> tuple[str, list[Matrix]]:
-        """Return a runtime's name with its members' in brackets, and all arrays."""
-        name, arrays, members = self.text(), [], []
-        for _ in range(*self.plain("<I")):
-            [rank] = self.plain("<I")
-            shape = self.plain(f"<{rank}Q")
-            self._at += -self._at % 8
-            count = int(np.prod(shape, dtype=np.uint64))
-            array = np.frombuffer(self._data, "<f8", count, self._at).reshape(shape)
-            arrays.append(array.copy())
-            self._at += array.nbytes
-        for _ in range(*self.plain("<I")):
-            inner, below = self.node()
-            members.append(f"{inner}:{len(below)}")
-            arrays += below
-        return f"{name}({','.join(members)})" if members else name, arrays
 
 
 class _Writer:
