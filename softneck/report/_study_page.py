@@ -89,7 +89,7 @@ def short(key: str) -> str:
 def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: list[str]) -> Section:
     study = description["study"]
     failed, held = sum(failures(runs)), runs["holds"].dropna().tolist()
-    text = [f"{len(runs)} of {study['runs']} runs, seed {study['seed']}, {study['sampling'].replace('_', ' ')}."]
+    text = [f"{len(runs)} of {study['runs']} runs, seed {study['seed']}."]
     if held:
         text.append(f"{100.0 * sum(held) / len(held):.1f} % keep all limits.")
     if failed:

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from softneck.core import FileFormatError, SettingsError, _errors, load
+from softneck.core import FileFormatError, SettingsError, load
 from softneck.cosim import (
     load_loop,
     load_study,
@@ -225,20 +225,6 @@ def test_runs_read_back_to_the_bit(place: Path) -> None:
             (True, False, None)[k % 3] for k in range(8)
         ]
         assert table["error"].str.startswith('a "fault", in two ').all()
-
-
-def test_parquet_is_written_where_it_is_asked_for(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    vary = {"plant.parameters.pole": [0.8, 0.9]}
-    study(place / "loop.toml", vary=vary, workers=0, output=place / "out")
-    assert not (place / "out" / "runs.parquet").exists()
-    runs = study(place / "loop.toml", vary=vary, workers=0, output=place / "out", force=True, parquet=True)
-    pd.testing.assert_frame_equal(
-        pd.read_parquet(place / "out" / "runs.parquet"), runs, check_dtype=False, check_exact=True
-    )
-    monkeypatch.setattr(_errors, "find_spec", lambda _: None)
-    with pytest.raises(SettingsError, match=r"pyarrow is not installed.*pip install .*pyarrow"):
-        study(place / "loop.toml", vary=vary, workers=0, output=place / "new", parquet=True)
-    assert not (place / "new").exists()
 
 
 @pytest.mark.slow

@@ -13,10 +13,8 @@ from softneck.core import SettingsError
 from softneck.cosim.studies._vary import StudyPoints, flattened, make_vary
 
 
-def points(
-    vary: dict[str, Any], runs: int | None = None, seed: int = 0, sampling: str = "latin_hypercube"
-) -> StudyPoints:
-    return StudyPoints({key: make_vary(key, given) for key, given in vary.items()}, runs, seed, sampling)
+def points(vary: dict[str, Any], runs: int | None = None, seed: int = 0) -> StudyPoints:
+    return StudyPoints({key: make_vary(key, given) for key, given in vary.items()}, runs, seed)
 
 
 def test_grids_alone_give_each_combination_once() -> None:
@@ -57,12 +55,6 @@ def test_normal_draws_have_their_mean_and_deviation() -> None:
     # Stratified: the mean is off by far less than 0.5 / sqrt(2000) = 0.011.
     assert values.mean() == pytest.approx(2.0, abs=2e-3)
     assert values.std() == pytest.approx(0.5, rel=0.01)
-
-
-def test_more_monte_carlo_runs_begin_with_the_fewer() -> None:
-    few, many = (points({"a": {"uniform": [0, 1]}}, runs, 3, "monte_carlo") for runs in (5, 50))
-    assert [few[i].values for i in range(5)] == [many[i].values for i in range(5)]
-    assert [few[i].seed for i in range(5)] == [many[i].seed for i in range(5)]
 
 
 def test_another_seed_draws_others() -> None:

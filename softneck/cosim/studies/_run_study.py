@@ -34,13 +34,11 @@ def study(
     vary: Mapping[str, Any] | None = None,
     runs: int | None = None,
     seed: int = 0,
-    sampling: str = "latin_hypercube",
     objectives: Sequence[str] | None = None,
     workers: int | None = None,
     dask: str | None = None,
     output: str | Path | None = None,
     force: bool = False,
-    parquet: bool = False,
     report: Progress | None = None,
 ) -> pd.DataFrame:
     """Run a loop many times and return a row for each run: what varied, metrics, whether limits hold, error.
@@ -53,13 +51,11 @@ def study(
             {"normal": [mean, standard deviation]} or {"seed": True}; as [vary] in a study file.
         runs: how many; each random sample meets every point of the grids before the next one.
         seed: of all that is drawn.
-        sampling: "latin_hypercube" or "monte_carlo".
         objectives: metrics to be small.
         workers: local processes, as many as cores if not given; 0 for this process.
         dask: address of a Dask scheduler instead.
         output: folder that keeps the runs as they end, in `runs.csv`; nothing is kept without one.
         force: replace the study that `output` holds; else the same one goes on, and another is an error.
-        parquet: whether `output` gets them as `runs.parquet` besides; needs pyarrow.
         report: called with the part done and a word; a bar in a terminal if not given.
 
     Raises:
@@ -82,7 +78,7 @@ def study(
     # A file without `vary` is a study file: a loop file alone has nothing to vary.
     given = load_study(Path(loop)) if isinstance(loop, str | Path) and vary is None else loop
     made = given if isinstance(given, Study) else make_study(
-        given, vary=vary or {}, runs=runs, seed=seed, sampling=sampling, objectives=objectives, parquet=parquet
+        given, vary=vary or {}, runs=runs, seed=seed, objectives=objectives
     )  # fmt: skip
     if isinstance(given, Study) and (vary, runs, objectives) != (None, None, None):
         raise SettingsError("a study has its own vary, runs and objectives; make another one with `make_study`.")

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from softneck import __version__
 from softneck.core import FileFormatError, OutputFileError, SettingsError, atomic_write
 from softneck.core._budget import MOST_JSON, require_table, settings_text
-from softneck.core._errors import require_package
 
 from ._study import Study
 from ._vary import Vary
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-RUNS, PARQUET, DESCRIPTION, _PARTS = "runs.csv", "runs.parquet", "study.json", "runs.parts"
+RUNS, DESCRIPTION, _PARTS = "runs.csv", "study.json", "runs.parts"
 # Small files are joined whenever there are so many of them: a folder stays readable, a merge stays rare.
 _MERGE_AT = 100
 # [characters] What a run's error may fill of its line.
@@ -45,8 +44,6 @@ class Store:
         Raises:
             SettingsError: the folder holds another study and `force` is not given.
         """
-        if study.parquet:
-            require_package("pyarrow")
         self.folder, self._study, self._parts = folder, study, folder / _PARTS
         if (folder / DESCRIPTION).is_file() and not force:
             self._check_same(study)
@@ -81,11 +78,7 @@ class Store:
         """Write all runs into one file, remove the small ones, return the table."""
         self._merge(self.folder / RUNS)
         shutil.rmtree(self._parts, ignore_errors=True)
-        table = self.frame()
-        if self._study.parquet:
-            with atomic_write(self.folder / PARQUET, force=True) as temporary:
-                table.to_parquet(temporary, index=False)
-        return table
+        return self.frame()
 
     def _frame(self, rows: list[dict[str, Any]]) -> pd.DataFrame:
         import pandas as pd
@@ -108,8 +101,7 @@ class Store:
 
     def _clear(self) -> None:
         shutil.rmtree(self._parts, ignore_errors=True)
-        for name in (RUNS, PARQUET):
-            (self.folder / name).unlink(missing_ok=True)
+        (self.folder / RUNS).unlink(missing_ok=True)
 
     def _check_same(self, study: Study) -> None:
         there = read_description(self.folder)

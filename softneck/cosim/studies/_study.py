@@ -26,7 +26,7 @@ from ..loops._loop_table import check_key, loop_table, set_sources, settable, wi
 from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
-_TOP = ("loop", "runs", "seed", "sampling", "objectives", "parquet", "dask", "vary")
+_TOP = ("loop", "runs", "seed", "objectives", "dask", "vary")
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
 
 
@@ -39,11 +39,9 @@ class Study(Shown):
         vary: dotted key -> how it varies.
         runs: how many; None for all points of the grids.
         seed: of everything that is drawn.
-        sampling: "latin_hypercube" or "monte_carlo".
         objectives: metrics to be small; the first one ranks, all of them span the Pareto front.
         folder: where relative paths of the loop start.
         name: for titles.
-        parquet: whether the folder gets the runs as Parquet besides.
         dask: address of a Dask scheduler that runs it, such as tcp://head:8786, unless `workers` are asked for.
     """
 
@@ -51,11 +49,9 @@ class Study(Shown):
     vary: Mapping[str, Vary]
     runs: int | None = None
     seed: int = 0
-    sampling: str = "latin_hypercube"
     objectives: tuple[str, ...] = ("pitch.rms_error_deg", "motors.total_variation_rad")
     folder: Path = field(default_factory=Path.cwd)
     name: str = "study"
-    parquet: bool = False
     dask: str | None = None
 
     def __post_init__(self) -> None:
@@ -68,8 +64,6 @@ class Study(Shown):
                 raise SettingsError(
                     f"`{metric}` is not a metric that can be an objective; use some of {', '.join(self.metrics)}."
                 )
-        if not isinstance(self.parquet, bool):
-            raise SettingsError(f"`parquet` must be true or false; got {self.parquet!r}.")
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
 
@@ -81,7 +75,7 @@ class Study(Shown):
     @cached_property
     def points(self) -> StudyPoints:
         """The runs: what each puts into the loop."""
-        return StudyPoints(self.vary, self.runs, self.seed, self.sampling)
+        return StudyPoints(self.vary, self.runs, self.seed)
 
     def table(self, run: int) -> dict[str, Any]:
         """Return the loop of one run, as the table of a loop file."""
@@ -131,7 +125,6 @@ class Study(Shown):
             },
             "runs": len(self.points),
             "seed": self.seed,
-            "sampling": self.sampling,
             "files": hashes,
         }
 
@@ -147,11 +140,9 @@ def make_study(
     vary: Mapping[str, Any],
     runs: int | None = None,
     seed: int = 0,
-    sampling: str = "latin_hypercube",
     objectives: Sequence[str] | None = None,
     name: str = "study",
     folder: str | Path | None = None,
-    parquet: bool = False,
     dask: str | None = None,
 ) -> Study:
     """Return a study of `loop`: a loop file, its table, or a loop; `vary` is as [vary] in a study file.
@@ -166,8 +157,7 @@ def make_study(
     chosen = {key: make_vary(key, given) for key, given in flattened(vary)}
     start = Path(folder) if folder else start
     return Study(
-        loop=table, vary=chosen, runs=runs, seed=seed, sampling=sampling, folder=start, name=name, parquet=parquet,
-        dask=dask,
+        loop=table, vary=chosen, runs=runs, seed=seed, folder=start, name=name, dask=dask,
         objectives=tuple(objectives) if objectives else _objectives(table, _robot_of(table, chosen, start)),
     )  # fmt: skip
 
@@ -197,7 +187,7 @@ def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
         raise SettingsError("`loop` is missing: name the loop file.")
     if not isinstance(table.get("vary", {}), dict):
         raise SettingsError("`vary` must be a table: [vary].")
-    rest = {key: table[key] for key in ("runs", "seed", "sampling", "objectives", "parquet", "dask") if key in table}
+    rest = {key: table[key] for key in ("runs", "seed", "objectives", "dask") if key in table}
     loop = table["loop"]
     if isinstance(loop, str):
         loop = source.parent / loop

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_one_of
+from softneck.core import Matrix, SettingsError
 
 KINDS = ("grid", "uniform", "log_uniform", "normal", "choices", "seed")
-SAMPLINGS = ("latin_hypercube", "monte_carlo")
 # A run's seed fits what FMUs take as `noise_seed`.
 _SEED_RANGE = 2**31 - 2
 # Of a tenth of a second each on two cores: half a day and more.
@@ -115,13 +114,12 @@ class Point:
 class StudyPoints:
     """The points of a study: every sample at every point of the grid, in that order; drawn ahead, by the seed alone."""
 
-    def __init__(self, vary: Mapping[str, Vary], runs: int | None, seed: int, sampling: str) -> None:
+    def __init__(self, vary: Mapping[str, Vary], runs: int | None, seed: int) -> None:
         """Draw the samples.
 
         Raises:
             SettingsError: no runs, nothing that varies, or a number of runs that does not fit the grid.
         """
-        require_one_of("sampling", sampling, SAMPLINGS)
         if not vary:
             raise SettingsError("the study varies nothing: give [vary] at least one key.")
         self._vary = vary
@@ -134,7 +132,7 @@ class StudyPoints:
         random = bool(drawn) or any(item.kind == "seed" for item in vary.values())
         self.runs = _number_of_runs(runs, len(self._grid), random=random)
         samples = -(-self.runs // len(self._grid))
-        self._drawn = dict(zip(drawn, _quantiles(samples, len(drawn), seed, sampling).T, strict=True))
+        self._drawn = dict(zip(drawn, _quantiles(samples, len(drawn), seed).T, strict=True))
         states = np.random.SeedSequence(seed).generate_state(samples, np.uint64)
         self._seeds = (states % _SEED_RANGE).astype(np.int64)
 
@@ -174,16 +172,13 @@ def _number_of_runs(runs: int | None, grid: int, *, random: bool) -> int:
     return runs
 
 
-def _quantiles(samples: int, keys: int, seed: int, sampling: str) -> Matrix:
-    """Return (samples, keys) of 0 to 1, none of them exactly 0 or 1."""
+def _quantiles(samples: int, keys: int, seed: int) -> Matrix:
+    """Return a Latin hypercube (samples, keys) of 0 to 1, none of them exactly 0 or 1."""
     from scipy.stats import qmc
 
-    rng = np.random.default_rng(seed)
     if keys == 0:
         return np.zeros((samples, 0))
-    drawn = (
-        qmc.LatinHypercube(keys, rng=rng).random(samples) if sampling == SAMPLINGS[0] else rng.random((samples, keys))
-    )
+    drawn = qmc.LatinHypercube(keys, rng=np.random.default_rng(seed)).random(samples)
     return np.clip(drawn, 1e-12, 1.0 - 1e-12)
 
 
