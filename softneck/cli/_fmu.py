@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import FileFormatError, SettingsError, file_hash, load
-from softneck.fmu.compiled._platforms import PLATFORMS
+from softneck.fmu.compiled._compilers import PLATFORMS
 
 from .shared._console import note, print_json, progress
 from .shared._options import common_options, output_option, target

@@ -240,7 +240,7 @@ def _fmu(file: Path) -> dict[str, Any]:
 def _toml(file: Path) -> dict[str, Any]:
     """Say what a TOML file is: a robot names motors, a loop a plant, a study what varies; else it must be a neck."""
     from softneck.cosim import load_loop, load_study
-    from softneck.cosim.loops._trust import python_of
+    from softneck.cosim.loops._loop_file import python_of
     from softneck.plant import NeckParameters, VirtualNeck
     from softneck.robot import Robot
     from softneck.signals import read_layout

@@ -59,8 +59,8 @@ def command(
         replay_log(loop_file, as_json=as_json)
         return
     from softneck.cosim import load_loop, load_ssp
+    from softneck.cosim.loops._loop_file import require_trusted
     from softneck.cosim.loops._simulate import run_setup
-    from softneck.cosim.loops._trust import require_trusted
     from softneck.loop._system import System
     from softneck.plots import neck_view, write_page
     from softneck.plots._neck3d import not_drawn

@@ -47,10 +47,9 @@ def command(
     Ctrl-C or a crash loses no finished run: the same command goes on where it was.
     """
     from softneck.cosim import load_study
-    from softneck.cosim.loops._trust import require_trusted
+    from softneck.cosim.loops._loop_file import require_trusted
     from softneck.cosim.studies._run_study import run_study
-    from softneck.cosim.studies._store import read_description
-    from softneck.cosim.studies._study_results import write_worst
+    from softneck.cosim.studies._store import read_description, write_worst
     from softneck.plots import write_page
     from softneck.report import study_page
     from softneck.report._study_page import failures

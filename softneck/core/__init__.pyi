@@ -4,11 +4,15 @@ from ._certificate import Certificate as Certificate
 from ._certificate import check_certificate as check_certificate
 from ._certificate import read_certificate as read_certificate
 from ._certificate import write_certificate as write_certificate
+from ._checks import Matrix as Matrix
+from ._checks import Progress as Progress
+from ._checks import Vector as Vector
 from ._checks import require_between as require_between
 from ._checks import require_finite as require_finite
 from ._checks import require_one_of as require_one_of
 from ._checks import require_positive as require_positive
 from ._checks import require_whole as require_whole
+from ._checks import silent as silent
 from ._errors import CheckFailedError as CheckFailedError
 from ._errors import DataError as DataError
 from ._errors import FileFormatError as FileFormatError
@@ -23,8 +27,4 @@ from ._kinds import Kind as Kind
 from ._kinds import find_kind as find_kind
 from ._kinds import load as load
 from ._kinds import resolve as resolve
-from ._types import Matrix as Matrix
-from ._types import Progress as Progress
-from ._types import Vector as Vector
-from ._types import silent as silent
 from ._units import to_si as to_si

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from ._types import Progress, silent
+from ._checks import Progress, silent
 
 # Nobody waits for what ends sooner [s].
 _PATIENCE = 2.0

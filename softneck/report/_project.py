@@ -14,9 +14,8 @@ import numpy as np
 from softneck.core import KINDS, FileFormatError, Progress, SettingsError, SoftneckError, load, read_archive, silent
 from softneck.core._budget import MOST_JSON, open_zip, settings_text
 from softneck.cosim import Result, load_loop, read_runs, simulate
-from softneck.cosim.loops._loop_file import is_loop_file
-from softneck.cosim.loops._loop_values import read_toml
-from softneck.cosim.loops._trust import python_of
+from softneck.cosim.loops._loop_file import is_loop_file, python_of
+from softneck.cosim.loops._loop_parts import read_toml
 from softneck.cosim.studies._store import read_description
 from softneck.identification.models._directions import bandwidth_of
 from softneck.robot._search import FILE

@@ -1,4 +1,4 @@
-"""Walks the text of a runtime on numbers where they are known, else on symbols.
+"""A runtime's `step` as a CasADi function: its text walked on numbers where they are known, else on symbols.
 
 Arrays, parameters, loop bounds and table indices must be known. Where a test is on symbols both branches are walked,
 each on its own copy of all that is in reach, and merged entry by entry. What has no rule here is an error that names
@@ -14,9 +14,11 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from softneck.core import SettingsError
+from softneck.core import SettingsError, Vector
 
-from ._casadi_values import Values, boxed, plain
+from ._block import Block
+from ._bundle import bundle
+from ._casadi_values import Values, boxed, filled, plain
 
 _CONSTANTS = {"pi": np.pi, "inf": np.inf, "nan": np.nan, "e": np.e}
 _WRONG = (ArithmeticError, IndexError, KeyError, TypeError, ValueError, NotImplementedError, RuntimeError)
@@ -376,3 +378,33 @@ def _root(array: np.ndarray) -> np.ndarray:
 
 
 _BUILTINS = {"int": int, "float": float, "bool": bool, "len": len, "range": range, "round": round}
+
+
+def step_function(block: Block, parameters: Vector, inputs: int) -> Any:
+    """Return `casadi.Function` x, u -> x_next, y: one `step` of `block`.
+
+    Args:
+        block: whose runtime is walked.
+        parameters: numbers, in the block's order.
+        inputs: that many are symbols u, the others are not given (NaN).
+
+    Raises:
+        SettingsError: the text does what a function of symbols cannot; the message names function and line.
+    """
+    import casadi as ca
+
+    size = block.initial_state().values.size
+    x, u = ca.SX.sym("x", size), ca.SX.sym("u", inputs)
+    state = filled(np.empty(size, dtype=object), [x[i] for i in range(size)])
+    given = [u[i] for i in range(inputs)] + [np.nan] * (len(block.inputs) - inputs)
+    outputs = np.zeros(len(block.outputs)).astype(object)
+    arrays = tuple(_fixed(array) for array in block.arrays)
+    text = Text(bundle(block.runtime, loops=False))
+    Walk(text).call("step", [arrays, _fixed(parameters), state, boxed(np.array(given, dtype=object)), outputs])
+    return ca.Function(block.kind, [x, u], [ca.vertcat(*state), ca.vertcat(*outputs)], ["x", "u"], ["x_next", "y"])
+
+
+def _fixed(array: np.ndarray) -> np.ndarray:
+    view = np.asarray(array, dtype=np.float64).view()
+    view.flags.writeable = False
+    return view

@@ -12,9 +12,8 @@ import copy
 from collections.abc import Callable
 
 from ._tangent_activity import Activity, Pattern, is_numpy, statements
-from ._tangent_lowering import Lowering, Terms, inner, undefined
 from ._tangent_rows import Derived, without_unused
-from ._tangent_vectors import names
+from ._tangent_vectors import Lowering, Terms, inner, names, undefined
 
 _LONGEST_WRITTEN_OUT = 4
 # tanh and the like of whole arrays: what they pass on, with v for their value and x for their argument.

@@ -11,8 +11,7 @@ import re
 from typing import Protocol
 
 from ._tangent_activity import MEMBER_START, SLOPES, Activity, Pattern, pairs
-from ._tangent_lowering import Terms, inner
-from ._tangent_vectors import Vectors, is_copy, linear, loops, names
+from ._tangent_vectors import Terms, Vectors, inner, is_copy, linear, loops, names
 
 _PLACE = re.compile(r"«(\w+)»")
 _ROW = re.compile(r"<(\w+)>")

@@ -1,11 +1,260 @@
-"""Derivatives of whole vectors in rows: what each of their entries is moved by, in loops of their own."""
+"""Expressions taken apart: the value as it was, and what it is moved by, linear in what moves; numbers, then vectors.
+
+`partial * place` are the terms of a derivative: the place is where what a variable is moved by stands. Partials are
+computed where the value is, and kept under names of their own, so that later statements may overwrite what they read.
+Vectors come in rows: what each of their entries is moved by, in loops of their own.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
+from typing import Any
 
-from ._tangent_activity import MAKERS, is_numpy, viewed
-from ._tangent_lowering import Lowering, Terms, inner
+from ._tangent_activity import MAKERS, Activity, is_numpy, viewed
+
+Terms = list[tuple[str, str]]
+_KEPT = re.compile(r"_[a-z]\d+|-?\d+(\.\d*)?(e-?\d+)?")
+_SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+# f(x): its derivative, with v for f(x). A root of zero is moved by nothing: it has no finite slope.
+_SLOPES = {
+    "sin": "math.cos({x})", "cos": "-math.sin({x})", "tan": "1.0 + {v} * {v}", "tanh": "1.0 - {v} * {v}",
+    "exp": "{v}", "log": "1.0 / {x}", "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0", "atan": "1.0 / (1.0 + {x} * {x})",
+    "arctan": "1.0 / (1.0 + {x} * {x})", "asin": "1.0 / math.sqrt(1.0 - {x} * {x})",
+    "acos": "-1.0 / math.sqrt(1.0 - {x} * {x})",
+}  # fmt: skip
+# A length below 1e-12 is rounding, and has no direction.
+_NO_LENGTH = 1e-24
+
+
+class Lowering:
+    """Writes the lines of one derived function; `lines` are without their indentation.
+
+    A derivative in rows and one in reverse differ in what they make of places and calls.
+    """
+
+    def __init__(self, activity: Activity) -> None:
+        """Begin with no lines."""
+        self.activity = activity
+        self.lines: list[str] = []
+        self._count = 0
+
+    def place(self, node: ast.Name | ast.Subscript) -> str:
+        """Return where what a number is moved by stands."""
+        raise NotImplementedError
+
+    def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
+        """Return value and derivative of a call of one of the text's own functions."""
+        raise NotImplementedError
+
+    def product(self, node: ast.Call) -> tuple[str, Terms]:
+        """Return value and derivative of an `np.dot` that is a number."""
+        raise self.fail(node, "there is no derivative of this here.")
+
+    def fail(self, node: ast.AST, text: str) -> Exception:
+        """Return the error that names function and line."""
+        return self.activity.fail(node, text)
+
+    def name(self, letter: str) -> str:
+        """Return a name that the text does not have."""
+        self._count += 1
+        return f"_{letter}{self._count}"
+
+    def kept(self, text: str, letter: str = "v") -> str:
+        """Return a number under a name of its own, which nothing overwrites."""
+        if _KEPT.fullmatch(text):
+            return text
+        name = self.name(letter)
+        self.lines.append(f"{name} = {text}")
+        return name
+
+    def value(self, node: ast.expr) -> tuple[str, Terms]:
+        """Return an expression's text, and the terms of its derivative."""
+        if not self.activity.is_active(node):
+            return f"({ast.unparse(node)})" if not isinstance(node, ast.Name | ast.Constant) else ast.unparse(node), []
+        handler: Any = getattr(self, f"_{type(node).__name__.lower()}", None)
+        if handler is None or self.activity.rank(node) not in (0, None):
+            raise self.fail(node, "there is no derivative of this here.")
+        return handler(node)
+
+    def times(self, terms: Terms, factor: str) -> Terms:
+        """Return `terms` multiplied by a number."""
+        if not terms or factor == "1.0":
+            return terms
+        factor = self.kept(factor, "p")
+        scaled = []
+        for partial, place in terms:
+            one = factor if partial == "1.0" else self.kept(f"{partial} * {factor}", "p")
+            scaled.append((one, place))
+        return scaled
+
+    def sum(self, first: Terms, second: Terms) -> Terms:
+        """Return the sum of both, each place once."""
+        found = {place: partial for partial, place in first}
+        for partial, place in second:
+            found[place] = self.kept(f"{found[place]} + {partial}", "p") if place in found else partial
+        return [(partial, place) for place, partial in found.items()]
+
+    def index(self, node: ast.Subscript) -> str:
+        """Return the place of an entry, kept."""
+        places = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        return ", ".join(self.kept(ast.unparse(place), "i") for place in places)
+
+    # Terms
+
+    def _name(self, node: ast.Name) -> tuple[str, Terms]:
+        return node.id, [("1.0", self.place(node))]
+
+    def _subscript(self, node: ast.Subscript) -> tuple[str, Terms]:
+        return ast.unparse(node), [("1.0", self.place(node))]
+
+    def _unaryop(self, node: ast.UnaryOp) -> tuple[str, Terms]:
+        text, terms = self.value(node.operand)
+        if isinstance(node.op, ast.UAdd):
+            return text, terms
+        if not isinstance(node.op, ast.USub):
+            raise self.fail(node, "this operator has no derivative.")
+        return f"(-{text})", self.times(terms, "-1.0")
+
+    def _binop(self, node: ast.BinOp) -> tuple[str, Terms]:
+        if isinstance(node.op, ast.Pow):
+            return self._power(node)
+        (a, first), (b, second) = self.value(node.left), self.value(node.right)
+        if isinstance(node.op, ast.Mod) and not second:
+            return f"({a} % {b})", first
+        sign = _SIGNS.get(type(node.op))
+        if sign is None:
+            raise self.fail(node, "this operator has no derivative.")
+        if sign in "+-":
+            return f"({a} {sign} {b})", self.sum(first, second if sign == "+" else self.times(second, "-1.0"))
+        if sign == "*":
+            a = self.kept(a) if second else a
+            b = self.kept(b) if first else b
+            return f"({a} * {b})", self.sum(self.times(first, b), self.times(second, a))
+        b = self.kept(b)
+        value = self.kept(f"{a} / {b}")
+        return value, self.sum(self.times(first, f"1.0 / {b}"), self.times(second, f"-{value} / {b}"))
+
+    def _power(self, node: ast.BinOp) -> tuple[str, Terms]:
+        n = node.right.value if isinstance(node.right, ast.Constant) else None
+        if not isinstance(n, int | float):
+            raise self.fail(node, "powers are differentiated with a constant exponent.")
+        text, terms = self.value(node.left)
+        text = self.kept(text)
+        slope = f"{n} * {text}" if n == 2 else f"{n} * {text} ** {n - 1}"
+        return f"({text} ** {n})", self.times(terms, slope)
+
+    def _ifexp(self, node: ast.IfExp) -> tuple[str, Terms]:
+        value, outside = self.name("y"), self.lines
+        found: list[tuple[str, str]] = []
+        written: list[list[str]] = []
+        for branch in (node.body, node.orelse):
+            self.lines = []
+            text, terms = self.value(branch)
+            self.lines.append(f"{value} = {text}")
+            for partial, place in terms:
+                name = self.name("p")
+                self.lines.append(f"{name} = {partial}")
+                found.append((name, place))
+            written.append(self.lines)
+        self.lines = outside + undefined(written, {value})
+        self.lines += [f"if {ast.unparse(node.test)}:", *inner(written[0]), "else:", *inner(written[1])]
+        terms: Terms = []
+        for term in found:
+            terms = self.sum(terms, [term])
+        return value, terms
+
+    def _call(self, node: ast.Call) -> tuple[str, Terms]:
+        own = self.activity.program.called(node)
+        if own is not None:
+            return self.call(node, own)
+        function = node.func
+        name = function.attr if is_numpy(node) else getattr(function, "id", "")  # type: ignore[attr-defined]
+        if node.keywords:
+            raise self.fail(node, "keyword arguments are not differentiated.")
+        if name == "dot":
+            return self.product(node)
+        if name in ("max", "min", "maximum", "minimum") and len(node.args) > 1:
+            return self._extreme(node, 1 if name.startswith("max") else -1)
+        if name in ("atan2", "arctan2", "hypot") and len(node.args) == 2:
+            return self._pair(node, name)
+        if len(node.args) != 1 or name not in (*_SLOPES, "float", "abs", "fabs"):
+            raise self.fail(node, "the derivative of this function is not known.")
+        if name == "sqrt" and (parts := squares(node.args[0])):
+            return self._root(node, parts)
+        text, terms = self.value(node.args[0])
+        if name == "float":
+            return f"float({text})", terms
+        text = self.kept(text)
+        if name in ("abs", "fabs"):
+            return f"abs({text})", self._chosen(1, (text, terms), (f"-{text}", self.times(terms, "-1.0")))
+        value = self.kept(f"{ast.unparse(function)}({text})")
+        return value, self.times(terms, _SLOPES[name].format(x=text, v=value))
+
+    def _extreme(self, node: ast.Call, sign: int) -> tuple[str, Terms]:
+        function = ast.unparse(node.func)
+        value, terms = self.value(node.args[0])
+        for other in node.args[1:]:
+            text, more = self.value(other)
+            value, text = self.kept(value), self.kept(text)
+            terms = self._chosen(sign, (value, terms), (text, more))
+            value = f"{function}({value}, {text})"
+        return value, terms
+
+    def _pair(self, node: ast.Call, name: str) -> tuple[str, Terms]:
+        parts = [self.value(part) for part in node.args]
+        (a, first), (b, second) = ((self.kept(text), terms) for text, terms in parts)
+        value = self.kept(f"{ast.unparse(node.func)}({a}, {b})")
+        if name == "hypot":
+            return value, self._length(value, [(a, first), (b, second)])
+        square = self.kept(f"{a} * {a} + {b} * {b}")
+        return value, self.sum(self.times(first, f"{b} / {square}"), self.times(second, f"-{a} / {square}"))
+
+    def _root(self, node: ast.Call, nodes: list[ast.expr]) -> tuple[str, Terms]:
+        parts = [self.value(part) for part in nodes]
+        parts = [(self.kept(text), terms) for text, terms in parts]
+        total = " + ".join(f"{text} * {text}" for text, _ in parts)
+        value = self.kept(f"{ast.unparse(node.func)}({total})")
+        return value, self._length(value, parts)
+
+    def _chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
+        """Return the derivative of the larger (sign 1) or smaller (-1) of two; of equal ones the first grows."""
+        first = self.kept(f"1.0 if {a[0]} {'>=' if sign > 0 else '<'} {b[0]} else 0.0", "p")
+        return self.sum(self.times(a[1], first), self.times(b[1], f"1.0 - {first}"))
+
+    def _length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
+        """Return the derivative of the length `value` of a vector; of zero length its first part grows."""
+        over = self.kept(f"1.0 / math.sqrt({value} * {value} + {_NO_LENGTH})", "p")
+        terms: Terms = []
+        for number, (text, more) in enumerate(parts):
+            slope = f"{text} * {over}"
+            terms = self.sum(terms, self.times(more, slope if number else f"{slope} if {value} > 0.0 else 1.0"))
+        return terms
+
+
+def squares(node: ast.expr) -> list[ast.expr]:
+    """Return a, b, ... of `a * a + b * b + ...`, nothing for other expressions: a root of that is a length."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        first, second = squares(node.left), squares(node.right)
+        return first + second if first and second else []
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult) and ast.dump(node.left) == ast.dump(node.right):
+        return [node.left]
+    return []
+
+
+def inner(lines: list[str]) -> list[str]:
+    """Return lines one step further in."""
+    return ["    " + line for line in lines]
+
+
+def undefined(branches: list[list[str]], others: set[str] | None = None) -> list[str]:
+    """Return lines that set to zero what only one of several branches sets: a compiler wants every name set."""
+    names = dict.fromkeys(sorted(others or ()))
+    for line in (line for branch in branches for line in branch):
+        found = re.match(r"\s*(_[a-z]\d+) = ", line)
+        if found:
+            names[found[1]] = None
+    return [f"{name} = {'0' if name.startswith('_i') else '0.0'}" for name in names if not name.startswith("_g")]
 
 
 class Vectors(Lowering):

@@ -9,7 +9,7 @@ from itertools import groupby
 
 import numpy as np
 
-from softneck.cosim.studies._study_results import pareto_rows
+from softneck.cosim.studies._store import pareto_rows
 from softneck.verification._linear import LARGE
 from softneck.verification._requirements import Requirement
 from softneck.verification._verify import Verdict

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from softneck.cosim.loops._trust import foreign_python
+from softneck.cosim.loops._loop_file import foreign_python
 
 from .conftest import Call
 

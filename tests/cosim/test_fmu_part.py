@@ -14,7 +14,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.cosim import FmuError, FmuPart, simulate_fmu_free_run
-from softneck.cosim.parts._free_run import drive_fmu
+from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.loop import BlockPart, Part
 from softneck.signals import Recording
 

@@ -28,9 +28,8 @@ from softneck.cosim import (
     worst_runs,
 )
 from softneck.cosim.loops._loop_table import loop_table
-from softneck.cosim.studies._store import Store, read_description
-from softneck.cosim.studies._study_results import write_worst
-from softneck.cosim.studies._study_run import failed_row
+from softneck.cosim.studies._run_study import failed_row
+from softneck.cosim.studies._store import Store, read_description, write_worst
 from softneck.loop import StepReference
 from softneck.loop._faults import make_fault
 from softneck.loop._result import metric_names

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.core import SettingsError
-from softneck.cosim.loops._validity import validity_remarks
+from softneck.cosim.loops._simulate import validity_remarks
 from softneck.identification import Model
 from softneck.identification.models._validity import grounded
 from softneck.loop import BlockPart, LoopResult, check_limits, metrics

@@ -14,7 +14,7 @@ import pytest
 from softneck import load, record
 from softneck.core import Matrix, SettingsError
 from softneck.cosim import simulate
-from softneck.cosim.parts._free_run import drive_fmu
+from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.design import NmpcController, NmpcSettings
 from softneck.fmu import build_fmu
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from softneck.cosim.parts._free_run import drive_fmu
+from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.fmu import build_fmu
 from softneck.runtime import Block, load_runtime
 

@@ -11,7 +11,7 @@ import pytest
 
 from softneck import identify, load
 from softneck.core import kinds_of
-from softneck.cosim.parts._free_run import drive_fmu
+from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot

@@ -9,7 +9,7 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.fmu.compiled import _compilers, _library
-from softneck.fmu.compiled._platforms import PLATFORMS, Platform
+from softneck.fmu.compiled._compilers import PLATFORMS, Platform
 from softneck.fmu.compiled._sources import GENERATED, Sources
 from softneck.fmu.compiled.translate._kinds import LIBRARIES
 

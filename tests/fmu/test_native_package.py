@@ -23,8 +23,8 @@ from softneck.fmu.compiled import _sources
 from softneck.fmu.compiled._library import packaged_library
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
-from softneck.fmu.compiled.translate._chunks import only_kinds
 from softneck.fmu.compiled.translate._kinds import LIBRARIES, RUNTIMES, ranks_of
+from softneck.fmu.compiled.translate._translate import only_kinds
 from softneck.fmu.describe._description import described_block
 from softneck.fmu.python._zip import deflated, write_zip
 

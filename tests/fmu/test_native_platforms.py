@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softneck.fmu.compiled._compilers import compile_for, have_zig
+from softneck.fmu.compiled._compilers import PLATFORMS, compile_for, have_zig
 from softneck.fmu.compiled._model_file import model_bytes
-from softneck.fmu.compiled._platforms import PLATFORMS
 from softneck.fmu.compiled._sources import c_sources
 from softneck.runtime import Block
 

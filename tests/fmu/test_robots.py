@@ -16,7 +16,7 @@ from fmpy.validation import validate_fmu
 
 from softneck.core import Matrix, SettingsError
 from softneck.cosim import make_loop
-from softneck.cosim.parts._free_run import drive_fmu
+from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.design import MpcSettings, PiSettings
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of

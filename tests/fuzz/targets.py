@@ -19,7 +19,7 @@ from softneck.core import FileFormatError, load, read_certificate, write_certifi
 from softneck.core._certificate import certificate_contents
 from softneck.cosim import load_loop, load_ssp, load_study
 from softneck.cosim.parts._fmu_part import FmuPart
-from softneck.cosim.parts._ours import block_of
+from softneck.cosim.parts._variables import block_of
 from softneck.cosim.studies._store import read_description, read_runs
 from softneck.drives.bus._read import load_drives
 from softneck.drives.logs._cycle import Cycle

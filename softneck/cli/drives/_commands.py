@@ -100,7 +100,7 @@ def run_command(
     ended it (to rest, then off).
     """
     from softneck.cosim import load_loop
-    from softneck.cosim.loops._trust import require_trusted
+    from softneck.cosim.loops._loop_file import require_trusted
     from softneck.drives import prepare, run_on_bus, run_simulated
     from softneck.drives.running._certified import require_certified, require_same_again
     from softneck.drives.running._deploy import neck_of

@@ -27,7 +27,7 @@ from softneck.runtime._compile import load_tangent
 from softneck.runtime._tangent_activity import TangentError
 
 from ..parts._fmu_part import FmuPart
-from ..parts._ours import block_of
+from ..parts._variables import block_of
 
 if TYPE_CHECKING:
     import control

@@ -1,4 +1,7 @@
-"""An FMU in a process of its own: a crash or a hang costs one run, not the program."""
+"""An FMU in a process of its own: a crash or a hang costs one run, not the program.
+
+The other side of the pipe is `python -m softneck.cosim.parts._isolated IN OUT` with two inherited file descriptors.
+"""
 
 from __future__ import annotations
 
@@ -132,7 +135,7 @@ class _Child:
         self.stderr: IO[Any] = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "softneck.cosim.parts._child", str(asked_out), str(answers_in)],
+                [sys.executable, "-m", "softneck.cosim.parts._isolated", str(asked_out), str(answers_in)],
                 pass_fds=(asked_out, answers_in), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                 stderr=self.stderr,
                 # What was unpacked goes with the folder, however the process ends.
@@ -162,3 +165,48 @@ class _Child:
         self.answers.close()
         self.stderr.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Serve one FMU until the pipe closes."""
+    asked, answers = (Connection(int(text)) for text in arguments)
+    part: FmuPart | None = None
+    while True:
+        try:
+            message = asked.recv_bytes()
+        except EOFError:
+            break
+        try:
+            if part is None:
+                part = FmuPart(**json.loads(message))
+                reply = b""
+            else:
+                reply = _serve(part, message)
+        except SoftneckError as error:
+            answers.send_bytes(b"-" + json.dumps([type(error).__name__, str(error)]).encode())
+        else:
+            answers.send_bytes(b"+" + reply)
+    if part is not None:
+        part.close()
+
+
+def _serve(part: FmuPart, message: bytes) -> bytes:
+    what, rest = message[:1], message[1:]
+    if what == b"A":
+        values = np.frombuffer(rest, dtype="<f8")
+        return part.advance(float(values[0]), values[1:]).tobytes()
+    if what == b"S":
+        (time,) = struct.unpack("<d", rest[:8])
+        parameters: dict[str, Any] = json.loads(rest[8:])
+        return part.start(time, parameters).tobytes()
+    if what == b"G":
+        return part.get_state()
+    if what == b"P":
+        part.set_state(rest)
+        return b""
+    part.close()
+    return b""
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

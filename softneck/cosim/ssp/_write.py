@@ -23,8 +23,7 @@ from softneck.runtime import Block, Port
 from ..loops._loop_file import LoopSetup
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
-from ..parts._ours import python_block
-from ..parts._variables import read_description
+from ..parts._variables import python_block, read_description
 from ._description import Component, Connection, system_description
 
 

@@ -21,9 +21,8 @@ from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 
 from ..loops._loop_file import LoopSetup, load_loop, make_loop, normal_table
-from ..loops._loop_parts import OBJECT, SOURCES, PartOpener
+from ..loops._loop_parts import OBJECT, SOURCES, PartOpener, read_toml
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
-from ..loops._loop_values import read_toml
 from ._vary import StudyPoints, Vary, flattened, make_vary
 
 _TOP = ("loop", "runs", "seed", "objectives", "dask", "vary")

@@ -10,7 +10,7 @@ from typing import Any
 from softneck.core import CheckFailedError, load
 from softneck.cosim import FmuPart
 from softneck.cosim.loops._loop_file import LoopSetup
-from softneck.cosim.loops._validity import reach_beyond
+from softneck.cosim.loops._simulate import reach_beyond
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 from softneck.robot import Robot

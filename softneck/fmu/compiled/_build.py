@@ -21,11 +21,11 @@ from ..describe._describe import Buildable, FmuInfo, block_and_info, documentati
 from ..describe._description import Identity, described_block, model_description, terminals_file
 from ..python._build import check_block, generation_date, license_text, model_name
 from ..python._zip import write_zip
+from ._compilers import PLATFORMS
 from ._library import Library, find_library
 from ._model_file import model_bytes, node_of
-from ._platforms import PLATFORMS
 from ._sources import FLAGS, GENERATED, MAIN, PROBE, Sources
-from .translate._chunks import only_kinds
+from .translate._translate import only_kinds
 
 FMI_VERSIONS = (2, 3)
 _HOST = (

@@ -20,11 +20,10 @@ import platformdirs
 from softneck.core import FileFormatError, SettingsError, atomic_write
 
 from ..python._zip import deflated
-from ._compilers import compile_for, compile_here, have_zig, local_compiler
-from ._platforms import PLATFORMS, here
+from ._compilers import PLATFORMS, compile_for, compile_here, have_zig, here, local_compiler
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
-from .translate._chunks import only_kinds
 from .translate._kinds import LIBRARIES, RUNTIMES
+from .translate._translate import only_kinds
 
 BINARIES = HERE / "binaries"
 # With the derivatives of the kinds' steps: half as large again, and no business of other FMUs.

@@ -10,8 +10,8 @@ from pathlib import Path
 from softneck.runtime import _tangent, bundle
 
 from .translate._kinds import RUNTIMES, ranks_of
+from .translate._scope import TranslationError
 from .translate._translate import Unit
-from .translate._types import TranslationError
 
 HERE = Path(__file__).parent
 # Floating point as it stands there, on every platform: no fused multiply-add, no errno, no traps.

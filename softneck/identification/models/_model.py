@@ -292,7 +292,7 @@ class Model(Shown):
         Raises:
             SettingsError: a kind that searches a set (`nlsm`, or `guarded` over it).
         """
-        from softneck.runtime._casadi import step_function
+        from softneck.runtime._casadi_walk import step_function
 
         held = [self.kind, *(kind for kind, _ in members(self.arrays))]
         for kind in held:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import ast
 from typing import Protocol
 
-from ._scope import Scope
-from ._types import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Type, Value, View, length
+from ._scope import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Scope, Type, Value, View, length
 
 # numpy's and math's name -> C, of one number.
 _EACH = {

@@ -11,8 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ._calls import array_of, method, numpy_call, plain_call
-from ._scope import Scope
-from ._types import (
+from ._scope import (
     BOOL,
     FLOAT,
     INT,
@@ -21,6 +20,7 @@ from ._types import (
     Arrays,
     Bundle,
     Scalar,
+    Scope,
     Type,
     Value,
     View,

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ._expressions import Expressions
-from ._scope import Scope
-from ._types import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Type, Value, View, unified
+from ._scope import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Scope, Type, Value, View, unified
 
 
 class Statements:

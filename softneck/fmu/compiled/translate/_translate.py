@@ -8,19 +8,33 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
+from functools import cache
 
 from softneck.runtime import bundle
 from softneck.runtime._tangent import with_tangent
 from softneck.runtime._tangent_activity import TangentError
 
-from ._along import along_one
-from ._chunks import defined, nested_loops, reached
 from ._expressions import Expressions
 from ._kinds import FAST
-from ._scope import Scope
+from ._scope import (
+    FLOAT,
+    INT,
+    MATRIX,
+    NONE,
+    VECTOR,
+    Arrays,
+    Bundle,
+    CTypes,
+    Scope,
+    TranslationError,
+    Type,
+    Value,
+    View,
+    lends,
+)
 from ._statements import Statements, holds_view
-from ._types import FLOAT, INT, MATRIX, NONE, VECTOR, Arrays, Bundle, CTypes, TranslationError, Type, Value, View, lends
 
 _MEMBERS = {
     "member_size": (2, INT, "sn_member_size(w, {})"),
@@ -289,3 +303,87 @@ def _zero(kind: Type) -> str:
     if isinstance(kind, View | Bundle):
         return " = {0}"
     return " = NULL" if isinstance(kind, Arrays) else " = 0"
+
+
+@cache
+def along_one(text: str) -> str:
+    """Return the bundle `text` with its `step_tangent` (see `softneck.runtime._tangent`) for one direction alone.
+
+    Raises:
+        TangentError: the step has no derivative.
+    """
+    return ast.unparse(ast.fix_missing_locations(_One().visit(ast.parse(with_tangent(text)))))
+
+
+class _One(ast.NodeTransformer):
+    def __init__(self) -> None:
+        self._direction = ""
+
+    def visit_For(self, node: ast.For) -> ast.AST | list[ast.stmt]:
+        """Return what stands in a loop over directions, and any other loop as it is."""
+        if ast.unparse(node.iter) != "range(moved)":
+            return self.generic_visit(node)
+        self._direction = ast.unparse(node.target)
+        body = [self.visit(statement) for statement in node.body]
+        self._direction = ""
+        return body
+
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        """Return the first direction for the one of a loop."""
+        return ast.Constant(0) if node.id == self._direction else node
+
+
+_DEFINED = re.compile(r"^(?:SN_SMALL )?static [^(\[=;]*?(\w+)[(\[]", re.MULTILINE)
+_NUMBERED = re.compile(r"\w+\d\b")
+_ENTRY = re.compile(r'^    \{"([^"]+)", .*\},\n', re.MULTILINE)
+_COUNT = re.compile(r"(sn_kind_count = )\d+")
+
+
+def defined(piece: str) -> str:
+    """Return the name of the function or table that a piece of generated C defines; "" for none."""
+    found = _DEFINED.search(piece)
+    return found[1] if found else ""
+
+
+def reached(pieces: Mapping[str, str], roots: Iterable[str]) -> set[str]:
+    """Return the names of the pieces that `roots` use, directly or through others; all are numbered."""
+    found: set[str] = set()
+    waiting = [name for name in roots if name in pieces]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting += [word for word in set(_NUMBERED.findall(pieces[name])) if word in pieces]
+    return found
+
+
+def nested_loops(piece: str) -> int:
+    """Return how many loops of a function stand within each other at most; 0 for none."""
+    depth, most = 0, 0
+    open_loops: list[int] = []
+    for line in piece.splitlines():
+        if line.lstrip().startswith("for ("):
+            open_loops.append(depth)
+            most = max(most, len(open_loops))
+        depth += line.count("{") - line.count("}")
+        while open_loops and depth <= open_loops[-1]:
+            open_loops.pop()
+    return most
+
+
+def only_kinds(text: str, modules: Set[str]) -> str:
+    """Return `sn_kinds.h` with the runtimes `modules` alone."""
+    left_out = [entry[0] for entry in _ENTRY.finditer(text) if entry[1] not in modules]
+    for entry in left_out:
+        text = text.replace(entry, "")
+    text = _COUNT.sub(rf"\g<1>{len(_ENTRY.findall(text))}", text)
+    # An empty line stands between two functions, none within one.
+    pieces = text.split("\n\n")
+    functions = {defined(piece): piece for piece in pieces if _is_function(piece)}
+    roots = [word for entry in _ENTRY.finditer(text) for word in _NUMBERED.findall(entry[0])]
+    needed = reached(functions, roots)
+    return "\n\n".join(piece for piece in pieces if not _is_function(piece) or defined(piece) in needed)
+
+
+def _is_function(piece: str) -> bool:
+    return bool(re.search(r"\d$", defined(piece)))
