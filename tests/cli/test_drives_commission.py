@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from softneck.cli._main import run
-from softneck.cli.drives import _commission as cli_commission
+from softneck.cli.drives import _target as cli_target
 from softneck.cli.drives._target import Target
 from softneck.drives import load_drives
 from softneck.drives.bus._link import VirtualLink
@@ -76,11 +76,11 @@ def test_two_devices_with_one_number_write_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     @contextlib.contextmanager
-    def planted(chosen: Target, *, moves: bool) -> Iterator[VirtualLink]:
+    def planted(chosen: Target, *, moves: bool, **_: object) -> Iterator[VirtualLink]:
         assert moves
         yield planted_link(chosen.file, plant(chosen.file, ["duplicate:2"]), None, sample_time=0.02)
 
-    monkeypatch.setattr(cli_commission, "open_link", planted)
+    monkeypatch.setattr(cli_target, "open_link", planted)
     assert run([*SIMULATED, "-o", str(tmp_path), "--json"]) == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["findings"][0]["name"] == "duplicate node"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -20,7 +20,6 @@ from ._target import (
     acting_files,
     drives_options,
     leave_if_asked,
-    open_drives,
     open_link,
     opened_log,
     require_log,
@@ -30,7 +29,7 @@ from ._target import (
 )
 
 if TYPE_CHECKING:
-    from softneck.drives import DrivesResult
+    from softneck.drives import CanLink, DrivesResult
     from softneck.drives.running._preflight import Report
 
 
@@ -133,7 +132,7 @@ def run_command(
     files = acting_files(setup, loop_file, controller, chosen.path)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file)
     with contextlib.ExitStack() as stack:
-        link = None if chosen.simulated else stack.enter_context(open_drives(chosen))
+        link = None if chosen.simulated else cast("CanLink", stack.enter_context(open_link(chosen, moves=True)))
         log = stack.enter_context(opened_log(chosen, "run", asked.log, force=force))
         with progress("drives", quiet=as_json) as tell, Keyboard() as keyboard:
             report = lambda done: tell(done, controller.name)  # noqa: E731
@@ -151,7 +150,7 @@ def run_command(
         if len(result.signals.time) > 1:
             write_recording(path, result.recording(), force=replace)
         _print_run(path, result, as_json=as_json)
-        leave_if_asked(keyboard, terminated=result.terminated)
+        leave_if_asked(keyboard)
         result.require()
 
 

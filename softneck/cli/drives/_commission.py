@@ -7,35 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import SettingsError
+from softneck.core import CheckFailedError, SettingsError
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._options import common_options
-from ._target import Asked, drives_of, drives_options, leave_if_asked, open_link, opened_log, require_log
+from ._target import SAMPLE_TIME, Asked, Target, drives_options, leave_if_asked, moving, open_link, require_log
 
 if TYPE_CHECKING:
     from softneck.drives.commissioning._commission import Commissioned
-
-
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-from softneck.core import CheckFailedError
-
-from ._target import (
-    SAMPLE_TIME,
-    Target,
-    look_of,
-    sensor_of,
-)
-
-if TYPE_CHECKING:
-    from softneck.drives import CanLink
-    from softneck.drives.bus._link import VirtualLink
     from softneck.drives.commissioning._jog import JogResult
-    from softneck.drives.logs._run_log import RunLogger
-    from softneck.drives.running._bus_loop import Session
-    from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives.master._gate import Reading
 
 
 def scan_step(asked: Asked, *, as_json: bool) -> None:
@@ -71,36 +52,38 @@ def _serials(serials: list[int | None]) -> str:
 def zero_step(asked: Asked, *, force: bool, as_json: bool) -> None:
     """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
     from softneck.drives import preflight, zero
+    from softneck.drives.bus._link import VirtualLink
     from softneck.drives.logs._run_log import run_facts
-    from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives.sensing._sources import LOOK, look_at
 
     chosen = asked.target()
     require_log(asked.log, force=force)
-    with (
-        open_link(chosen, moves=True) as link,
-        opened_log(chosen, "zero", asked.log, force=force) as log,
-    ):
-        link.tap = None if log is None else log.frame
-        look = look_of(link, chosen.file)
+    with moving(asked, chosen, "zero", force=force) as (session, keyboard):
+        link, sensor = session.link, session.sensor
         report = preflight(link, chosen.file, override=asked.override)
         report.require()
-        if log is not None:
+        if session.log is not None:
             # It has no cycles: what was set up, and the frames.
             settings = chosen.file.master_settings(SAMPLE_TIME, guarding=report.guarding)
-            log.describe(run_facts(settings, drives_of(chosen.path), simulated=chosen.simulated))
-        with Keyboard() as keyboard:
-            try:
-                zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
-            except CheckFailedError as error:
-                if keyboard.interrupted or keyboard.terminated:
-                    note(str(error))
-                leave_if_asked(keyboard)
-                raise
-    if as_json:
-        print_json(zeroed.table())
-        return
-    rows = [[f"node {node}", f"{pulled:.3f}"] for node, pulled in zip(zeroed.nodes, zeroed.pulled, strict=True)]
-    print_table("Zeroed", ["motor", "pulled [rad]"], rows)
+            session.log.describe(run_facts(settings, session.files, simulated=chosen.simulated))
+
+        def look() -> Reading | None:
+            if isinstance(link, VirtualLink):
+                return link.newest
+            return None if sensor is None else look_at(sensor, link, LOOK)
+
+        try:
+            zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
+        except CheckFailedError as error:
+            if keyboard.interrupted or keyboard.terminated:
+                note(str(error))
+            leave_if_asked(keyboard)
+            raise
+        if as_json:
+            print_json(zeroed.table())
+            return
+        rows = [[f"node {node}", f"{pulled:.3f}"] for node, pulled in zip(zeroed.nodes, zeroed.pulled, strict=True)]
+        print_table("Zeroed", ["motor", "pulled [rad]"], rows)
 
 
 def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json: bool) -> None:
@@ -109,7 +92,6 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
     Fails if that is not where the tendon's angle says: nodes swapped, a sign reversed, a tendon that hangs.
     """
     from softneck.drives import jog
-    from softneck.drives.running._keyboard import Keyboard
     from softneck.drives.running._virtual import physics_of
 
     require_log(asked.log, force=force)
@@ -119,20 +101,14 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
     # A neck's tendons stand where its own file says.
     physics = physics_of(chosen.file.moves, None) if chosen.is_neck else None
     angles = physics and (physics.tendon_angle_1, physics.tendon_angle_2, physics.tendon_angle_3)
-    with (
-        open_link(chosen, moves=True, homed=True) as link,
-        opened_log(chosen, "jog", asked.log, force=force) as log,
-    ):
-        with progress("jog", quiet=as_json) as tell, Keyboard() as keyboard:
+    with moving(asked, chosen, "jog", force=force, homed=True) as (session, keyboard):
+        with progress("jog", quiet=as_json) as tell:
             found = jog(
-                motor,
-                session_of(asked, chosen, link, keyboard, log, drives_of(chosen.path)),
-                tendon_angles=angles,
-                amplitude=amplitude,
+                motor, session, tendon_angles=angles, amplitude=amplitude,
                 report=lambda done: tell(done, f"motor {motor}"),
-            )
+            )  # fmt: skip
         _print_jog(found, as_json=as_json)
-        leave_if_asked(keyboard, terminated=found.ended.terminated)
+        leave_if_asked(keyboard)
         found.require()
 
 
@@ -146,21 +122,6 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
         cells = [values[key][name] for key in ("expected", "seen")]
         rows.append([name, *("-" if cell is None or cell != cell else f"{cell:.2f}" for cell in cells)])
     print_table(f"Motor {found.motor} (node {found.node}): {found.verdict}", ["way up", "expected", "seen"], rows)
-
-
-def session_of(
-    asked: Asked, chosen: Target, link: CanLink | VirtualLink, keyboard: Keyboard, log: RunLogger | None,
-    files: Mapping[str, str | Path],
-) -> Session:  # fmt: skip
-    """Return what a master needs to move the drives."""
-    from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.running._bus_loop import Session
-
-    sensor = None if isinstance(link, VirtualLink) else sensor_of(chosen.file)
-    return Session(
-        file=chosen.file, link=link, sensor=sensor, override=asked.override, pace=asked.pace, operator=keyboard,
-        log=log, files=files,
-    )  # fmt: skip
 
 
 _PARTS = ("scan", "tendons", "zero", "jog")
@@ -217,24 +178,18 @@ def _tendons(
     """Ask who is there, move what is to be moved, and propose files."""
     from softneck.drives.commissioning._commission import commission, require_folder, write_files
     from softneck.drives.commissioning._moves import Guards
-    from softneck.drives.running._keyboard import Keyboard
 
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)
     require_log(asked.log, force=force)
     chosen = asked.target()
     guards = Guards.of(chosen.file.watch.gain, travel=travel)
     require_folder(folder, force=replace)
-    with (
-        open_link(chosen, moves=True) as link,
-        opened_log(chosen, "commission", asked.log, force=force) as log,
-    ):
-        link.tap = None if log is None else log.frame
-        with progress("commission", quiet=as_json) as tell, Keyboard() as keyboard:
-            session = session_of(asked, chosen, link, keyboard, log, drives_of(chosen.path))
+    with moving(asked, chosen, "commission", force=force) as (session, keyboard):
+        with progress("commission", quiet=as_json) as tell:
             result = commission(session, guards=guards, motors=motors, report=tell, where=asked.bus or "the bus")
         written = write_files(folder, result, force=replace)
         _print(result, written, as_json=as_json)
-        leave_if_asked(keyboard, terminated=result.ended is not None and result.ended.terminated)
+        leave_if_asked(keyboard)
         result.require()
 
 

@@ -13,8 +13,7 @@ from softneck.signals import signal_names, write_recording
 
 from ..shared._console import note, print_json, progress
 from ..shared._options import common_options, output_option
-from ._commission import session_of
-from ._target import Asked, drives_of, drives_options, leave_if_asked, open_link, opened_log, require_log
+from ._target import Asked, drives_options, leave_if_asked, moving, require_log
 
 if TYPE_CHECKING:
     from softneck.drives.commissioning._record import ExperimentResult
@@ -49,7 +48,6 @@ def record_command(
     from softneck.drives import Experiment, record_signal
     from softneck.drives.bus._link import VirtualLink
     from softneck.drives.commissioning._record import drive_limits
-    from softneck.drives.running._keyboard import Keyboard
     from softneck.signals.recording._files import recording_suffix
 
     recording_suffix(output)
@@ -64,15 +62,11 @@ def record_command(
         ranges=() if moved is None else chosen.file.ranges,
     )  # fmt: skip
     prepared = experiment.prepared()
-    with (
-        open_link(chosen, moves=True, homed=True, seed=seed) as link,
-        opened_log(chosen, "record", asked.log, force=force) as log,
-    ):
-        if isinstance(link, VirtualLink):
-            link.neck.set(payload=payload)
-        with progress("record", quiet=as_json) as tell, Keyboard() as keyboard:
-            files = {**drives_of(chosen.path), **({"signal": signal_name} if Path(signal_name).is_file() else {})}
-            session = session_of(asked, chosen, link, keyboard, log, files)
+    files = {"signal": signal_name} if Path(signal_name).is_file() else {}
+    with moving(asked, chosen, "record", force=force, homed=True, seed=seed, **files) as (session, keyboard):
+        if isinstance(session.link, VirtualLink):
+            session.link.neck.set(payload=payload)
+        with progress("record", quiet=as_json) as tell:
             recorded = record_signal(
                 [excitation for excitation, _ in prepared],
                 replace(session, facts={"record": experiment.facts()}),
@@ -83,7 +77,7 @@ def record_command(
             write_recording(output, recorded.recording, force=force)
         facts: dict[str, Any] = {"signal": signal_name, "runs": len(prepared), "changes": prepared[0][1].as_dict()}
         _print_record(output, recorded, facts, str(prepared[0][1]), as_json=as_json)
-        leave_if_asked(keyboard, terminated=recorded.ended.terminated)
+        leave_if_asked(keyboard)
         recorded.require()
 
 

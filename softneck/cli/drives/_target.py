@@ -9,14 +9,16 @@ import contextlib
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import platformdirs
 
-from softneck.core import SettingsError, SoftneckError, require_between
+from softneck.core import OutputFileError, SettingsError, SoftneckError, require_between
 from softneck.drives.bus._link import HARMLESS
 from softneck.drives.running._preflight import OVERRIDES
 
@@ -24,27 +26,16 @@ from ..shared._console import note
 from ..shared._options import COMMON
 
 if TYPE_CHECKING:
+    from softneck.cosim.loops._loop_file import LoopSetup
     from softneck.drives import CanLink, DrivesFile
     from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.logs._run_log import RunLogger
     from softneck.drives.master import Frame, Tilt
-    from softneck.drives.master._gate import Reading
+    from softneck.drives.running._bus_loop import Session
     from softneck.drives.running._keyboard import Keyboard
     from softneck.drives.sensing._sources import Sensor
     from softneck.plant import NeckParameters
     from softneck.robot import Robot
-
-
-import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-import platformdirs
-
-from softneck.core import OutputFileError
-
-if TYPE_CHECKING:
-    from softneck.cosim.loops._loop_file import LoopSetup
-    from softneck.drives.logs._run_log import RunLogger
 
 # For a service, where nobody can type: the same words.
 VARIABLE = "SOFTNECK_ARM"
@@ -86,8 +77,6 @@ def require_armed(bus: str, *, arm: bool) -> None:
 
 
 SAMPLE_TIME = 0.02
-# How long a command waits for a sample of the inclinometer [s].
-_LOOK = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +128,9 @@ class Asked:
     log: str | None = None
 
     def __post_init__(self) -> None:
-        checked_names(self.override)
+        for name in self.override:
+            if name not in OVERRIDES:
+                raise SettingsError(f"--override takes one of {', '.join(OVERRIDES)}; got `{name}`.")
         if self.pace is not None:
             require_between("--pace", self.pace, 0.01, 1000.0)
             if not self.simulated:
@@ -215,55 +206,47 @@ def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0
                 note(f"bus {chosen.bus}: {link.problem}")
 
 
+@contextlib.contextmanager
+def moving(
+    asked: Asked, chosen: Target, command: str, *, force: bool, homed: bool = False, seed: int = 0, **files: Path | str
+) -> Iterator[tuple[Session, Keyboard]]:
+    """Yield what a master needs to move the drives, and who is at the keyboard; all are given back after the results.
+
+    Args:
+        asked, chosen: which drives.
+        command: what runs, for its log.
+        force: replace an existing log.
+        homed, seed: of simulated drives.
+        files: what acts beside the drives file, for the log.
+    """
+    from softneck.drives.bus._link import VirtualLink
+    from softneck.drives.running._bus_loop import Session
+    from softneck.drives.running._keyboard import Keyboard
+
+    with (
+        open_link(chosen, moves=True, homed=homed, seed=seed) as link,
+        opened_log(chosen, command, asked.log, force=force) as log,
+        Keyboard() as keyboard,
+    ):
+        link.tap = None if log is None else log.frame
+        yield Session(
+            file=chosen.file, link=link, sensor=None if isinstance(link, VirtualLink) else sensor_of(chosen.file),
+            override=asked.override, pace=asked.pace, operator=keyboard, log=log,
+            files={**drives_of(chosen.path), **files},
+        ), keyboard  # fmt: skip
+
+
 # As a shell says it of a process that SIGTERM ended: 128 + 15.
 _TERMINATED = 143
 
 
-def leave_if_asked(keyboard: Keyboard, *, terminated: bool = False) -> None:
+def leave_if_asked(keyboard: Keyboard) -> None:
     """End the command as somebody at the keyboard, or SIGTERM, asked; after its results are out."""
     if keyboard.interrupted:
         raise KeyboardInterrupt
-    if terminated or keyboard.terminated:
+    if keyboard.terminated:
         note("ended by SIGTERM; the drives are off.")
         click.get_current_context().exit(_TERMINATED)
-
-
-@contextlib.contextmanager
-def open_drives(chosen: Target) -> Iterator[CanLink]:
-    """Yield the bus to drives that are to move."""
-    from softneck.drives.bus._link import VirtualLink
-
-    with open_link(chosen, moves=True) as link:
-        if isinstance(link, VirtualLink):
-            raise SettingsError("this command needs drives on a bus (--bus).")
-        yield link
-
-
-def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """Return `names` if each may be overridden."""
-    for name in names:
-        if name not in OVERRIDES:
-            raise SettingsError(f"--override takes one of {', '.join(OVERRIDES)}; got `{name}`.")
-    return tuple(names)
-
-
-def look_of(link: CanLink | VirtualLink, file: DrivesFile) -> Callable[[], Reading | None]:
-    """Return what gives the newest sample of the inclinometer."""
-    from softneck.drives.bus._link import VirtualLink
-
-    if isinstance(link, VirtualLink):
-        return lambda: link.newest
-    sensor = sensor_of(file)
-
-    def look() -> Reading | None:
-        until = link.now + _LOOK
-        while link.now < until:
-            tilt = sensor.read(link.now, link.receive(0.02))
-            if tilt is not None:
-                return tilt
-        return None
-
-    return look
 
 
 def sensor_of(file: DrivesFile) -> Any:
@@ -338,7 +321,6 @@ def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool)
     Raises:
         OutputFileError: it cannot be written (before anything moves), or is not complete.
     """
-    from softneck.drives.bus._link import HARMLESS
     from softneck.drives.logs._run_log import RunLogger
 
     own = wanted is None and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
