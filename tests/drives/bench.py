@@ -87,7 +87,7 @@ class Bench:
                 *pdo_writes(entry, self.file.profile),
                 *drive_changes,
             ]
-            configure(drive, [write for write in writes if not (late and write.index == 0x6060)])
+            configure(drive, [write for write in writes if not (late and write.at == 0x6060)])
         self.link.send([nmt_frame(Command.START, 0)])
         self.link.drain()
         self.run = VirtualRun(self.link, self.master)
@@ -166,7 +166,7 @@ class Bench:
 def configure(drive: SimulatedDrive, writes: list[Write]) -> None:
     """Write objects into a drive without a bus."""
     for write in writes:
-        item = drive.axis.profile.items[(write.index, write.subindex)]
+        item = drive.axis.profile.items[(write.at, write.sub)]
         data = (write.value & ((1 << 8 * item.size) - 1)).to_bytes(item.size, "little")
-        code = drive._write(write.index, write.subindex, data)
-        assert code == 0, f"{write.index:04X}h:{write.subindex} {write.value}: {code:08X}h"
+        code = drive._write(write.at, write.sub, data)
+        assert code == 0, f"{write.at:04X}h:{write.sub} {write.value}: {code:08X}h"

@@ -53,7 +53,7 @@ def _narrow(settings: MasterSettings) -> MasterSettings:
     return replace(settings, limits=replace(settings.limits, position=1.0))
 
 
-_NO_LIFE = (Write(0x6007, 0, 0, "test"),)
+_NO_LIFE = (Write(0x6007, 0, 0),)
 SCENARIOS: dict[str, Scenario] = {
     "lost_setpoints": Scenario("lost set-points", lost_setpoints, set_off("setpoint_lost")),
     "bus_off": Scenario("bus-off, cable", bus_off, set_off("bus_off")),

@@ -151,7 +151,7 @@ def test_the_tighter_limit_of_robot_and_drives_file_holds_and_check_says_whose(t
         "-4.5 rad (drives file) to 2 rad (robot), 12 rad/s (robot)",
         "-4.5 rad (drives file) to 4.5 rad (drives file), 12 rad/s (robot)",
     ]
-    high = [write.value for write in limit_writes(file, file.drives[0]) if (write.index, write.subindex) == (0x607D, 2)]
+    high = [write.value for write in limit_writes(file, file.drives[0]) if (write.at, write.sub) == (0x607D, 2)]
     assert high == [round(2.0 * file.drives[0].scale.counts_per_radian) + 1]
 
 

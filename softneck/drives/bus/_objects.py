@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ._file import DriveEntry, DrivesFile
 from ._units import (
@@ -30,20 +30,12 @@ _CURRENT = {"ipos2015": 0x207E, "ds402": 0x6078}
 RATED_CURRENT = 0.060
 
 
-@dataclass(frozen=True, slots=True)
-class Write:
-    """One object to write and read back.
+class Write(NamedTuple):
+    """A value for the object `at`, subindex `sub`, to be read back."""
 
-    Attributes:
-        index, subindex: where.
-        value: what.
-        topic: row of the report it belongs to.
-    """
-
-    index: int
-    subindex: int
+    at: int
+    sub: int
     value: int
-    topic: str
 
 
 # What a drive needs to be guarded: a heartbeat consumer and producer, or life guarding.
@@ -64,11 +56,11 @@ def speed_of_units(units: int, entry: DriveEntry, profile: str) -> float:
     return units / entry.scale.counts_per_radian if profile == _PLAIN else internal_to_speed(units, entry.scale)
 
 
-def current_write(current: float, entry: DriveEntry, profile: str, topic: str) -> Write:
+def current_write(current: float, entry: DriveEntry, profile: str) -> Write:
     """Return the write that limits the motor's current [A]."""
     if profile == _PLAIN:
-        return Write(0x6073, 0, round(1000.0 * current / RATED_CURRENT), topic)
-    return Write(0x207F, 0, abs(current_to_internal(current, entry.scale)), topic)
+        return Write(0x6073, 0, round(1000.0 * current / RATED_CURRENT))
+    return Write(0x207F, 0, abs(current_to_internal(current, entry.scale)))
 
 
 def ampere(entry: DriveEntry, profile: str) -> float:
@@ -85,9 +77,9 @@ def _acceleration(value: float, entry: DriveEntry, profile: str) -> int:
 def option_writes() -> list[Write]:
     """What a drive does when connection, master or itself fails: latch Fault after a quick-stop ramp."""
     return [
-        Write(0x6007, 0, 1, "options"),
-        Write(0x605E, 0, 2, "options"),
-        Write(0x605A, 0, 2, "options"),
+        Write(0x6007, 0, 1),
+        Write(0x605E, 0, 2),
+        Write(0x605A, 0, 2),
     ]
 
 
@@ -98,13 +90,13 @@ def limit_writes(file: DrivesFile, entry: DriveEntry) -> list[Write]:
     edges = [position_to_counts(edge, entry.scale) + HOMED_MARK for edge in (-file.limits.position, high)]
     window = abs(position_to_counts(file.following, entry.scale))
     return [
-        Write(0x607D, 1, min(edges), "limits"),
-        Write(0x607D, 2, max(edges), "limits"),
-        Write(0x6083, 0, _acceleration(file.quick_stop, entry, file.profile), "limits"),
-        Write(0x6085, 0, _acceleration(file.quick_stop, entry, file.profile), "limits"),
-        Write(0x6065, 0, window, "limits"),
-        Write(0x6066, 0, _FOLLOWING_TIME, "limits"),
-        current_write(entry.current_limit, entry, file.profile, "limits"),
+        Write(0x607D, 1, min(edges)),
+        Write(0x607D, 2, max(edges)),
+        Write(0x6083, 0, _acceleration(file.quick_stop, entry, file.profile)),
+        Write(0x6085, 0, _acceleration(file.quick_stop, entry, file.profile)),
+        Write(0x6065, 0, window),
+        Write(0x6066, 0, _FOLLOWING_TIME),
+        current_write(entry.current_limit, entry, file.profile),
     ]
 
 
@@ -118,37 +110,37 @@ def guarding_writes(file: DrivesFile, kind: str, master: int, has: frozenset[int
         off, on = [(0x100C, 0), (0x100D, 0)], [(0x1017, 0, max(10, milliseconds // 2))]
         on.append((0x1016, 1, (master << 16) | milliseconds))
     values = [(index, subindex, 0) for index, subindex in off if index in has] + on
-    return [Write(index, subindex, value, "guarding") for index, subindex, value in values]
+    return [Write(index, subindex, value) for index, subindex, value in values]
 
 
 def disarm_writes(kind: str) -> list[Write]:
     """The end of guarding, so that a drive that is left alone does not fault."""
     if kind == "life":
-        return [Write(0x100C, 0, 0, "guarding"), Write(0x100D, 0, 0, "guarding")]
-    return [Write(0x1016, 1, 0, "guarding"), Write(0x1017, 0, 0, "guarding")]
+        return [Write(0x100C, 0, 0), Write(0x100D, 0, 0)]
+    return [Write(0x1016, 1, 0), Write(0x1017, 0, 0)]
 
 
 def pdo_writes(entry: DriveEntry, profile: str) -> list[Write]:
     """RPDO 1: control word, target; TPDO 1: status word, position, current; both with each SYNC."""
-    node, topic = entry.node, "mapping"
+    node = entry.node
     current = _CURRENT[profile] << 16 | 0x0010
     disabled = 0x80000000
     return [
-        Write(0x1400, 1, disabled | 0x200 + node, topic),
-        Write(0x1600, 0, 0, topic),
-        Write(0x1600, 1, 0x60400010, topic),
-        Write(0x1600, 2, 0x607A0020, topic),
-        Write(0x1600, 0, 2, topic),
-        Write(0x1400, 2, 1, topic),
-        Write(0x1400, 1, 0x200 + node, topic),
-        Write(0x1800, 1, disabled | 0x180 + node, topic),
-        Write(0x1A00, 0, 0, topic),
-        Write(0x1A00, 1, 0x60410010, topic),
-        Write(0x1A00, 2, 0x60640020, topic),
-        Write(0x1A00, 3, current, topic),
-        Write(0x1A00, 0, 3, topic),
-        Write(0x1800, 2, 1, topic),
-        Write(0x1800, 1, 0x180 + node, topic),
+        Write(0x1400, 1, disabled | 0x200 + node),
+        Write(0x1600, 0, 0),
+        Write(0x1600, 1, 0x60400010),
+        Write(0x1600, 2, 0x607A0020),
+        Write(0x1600, 0, 2),
+        Write(0x1400, 2, 1),
+        Write(0x1400, 1, 0x200 + node),
+        Write(0x1800, 1, disabled | 0x180 + node),
+        Write(0x1A00, 0, 0),
+        Write(0x1A00, 1, 0x60410010),
+        Write(0x1A00, 2, 0x60640020),
+        Write(0x1A00, 3, current),
+        Write(0x1A00, 0, 3),
+        Write(0x1800, 2, 1),
+        Write(0x1800, 1, 0x180 + node),
     ]
 
 
@@ -158,7 +150,7 @@ def mode_writes(file: DrivesFile) -> list[Write]:
     if abs(period - round(period)) > 1e-6:
         exponent, period = -4, file.cycle * 1e4
     return [
-        Write(0x60C2, 1, round(period), "modes"),
-        Write(0x60C2, 2, exponent, "modes"),
-        Write(0x6060, 0, CSP, "modes"),
+        Write(0x60C2, 1, round(period)),
+        Write(0x60C2, 2, exponent),
+        Write(0x6060, 0, CSP),
     ]

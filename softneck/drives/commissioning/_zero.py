@@ -95,17 +95,17 @@ class _Motor:
         pull = speed_units(zero.speed, self.entry, self.file.profile)
         writes = [
             *option_writes(),
-            Write(0x6065, 0, 0, "zero"),
-            Write(0x607C, 0, 0, "zero"),
-            Write(0x607D, 1, -(2**31), "zero"),
-            Write(0x607D, 2, 2**31 - 1, "zero"),
-            Write(0x6083, 0, max(1, abs(pull)), "zero"),
-            Write(0x6085, 0, max(1, abs(pull)), "zero"),
-            current_write(zero.current, self.entry, self.file.profile, "zero"),
-            Write(0x60FF, 0, 0, "zero"),
+            Write(0x6065, 0, 0),
+            Write(0x607C, 0, 0),
+            Write(0x607D, 1, -(2**31)),
+            Write(0x607D, 2, 2**31 - 1),
+            Write(0x6083, 0, max(1, abs(pull))),
+            Write(0x6085, 0, max(1, abs(pull))),
+            current_write(zero.current, self.entry, self.file.profile),
+            Write(0x60FF, 0, 0),
         ]
         for write in writes:
-            self._keep(write.index, write.subindex, write.value)
+            self._keep(*write)
         try:
             self._keep(_MODE, 0, _VELOCITY)
         except SdoError as error:

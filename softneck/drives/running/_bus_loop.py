@@ -156,7 +156,7 @@ def _run_session(
         link.tap = log.frame
     checked = preflight(link, file, override=session.override, homed=True, sensor=session.sensor)
     checked.require()
-    settings = file.master_settings(sample_time, guarding=checked.guarding, late_modes=checked.late_modes)
+    settings = file.master_settings(sample_time, guarding=checked.guarding, late_modes=tuple(checked.late_modes))
     settings = settings if session.settings is None else session.settings(settings)
     if log is not None:
         whose = {} if file.moves.is_neck else {"robot": file.moves.as_dict()}

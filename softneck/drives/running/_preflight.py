@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from softneck.core import CheckFailedError
@@ -171,21 +171,25 @@ class PreflightCheck:
     advice: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Report:
     """What a check found.
 
     Attributes:
-        rows: all lines.
+        overridden: names that are let pass by the user.
         guarding: "life" or "heartbeat", as it was set up.
-        overridden: names that were let pass by the user.
+        rows: all lines.
         late_modes: nodes of drives that take their mode in Operation Enabled alone.
     """
 
-    rows: tuple[PreflightCheck, ...]
-    guarding: str
     overridden: tuple[str, ...] = ()
-    late_modes: tuple[int, ...] = ()
+    guarding: str = "none"
+    rows: list[PreflightCheck] = field(default_factory=list)
+    late_modes: list[int] = field(default_factory=list)
+
+    def add(self, node: int, name: str, found: str, holds: bool, advice: str = "") -> None:
+        """Add a line."""
+        self.rows.append(PreflightCheck(node, name, found, holds, "" if holds else advice))
 
     @property
     def holds(self) -> bool:
@@ -203,25 +207,10 @@ class Report:
 
     def table(self) -> dict[str, Any]:
         """Return the JSON of `softneck drives check`."""
-        rows = [
-            {"node": row.node, "check": row.name, "found": row.found, "holds": row.holds, "advice": row.advice}
-            for row in self.rows
-        ]
-        return {
-            "holds": self.holds,
-            "guarding": self.guarding,
-            "overridden": list(self.overridden),
-            "rows": rows,
-        }
-
-
-@dataclass(slots=True)
-class _Checks:
-    rows: list[PreflightCheck] = field(default_factory=list)
-    late_modes: list[int] = field(default_factory=list)
-
-    def add(self, node: int, name: str, found: str, holds: bool, advice: str = "") -> None:
-        self.rows.append(PreflightCheck(node, name, found, holds, "" if holds else advice))
+        rows = [{"check": row["name"], **{key: row[key] for key in ("node", "found", "holds", "advice")}}
+                for row in map(asdict, self.rows)]  # fmt: skip
+        overridden = list(self.overridden)
+        return {"holds": self.holds, "guarding": self.guarding, "overridden": overridden, "rows": rows}
 
 
 def foreign_master(frames: Sequence[Frame]) -> str:
@@ -276,13 +265,13 @@ def preflight(
     Raises:
         BusError: the bus takes no frames.
     """
-    rows = _Checks()
+    rows = Report(tuple(override))
     if file.robot is not None:
         _tell_robot(file, rows)
     other = listen(link, file.nodes)
     rows.add(0, "second master", other or "none", not other, "Stop the other master before this one starts.")
     if other:
-        return Report(tuple(rows.rows), "none")
+        return rows
     link.send([nmt_frame(Command.PRE_OPERATIONAL, node) for node in file.nodes])
     require_bus(link)
     guarding = file.guarding.kind
@@ -290,7 +279,7 @@ def preflight(
     for node, found in devices.items():
         rows.add(node, "node number", found or "one device", not found, "Give one of them another node number.")
     if any(devices.values()):
-        return Report(tuple(rows.rows), "none")
+        return rows
     for entry in file.drives:
         objects = Objects(link, entry.node)
         try:
@@ -308,10 +297,11 @@ def preflight(
         guarding = guarding if guarding != "auto" else kind
     if sensor is not None:
         _check_sensor(link, file, sensor, rows)
-    return Report(tuple(rows.rows), guarding, tuple(override), tuple(rows.late_modes))
+    rows.guarding = guarding
+    return rows
 
 
-def _tell_robot(file: DrivesFile, rows: _Checks) -> None:
+def _tell_robot(file: DrivesFile, rows: Report) -> None:
     """Say what the robot changes: its limits where they are the tighter ones, what is watched, how full the bus is."""
     robot = file.moves
     rows.add(0, "robot", robot.label(), True)
@@ -322,7 +312,7 @@ def _tell_robot(file: DrivesFile, rows: _Checks) -> None:
     rows.add(0, "bus load", f"{100.0 * file.load:.0f} % of {file.bit_rate:g} bit/s at worst", True)
 
 
-def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -> None:
+def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: Report) -> None:
     """Look for one sample that may be an angle of the neck; a drive must not get power without."""
     on_bus = file.sensor_kind == "can"
     if on_bus:
@@ -340,7 +330,7 @@ def _check_sensor(link: Link, file: DrivesFile, sensor: Sensor, rows: _Checks) -
     rows.add(node, "inclinometer", found, holds, getattr(sensor, "problem", "") or advice)
 
 
-def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding: str, rows: _Checks) -> str:
+def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding: str, rows: Report) -> str:
     """Add the rows of one drive; return the guarding it got."""
     node = entry.node
     kind = objects.read(0x1000)
@@ -359,7 +349,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
         return "auto"
     late = node in rows.late_modes
     for topic, writes in (
-        ("modes", [write for write in mode_writes(file) if not (late and write.index == _MODE)]),
+        ("modes", [write for write in mode_writes(file) if not (late and write.at == _MODE)]),
         ("options", option_writes()),
         ("limits", limit_writes(file, entry)),
         ("guarding", guarding_writes(file, guarding, MASTER_NODE, has)),
@@ -369,7 +359,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
     return guarding
 
 
-def _check_identity(objects: Objects, entry: DriveEntry, rows: _Checks) -> None:
+def _check_identity(objects: Objects, entry: DriveEntry, rows: Report) -> None:
     wrong, found = [], []
     for name, subindex, wanted in (("vendor", 1, entry.vendor), ("product", 2, entry.product),
                                    ("serial", 4, entry.serial)):  # fmt: skip
@@ -384,7 +374,7 @@ def _check_identity(objects: Objects, entry: DriveEntry, rows: _Checks) -> None:
     rows.add(entry.node, "firmware", firmware or "not told", holds, f"The drives file says {entry.firmware}.")
 
 
-def _check_factors(objects: Objects, node: int, rows: _Checks) -> None:
+def _check_factors(objects: Objects, node: int, rows: Report) -> None:
     wrong = []
     for index in (0x6093, 0x6094, 0x6097):
         pair = [or_none(lambda i=index, s=sub: objects.read(i, s)) for sub in (1, 2)]
@@ -394,7 +384,7 @@ def _check_factors(objects: Objects, node: int, rows: _Checks) -> None:
     rows.add(node, "factor group", ", ".join(wrong) or "neutral", not wrong, advice)
 
 
-def _check_modes(objects: Objects, node: int, rows: _Checks) -> None:
+def _check_modes(objects: Objects, node: int, rows: Report) -> None:
     modes = objects.read(0x6502) & 0xFFFFFFFF
     said = bool(modes & 0x80) or modes == _NO_CSP_BIT
     try:
@@ -419,7 +409,7 @@ def _when_enabled(objects: Objects) -> str:
     return _LATE
 
 
-def _guarding(objects: Objects, wanted: str, rows: _Checks) -> tuple[str, frozenset[int]]:
+def _guarding(objects: Objects, wanted: str, rows: Report) -> tuple[str, frozenset[int]]:
     """Return how the drive is guarded and which of the objects for it the drive has; "" after a row that says why not.
 
     With "auto" by heartbeat where the drive can send and watch one, else by life guarding.
@@ -439,12 +429,12 @@ def _listed(indices: Sequence[int]) -> str:
     return ", ".join(f"{index:04X}h" for index in indices)
 
 
-def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: _Checks) -> None:
+def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: Report) -> None:
     """Write all of one topic and read each back."""
     for write in writes:
-        place = f"{write.index:04X}h:{write.subindex}"
+        place = f"{write.at:04X}h:{write.sub}"
         try:
-            found = objects.written(write.index, write.subindex, write.value)
+            found = objects.written(*write)
         except SdoError as error:
             if not error.aborted:
                 raise

@@ -85,7 +85,7 @@ def disarm(link: Link, file: DrivesFile, guarding: str, signs: Sequence[Frame]) 
         objects = Objects(guarded, node)
         try:
             for write in disarm_writes(guarding):
-                objects.write(write.index, write.subindex, write.value)
+                objects.write(*write)
         except SdoError as error:
             left[node] = str(error).rstrip(".")
     for node in [node for node in file.nodes if node not in left]:

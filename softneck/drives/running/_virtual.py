@@ -177,10 +177,3 @@ class VirtualRun:
             if self.master.finished:
                 return
             self.step()
-
-
-def recorded(link: VirtualLink) -> list[tuple[float, bool, Frame]]:
-    """Return a list that will hold every frame on the wire: (time, from the master, frame)."""
-    frames: list[tuple[float, bool, Frame]] = []
-    link.tap = lambda now, from_master, frame: frames.append((now, from_master, frame))
-    return frames
