@@ -162,7 +162,7 @@ def test_the_pre_flight_says_what_it_could_not_read_back(habits: dict[str, Any],
     report = preflight(linked(**habits), default_drives(), homed=True)
     assert report.holds, [row for row in report.rows if not row.holds]
     assert any(row.name == "modes" and row.found.startswith(said) for row in report.rows)
-    assert report.late_modes == ((1, 2, 3) if habits.get("mode_when") == "enabled" else ())
+    assert tuple(report.late_modes) == ((1, 2, 3) if habits.get("mode_when") == "enabled" else ())
 
 
 def test_a_guard_that_cannot_be_read_back_is_none() -> None:
