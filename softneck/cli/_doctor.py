@@ -18,7 +18,6 @@ from .shared._options import common_options
 
 # Extra -> the module it brings, and what for.
 _EXTRAS = {
-    "slycot": ("slycot", "H-infinity by SLICOT"),
     "dask": ("distributed", "studies on a cluster"),
 }
 

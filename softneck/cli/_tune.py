@@ -115,7 +115,9 @@ def _print(found: Tuned, folder: Path) -> None:
     from softneck.report._tune_page import notes, requirement_rows
 
     best = found.best
-    settings = ", ".join(f"{name} {value:.4g}" for name, value in best.settings.items())
+    settings = ", ".join(
+        f"{name} {value if isinstance(value, list) else f'{value:.4g}'}" for name, value in best.settings.items()
+    )
     print_table(f"{folder / 'best.npz'}: {best.kind} ({settings})", ["metric", "bound", "limit", "value", ""],
                 [row[:5] for row in requirement_rows(found)])  # fmt: skip
     for line in notes(found):

@@ -61,7 +61,6 @@ EXTRAS = {
     "canopen": ("drives", "CANopen drives, simulated ones too"),
     "mcap": ("drives", "logs of runs on drives"),
     "serial": ("drives", "an inclinometer on a serial port"),
-    "slycot": ("slycot", "synthesis by SLICOT"),
     "xarray": ("xarray", "`.to_xarray()`"),
     "distributed": ("dask", "studies on a Dask cluster"),
 }

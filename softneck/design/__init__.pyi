@@ -2,7 +2,7 @@ from ._design import design_controller as design_controller
 from .linear._controller import LinearController as LinearController
 from .linear._custom import CustomSettings as CustomSettings
 from .linear._fopi import FopiSettings as FopiSettings
-from .linear._fractional import fopi as fopi
+from .linear._fopi import fopi as fopi
 from .linear._lqg import LqgSettings as LqgSettings
 from .linear._own import OwnController as OwnController
 from .linear._pi import PiSettings as PiSettings
@@ -19,6 +19,5 @@ from .robust._mu import mu_bounds as mu_bounds
 from .robust._synthesis import hinfsyn as hinfsyn
 from .robust._synthesis import mixsyn as mixsyn
 from .robust._weights import makeweight as makeweight
-from .robust._weights import ucover as ucover
 from .varying._adaptive import AdaptiveSettings as AdaptiveSettings
 from .varying._varying import VaryingController as VaryingController

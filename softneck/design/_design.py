@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from softneck.core import SettingsError, find_kind, resolve
 from softneck.core._kinds import fitting, make_settings
 from softneck.core._shown import percent
+from softneck.robot import Robot
 from softneck.robot._opened import opened
 
 if TYPE_CHECKING:
@@ -21,25 +22,44 @@ _LEAST_FIT = 30.0
 
 
 @overload
-def design_controller(kind: Literal["mpc"], plant: Any, *, any_fit: bool = ..., **settings: Any) -> MpcController: ...
-@overload
-def design_controller(kind: Literal["nmpc"], plant: Any, *, any_fit: bool = ..., **settings: Any) -> NmpcController: ...
+def design_controller(
+    kind: Literal["mpc"], plant: Any, *, robot: Robot | str | Path | None = ..., any_fit: bool = ..., **settings: Any
+) -> MpcController: ...
 @overload
 def design_controller(
-    kind: Literal["adaptive"], plant: Any, *, any_fit: bool = ..., **settings: Any
+    kind: Literal["nmpc"], plant: Any, *, robot: Robot | str | Path | None = ..., any_fit: bool = ..., **settings: Any
+) -> NmpcController: ...
+@overload
+def design_controller(
+    kind: Literal["adaptive"],
+    plant: Any,
+    *,
+    robot: Robot | str | Path | None = ...,
+    any_fit: bool = ...,
+    **settings: Any,
 ) -> VaryingController: ...
 @overload
 def design_controller(
-    kind: Literal["pi", "pid", "fopi", "hinf", "lqg", "custom"], plant: Any, *, any_fit: bool = ..., **settings: Any
+    kind: Literal["pi", "pid", "fopi", "hinf", "lqg", "custom"],
+    plant: Any,
+    *,
+    robot: Robot | str | Path | None = ...,
+    any_fit: bool = ...,
+    **settings: Any,
 ) -> LinearController: ...
 @overload
-def design_controller(kind: str, plant: Any, *, any_fit: bool = ..., **settings: Any) -> Any: ...
-def design_controller(kind: str, plant: Any, *, any_fit: bool = False, **settings: Any) -> Any:
+def design_controller(
+    kind: str, plant: Any, *, robot: Robot | str | Path | None = ..., any_fit: bool = ..., **settings: Any
+) -> Any: ...
+def design_controller(
+    kind: str, plant: Any, *, robot: Robot | str | Path | None = None, any_fit: bool = False, **settings: Any
+) -> Any:
     """Return the controller of `kind` designed on `plant`; `settings` are those of the kind's settings class.
 
     Args:
         kind: name in the table of kinds: "pi", "pid", "hinf", "mpc", ...
         plant: an identified linear model, a family, the file of one, or a list whose first entry is the nominal plant.
+        robot: whose limits count, itself, a preset or its file; None: those that the plant says.
         any_fit: design on models too whose free run on the rows held out fits less than 30 %.
         **settings: for instance `phase_margin=1.05`; angles in rad.
 
@@ -60,11 +80,13 @@ def design_controller(kind: str, plant: Any, *, any_fit: bool = False, **setting
         'pi'
     """
     made = make_settings(resolve(find_kind(kind, "controller").settings), settings)
-    plants = [linear_plant(one, any_fit=any_fit) for one in (plant if isinstance(plant, list | tuple) else [plant])]
-    return made.design(plants[0] if len(plants) == 1 else plants)
+    several = list(plant) if isinstance(plant, list | tuple) else [plant]
+    plants = [linear_plant(one, any_fit=any_fit, robot=robot) for one in several]
+    given = plants[0] if len(plants) == 1 else plants
+    return made.design(given) if robot is None else made.design(given, robot=robot)
 
 
-def linear_plant(thing: Any, *, any_fit: bool, robot: str | None = None) -> Any:
+def linear_plant(thing: Any, *, any_fit: bool, robot: Robot | str | Path | None = None) -> Any:
     """Return what is designed on: a model or family, or that of a file.
 
     Raises:

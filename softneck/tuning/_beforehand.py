@@ -10,6 +10,7 @@ import numpy as np
 from softneck.core import SettingsError
 from softneck.design.linear._axis_settings import axis_test
 from softneck.design.linear._loop_settings import LoopSettings
+from softneck.design.linear._ports import ControllerLimits
 from softneck.design.linear._rise import least_rise
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.estimation import AxisPlant
@@ -29,7 +30,7 @@ def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
         plant: whatever `uncertain_plant` takes.
     """
     uncertain = uncertain_plant(plant)
-    limits = LoopSettings().of_robot(uncertain)
+    limits = LoopSettings().limits(uncertain.robot)
     _refuse_quiet(asked)
     for name in uncertain.names:
         nominal = uncertain.axis(name).nominal
@@ -44,9 +45,9 @@ def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
 def quickest(plant: Any) -> float:
     """Return the least `rise_s` [s] that designs on a plant take; 0 where the motors do not reach their test step."""
     uncertain = uncertain_plant(plant)
-    limits = LoopSettings().of_robot(uncertain)
+    limits = LoopSettings().limits(uncertain.robot)
     found = [
-        least_rise(axis, axis_test(axis, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1]))
+        least_rise(axis, axis_test(axis, limits, uncertain.redefinition[1]))
         for axis in (uncertain.axis(name).nominal for name in uncertain.names)
     ]
     return max((least for least in found if math.isfinite(least)), default=0.0)
@@ -55,11 +56,14 @@ def quickest(plant: Any) -> float:
 def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
     """Return the rise [s] that is asked of a neck by default: of the slowest axis; None where no step is reached."""
     uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
-    limits, size = LoopSettings().of_robot(uncertain), asked.certificate.si(float(asked.certificate.neck["size_deg"]))
+    limits, size = (
+        LoopSettings().limits(uncertain.robot),
+        asked.certificate.si(float(asked.certificate.neck["size_deg"])),
+    )
     found = []
     for name in uncertain.names:
         axis = uncertain.axis(name)
-        test = axis_test(axis.nominal, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1])
+        test = axis_test(axis.nominal, limits, uncertain.redefinition[1])
         latest = max((plant.delay + 1) * plant.sample_time for plant in (axis.nominal, *axis.samples))
         least = least_rise(axis.nominal, test, size)
         found.append(usual_rise(least, latest) if math.isfinite(least) else math.inf)
@@ -95,10 +99,10 @@ def _refuse_quiet(asked: TuneRequirements) -> None:
 
 
 def _refuse_rise(
-    asked: TuneRequirements, uncertain: UncertainPlant, limits: LoopSettings, name: str, plant: AxisPlant
+    asked: TuneRequirements, uncertain: UncertainPlant, limits: ControllerLimits, name: str, plant: AxisPlant
 ) -> None:
     """Refuse a rise that slew and range cannot give, however the motors are led."""
-    test = axis_test(plant, limits.limits(uncertain.robot), limits.redefinition(uncertain)[1])
+    test = axis_test(plant, limits, uncertain.redefinition[1])
     for metric in _RISES:
         limit = asked.wanted(metric)
         if limit is None:
@@ -132,7 +136,7 @@ def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None
 
 
 def _refuse_turn(
-    asked: TuneRequirements, uncertain: UncertainPlant, limits: LoopSettings, name: str, plant: AxisPlant
+    asked: TuneRequirements, uncertain: UncertainPlant, limits: ControllerLimits, name: str, plant: AxisPlant
 ) -> None:
     """Refuse a circle whose first harmonic slew and range of the motors cannot give.
 
@@ -141,9 +145,8 @@ def _refuse_turn(
     if not asked.certificate.robot.is_neck:
         return
     size, turn = asked.track["circle_deg"], asked.track["circle_rad_s"]
-    motors = limits.limits(uncertain.robot)
-    share = float(np.abs(limits.redefinition(uncertain)[1][:, uncertain.names.index(name)]).max())
-    most = 4.0 / math.pi * min(motors.position_limit, motors.slew_limit / turn) / share
+    share = float(np.abs(uncertain.redefinition[1][:, uncertain.names.index(name)]).max())
+    most = 4.0 / math.pi * min(limits.position_limit, limits.slew_limit / turn) / share
     reached = math.degrees(most * float(np.abs(plant.response(np.array([turn])))[0]))
     # Of one output alone; a sine has its amplitude over the root of two.
     least = (size - reached) / math.sqrt(2.0)

@@ -12,6 +12,7 @@ import numpy as np
 
 from softneck.core import KINDS, SettingsError, Vector, resolve
 from softneck.core._kinds import kinds_of
+from softneck.design.linear._axis_settings import AxisSettings
 
 #: Kinds that are searched where nobody names any; `nmpc` needs a nonlinear model of its own and minutes.
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "lqg", "adaptive", "mpc")
@@ -68,7 +69,8 @@ _ROOM = 1.03
 # same from 0.4 to 1.5, and the neck itself overshoots by 2 % at 0.4 and 0.6, by 7 % at 0.8, by 20 % at 1.5; at 0.4 it
 # is slow (0.42 to 0.48 s).
 _LEAD = 0.6
-_LEADING = Dimension("reference_lead", 0.2, 2.5, 1.0)
+# The second number of `reference_time`.
+_LEADING = Dimension("lead", 0.2, 2.5, 1.0)
 # These plan with it.
 _PLANNED = {kind: Dimension("lead_limit", 0.4, 2.0, 0.8) for kind in ("mpc", "nmpc")}
 
@@ -100,7 +102,11 @@ class Space:
 
     def settings(self, x: Vector) -> dict[str, Any]:
         """Return the settings at a point of the cube."""
-        searched = {item.name: item.value(float(part)) for item, part in zip(self.dimensions, x, strict=True)}
+        searched: dict[str, Any] = {
+            item.name: item.value(float(part)) for item, part in zip(self.dimensions, x, strict=True)
+        }
+        if _LEADING.name in searched:
+            searched["reference_time"] = [searched["reference_time"], searched.pop(_LEADING.name)]
         return {**self.fixed, **searched}
 
 
@@ -132,11 +138,12 @@ def spaces(
                 if kind in kinds_of("controller")
                 else f"unknown kind of controller `{kind}`; use some of {', '.join(_OWN)}."
             )
-        names = {item.name for item in dataclasses.fields(resolve(KINDS[kind].settings))}
+        settings = resolve(KINDS[kind].settings)
+        names = {_LEADING.name, *(item.name for item in dataclasses.fields(settings))}
         speed: tuple[Dimension, ...] = (
             Dimension("rise_s", max(0.3 * rise, _ROOM * least), 1.2 * rise, max(_AIM * rise, _ROOM**2 * least)),
         )
-        if "reference_lead" in names:
+        if issubclass(settings, AxisSettings):
             # A step is led into the motors' limits at once, and a circle is followed the closer.
             speed = (Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), _LEADING)
         wanted = (*speed, *_OWN[kind], *((_PLANNED[kind],) if neck and kind in _PLANNED else ()))

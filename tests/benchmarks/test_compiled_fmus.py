@@ -109,7 +109,7 @@ _KINDS = {
     "observer (kalman)": _Kind(make=lambda: KalmanSettings().design(bake_off_neck()).block()),
     "pi": _Kind(make=lambda: PiSettings().design(bake_off_neck()).block()),
     "fopi": _Kind(make=lambda: FopiSettings().design(bake_off_neck()).block()),
-    "hinf": _Kind(make=lambda: HinfSettings(bandwidth=4.0, gain_spread=0.0).design(bake_off_neck()).block()),
+    "hinf": _Kind(make=lambda: HinfSettings(bandwidth=4.0).design(bake_off_neck()).block()),
     "mpc, 30 unknowns": _Kind(
         make=lambda: MpcSettings(bandwidth=8.0, lead_limit=12.0).design(bake_off_neck()).block(), wanted=30.0
     ),

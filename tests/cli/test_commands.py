@@ -247,7 +247,7 @@ def test_the_doctor_tells_of_every_dependency(call: Call) -> None:
     assert {"numpy", "numba", "scipy", "control", "pythonfmu"} <= asked
     assert all(states[name] == "ok" for name in ("python", *asked, "pythonfmu binary"))
     printed = call("doctor").out
-    assert all(f"extra {name}" in printed for name in ("slycot", "dask"))
+    assert "extra dask" in printed
 
 
 def test_the_doctor_fails_when_something_is_missing(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from ..data import neck_recording
 Call = Callable[..., Any]
 SETTINGS = {
     "hinf": "bandwidth=3.0",
-    "lqg": "load_rate=10.0",
+    "lqg": "control_weight=0.2",
     "pid": "max_sensitivity=1.8",
     "fopi": "phase_margin_deg=75",
 }
@@ -49,11 +49,15 @@ def test_it_designs_every_kind(kind: str, models: list[str], call: Call) -> None
     [
         (("pi", "m0.npz", "--observer", "m0.npz"), "`--observer` is for mpc and nmpc, and pi does not ask for it"),
         (("mpc", "m0.npz", "--observer", "m0.npz"), "m0.npz: is a model (rls), not an observer"),
-        (("lqg", "m0.npz", "--set", "sample_time=0.01"), "`sample_time` is for continuous plants"),
+        (
+            ("lqg", "m0.npz", "--set", "sample_time=0.01"),
+            "`sample_time` is the robot's: robot.toml says it, `sample_time_s`",
+        ),
+        (("pi", "m0.npz", "--set", "position_limit=5"), "`[motors] setpoint_min and setpoint_max`"),
         (("hinf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),
         (("custom", "m0.npz"), "`controller` must be a control.StateSpace"),
         (("switched", "m0.npz"), "kind `switched` was removed after softneck 0.2.0"),
-        (("pid", "m0.npz", "--set", "tuning=placement", "--set", "frequency=3"), "take another `frequency`"),
+        (("pid", "m0.npz", "--set", "tuning=placement"), "unknown setting `tuning`"),
     ],
 )
 def test_it_says_what_to_do(words: tuple[str, ...], message: str, models: list[str], call: Call) -> None:

@@ -6,14 +6,12 @@ import sys
 import tomllib
 from pathlib import Path
 
-import control
 import pytest
 
 from softneck.cli import _new
 from softneck.cli._main import run
 from softneck.core import SettingsError, _errors
 from softneck.core._errors import EXTRAS, missing_extra
-from softneck.design import mixsyn
 from softneck.signals import write_recording
 from softneck.signals.importing.formats._mat import mat_arrays
 
@@ -60,12 +58,6 @@ def test_a_new_project_says_how_its_test_runs(
     said = capsys.readouterr().out
     assert "python identify.py && python design.py && softneck simulate loop.toml\n" in said
     assert ("pip install pytest" in said) != there
-
-
-def test_a_function_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_errors, "find_spec", lambda _: None)
-    with pytest.raises(SettingsError, match=r"slycot is not installed.*pip install 'slycot>="):
-        mixsyn(control.tf([1.0], [1.0, 1.0]), 1.0, 0.1, None, method="slycot")
 
 
 def test_what_the_design_card_names_is_installed_with_softneck() -> None:

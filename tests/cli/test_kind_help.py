@@ -44,8 +44,8 @@ def test_a_default_is_shown_as_set_takes_it(call: Call) -> None:
 def test_a_kind_s_own_word_on_a_setting_goes_before_the_inherited_one() -> None:
     rows = {name: meaning for name, _, meaning in settings_of(resolve(KINDS["pi"].settings))}
     adaptive = {name: meaning for name, _, meaning in settings_of(resolve(KINDS["adaptive"].settings))}
-    assert adaptive["small_move_pole"] != rows["small_move_pole"]
-    assert adaptive["small_move_pole"] == meanings_in(resolve(KINDS["adaptive"].settings).__doc__)["small_move_pole"]
+    assert adaptive["max_sensitivity"] != rows["max_sensitivity"]
+    assert adaptive["max_sensitivity"] == meanings_in(resolve(KINDS["adaptive"].settings).__doc__)["max_sensitivity"]
     assert rows["rise_s"].startswith("time [s] in which a step")
 
 

@@ -119,7 +119,7 @@ def test_fmus_and_pages_of_a_tank(call: Call, log: Path, tmp_path: Path) -> None
 @pytest.mark.slow
 def test_the_page_of_a_loop_has_a_panel_for_each_output_in_its_unit(call: Call, tmp_path: Path) -> None:
     plant(BELLOWS, gain=1e-7, rest=0.03).save(tmp_path / "m.npz")
-    assert call("design", "pi", "m.npz", "-o", "c.npz", "--set", "slew_limit=10", "--any-fit").code == 0
+    assert call("design", "pi", "m.npz", "-o", "c.npz", "--any-fit").code == 0
     (tmp_path / "loop.toml").write_text(
         'duration_s = 2.0\nplant = { model = "m.npz" }\ncontroller = { file = "c.npz" }\n'
         '[reference]\nkind = "step"\nx = 41.0\ny = 43.0\nz = 49.0\n'

@@ -14,11 +14,12 @@ from scipy.linalg import null_space
 from scipy.optimize import linprog
 
 from softneck.core import SettingsError, load, read_archive, write_archive
-from softneck.design import LinearController, PiSettings
+from softneck.design import ControllerLimits, LinearController, PiSettings
 from softneck.robot._redefined import redefinition_of
 from softneck.runtime import load_functions
 from softneck.signals import redefinition_matrix
 
+from ..oracles.bake_off import neck_within
 from ..oracles.neck_table import NeckSteps, neck_step
 from .test_neck_table import neck
 
@@ -215,9 +216,8 @@ def test_any_robot_gives_away_no_more_tilt_than_a_linear_program(
 
 
 def pi(*, least_position: float = -6.0, least_cocontraction: float = -6.0) -> LinearController:
-    return PiSettings(
-        lead_limit=0.8, reference_time=0.12, least_position=least_position, least_cocontraction=least_cocontraction
-    ).design(neck())
+    settings = PiSettings(lead_limit=0.8, reference_time=0.12, least_cocontraction=least_cocontraction)
+    return settings.design(neck(), robot=neck_within(lowest=least_position))
 
 
 def test_a_least_cocontraction_keeps_tendons_taut_under_a_payload_that_slackens_them() -> None:
@@ -263,4 +263,4 @@ def test_files_of_before_the_rule_are_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["least_position", "least_cocontraction"])
 def test_a_rule_that_leaves_no_room_is_refused(name: str) -> None:
     with pytest.raises(SettingsError, match=rf"`{name}` must be below `position_limit`, 2 rad"):
-        replace(PiSettings(position_limit=2.0), **{name: 2.5}).limits()
+        replace(ControllerLimits(position_limit=2.0), **{name: 2.5})

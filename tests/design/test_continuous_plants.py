@@ -27,8 +27,11 @@ from softneck.design import (
 from softneck.design.plants._coupled import coupled_plant
 from softneck.estimation import LinearNeck
 
+from .test_coupled_plants import within
+
 TS = 0.02
 LIMITS: dict[str, Any] = {"position_limit": 6.0, "slew_limit": 12.0}
+ROBOT = within(3, 2)
 # The paper's own (Eq. 31), without its dead time.
 NECK = control.TransferFunction([math.radians(27.691)], [1.0, 5.293])
 # Three inputs, two outputs, each moved by all.
@@ -69,14 +72,18 @@ def test_a_neck_of_ones_own_is_designed_as_what_is_held(settings: Any) -> None:
 
 @pytest.mark.parametrize(
     "settings",
-    [LqgSettings(**LIMITS), MpcSettings(**LIMITS, bandwidth=4.0)],
+    [LqgSettings(), MpcSettings(**LIMITS, bandwidth=4.0)],
     ids=["lqg", "mpc"],
 )
 @pytest.mark.parametrize("period", [None, 0.01])
 def test_plants_of_any_size_are_reached_in_continuous_time(settings: Any, period: float | None, tmp_path: Path) -> None:
     """The controller's file around the differential equation, looked at ten times between samples; a load half way."""
-    controller = replace(settings, sample_time=period).design(LAGS)
-    same(controller, settings.design(stepped(LAGS, period or TS)))
+    if isinstance(settings, MpcSettings):
+        controller = replace(settings, sample_time=period).design(LAGS)
+        same(controller, settings.design(stepped(LAGS, period or TS)))
+    else:
+        controller = settings.design(LAGS, robot=replace(ROBOT, sample_time_s=period))
+        same(controller, settings.design(stepped(LAGS, period or TS), robot=ROBOT))
     controller.save(tmp_path / "k.npz")
     block = load(tmp_path / "k.npz").block()
     assert block.sample_time == (period or TS)
@@ -94,39 +101,27 @@ def test_plants_of_any_size_are_reached_in_continuous_time(settings: Any, period
     assert (largest <= 1.08 * asked).all()
 
 
-def test_a_dead_time_is_as_stated() -> None:
-    """In seconds by `least_delay`: as many samples as those that a discrete plant has as poles at zero."""
-    late: Any = control.ss(control.TransferFunction([1.0], [1.0, 0.0, 0.0, 0.0], TS))
-    controller = LqgSettings(**LIMITS, least_delay=3 * TS).design(LAGS)
-    whole = LqgSettings(**LIMITS).design(stepped(LAGS, TS) * control.append(late, late, late))
-    z = np.exp(1j * np.array([0.3, 3.0, 30.0]) * TS)
-    # In states of another basis: two Riccati equations.
-    np.testing.assert_allclose(controller.ss()(z), whole.ss()(z), rtol=1e-6, atol=1e-8)
-    assert controller.design["output_1"]["dead_time_s"] == pytest.approx(3 * TS)
-
-
 def test_a_controller_of_ones_own_says_how_often_it_runs() -> None:
     """The plant is held at its sample time, and the loop is that of the discrete plant."""
     G = stepped(LAGS, 0.01)
     K: Any = mixsyn(G, makeweight(10.0, 1.0, 0.5), 0.5).controller
     whole: Any = coupled_plant(G)
     mine = control.StateSpace(K.A, K.B, whole.own_redefinition[0][:2] @ K.C, whole.own_redefinition[0][:2] @ K.D, 0.01)
-    same(*(CustomSettings(controller=mine, **LIMITS).design(plant) for plant in (LAGS, G)))
+    same(*(CustomSettings(controller=mine).design(plant, robot=ROBOT) for plant in (LAGS, G)))
     with pytest.raises(SettingsError, match=r"runs every 0.01 s, the plant every 0.02 s"):
-        CustomSettings(controller=mine, sample_time=TS, **LIMITS).design(LAGS)
+        CustomSettings(controller=mine).design(stepped(LAGS, TS), robot=ROBOT)
 
 
 @pytest.mark.parametrize(
     ("settings", "plant", "error", "message"),
     [
-        (LqgSettings(sample_time=0.01), stepped(NECK, TS), SettingsError, "`sample_time` is for continuous plants"),
         (PiSettings(), control.TransferFunction([1.0, 1.0, 1.0], [1.0, 2.0]), SettingsError, "must be proper"),
         (MpcSettings(), control.TransferFunction([1.0, 1.0], [1.0, 2.0]), DataError, "strictly proper"),
-        (LqgSettings(**LIMITS), control.StateSpace(np.eye(3), np.eye(3), np.eye(3)[:2], np.zeros((2, 3))),
+        (LqgSettings(), control.StateSpace(np.eye(3), np.eye(3), np.eye(3)[:2], np.zeros((2, 3))),
          SettingsError, r"not stable \(spectral radius 1.0202\)"),
-        (LqgSettings(**LIMITS), control.StateSpace(np.diag([-1.0, -math.inf]), np.eye(2), np.eye(2), 0.0),
+        (LqgSettings(), control.StateSpace(np.diag([-1.0, -math.inf]), np.eye(2), np.eye(2), 0.0),
          SettingsError, "not finite"),
-        (LqgSettings(**LIMITS), control.StateSpace(LAGS.A, LAGS.B, LAGS.C, 0.0, None), SettingsError,
+        (LqgSettings(), control.StateSpace(LAGS.A, LAGS.B, LAGS.C, 0.0, None), SettingsError,
          "its dt is None. Give"),
         (AdaptiveSettings(), LinearNeck(NECK, NECK), SettingsError, "must be discrete; its dt is 0"),
     ],
@@ -136,7 +131,7 @@ def test_what_cannot_be_is_one_line(settings: Any, plant: Any, error: Any, messa
         settings.design(plant)
 
 
-@pytest.mark.parametrize("kind", [PiSettings, LqgSettings, MpcSettings])
+@pytest.mark.parametrize("kind", [MpcSettings])
 def test_sample_times_are_positive(kind: Any) -> None:
     with pytest.raises(SettingsError, match=r"`sample_time` must be positive.*got 0"):
         kind(sample_time=0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,10 @@ from softneck.design.plants._coupled import CoupledPlant, coupled_plant
 from softneck.design.plants._coupled_axis import closed, responses, times
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.robot import Robot
 from softneck.signals import redefinition_matrix, signal
 
-from ..oracles.bake_off import bake_off_plant
+from ..oracles.bake_off import bake_off_plant, exact
 
 TS = 0.02
 LIMITS: dict[str, Any] = {"position_limit": 6.0, "slew_limit": 12.0}
@@ -34,6 +36,16 @@ def plant(inputs: int, outputs: int, *, late: int = 2, seed: int = 0) -> control
     lags = control.StateSpace(np.diag(poles), (1.0 - poles)[:, None] * B, C, np.zeros((outputs, inputs)), TS)
     line: Any = control.ss(control.TransferFunction([1.0], [1.0, *[0.0] * late], TS))
     return lags * control.append(*[line] * inputs)
+
+
+def within(inputs: int, outputs: int) -> Robot:
+    """Return a robot of so many channels with limits, whose directions nobody knows."""
+    return Robot.from_dict({
+        "name": "plant", "directions": {"kind": "identified"},
+        "motors": {"names": [f"p{j}" for j in range(inputs)], "unit": "1", "setpoint_min": -6, "setpoint_max": 6,
+                   "rate_limit": 12},
+        "outputs": {"names": [f"output_{i + 1}" for i in range(outputs)], "unit": "1"},
+    })  # fmt: skip
 
 
 def taken(G: Any, **more: Any) -> CoupledPlant:
@@ -65,8 +77,9 @@ def test_a_plants_rows_answer_as_it_does(inputs: int, outputs: int) -> None:
 
 def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
     """One filter and one regulator for two axes that do not touch are those of each axis."""
-    settings = LqgSettings(load_rate=3.0, reference_time=0.2)
-    each, whole = settings.design(neck()), settings._whole(taken(neck(), asked=True))
+    gains = (1.0, 1.0)  # so that both axes of the searches end at the same filter
+    settings = LqgSettings(reference_time=0.2)
+    each, whole = settings.design(exact(neck(gains))), settings._whole(taken(neck(gains), asked=True))
     z = np.exp(1j * np.array([0.3, 3.0, 30.0]) * TS)
     # Riccati equations of twice the order.
     np.testing.assert_allclose(whole.ss()(z), each.ss()(z), rtol=1e-7, atol=1e-9)
@@ -79,14 +92,16 @@ def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
 @pytest.mark.parametrize(("inputs", "outputs"), SIZES)
 @pytest.mark.parametrize(
     "settings",
-    [LqgSettings(**LIMITS), pytest.param(MpcSettings(**LIMITS, bandwidth=4.0), marks=pytest.mark.slow)],
+    [LqgSettings(), pytest.param(MpcSettings(**LIMITS, bandwidth=4.0), marks=pytest.mark.slow)],
     ids=["lqg", "mpc"],
 )
 def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, outputs: int, tmp_path: Path) -> None:
     G: Any = plant(inputs, outputs, seed=1)
     G = control.StateSpace(G.A, G.B, G.C, G.D, TS, inputs=[f"p{j}" for j in range(inputs)],
                            outputs=[f"y{i}" for i in range(outputs)])  # fmt: skip
-    controller = settings.design(G)
+    robot = within(inputs, outputs)
+    robot = replace(robot, outputs=replace(robot.outputs, names=tuple(G.output_labels)))
+    controller = settings.design(G, robot=robot) if isinstance(settings, LqgSettings) else settings.design(G)
     controller.save(tmp_path / "k.npz")
     block = load(tmp_path / "k.npz").block()
     assert [port.name for port in block.outputs] == [f"motor_setpoint_{j + 1}" for j in range(inputs)]
@@ -109,7 +124,7 @@ def test_a_coupled_design_holds_where_one_for_each_axis_does_not() -> None:
     """Axes that turn into each other by as much as they move themselves."""
     G, settings = neck((1.0, 1.0), across=1.0), LqgSettings()
     whole, apart = settings.design(G), settings.design({"pitch": G[0, 0], "roll": G[1, 1]})
-    # What `lqg` asks of a step of each reference, some of it for the gains within `gain_spread`; the other swings.
+    # What `lqg` asks of a step of each reference, some of it for the spread of gains; the other swings.
     assert largest(whole, G) < 1.06
     assert largest(apart, G) > 1.3
 
@@ -127,18 +142,18 @@ def largest(controller: Any, G: Any) -> float:
     return most
 
 
-@pytest.mark.parametrize("more", [{"rise_s": 1.2}, {"rise_s": 1.2, "order": "jacobi"}, {"overshoot_pct": 1.0}])
+@pytest.mark.parametrize("more", [{"rise_s": 1.2}, {"rise_s": 1.2, "order": "jacobi"}, {}])
 def test_steps_are_as_they_were_asked_for(more: dict[str, Any]) -> None:
     """The slowest output's rise, or what the worst sample overshoots by, on the plant with the delay of its loop."""
     G = plant(3, 2, seed=2)
-    controller = LqgSettings(**LIMITS, **more).design(G)
+    controller = LqgSettings(**more).design(G, robot=within(3, 2))
     late = 2 if "order" in more else 0
     asked = [step_of(controller, taken(G), gain, late) for gain in (1.0, 0.8, 1.2)]
     if "rise_s" in more:
         # The filter is found to a millionth.
         assert max(rise_time(y, TS) for y in asked[0].T) == pytest.approx(1.2, rel=1e-3)
     else:
-        assert max(float(y.max()) for y in asked) <= 1.01
+        assert max(float(y.max()) for y in asked) <= 1.04
 
 
 def step_of(controller: Any, G: CoupledPlant, gain: float, late: int) -> np.ndarray:
@@ -158,13 +173,13 @@ def test_a_controller_of_ones_own_is_taken_with_its_plant() -> None:
     # K of u = K e in the plant's inputs is T K in its redefined ones.
     K: Any = mixsyn(G, makeweight(10.0, 1.0, 0.5), 0.5).controller
     K = control.StateSpace(K.A, K.B, found.redefinition[0][:2] @ K.C, found.redefinition[0][:2] @ K.D, TS)
-    controller = CustomSettings(controller=K, **LIMITS).design(G)
+    controller = CustomSettings(controller=K).design(G, robot=within(3, 2))
     z = np.exp(1j * np.array([0.3, 3.0]) * TS)
     np.testing.assert_allclose(controller.ss()(z)[:, :2], K(z), rtol=1e-9)
     with pytest.raises(SettingsError, match="the loop is not stable around sample 0 of 1"):
-        CustomSettings(controller=K * 100.0, **LIMITS).design(G)
+        CustomSettings(controller=K * 100.0).design(G, robot=within(3, 2))
     with pytest.raises(SettingsError, match="need one `controller` of output_1 and output_2"):
-        CustomSettings(controller={"pitch": K[0, 0], "roll": K[1, 1]}, **LIMITS).design(G)
+        CustomSettings(controller={"pitch": K[0, 0], "roll": K[1, 1]}).design(G, robot=within(3, 2))
 
 
 @pytest.fixture(scope="module")
@@ -175,13 +190,11 @@ def mimo() -> Any:
     )
 
 
-@pytest.mark.parametrize(
-    "settings", [LqgSettings(coupled=True), MpcSettings(coupled=True, bandwidth=5.0)], ids=["lqg", "mpc"]
-)
+@pytest.mark.parametrize("settings", [LqgSettings(), MpcSettings(bandwidth=5.0)], ids=["lqg", "mpc"])
 def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, mimo: Any) -> None:
-    controller = settings.design(mimo)
+    controller = settings.design(mimo.ss())
     plants = taken(mimo, asked=True).own_rows
-    late = tuple(row.delayed(settings.least_delay) for row in plants)
+    late = tuple(row.delayed(0.08 if isinstance(settings, LqgSettings) else settings.least_delay) for row in plants)
     made = controller.ss()
     A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)
     assert np.abs(np.linalg.eigvals(A)).max() < 1.0
@@ -230,7 +243,7 @@ UNSTABLE = control.StateSpace(np.diag([1.1, 0.5, 0.5]), np.ones((3, 3)), np.ones
         (plant(1, 2), "1 input.s. cannot bring 2 output.s. to references of their own: they are too few"),
         (plant(3, 2) * 0.0, "`output_1` answers to none of them at rest"),
         (plant(9, 2), "`motors.names` must hold 1 to 8 names; got 9"),
-        (plant(3, 2), "gives no `motors.setpoint_min` and `setpoint_max`.*or give `position_limit` in 1"),
+        (plant(3, 2), "gives no `motors.setpoint_min` and `setpoint_max`"),
         (control.StateSpace(0.5 * np.eye(2), np.ones((2, 3)), np.eye(2), np.ones((2, 3)), TS), "strictly proper"),
     ],
 )
@@ -244,4 +257,4 @@ def test_other_kinds_say_who_takes_it() -> None:
     with pytest.raises(SettingsError, match="`lqg`, `mpc` and `custom` take systems of any size"):
         PidSettings().design(plant(3, 2))
     with pytest.raises(SettingsError, match="`coupled` needs one model with a state space"):
-        LqgSettings(coupled=True).design([neck()])
+        MpcSettings(coupled=True).design([neck()])

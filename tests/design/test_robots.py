@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from softneck import identify, load, record
-from softneck.core import SettingsError
+from softneck.core import DataError, SettingsError
 from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
 from softneck.design import MpcSettings, PiSettings, design_controller
@@ -34,6 +34,7 @@ BELLOWS = Robot.from_dict({
     "outputs": {"names": ["x", "y", "z"], "unit": "mm", "min": 40, "max": 60},
     "directions": {"kind": "identified"},
 })  # fmt: skip
+SLOW = replace(BELLOWS, motors=replace(BELLOWS.motors, rate_limit=(10.0,) * 4))
 LEARNED = np.array([[0.8, -0.6, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0], [0.5, 0.5, 0.5, 0.5]])
 KINDS = ("pi", "pid", "fopi", "hinf", "lqg")
 
@@ -122,7 +123,7 @@ def test_a_reference_is_known_ahead_by_the_outputs_of_its_robot() -> None:
 @pytest.mark.slow
 def test_three_lengths_of_four_chambers_in_bar_and_mm() -> None:
     model = plant(BELLOWS, gain=1e-7, rest=0.03)
-    controller = design_controller("pi", model, slew_limit=10.0)
+    controller = design_controller("pi", model, robot=SLOW)
     assert "set-points 0 to 3 bar, slew 10 bar/s" in controller.summary()
     result = closed(model, controller, duration=6.0, x=41.0, y_mm=43.0, z=49.0, at_s=0.0, cocontraction=1.0)
     for name in ("x", "y", "z"):
@@ -139,15 +140,16 @@ def test_limits_come_from_the_robot_file_and_what_is_missing_is_asked_for() -> N
     del table["motors"]["rate_limit"]
     model = plant(Robot.from_dict(table))
     with pytest.raises(
-        SettingsError, match=r"robot `antagonist` .* gives no `motors.rate_limit`.*or give `slew_limit`"
+        SettingsError, match=r"robot `antagonist` .* gives no `motors.rate_limit`.* add it to its robot"
     ):
         PiSettings().design(model)
-    limits = PiSettings(slew_limit=3.0, position_limit=4.0).design(model).limits
-    assert (limits.slew_limit, limits.position_limit) == (3.0, 4.0)
+    table["motors"] |= {"rate_limit": [3.0, 3.0], "setpoint_min": [-4.0, -4.0], "setpoint_max": [4.0, 4.0]}
+    limits = PiSettings().design(model, robot=Robot.from_dict(table)).limits
+    assert (limits.slew_limit, limits.position_limit, limits.lead_limit) == (3.0, 4.0, 8.0)
     # The neck's own numbers given on purpose are given: only its defaults say nothing of others.
-    assert PiSettings(slew_limit=12.5, lead_limit=0.4).design(model).limits.lead_limit == 0.4
-    with pytest.raises(SettingsError, match="`tendon_angles` are of necks"):
-        PiSettings(slew_limit=3.0, tendon_angles=(0.0, 2.0, 4.0)).design(model)
+    assert PiSettings(lead_limit=0.4).design(model, robot=Robot.from_dict(table)).limits.lead_limit == 0.4
+    with pytest.raises(DataError, match="the plant and `robot` of two robots"):
+        PiSettings().design(model, robot="finger")
 
 
 def test_a_loop_is_of_one_robot() -> None:
@@ -331,12 +333,12 @@ def test_a_controller_of_ones_own_is_named_by_the_robots_outputs() -> None:
     K = control.ss(control.tf([2e6, -1.9e6], [1.0, -1.0], TS))
     given = K.copy()
     given.update_names(inputs=["x_error"], outputs=["x_input"])
-    made: Any = design_controller("custom", model, controller={"x": given, "y": K, "z": K}, slew_limit=10.0)
+    made: Any = design_controller("custom", model, controller={"x": given, "y": K, "z": K}, robot=SLOW)
     assert made.robot.hash == BELLOWS.hash
-    pi = design_controller("pi", model, slew_limit=10.0)
+    pi = design_controller("pi", model, robot=SLOW)
     assert list(made.ss().input_labels) == list(pi.ss().input_labels)
     z = np.exp(1j * np.geomspace(0.5, 100.0, 10) * TS)
     for i in range(3):
         np.testing.assert_allclose(made.ss()(z)[i, 3 + i], -np.asarray(K(z)), rtol=1e-9)
     with pytest.raises(SettingsError, match="`controller` must be given for x and y and z; got pitch, roll"):
-        design_controller("custom", model, controller={"pitch": K, "roll": K}, slew_limit=10.0)
+        design_controller("custom", model, controller={"pitch": K, "roll": K}, robot=SLOW)

@@ -24,6 +24,7 @@ from softneck.design import (
     uncertain_plant,
 )
 from softneck.design.plants._step_and_load import StepAndLoad
+from softneck.design.plants._uncertain import UncertainPlant
 from softneck.estimation import LinearNeck
 from softneck.signals import redefinition_matrix
 
@@ -34,27 +35,31 @@ from ..oracles.bake_off import (
     bake_off_plants,
     bake_off_samples,
     block_stepper,
+    exact,
+    neck_within,
     run_bake_off,
 )
 
 TS = 0.02
-# The bake-off's samples are the uncertain plant; the motor that moves most has 2/3 of theta_i.
-TEST: dict[str, Any] = {
-    "least_delay": 0.0, "small_move_pole": 0.0, "lead_limit": 12.0, "position_limit": 4.0, "slew_limit": 25.0 / 3.0,
-}  # fmt: skip
+FAR = 12.0
 KINDS: dict[str, Any] = {
-    "pi": PiSettings(tuning="samples", max_sensitivity=3.0, phase_margin=0.4, **TEST),
-    "pid": PidSettings(max_sensitivity=3.0, **TEST),
-    "fopi": FopiSettings(max_sensitivity=3.0, **TEST),
-    "fopid": FopiSettings(max_sensitivity=3.5, derivative=0.1, **TEST),
-    "hinf": HinfSettings(max_sensitivity=3.0, **TEST),
-    "lqg": LqgSettings(max_sensitivity=3.0, **TEST),
+    "pi": PiSettings(tuning="samples", max_sensitivity=3.0, phase_margin=0.4, lead_limit=FAR),
+    "pid": PidSettings(max_sensitivity=3.0, lead_limit=FAR),
+    "fopi": FopiSettings(max_sensitivity=3.0, lead_limit=FAR),
+    "hinf": HinfSettings(max_sensitivity=3.0, lead_limit=FAR),
+    "lqg": LqgSettings(max_sensitivity=3.0, lead_limit=FAR),
 }
 
 
 @cache
+def samples() -> UncertainPlant:
+    """The bake-off's samples are the uncertain plant; the motor that moves most has 2/3 of theta_i."""
+    return exact(bake_off_samples(), robot=neck_within(4.0, 25.0 / 3.0))
+
+
+@cache
 def robust(kind: str) -> LinearController:
-    return KINDS[kind].design(bake_off_samples())
+    return KINDS[kind].design(samples())
 
 
 def loop_of(controller: LinearController, plant: Any) -> Any:
@@ -85,7 +90,7 @@ def test_the_worst_sensitivity_is_kept_and_is_what_it_says(kind: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", slow_but(["pid", "fopid", "hinf", "lqg"], ["pid", "hinf"]))
+@pytest.mark.parametrize("kind", slow_but(["pid", "hinf", "lqg"], ["pid", "hinf"]))
 def test_the_figures_of_the_bake_off_are_reached_from_the_file(kind: str, tmp_path: Path) -> None:
     robust(kind).save(tmp_path / "c.npz")
     row = run_bake_off(block_stepper(load(tmp_path / "c.npz", role="controller").block())).row
@@ -186,38 +191,17 @@ def test_a_design_of_a_control_system_equals_that_of_a_model() -> None:
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["riccati", "slycot"])
-def test_hinf_with_a_cover_proves_what_it_covers(method: str) -> None:
-    if method == "slycot":
-        pytest.importorskip("slycot")
-    samples = [bake_off_plant(k, p, d).tf() for k in (1.0, 0.9, 1.1) for p in (1.0, 0.9, 1.1) for d in (4, 5)]
-    settings = HinfSettings(cover=True, bandwidth=2.0, method=method, **TEST)
-    found = settings.design(samples).design["pitch"]
-    assert found["method"] == method
-    assert found["worst_sensitivity"] < 2.0
-
-
 @pytest.mark.parametrize(
     ("settings", "plant", "message"),
     [
-        (HinfSettings(cover=True, **TEST), bake_off_samples(), r"infeasible weights: .* spread by 133 %"),
-        (HinfSettings(max_sensitivity=1.1, **TEST), bake_off_samples(), "not even a bandwidth of"),
-        (HinfSettings(bandwidth=60.0, control_weight=1e-3, **TEST), bake_off_samples(), "not stable around"),
-        (LqgSettings(max_sensitivity=1.05, **TEST), bake_off_samples(), "not even a load_rate of"),
+        (HinfSettings(max_sensitivity=1.1), samples(), "not even a bandwidth of"),
+        (HinfSettings(bandwidth=60.0, control_weight=1e-3), samples(), r"samples \(the first is sample"),
+        (LqgSettings(max_sensitivity=1.05), samples(), "not even a filter of"),
         (FopiSettings(crossover=40.0), bake_off_neck(), "no integration order between 0 and 2"),
-        (LqgSettings(load_rate=1e4, control_weight=1e-4, **TEST), bake_off_samples(), r"samples \(the first is sample"),
-        (PidSettings(tuning="placement", frequency=4.0), bake_off_neck(), "need gains of both signs"),
-        (PidSettings(tuning="placement", frequency=16.0), bake_off_neck(), "a slower or unstable one remains"),
-        (PidSettings(max_sensitivity=1.05, noise_gain=0.1, **TEST), bake_off_samples(), "no PID keeps Ms"),
-        (PiSettings(tuning="placement", frequency=1.0), bake_off_neck(), "need gains of both signs"),
-        (HinfSettings(bandwidth=4.0, overshoot_pct=0.1, max_sensitivity=2.0), bake_off_neck(), None),
+        (PidSettings(max_sensitivity=1.05, noise_gain=0.1), samples(), "no PID keeps Ms"),
     ],
 )
-def test_no_solution_is_said_with_the_remedy(settings: Any, plant: Any, message: str | None) -> None:
-    if message is None:
-        settings.design(plant)
-        return
+def test_no_solution_is_said_with_the_remedy(settings: Any, plant: Any, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         settings.design(plant)
 
@@ -225,9 +209,8 @@ def test_no_solution_is_said_with_the_remedy(settings: Any, plant: Any, message:
 @pytest.mark.parametrize(
     ("kind", "field", "value"),
     [
-        (HinfSettings, "bandwidth", -1.0), (HinfSettings, "peak", 0.9), (HinfSettings, "method", "lmi"),
-        (LqgSettings, "control_weight", 0.0), (FopiSettings, "derivative_order", 2.0),
-        (PidSettings, "tuning", "luck"), (PidSettings, "noise_gain", 0.0), (PiSettings, "tuning", "luck"),
+        (HinfSettings, "bandwidth", -1.0), (HinfSettings, "control_weight", 0.0), (LqgSettings, "control_weight", 0.0),
+        (FopiSettings, "crossover", 0.0), (PidSettings, "noise_gain", 0.0), (PiSettings, "tuning", "luck"),
         (HinfSettings, "max_sensitivity", 1.0), (LqgSettings, "order", "x"),
     ],
 )  # fmt: skip

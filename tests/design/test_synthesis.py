@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import control
@@ -10,6 +11,8 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.design import hinfsyn, makeweight, mixsyn
+from softneck.design.robust import _synthesis
+from softneck.design.robust._synthesis import Synthesis
 
 from ..oracles.bake_off import bake_off_plant
 
@@ -20,6 +23,22 @@ DISCRETE: Any = PLANT.tf() / PLANT.static_gain
 LAG = control.TransferFunction([1.0], [1.0 / 5.293, 1.0])
 CONTINUOUS: Any = control.ss(LAG * control.TransferFunction(*control.pade(0.08, 3)))
 W1 = makeweight(1e4, 3.0, 0.6)
+
+
+def by_slycot(P: Any, nmeas: int, ncon: int, *, above: float = 1.05) -> Synthesis:
+    """Return what SLICOT's sb10ad, the routine behind python-control's `mixsyn`, makes of a continuous P."""
+    slycot = pytest.importorskip("slycot")
+    sizes = (P.nstates, P.ninputs, P.noutputs, ncon, nmeas)
+    gamma = float(slycot.sb10ad(*sizes, 1e6, P.A, P.B, P.C, P.D, job=1, gtol=1e-5)[0])
+    K = slycot.sb10ad(*sizes, above * gamma, P.A, P.B, P.C, P.D, job=4)[1:5]
+    return Synthesis(controller=control.StateSpace(*K, 0), gamma=gamma, achieved=math.nan)
+
+
+def mixsyn_by_slycot(*given: Any) -> Synthesis:
+    """Return `mixsyn` of the same generalised plant."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_synthesis, "hinfsyn", by_slycot)
+        return mixsyn(*given)
 
 
 def norm_of_mixed(G: Any, K: Any, weights: list[Any], points: int = 2000) -> float:
@@ -44,9 +63,7 @@ def norm_of_mixed(G: Any, K: Any, weights: list[Any], points: int = 2000) -> flo
 )
 @pytest.mark.parametrize("W3", [None, makeweight(0.3, 20.0, 5.0)], ids=["two", "three"])
 def test_our_riccati_synthesis_equals_slycot(plant: Any, W3: Any) -> None:
-    pytest.importorskip("slycot")
-    ours = mixsyn(plant, W1, 0.2, W3, method="riccati")
-    theirs = mixsyn(plant, W1, 0.2, W3, method="slycot")
+    ours, theirs = mixsyn(plant, W1, 0.2, W3), mixsyn_by_slycot(plant, W1, 0.2, W3)
     # Both searches end within 1e-4 of the least gamma.
     assert ours.gamma == pytest.approx(theirs.gamma, rel=3e-4)
     z = np.exp(1j * np.geomspace(1e-2, 100.0, 50) * TS) if plant.dt else 1j * np.geomspace(1e-2, 100.0, 50)
@@ -54,12 +71,9 @@ def test_our_riccati_synthesis_equals_slycot(plant: Any, W3: Any) -> None:
     np.testing.assert_allclose(ours.controller(z), theirs.controller(z), rtol=2e-2)
 
 
-@pytest.mark.parametrize("method", ["riccati", "slycot"])
 @pytest.mark.parametrize("plant", [DISCRETE, CONTINUOUS], ids=["exact_delay", "pade"])
-def test_the_norm_is_what_it_says(plant: Any, method: str) -> None:
-    if method == "slycot":
-        pytest.importorskip("slycot")
-    found = mixsyn(plant, W1, 0.2, method=method)
+def test_the_norm_is_what_it_says(plant: Any) -> None:
+    found = mixsyn(plant, W1, 0.2)
     size = norm_of_mixed(plant, found.controller, [W1, 0.2, None])
     # Built 5 % above gamma; two grids see the peak to 1e-3.
     assert found.gamma <= size * 1.001
@@ -69,7 +83,7 @@ def test_the_norm_is_what_it_says(plant: Any, method: str) -> None:
 
 def test_no_pi_does_better_than_gamma() -> None:
     """gamma is a bound below for every controller: PI controllers stay above it."""
-    gamma = mixsyn(DISCRETE, W1, 0.2, method="riccati").gamma
+    gamma = mixsyn(DISCRETE, W1, 0.2).gamma
     for gain in (0.3, 0.6, 0.9):
         for time in (0.1, 0.19, 0.4):
             pi: Any = control.TransferFunction([gain, gain * (TS / time - 1.0)], [1.0, -1.0], TS)
@@ -79,7 +93,7 @@ def test_no_pi_does_better_than_gamma() -> None:
 def test_a_known_optimum() -> None:
     """min over K of |K S|: any stable plant has 0; an unstable 1/(s - 1) needs |K S| >= 2 (Glover 1986)."""
     G = control.ss(control.TransferFunction([1.0], [1.0, -1.0]))
-    found = mixsyn(G, makeweight(1e-4, (1.0, 1e-5), 1e-6), 1.0, method="riccati")
+    found = mixsyn(G, makeweight(1e-4, (1.0, 1e-5), 1e-6), 1.0)
     # W1 of 1e-4 at most adds at most its square.
     assert found.gamma == pytest.approx(2.0, rel=1e-3)
 
@@ -94,13 +108,9 @@ def test_what_hangs_or_lies_is_refused_in_words() -> None:
     integrator = control.TransferFunction([1.0], [1.0, 0.0])
     slow = makeweight(0.1, 20.0, 3.0)
     strictly_proper = control.TransferFunction([1.0], [1.0, 1.0])
-    for method in ("riccati", "slycot"):
+    for given in ((DISCRETE, W1), (DISCRETE, W1, strictly_proper), (CONTINUOUS, W1, None, slow)):  # G itself falls off
         with pytest.raises(SettingsError, match="D12 has not full rank"):
-            mixsyn(DISCRETE, W1, method=method)
-        with pytest.raises(SettingsError, match="D12 has not full rank"):
-            mixsyn(DISCRETE, W1, strictly_proper, method=method)
-        with pytest.raises(SettingsError, match="D12 has not full rank"):
-            mixsyn(CONTINUOUS, W1, None, slow, method=method)  # G itself falls off
+            mixsyn(*given)
     with pytest.raises(SettingsError, match="W1 has an integrator"):
         mixsyn(DISCRETE, integrator, 0.2)
     with pytest.raises(SettingsError, match="W2 is not stable"):
@@ -129,7 +139,7 @@ def test_a_mode_that_no_input_reaches_is_no_solution() -> None:
     C = np.array([[1.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
     P = control.StateSpace(A, B, C, [[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]], 0)
     with pytest.raises(SettingsError, match="no controller exists"):
-        hinfsyn(P, 1, 1, method="riccati")
+        hinfsyn(P, 1, 1)
 
 
 def _with_measurements(scale: np.ndarray) -> control.StateSpace:
@@ -145,10 +155,9 @@ def _with_measurements(scale: np.ndarray) -> control.StateSpace:
 
 @pytest.mark.parametrize("D21", [[0.0, 3.0], [0.0, 0.2], [1.2, -0.7]], ids=["3", "0.2", "turned"])
 def test_measurement_noise_of_any_size_gives_slycots_controller(D21: list[float]) -> None:
-    pytest.importorskip("slycot")
     P: Any = _with_measurements(np.array([D21, [0.0, 0.0]]))
     P = control.StateSpace(P.A, P.B, P.C[:3], P.D[:3], 0)
-    ours, theirs = (hinfsyn(P, 1, 1, method=method) for method in ("riccati", "slycot"))
+    ours, theirs = (synthesis(P, 1, 1) for synthesis in (hinfsyn, by_slycot))
     # Both searches end within 1e-4 of the least gamma.
     assert ours.gamma == pytest.approx(theirs.gamma, rel=3e-4)
     s = 1j * np.geomspace(1e-2, 100.0, 30)
@@ -163,8 +172,8 @@ def test_other_units_of_a_measurement_and_of_the_input_change_the_controller_by_
     A, B, C, D = (np.array(part) for part in (P.A, P.B, P.C, P.D))
     C[2:], D[2:] = M @ C[2:], M @ D[2:]
     B[:, 3:], D[:, 3:] = B[:, 3:] * N, D[:, 3:] * N
-    plain = hinfsyn(P, 2, 1, method="riccati")
-    scaled = hinfsyn(control.StateSpace(A, B, C, D, 0), 2, 1, method="riccati")
+    plain = hinfsyn(P, 2, 1)
+    scaled = hinfsyn(control.StateSpace(A, B, C, D, 0), 2, 1)
     # The bisection passes through the same gammas; the rest is rounding of two Riccati equations.
     assert scaled.gamma == pytest.approx(plain.gamma, rel=1e-6)
     for s in 1j * np.geomspace(1e-2, 100.0, 10):
@@ -186,10 +195,9 @@ SIZES = [(2, 2, True), (2, 2, False), (3, 2, True), (1, 2, False), (3, 1, False)
 
 @pytest.mark.parametrize(("inputs", "outputs", "discrete"), SIZES)
 def test_mixsyn_of_any_size_equals_slycot(inputs: int, outputs: int, discrete: bool) -> None:
-    pytest.importorskip("slycot")
     plant = several(inputs, outputs, discrete=discrete)
     W1, W3 = makeweight(20.0, 1.0, 0.5), makeweight(0.3, 20.0, 5.0)
-    ours, theirs = (mixsyn(plant, W1, 0.5, W3, method=method) for method in ("riccati", "slycot"))
+    ours, theirs = (synthesis(plant, W1, 0.5, W3) for synthesis in (mixsyn, mixsyn_by_slycot))
     # Both searches end within 1e-4 of the least gamma.
     assert ours.gamma == pytest.approx(theirs.gamma, rel=3e-4)
     K = ours.controller
@@ -203,8 +211,8 @@ def test_mixsyn_of_two_plants_side_by_side_is_that_of_the_worse_one() -> None:
     """gamma of a diagonal problem is the larger of both: what is between the axes is nothing."""
     one, two = LAG, control.TransferFunction([2.0], [0.05, 1.0])
     W1 = makeweight(20.0, 1.0, 0.5)
-    apart = [mixsyn(plant, W1, 0.2, method="riccati").gamma for plant in (one, two)]
-    both = mixsyn(control.append(control.ss(one), control.ss(two)), W1, 0.2, method="riccati")
+    apart = [mixsyn(plant, W1, 0.2).gamma for plant in (one, two)]
+    both = mixsyn(control.append(control.ss(one), control.ss(two)), W1, 0.2)
     assert both.gamma == pytest.approx(max(apart), rel=3e-4)
 
 

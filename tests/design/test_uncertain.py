@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.design import makeweight, ucover, uncertain_plant
-from softneck.design.robust._bilinear import drawn_out, to_continuous, to_discrete
+from softneck.design import makeweight, uncertain_plant
+from softneck.design.robust._weights import drawn_out, to_continuous, to_discrete
 from softneck.estimation import LinearNeck
 from softneck.robot import Robot
 
-from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, bake_off_samples
+from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_samples
 
 TS = 0.02
 
@@ -143,26 +143,6 @@ def test_makeweight_says_what_it_cannot_do() -> None:
         makeweight(math.inf, 3.0, 0.5)
     with pytest.raises(SettingsError, match="below the Nyquist frequency"):
         makeweight(100.0, 200.0, 0.5, dt=TS)
-
-
-def test_ucover_covers_every_sample_closely() -> None:
-    samples = [plant.tf() for plant in bake_off_plants()]
-    nominal = bake_off_plant().tf()
-    W = ucover(samples, nominal)
-    assert W.dt == TS
-    z = np.exp(1j * np.geomspace(0.01, 0.99 * math.pi / TS, 700) * TS)
-    errors = np.array([np.abs(G(z) / nominal(z) - 1.0) for G in samples]).max(axis=0)
-    ratio = np.abs(W(z)) / errors
-    # The fit's grid is 10 % apart; the envelope has kinks where another sample takes over.
-    assert ratio.min() >= 0.995
-    # The delays make the envelope oscillate near the Nyquist frequency, where order 2 goes along its top.
-    assert np.median(ratio) <= 1.25
-    with pytest.raises(DataError, match="all alike"):
-        ucover([nominal, nominal])
-    with pytest.raises(DataError, match="needs samples"):
-        ucover([])
-    with pytest.raises(SettingsError, match=r"sample 1 has dt = 0.01"):
-        ucover([nominal, tf(dt=0.01)])
 
 
 def test_a_list_of_models_is_their_samples() -> None:

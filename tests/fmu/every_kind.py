@@ -152,24 +152,24 @@ def _adaptive() -> Block:
 
 
 def _hinf() -> Block:
-    return HinfSettings(bandwidth=4.0, gain_spread=0.0).design(_linear()).block()
+    return HinfSettings(bandwidth=4.0).design(_linear()).block()
 
 
 def _pid() -> Block:
-    return PidSettings(tuning="placement", frequency=12.0, gain_spread=0.0).design(_linear()).block()
+    return PidSettings().design(_linear()).block()
 
 
 def _fopi() -> Block:
-    return FopiSettings(crossover=4.0, gain_spread=0.0).design(_linear()).block()
+    return FopiSettings(crossover=4.0).design(_linear()).block()
 
 
 def _lqg() -> Block:
-    return LqgSettings(load_rate=20.0, gain_spread=0.0).design(_linear()).block()
+    return LqgSettings().design(_linear()).block()
 
 
 def _custom() -> Block:
     K = control.TransferFunction([4.0, -3.5], [1.0, -1.0], TS)
-    return CustomSettings(controller=K, gain_spread=0.0).design(_linear()).block()
+    return CustomSettings(controller=K).design(_linear()).block()
 
 
 def _mpc() -> Block:

@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import control
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_one_of
 from softneck.design.plants._step_and_load import StepAndLoad, StepAndLoadResult, judge
+from softneck.design.plants._uncertain import Doubts, UncertainPlant, uncertain_plant
 from softneck.estimation import AxisPlant, LinearNeck
 from softneck.estimation._axis import AXES
+from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
@@ -58,6 +62,18 @@ def bake_off_neck() -> LinearNeck:
     """Return the nominal plant as both axes of a neck."""
     nominal = bake_off_plant().tf()
     return LinearNeck(pitch=nominal, roll=nominal)
+
+
+def exact(source: Any, *, robot: Robot | None = None, spread: float = 0.2) -> UncertainPlant:
+    """Return a plant as it is: no dead time and no pole of the paper's neck are allowed for besides."""
+    return replace(uncertain_plant(source, robot), doubts=Doubts(0.0, 0.0, spread))
+
+
+def neck_within(position: float = 6.0, slew: float = 12.5, *, lowest: float = -6.0) -> Robot:
+    """Return a neck whose file says so of its motors [rad, rad/s]."""
+    neck = Robot.preset("neck")
+    motors = replace(neck.motors, setpoint_min=(lowest,) * 3, setpoint_max=(position,) * 3, rate_limit=(slew,) * 3)
+    return replace(neck, motors=motors)
 
 
 def run_bake_off(

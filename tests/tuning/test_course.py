@@ -27,7 +27,7 @@ CERTIFIED = {"pi": 1.6, "hinf": 1.2}
 
 def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgement:
     """A loop that is quicker and overshoots more the more is asked, as far as Ms goes that it is designed for."""
-    Ms, rise = settings["max_sensitivity"], 2.0 * settings["reference_time"]
+    Ms, rise = settings["max_sensitivity"], 2.0 * settings["reference_time"][0]
     certified = CERTIFIED[kind] * Ms
     if level == "linear":
         return Judgement({"axes.sensitivity": certified, "axes.gain_margin": certified / (certified - 1.0)})

@@ -167,6 +167,8 @@ def test_every_point_of_a_space_is_a_setting_of_its_kind(kind: str) -> None:
     for x in (np.zeros(n), np.ones(n), space.start, *rng.random((5, n))):
         make_settings(made, space.settings(x))
     started = space.settings(space.start)
+    if isinstance(started.get("reference_time"), list):
+        started["reference_time"], started["lead"] = started["reference_time"]
     # To the four digits that settings are rounded to.
     assert all(started[item.name] == pytest.approx(item.start, rel=1e-3) for item in space.dimensions)
 

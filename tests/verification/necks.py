@@ -13,6 +13,8 @@ from softneck.estimation import LinearNeck
 from softneck.identification import Family
 from softneck.identification.uncertainty._family import AxisFamily
 
+from ..oracles.bake_off import exact
+
 TS = 0.02
 PAPER = np.array([math.radians(27.69) / 5.293, 5.293, 0.08])  # Eq. 31
 QUICK = {
@@ -50,7 +52,7 @@ def family(*, spread: float = 0.15, cross: float = 0.0, std: float = 0.02, count
 
 def pi(*, order: str = "sequential", delay: int = 4) -> LinearController:
     """A PI on the paper's neck."""
-    return PiSettings(order=order, least_delay=0.0, small_move_pole=0.0).design(linear_neck(delay=delay))
+    return PiSettings(order=order).design(exact(linear_neck(delay=delay)))
 
 
 def controller_of(numerator: Vector, denominator: Vector) -> control.StateSpace:

@@ -25,7 +25,7 @@ from softneck.verification._requirements import read_requirements
 from softneck.verification._steps import StepTest, run_steps
 from softneck.verification._verify import sources_of
 from tests.data import slow_but
-from tests.design.test_robots import BELLOWS, LEARNED, plant
+from tests.design.test_robots import BELLOWS, LEARNED, SLOW, plant
 
 FEW: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "neck": {"necks": 0}}
 NONE = {"gain": 0.0, "pole": 0.0, "delay": 0.0}
@@ -110,7 +110,7 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays(tmp_path: P
     model = plant(BELLOWS, gain=1e-7)
     table = {**FEW, "step": {"size_mm": 3.0, "noise_mm": 0.0}, "require": {"step.settling_s": {"max": 1.5}}}
     asked = make_requirements(table, robot=BELLOWS)
-    controller = design_controller("pi", model, slew_limit=10.0)
+    controller = design_controller("pi", model, robot=SLOW)
     found = verify(controller, model, asked)
     limits = {item.requirement.metric: item.requirement.limit for item in found.verdicts}
     assert limits["step.settling_s"] == 1.5
@@ -141,7 +141,7 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays(tmp_path: P
 
 def test_steps_of_a_robot_are_those_of_its_equations() -> None:
     model = plant(BELLOWS, gain=1e-7)
-    controller = design_controller("pi", model, slew_limit=10.0)
+    controller = design_controller("pi", model, robot=SLOW)
     plants = all_plants(sources_of({"m": model}, make_requirements(FEW, robot=BELLOWS)), 1, 0).take([0])
     test = StepTest(step=1e-3, duration=2.0, noise=0.0, load=0.0, seed=0)
     steps = run_steps(plants, controller.block(), test, robot=BELLOWS, weights=LEARNED)

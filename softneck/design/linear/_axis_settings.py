@@ -6,21 +6,24 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_positive
+from softneck.core import Matrix, SettingsError, require_between
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
+from softneck.robot import Robot
+from softneck.robot._search import find_robot
 
-from ..plants._held import USUAL_PERIOD, held
+from ..plants._held import USUAL_PERIOD, discrete
 from ..plants._step_and_load import StepAndLoad
 from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
 from ._assembly import AxisController, ReferenceFilter, assemble
 from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
 from ._controller import LinearController
-from ._loop_settings import LoopSettings, check_reference
+from ._loop_settings import LoopSettings, reference_numbers
 from ._margins import Margins
 from ._ports import ControllerLimits
 from ._rise import check_rise, filter_for, leading_filter
@@ -51,59 +54,54 @@ class AxisDesign:
 class AxisSettings(LoopSettings, ABC):
     """Settings that all kinds of linear controller share; a kind adds its own and one synthesis.
 
-    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`.
+    Limits and the order of the loop are those of `LoopSettings`.
 
     Attributes:
         max_sensitivity: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
-        reference_time: time constant of the reference filter [s]; None for the least with which no sample overshoots
-            by more than `overshoot_pct`, from half the plant's lag on.
-        reference_lead: T1 of that filter, (1 + T1 s)/(1 + T2 s), where `reference_time` is given, as a part of the
-            loop's own lag (its rise over ln 9): what moves is followed the closer, and a step overshoots rather.
-        overshoot_pct: of a step of 10 deg, within the limits.
-        gain_spread: relative; a plant without samples of its own is taken at both ends of it as well.
-        sample_time: [s] at which a continuous `control` system is held (exact); None for 20 ms. Other plants have their
-            own.
+        reference_time: T2 of the reference filter (1 + T1 s)/(1 + T2 s) [s]; None for the least with which no sample
+            overshoots a step of 10 deg by more than 4 %, from half the plant's lag on. Or T2 and lead, [0.2, 0.5]: T1
+            is that part of the loop's own lag (its rise over ln 9); what moves is followed the closer, and a step
+            overshoots rather.
     """
 
     KIND: ClassVar[str]
+    OVERSHOOT_PCT: ClassVar[float] = DESIGN_OVERSHOOT_IN_LIMITS_PCT
 
     max_sensitivity: float = 2.0
-    reference_time: float | None = None
-    reference_lead: float = 0.0
-    overshoot_pct: float = DESIGN_OVERSHOOT_IN_LIMITS_PCT
-    gain_spread: float = 0.2
-    sample_time: float | None = None
+    reference_time: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 10.0)
-        check_reference(self.reference_time, self.reference_lead)
-        require_between("overshoot_pct", self.overshoot_pct, 0.1, 100.0, "%")
-        require_between("gain_spread", self.gain_spread, 0.0, 0.9)
-        if self.sample_time is not None:
-            require_positive("sample_time", self.sample_time, "s")
+        reference_numbers(self.reference_time)
 
-    def design(self, plant: Any) -> LinearController:
-        """Return the controller for `plant`, whatever `uncertain_plant` takes, continuous `control` systems as well;
-        verified on every sample. `lqg` and `custom` take systems of any size.
+    def design(self, plant: Any, *, robot: Robot | str | Path | None = None) -> LinearController:
+        """Return the controller for `plant`, verified on every sample.
+
+        Args:
+            plant: whatever `uncertain_plant` takes, continuous `control` systems as well; `lqg` and `custom` take
+                systems of any size.
+            robot: whose limits count, itself, a preset or a file; None: those that the plant says.
 
         Raises:
             SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
         """
-        settings, discrete = held(self, plant, self._period())
-        return settings._around(discrete)
+        whose = None if robot is None else find_robot(robot)
+        period, taken = discrete(plant, self._period(whose))
+        made = self._around(taken, whose)
+        return made if period is None else replace(made, design={**made.design, "held_s": period})
 
-    def _period(self) -> float:
-        """Sample time [s] at which a continuous plant is held where nobody says."""
-        return USUAL_PERIOD
+    def _period(self, robot: Robot | None) -> float:
+        """Sample time [s] at which a continuous plant is held."""
+        return (robot and robot.sample_time_s) or USUAL_PERIOD
 
-    def _around(self, plant: Any) -> LinearController:
+    def _around(self, plant: Any, robot: Robot | None) -> LinearController:
         """Return the controller for what `uncertain_plant` takes; `lqg` and `custom` take coupled plants as well."""
-        uncertain = uncertain_plant(plant)
+        uncertain = uncertain_plant(plant, robot)
         return self.of_robot(uncertain)._designed(uncertain)
 
     def _designed(self, uncertain: UncertainPlant) -> LinearController:
-        limits, redefinition = self.limits(uncertain.robot), self.redefinition(uncertain)
+        limits, redefinition = self.limits(uncertain.robot), uncertain.redefinition
         axes = {name: self._prepared(uncertain.axis(name)) for name in uncertain.names}
         axes = {
             name: replace(axis, test=axis_test(axis.nominal, limits, redefinition[1])) for name, axis in axes.items()
@@ -133,7 +131,7 @@ class AxisSettings(LoopSettings, ABC):
             design={
                 "settings": self._stored(),
                 "extra_delay": self.extra_delay,
-                "assumed": self.assumed(uncertain),
+                "assumed": uncertain.assumed(),
                 **{name: item[2] for name, item in made.items()},
             },
         )
@@ -152,12 +150,7 @@ class AxisSettings(LoopSettings, ABC):
 
     def _prepared(self, axis: UncertainAxis) -> UncertainAxis:
         """Return the axis as it is designed for."""
-        taken = axis.prepared(self.least_delay, self.small_move_pole)
-        if len(axis.samples) > 1 or self.gain_spread == 0.0:
-            return taken
-        scales = (1.0 - self.gain_spread, 1.0 + self.gain_spread)
-        more = tuple(scaled(plant, scale) for plant in taken.samples for scale in scales)
-        return UncertainAxis(taken.nominal, (*taken.samples, *more))
+        return axis.spread()
 
     def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, ReferenceFilter, dict[str, Any]]:
         found = self._synthesise(axis, name)
@@ -188,13 +181,14 @@ class AxisSettings(LoopSettings, ABC):
             )
 
     def _reference(self, controller: AxisController, axis: UncertainAxis) -> ReferenceFilter:
-        """Return the reference filter: for `rise_s`, of `reference_time`, or the least that keeps `overshoot_pct`."""
+        """Return the reference filter: for `rise_s`, of `reference_time`, or the least that keeps the overshoot."""
         if self.rise_s is not None:
             if axis.test is not None:
                 check_rise(self.rise_s, axis.nominal, axis.test)
             return filter_for(self.rise_s, controller, axis.nominal, self.extra_delay)
-        if self.reference_time is not None:
-            return leading_filter(self.reference_time, self.reference_lead, controller, axis.nominal, self.extra_delay)
+        time, lead = reference_numbers(self.reference_time)
+        if time is not None:
+            return leading_filter(time, lead, controller, axis.nominal, self.extra_delay)
         return ReferenceFilter(self._reference_time(controller, axis))
 
     def _reference_time(self, controller: AxisController, axis: UncertainAxis) -> float:
@@ -202,7 +196,7 @@ class AxisSettings(LoopSettings, ABC):
         sweep, L = self._sweep(axis), controller.conditioning()
 
         def keeps(samples: int) -> bool:
-            return bool(sweep.run(controller, samples * axis.sample_time, L).overshoot.max() <= self.overshoot_pct)
+            return bool(sweep.run(controller, samples * axis.sample_time, L).overshoot.max() <= self.OVERSHOOT_PCT)
 
         low, high = _first_filter(axis.nominal), _slowest_filter(axis.nominal)
         if keeps(low):
@@ -210,7 +204,7 @@ class AxisSettings(LoopSettings, ABC):
         if not keeps(high):
             raise SettingsError(
                 f"no reference filter up to {high * axis.sample_time:g} s keeps the overshoot below "
-                f"{self.overshoot_pct:g} % on every sample; lower `max_sensitivity`, or give `reference_time`."
+                f"{self.OVERSHOOT_PCT:g} % on every sample; lower `max_sensitivity`, or give `reference_time`."
             )
         while high - low > 1:
             middle = (low + high) // 2
@@ -236,7 +230,7 @@ class AxisSettings(LoopSettings, ABC):
         for L in conditioning_candidates(controller):
             found = worst(L)
             # What is asked for within the limits must not suffer.
-            if found < least and usual.run(controller, led, L).overshoot.max() <= self.overshoot_pct:
+            if found < least and usual.run(controller, led, L).overshoot.max() <= self.OVERSHOOT_PCT:
                 best, least = L, found
         return replace(controller, L=best)
 
@@ -323,11 +317,6 @@ def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign |
         return build(speed)
     except SettingsError:
         return None
-
-
-def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
-    """Return the plant with its gain times `factor`."""
-    return replace(plant, numerator=factor * plant.numerator)
 
 
 def margins_json(margins: Margins) -> dict[str, float | None]:

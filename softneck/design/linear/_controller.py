@@ -167,10 +167,7 @@ def assumed_lines(values: Mapping[str, float]) -> list[str]:
     words = {"least_delay": "a dead time of at least {:g} s", "small_move_pole": "small moves as fast as {:g} 1/s",
              "taut_pole": "a neck with taut tendons as fast as {:g} 1/s"}  # fmt: skip
     told = [words[name].format(value) for name, value in values.items()]
-    if not told:
-        return []
-    way = f"`softneck design --set {'=... '.join(values)}=...` says otherwise"
-    return [f"  of the paper's neck, not of this plant: {' and '.join(told)}; {way}"]
+    return [f"  of the paper's neck, not of this plant: {' and '.join(told)}"] if told else []
 
 
 def _findings(item: Mapping[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from softneck.robot import Robot
 
 from ..plants._coupled import coupled_plant
 from ..plants._coupled_axis import AnyAxes
-from ..plants._uncertain import UncertainAxis, UncertainPlant
+from ..plants._uncertain import UncertainAxis, UncertainPlant, doubts_of
 from ._assembly import AxisController
 from ._axis_loop import conditioning_gain, error_feedback, innovations_gain
 from ._axis_settings import AxisDesign, AxisSettings
@@ -59,21 +59,21 @@ class CustomSettings(AxisSettings):
             axes = [self._prepared(uncertain.axis(name)).samples for name in names]
             count = max(len(samples) for samples in axes)
             plants = [tuple(samples[min(k, len(samples) - 1)] for samples in axes) for k in range(count)]
-            return self._whole(uncertain.robot, plants, self.redefinition(uncertain))
+            return self._whole(uncertain.robot, plants, uncertain.redefinition)
         return AxisSettings._designed(self, uncertain)
 
-    def _around(self, plant: Any) -> LinearController:
-        whole: Any = coupled_plant(plant)
+    def _around(self, plant: Any, robot: Robot | None) -> LinearController:
+        whole: Any = coupled_plant(plant, robot=robot)
         if whole is None or (whole.robot.is_neck and not self._is_whole()):
-            return AxisSettings._around(self, plant)
+            return AxisSettings._around(self, plant, robot)
         if isinstance(self.controller, Mapping):
             raise SettingsError(
                 f"outputs that answer to each other need one `controller` of {' and '.join(whole.names)}."
             )
-        samples = [tuple(row.delayed(self.least_delay) for row in whole.own_rows)]
+        samples = [tuple(row.delayed(doubts_of(whole.robot).least_delay) for row in whole.own_rows)]
         return self.of_robot(whole)._whole(whole.robot, samples, whole.own_redefinition)
 
-    def _period(self) -> float:
+    def _period(self, robot: Robot | None) -> float:  # noqa: ARG002
         # It says itself how often it runs.
         one = next(iter(self.controller.values())) if isinstance(self.controller, Mapping) else self.controller
         return float(one.dt)

@@ -7,14 +7,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_positive
+from softneck.core import Matrix, SettingsError, require_between
+from softneck.robot import Robot
 
 from ..plants._coupled import CoupledPlant, coupled_plant
 from ..plants._coupled_axis import AnyAxes, realised, times
-from ..plants._uncertain import UncertainAxis
+from ..plants._uncertain import UncertainAxis, doubts_of, scaled
 from ._assembly import AxisController
 from ._axis_loop import delayed_form
-from ._axis_settings import AxisDesign, AxisSettings, scaled
+from ._axis_settings import AxisDesign, AxisSettings
 from ._controller import LinearController
 from ._whole import WholeDesign, fastest, whole_controller
 
@@ -27,40 +28,36 @@ class LqgSettings(AxisSettings):
     driven by what the motors were really told, which is its conditioning (Astrom and Wittenmark 1997, Computer-
     Controlled Systems, sec. 9.2 and 11.4).
 
+    How fast the load is expected to wander, the filter's speed, is the largest whose loops keep `max_sensitivity` on
+    all samples. A `control` system is taken with all that each motor does to each output: one filter, one regulator.
+
     Reference filter, order and conditioning, with limits and loop, are those of `AxisSettings`.
 
     Attributes:
-        load_rate: how fast the load is expected to wander against the noise [rad/s], the filter's speed; None for
-            the largest whose loops keep `max_sensitivity` on all samples.
         control_weight: weight of the input against the angle, in units of the plant's static gain.
         input_noise: white noise on the input against that of the angle, in the same units.
-        coupled: whether an identified model (`rls` with structure "mimo") is taken with all that each motor does to
-            each output: one filter and one regulator for all. A `control` system of any size is always.
     """
 
     KIND: ClassVar[str] = "lqg"
 
-    load_rate: float | None = None
     control_weight: float = 0.1
     input_noise: float = 10.0
-    coupled: bool = False
 
     def __post_init__(self) -> None:
         AxisSettings.__post_init__(self)
-        if self.load_rate is not None:
-            require_positive("load_rate", self.load_rate, "rad/s")
         require_between("control_weight", self.control_weight, 1e-4, 1e4)
         require_between("input_noise", self.input_noise, 0.0, 1e4)
 
-    def _around(self, plant: Any) -> LinearController:
-        whole: Any = coupled_plant(plant, asked=self.coupled)
-        return AxisSettings._around(self, plant) if whole is None else self.of_robot(whole)._whole(whole)
+    def _around(self, plant: Any, robot: Robot | None) -> LinearController:
+        whole: Any = coupled_plant(plant, robot=robot)
+        return AxisSettings._around(self, plant, robot) if whole is None else self.of_robot(whole)._whole(whole)
 
     def _whole(self, plant: CoupledPlant) -> LinearController:
         """Return the controller of a coupled plant."""
-        nominal: AnyAxes = tuple(row.delayed(self.least_delay) for row in plant.rows)
-        spread = {1.0, 1.0 - self.gain_spread, 1.0 + self.gain_spread}
-        own = tuple(row.delayed(self.least_delay) for row in plant.own_rows)
+        doubts = doubts_of(plant.robot)
+        nominal: AnyAxes = tuple(row.delayed(doubts.least_delay) for row in plant.rows)
+        spread = {1.0, 1.0 - doubts.gain_spread, 1.0 + doubts.gain_spread}
+        own = tuple(row.delayed(doubts.least_delay) for row in plant.own_rows)
         samples = [times(own, gain) for gain in sorted(spread, key=lambda gain: (gain != 1.0, gain))]
         lag = max(row.time_constant + row.delay * row.sample_time for row in nominal)
 
@@ -76,14 +73,12 @@ class LqgSettings(AxisSettings):
             except SettingsError:
                 return False
 
-        rate = self.load_rate
+        rate = fastest(keeps, 0.02 / lag, 100.0 / lag)
         if rate is None:
-            rate = fastest(keeps, 0.02 / lag, 100.0 / lag)
-            if rate is None:
-                raise SettingsError(
-                    f"not even a load_rate of {0.02 / lag:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
-                    f"{len(samples)} samples; raise `max_sensitivity`, or give `load_rate` and see what is lost."
-                )
+            raise SettingsError(
+                f"not even a filter of {0.02 / lag:.3g} rad/s keeps Ms <= {self.max_sensitivity:g} on all "
+                f"{len(samples)} samples; raise `max_sensitivity`."
+            )
         made = built(rate)
         made.notes["worst_sensitivity"] = made.worst(self.extra_delay)
         return whole_controller(self, made, plant.robot, filtered=True)
@@ -111,11 +106,9 @@ class LqgSettings(AxisSettings):
         return np.linalg.solve(self.control_weight * np.eye(B.shape[1]) + B.T @ X @ B, B.T @ X @ A), M
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
-        if self.load_rate is not None:
-            return self._built(axis, self.load_rate)
         lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
-            lambda speed: self._built(axis, speed), axis, low=0.02 / lag, high=100.0 / lag, what="load_rate"
+            lambda speed: self._built(axis, speed), axis, low=0.02 / lag, high=100.0 / lag, what="filter"
         )
 
     def _built(self, axis: UncertainAxis, rate: float) -> AxisDesign:

@@ -118,7 +118,7 @@ def leading_filter(
     alone = _rise_with(ReferenceFilter(0.0), time, axis, plant, extra_delay)
     if not math.isfinite(alone):
         raise SettingsError(
-            "`reference_lead`: the loop does not rise by itself; raise `max_sensitivity`, or leave it out."
+            "the lead of `reference_time`: the loop does not rise by itself; raise `max_sensitivity`, or leave it out."
         )
     return ReferenceFilter(time, lead * alone / LAG)
 

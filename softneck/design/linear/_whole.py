@@ -15,6 +15,7 @@ from ..plants._coupled_axis import AnyAxes, closed, radius, sensitivity
 from ._assembly import ReferenceFilter, assemble_whole
 from ._axis_settings import AxisSettings, _slowest_filter
 from ._controller import LinearController
+from ._loop_settings import reference_numbers
 from ._margins import LOWEST, frequencies
 from ._rise import rise_time
 
@@ -77,12 +78,15 @@ def whole_controller(settings: AxisSettings, made: WholeDesign, robot: Any, *, f
                 f"the loop is not stable around sample {k} of {len(made.samples)} (spectral radius {found:.4f}); "
                 "design the controller for less."
             )
-    if settings.reference_lead > 0.0:
-        raise SettingsError("`reference_lead` is of plants whose axes do not answer to each other; leave it out.")
-    time = settings.reference_time or 0.0
+    given, lead = reference_numbers(settings.reference_time)
+    if lead > 0.0:
+        raise SettingsError(
+            "a lead in `reference_time` is of plants whose axes do not answer to each other; leave it out."
+        )
+    time = given or 0.0
     if settings.rise_s is not None:
         time = _filter_for(settings.rise_s, made, extra)
-    elif settings.reference_time is None and filtered:
+    elif given is None and filtered:
         time = _least_filter(settings, made)
     sample_time, limits = plants[0].sample_time, settings.limits(robot)
     found = {
@@ -145,13 +149,13 @@ def _least_filter(settings: AxisSettings, made: WholeDesign) -> float:
 
     def keeps(samples: int) -> bool:
         peaks = [_steps(made, each, settings.extra_delay, samples * Ts).max() for each in made.samples]
-        return max(peaks) <= 1.0 + settings.overshoot_pct / 100.0
+        return max(peaks) <= 1.0 + settings.OVERSHOOT_PCT / 100.0
 
     if keeps(low):
         return low * Ts
     if not keeps(high):
         raise SettingsError(
-            f"no reference filter up to {high * Ts:g} s keeps the overshoot below {settings.overshoot_pct:g} % on "
+            f"no reference filter up to {high * Ts:g} s keeps the overshoot below {settings.OVERSHOOT_PCT:g} % on "
             "every sample; lower `max_sensitivity`, or give `reference_time`."
         )
     while high - low > 1:

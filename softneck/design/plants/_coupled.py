@@ -69,12 +69,13 @@ class CoupledPlant:
         return {name: UncertainAxis(row, (row,)) for name, row in zip(self.names, rows, strict=True)}
 
 
-def coupled_plant(source: Any, *, asked: bool = False) -> CoupledPlant | None:
+def coupled_plant(source: Any, *, asked: bool = False, robot: Robot | None = None) -> CoupledPlant | None:
     """Return the coupled plant of a `control` system of any size; None for what is a plant for each axis.
 
     Args:
         source: a discrete system from motors, or a neck's redefined inputs, to outputs; else whatever a design takes.
         asked: whether an identified model is to be taken with all that it says between its axes.
+        robot: whose plant a `control` system is; None: a neck's, or one with the names of its signals.
 
     Raises:
         SettingsError: a model that says nothing between its axes, or a system that no controller of this package can be
@@ -84,10 +85,11 @@ def coupled_plant(source: Any, *, asked: bool = False) -> CoupledPlant | None:
 
     if isinstance(source, control.StateSpace | control.TransferFunction):
         system: Any = control.ss(source)
-        neck = _is_necks(system)
+        neck = _is_necks(system) if robot is None else robot.is_neck
         if neck and (system.ninputs == 1 or not (asked or _crosses(system))):
             return None
-        return _coupled(system, Robot.preset() if neck else _robot(system))
+        whose = robot or (Robot.preset() if neck else _robot(system))
+        return _coupled(system, whose, whose.weights(), named=robot is None and not neck)
     if not asked:
         return None
     if not hasattr(source, "ss"):
@@ -155,15 +157,21 @@ def _turned(redefinition: tuple[Matrix, Matrix], turn: Matrix) -> tuple[Matrix, 
     return np.vstack([turn @ T[:m], T[m:]]), np.hstack([inverse[:, :m] @ np.linalg.inv(turn), inverse[:, m:]])
 
 
-def _coupled(system: Any, robot: Robot, weights: Matrix | None = None) -> CoupledPlant:
+def _coupled(system: Any, robot: Robot, weights: Matrix | None, *, named: bool = False) -> CoupledPlant:
+    """Return the plant of a system; `named`: the robot has nothing but the names of its signals."""
     dt = system.dt
     if dt is None or isinstance(dt, bool) or not dt > 0.0:
         raise SettingsError(
             f"the plant must say its sample time; its dt is {dt}. Give dt in seconds, or 0: a continuous plant is held "
-            "for the `sample_time` of the settings."
+            "for the robot's `sample_time_s`."
         )
     A, B, C = _sorted(system, robot)
     _check(A, B, C, np.asarray(system.D, dtype=np.float64))
+    if not robot.is_neck and (B.shape[1], len(C)) != (len(robot.motors.names), len(robot.outputs.names)):
+        raise SettingsError(
+            f"the plant has {B.shape[1]} input(s) and {len(C)} output(s), robot {robot.label()} "
+            f"{len(robot.motors.names)} motor(s) and {len(robot.outputs.names)}."
+        )
     if B.shape[1] == len(_NECK_INPUTS) < len(robot.motors.names) and robot.is_neck:
         B = B @ redefinition_matrix()[: len(_NECK_INPUTS)]
     at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
@@ -172,7 +180,7 @@ def _coupled(system: Any, robot: Robot, weights: Matrix | None = None) -> Couple
         own = redefinition_matrix(), np.linalg.inv(redefinition_matrix())
     else:
         found: Any = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True) if weights is None else weights
-        if weights is None:
+        if named:
             robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, found.tolist()))))
         own = redefinition_of(found, robot.outputs.names)
     gains = at_rest @ own[1][:, : len(C)]

@@ -38,9 +38,21 @@ def held(settings: S, plant: Any, usual: float = USUAL_PERIOD) -> tuple[S, Any]:
     return replace(settings, sample_time=period), _sampled(plant, period)
 
 
+def discrete(plant: Any, period: float) -> tuple[float | None, Any]:
+    """Return the plant with each continuous `control` system of it made discrete by a zero-order hold, and its period.
+
+    At the samples both agree, as set-points are held in between. A plant that is discrete stays as it is, with None.
+
+    Raises:
+        SettingsError: a system that has no state space.
+    """
+    return (period, _sampled(plant, period)) if _any_continuous(plant) else (None, plant)
+
+
 def held_line(design: Mapping[str, Any]) -> list[str]:
     """Return a line on a continuous plant, none for another."""
-    period = design.get("settings", {}).get("sample_time")
+    # Files before 0.3 have it among the settings.
+    period = design.get("held_s", design.get("settings", {}).get("sample_time"))
     return [] if period is None else [f"  the plant is continuous, its inputs held for {1e3 * period:g} ms (exact)"]
 
 
@@ -70,7 +82,7 @@ def _sampled(plant: Any, period: float) -> Any:
     except (ValueError, control.ControlMIMONotImplemented) as error:
         raise SettingsError(
             "the continuous plant has no state space: each of its transfer functions must be proper, and several "
-            "outputs need slycot, or a control.StateSpace."
+            "outputs need a control.StateSpace."
         ) from error
     if not all(np.isfinite(part).all() for part in (system.A, system.B, system.C, system.D)):
         raise SettingsError("the plant has entries that are not finite.")

@@ -14,6 +14,8 @@ from softneck.core._shown import Shown
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import AXES, directions_of, robot_of
 from softneck.robot import Robot
+from softneck.robot._redefined import redefinition_of
+from softneck.signals import redefinition_matrix
 from softneck.signals.recording._recording import require_same_robot
 
 from ._step_and_load import StepAndLoad
@@ -27,6 +29,32 @@ _ROUNDING = 1e-11
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
+@dataclass(frozen=True, slots=True)
+class Doubts:
+    """What a design allows for besides what was identified.
+
+    Attributes:
+        least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
+        small_move_pole: the plant is taken as well with its main pole as fast as this [1/s], at the same static gain;
+            0 for the identified plant alone. Fits to large moves come out slower than small moves are, for there the
+            drives run at their current limit.
+        gain_spread: relative; a plant without samples of its own is taken at both ends of it as well.
+    """
+
+    least_delay: float
+    small_move_pole: float
+    gain_spread: float = 0.2
+
+
+# The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s); nothing of the kind is known of other robots.
+_OF_NECKS, _OF_OTHERS = Doubts(0.08, 5.293), Doubts(0.0, 0.0)
+
+
+def doubts_of(robot: Robot) -> Doubts:
+    """Return what a design allows for where nobody says otherwise."""
+    return _OF_NECKS if robot.is_neck else _OF_OTHERS
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainAxis:
     """What one axis may be.
@@ -35,11 +63,13 @@ class UncertainAxis:
         nominal: the plant that synthesis takes.
         samples: every plant that the controller must hold on; the nominal one is the first.
         test: what a controller is judged by on all of them; None where nobody judges.
+        doubts: what is allowed for besides.
     """
 
     nominal: AxisPlant
     samples: tuple[AxisPlant, ...]
     test: StepAndLoad | None = None
+    doubts: Doubts = _OF_OTHERS
 
     @property
     def sample_time(self) -> float:
@@ -56,15 +86,21 @@ class UncertainAxis:
             for a, b in zip(mine, its, strict=True)
         )
 
-    def prepared(self, least_delay: float, small_move_pole: float) -> UncertainAxis:
-        """Return it with a nominal dead time of at least `least_delay` [s], and the form of small moves as a sample.
-
-        The samples stay as they are; see `PiSettings` for why a single fit needs both.
-        """
-        nominal = self.nominal.delayed(least_delay)
-        faster = nominal.faster(small_move_pole) if small_move_pole > 0.0 else nominal
+    def prepared(self) -> UncertainAxis:
+        """Return it with the least nominal dead time, and the form of small moves as a sample; others stay."""
+        nominal = self.nominal.delayed(self.doubts.least_delay)
+        pole = self.doubts.small_move_pole
+        faster = nominal.faster(pole) if pole > 0.0 else nominal
         more = () if faster is nominal else (faster,)
-        return UncertainAxis(nominal, (nominal, *more, *self.samples[1:]))
+        return replace(self, nominal=nominal, samples=(nominal, *more, *self.samples[1:]))
+
+    def spread(self) -> UncertainAxis:
+        """Return it with each plant at both ends of the gain's spread, unless it has samples of its own."""
+        taken, gain = self.prepared(), self.doubts.gain_spread
+        if len(self.samples) > 1 or gain == 0.0:
+            return taken
+        more = (scaled(plant, scale) for plant in taken.samples for scale in (1.0 - gain, 1.0 + gain))
+        return replace(taken, samples=(*taken.samples, *more))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -76,11 +112,13 @@ class UncertainPlant(Shown):
         robot: whose plant it is.
         weights: (outputs, motors) of the motors in the redefined input of each axis; None for a neck, which has theta_i
             and phi_i.
+        doubts: what a design allows for; None for what is usual of the robot.
     """
 
     axes: Mapping[str, UncertainAxis]
     robot: Robot = field(default_factory=Robot.preset)
     weights: Matrix | None = None
+    doubts: Doubts | None = None
 
     @property
     def sample_time(self) -> float:
@@ -95,7 +133,27 @@ class UncertainPlant(Shown):
     def axis(self, name: str) -> UncertainAxis:
         """Return the axis of an output."""
         require_one_of("axis", name, self.names)
-        return self.axes[name]
+        return replace(self.axes[name], doubts=self.doubts or doubts_of(self.robot))
+
+    @property
+    def redefinition(self) -> tuple[Matrix, Matrix]:
+        """T from motors to the redefined inputs of all axes and co-contraction (Eq. 9-11), and its inverse."""
+        if self.weights is not None:
+            return redefinition_of(self.weights, self.names)
+        return redefinition_matrix(), np.linalg.inv(redefinition_matrix())
+
+    def assumed(self) -> dict[str, float]:
+        """Return what of the paper's neck, and not of this plant, a design takes."""
+        if self.doubts is not None or not self.robot.is_neck:
+            return {}
+        found = {}
+        for axis in map(self.axis, self.names):
+            delay, pole, plant = axis.doubts.least_delay, axis.doubts.small_move_pole, axis.nominal
+            if plant.delayed(delay).delay > plant.delay:
+                found["least_delay"] = delay
+            if plant.faster(pole) is not plant:
+                found["small_move_pole"] = pole
+        return dict(sorted(found.items()))
 
     def tf(self, output: str) -> control.TransferFunction:
         """Return the nominal plant of an axis, as a model's `tf`."""
@@ -106,7 +164,12 @@ class UncertainPlant(Shown):
         return [plant.tf() for plant in self.axis(output).samples]
 
 
-def uncertain_plant(source: Any) -> UncertainPlant:
+def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
+    """Return the plant with its gain times `factor`."""
+    return replace(plant, numerator=factor * plant.numerator)
+
+
+def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
     """Return what a design works on.
 
     Args:
@@ -114,13 +177,18 @@ def uncertain_plant(source: Any) -> UncertainPlant:
             of those (the first is nominal), or a mapping of "pitch" and "roll" to such systems or lists. A
             scalar system without names stands for both axes; one of two outputs is read by its signal names
             (theta_i, phi_i to pitch, roll), or in that order where it has none.
+        robot: whose limits and sensor count instead of those that the plant says.
 
     Raises:
         SettingsError: not linear, discrete or stable; different sample times; names that do not match.
-        DataError: a plant that is zero, not strictly proper or not finite, or of the other sign.
+        DataError: a plant that is zero, not strictly proper or not finite, or of the other sign; or another's robot.
     """
     import control
 
+    if robot is not None:
+        found = uncertain_plant(source)
+        require_same_robot(found.robot, robot, "the plant and `robot`")
+        return replace(found, robot=robot)
     if isinstance(source, UncertainPlant):
         return source
     if isinstance(source, Mapping):

@@ -1,4 +1,4 @@
-"""Bounds of the structured singular value of many matrices at once, by our own scalings; no slycot needed.
+"""Bounds of the structured singular value of many matrices at once, by our own scalings.
 
 `mu(M) = 1 / min{ |Delta| : det(I - M Delta) = 0 }` over block-diagonal Delta of a structure.
 

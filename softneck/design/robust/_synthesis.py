@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of
-from softneck.core._errors import require_package
+from softneck.core import Matrix, SettingsError, require_between
 
-from ._bilinear import to_continuous, to_discrete
 from ._riccati import least_gamma, partition, solve_at
-from ._weights import weight_image
+from ._weights import to_continuous, to_discrete, weight_image
 
 if TYPE_CHECKING:
     import control
 
 
-METHODS = ("auto", "slycot", "riccati")
 # The optimal controller has a pole near infinity (3e9 rad/s); a little above gamma it is an ordinary one.
 _ABOVE = 1.05
 # |T_zw| found on a grid may exceed gamma by rounding of the synthesis, not more.
@@ -36,18 +32,11 @@ class Synthesis:
         controller: K for negative feedback, `u = K (r - y)`, with the plant's dt and names.
         gamma: the least possible norm.
         achieved: the norm with this controller, on a grid of frequencies.
-        method: "slycot" or "riccati".
     """
 
     controller: control.StateSpace
     gamma: float
     achieved: float
-    method: str
-
-
-def have_slycot() -> bool:
-    """Return whether the extra `[slycot]` is installed, without importing it."""
-    return importlib.util.find_spec("slycot") is not None
 
 
 def mixsyn(
@@ -56,7 +45,6 @@ def mixsyn(
     W2: Any = None,
     W3: Any = None,
     *,
-    method: str = "auto",
     above: float = _ABOVE,
 ) -> Synthesis:
     """Return the controller that keeps `|W1 S; W2 K S; W3 T|` small (Skogestad and Postlethwaite 2005, sec. 9.3.6).
@@ -67,7 +55,6 @@ def mixsyn(
         W1, W2, W3: None, numbers or stable systems, continuous or of the plant's dt: of as many inputs as the plant
             has outputs (W1, W3) or inputs (W2), or scalar ones, which weigh each of the signals alike. Continuous
             weights of a discrete plant act at `2/Ts tan(w Ts/2)`.
-        method: "slycot" (the routine behind python-control's `mixsyn`), "riccati" (ours), or what is there.
         above: the controller is built at this factor above the least gamma.
 
     Raises:
@@ -84,43 +71,37 @@ def mixsyn(
             "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
             "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
         )
-    found = hinfsyn(_augmented(to_continuous(G), weights), outputs, inputs, method=method, above=above)
+    found = hinfsyn(_augmented(to_continuous(G), weights), outputs, inputs, above=above)
     K = to_discrete(found.controller, dt) if dt else found.controller
-    return Synthesis(controller=_named(K, G, dt), gamma=found.gamma, achieved=found.achieved, method=found.method)
+    return Synthesis(controller=_named(K, G, dt), gamma=found.gamma, achieved=found.achieved)
 
 
-def hinfsyn(P: Any, nmeas: int, ncon: int, *, method: str = "auto", above: float = _ABOVE) -> Synthesis:
+def hinfsyn(P: Any, nmeas: int, ncon: int, *, above: float = _ABOVE) -> Synthesis:
     """Return the H-infinity controller of the generalised plant P, built at `above` times the least gamma.
 
-    Both methods refuse what makes the search hang (D12 or D21 of less than full rank), and what comes out is
-    verified: a stable loop and its norm. A discrete P gives a controller of its dt.
+    What makes the search hang is refused (D12 or D21 of less than full rank), and what comes out is verified: a stable
+    loop and its norm. A discrete P gives a controller of its dt.
 
     Raises:
         SettingsError: as said, or no controller exists.
     """
     import control
 
-    require_one_of("method", method, METHODS)
     require_between("above", above, 1.001, 100.0)
     dt = _dt_of(P)
     image: Any = to_continuous(P)
     A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (image.A, image.B, image.C, image.D))
     plant = partition(A, B, C, D, nmeas=nmeas, ncon=ncon)
-    chosen = ("slycot" if have_slycot() else "riccati") if method == "auto" else method
-    if chosen == "slycot":
-        gamma, K = _by_slycot(image, nmeas, ncon, above)
-    else:
-        gamma = least_gamma(plant)
-        parts = solve_at(plant, above * gamma)
-        if parts is None:
-            raise SettingsError(f"no controller at {above:g} times gamma {gamma:.4g}; scale the weights.")
-        K = control.StateSpace(*parts, 0)
+    gamma = least_gamma(plant)
+    parts = solve_at(plant, above * gamma)
+    if parts is None:
+        raise SettingsError(f"no controller at {above:g} times gamma {gamma:.4g}; scale the weights.")
+    K = control.StateSpace(*parts, 0)
     closed: Any = image.lft(K)
     return Synthesis(
         controller=to_discrete(K, dt) if dt else K,
         gamma=gamma,
         achieved=_verified(closed, above * gamma),
-        method=chosen,
     )
 
 
@@ -150,22 +131,6 @@ def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
         direct.append(Dw @ gain)
     wide = [np.hstack([row, np.zeros((len(row), states.shape[0] - row.shape[1]))]) for row in outputs]
     return control.StateSpace(states, inputs, np.vstack(wide), np.vstack(direct), 0)
-
-
-def _by_slycot(P: Any, nmeas: int, ncon: int, above: float) -> tuple[float, control.StateSpace]:
-    import control
-
-    require_package("slycot")
-    from slycot import sb10ad
-    from slycot.exceptions import SlycotError
-
-    sizes = (P.nstates, P.ninputs, P.noutputs, ncon, nmeas)
-    try:
-        gamma = float(sb10ad(*sizes, 1e6, P.A, P.B, P.C, P.D, job=1, gtol=1e-5)[0])
-        K = sb10ad(*sizes, above * gamma, P.A, P.B, P.C, P.D, job=4)[1:5]
-    except SlycotError as error:
-        raise SettingsError(f"slycot found no controller ({error}); scale the weights, or use `riccati`.") from error
-    return gamma, control.StateSpace(*K, 0)
 
 
 def _verified(closed: Any, bound: float) -> float:

@@ -1,17 +1,18 @@
-"""Weights by the numbers that engineers have: gains at both ends, a corner, a cover of samples."""
+"""Weights by the numbers that engineers have, and discrete systems as continuous ones and back.
+
+The map `s = 2/Ts (z - 1)/(z + 1)` keeps stability, H-infinity norms and frequency responses (with `w` drawn out to
+`2/Ts tan(w Ts/2)`), so a synthesis in s is one of the discrete plant with its delay as poles at zero (Chen and Francis
+1995, sec. 3.4).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, require_positive, require_whole
-from softneck.identification.uncertainty._family_fit import envelope_weight
-
-from ._bilinear import drawn_out, to_discrete
+from softneck.core import SettingsError, Vector, require_positive, require_whole
 
 if TYPE_CHECKING:
     import control
@@ -60,48 +61,6 @@ def makeweight(
     return control.TransferFunction(above, below) if not dt else _discrete(above, below, dt)
 
 
-def ucover(
-    samples: Sequence[Any], nominal: Any | None = None, *, order: int = 2, points: int = 100
-) -> control.TransferFunction:
-    """Return W, stable and of minimum phase, with `|G/G0 - 1| <= |W|` for every sample at every frequency.
-
-    Args:
-        samples: scalar `control` systems of one sample time, or a list of `AxisPlant`.
-        nominal: G0; the first sample if None.
-        order: of W, 1 to 3.
-        points: of the frequency grid, four decades up to the Nyquist frequency (1e-2 to 1e3 rad/s if continuous).
-
-    Returns:
-        W with the samples' `dt`, named after their output.
-
-    Raises:
-        SettingsError: different sample times.
-        DataError: no samples, or samples all alike.
-    """
-    import control
-
-    systems = [_system(item) for item in samples]
-    if not systems:
-        raise DataError("`ucover` needs samples.")
-    G0 = systems[0] if nominal is None else _system(nominal)
-    dt = float(G0.dt or 0.0)
-    for i, item in enumerate(systems):
-        if not math.isclose(float(item.dt or 0.0), dt, rel_tol=1e-9, abs_tol=1e-15):
-            raise SettingsError(f"sample {i} has dt = {item.dt}, the nominal plant dt = {G0.dt}; resample it.")
-    # Up to 0.999 of Nyquist: tan(w Ts/2) has its pole there.
-    w = np.geomspace(1e-2, 1e3, points) if dt == 0.0 else np.geomspace(1e-4, 0.999, points) * math.pi / dt
-    at = 1j * w if dt == 0.0 else np.exp(1j * w * dt)
-    base = np.asarray(G0(at))
-    errors = np.array([np.abs(np.asarray(item(at)) / base - 1.0) for item in systems])
-    envelope = errors.max(axis=0)
-    if envelope.max() < 1e-12:
-        raise DataError("the samples are all alike; there is no uncertainty to cover.")
-    above, below = envelope_weight(w if dt == 0.0 else drawn_out(w, dt), envelope, order)
-    W = control.TransferFunction(above, below) if dt == 0.0 else _discrete(above, below, dt)
-    W.name = f"W_{G0.output_labels[0]}" if not G0.output_labels[0].startswith("y[") else "W"
-    return W
-
-
 def weight_image(weight: Any, dt: float, name: str, size: int = 1) -> control.StateSpace | None:
     """Return a weight as a continuous system for synthesis at `dt`, after the checks that spare a hang or a lie.
 
@@ -116,8 +75,6 @@ def weight_image(weight: Any, dt: float, name: str, size: int = 1) -> control.St
         SettingsError: another number of inputs, another sample time, an integrator, an unstable or improper weight.
     """
     import control
-
-    from ._bilinear import to_continuous
 
     if weight is None:
         return None
@@ -169,5 +126,41 @@ def _discrete(above: np.ndarray, below: np.ndarray, dt: float) -> control.Transf
     return control.TransferFunction(made.num, made.den, dt)
 
 
-def _system(item: Any) -> Any:
-    return item.tf() if hasattr(item, "observable_form") else item
+def to_continuous(system: Any) -> control.StateSpace:
+    """Return the continuous image of a discrete system; a continuous one as it is."""
+    import control
+
+    discrete: Any = control.ss(system)
+    if discrete.dt == 0:
+        return discrete
+    T = float(discrete.dt)
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (discrete.A, discrete.B, discrete.C, discrete.D))
+    n = A.shape[0]
+    if n == 0:
+        return control.StateSpace(A, B, C, D, 0)
+    whole = A + np.eye(n)
+    if np.linalg.cond(whole) > 1e12:
+        raise SettingsError("the plant has a pole at z = -1, which no plant with a held input has; identify it again.")
+    E = np.linalg.inv(whole)
+    r = 2.0 / math.sqrt(T)
+    return control.StateSpace(2.0 / T * (A - np.eye(n)) @ E, r * E @ B, r * C @ E, D - C @ E @ B, 0)
+
+
+def to_discrete(system: Any, sample_time: float) -> control.StateSpace:
+    """Return the discrete system of which `system` is the image."""
+    import control
+
+    continuous: Any = control.ss(system)
+    T = sample_time
+    A, B, C, D = (np.asarray(p, dtype=np.float64) for p in (continuous.A, continuous.B, continuous.C, continuous.D))
+    n = A.shape[0]
+    if n == 0:
+        return control.StateSpace(A, B, C, D, T)
+    E = np.linalg.inv(np.eye(n) - 0.5 * T * A)
+    r = math.sqrt(T)
+    return control.StateSpace((np.eye(n) + 0.5 * T * A) @ E, r * E @ B, r * C @ E, D + 0.5 * T * C @ E @ B, T)
+
+
+def drawn_out(frequency: Vector, sample_time: float) -> Vector:
+    """Return `2/Ts tan(w Ts/2)`, where the image has the response that the discrete system has at w [rad/s]."""
+    return 2.0 / sample_time * np.tan(0.5 * sample_time * np.asarray(frequency))

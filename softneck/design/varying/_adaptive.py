@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
-from softneck.estimation import AxisPlant, axis_plant
-from softneck.estimation._axis import HasTransferFunctions, directions_of, robot_of
+from softneck.estimation import AxisPlant
 from softneck.estimation._forms import Reach
 from softneck.estimation._reach import linear_reach
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
+from softneck.robot._search import find_robot
 from softneck.runtime import Port
 
 from ..linear._assembly import ReferenceFilter, assemble, pi_axis
@@ -25,7 +26,7 @@ from ..linear._loop_settings import LoopSettings
 from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import ControllerLimits
 from ..linear._rise import filter_for_lag
-from ..plants._uncertain import UncertainPlant, uncertain_plant
+from ..plants._uncertain import UncertainPlant, scaled, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
 from ._varying import RUNTIMES, VaryingController
 
@@ -36,70 +37,82 @@ _NECK_GAIN = math.radians(27.69 / 5.293)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Learning:
+    """The numbers of what is learnt, for a plant with the neck's static gain, reach and pole.
+
+    Attributes:
+        forgetting: lambda of the recursion, for the samples it takes in; 4 s of motion.
+        start_covariance: diagonal of F(0); small trusts the identified plant, so that no first step is one of learning:
+            one step of 15 deg teaches about as much.
+        covariance_bound: on the trace of F.
+        dead_zone: errors of the band-passed angle up to this [rad], the filtered noise of the 3DM inclinometer, teach
+            nothing.
+        excitation: band-passed input [rad], rms over the last second, below which nothing is learnt.
+        band: centre of the band-pass of the regression [rad/s]: the neck's own pole, and about the crossover.
+        pole_range: the pole stays within the nominal one divided and multiplied by this.
+        distrust: the nominal plant is used where its mean square prediction error is this many times smaller.
+        gain_rate: change of lag and gain in use [1/s].
+        leak_time: over which the integral gives up what is beyond a limit [s].
+    """
+
+    forgetting: float = 0.995
+    start_covariance: float = 0.5
+    covariance_bound: float = 100.0
+    dead_zone: float = math.radians(0.02)
+    excitation: float = 0.05
+    band: float = 5.0
+    pole_range: float = 2.0
+    distrust: float = 1.5
+    gain_rate: float = 1.0
+    leak_time: float = 3.0
+
+    def scaled(self, size: float, stretch: float) -> Learning:
+        """Return them for outputs that go `size` times as far, and a plant that is `stretch` times as slow."""
+        # Inputs and outputs have the neck's ratio: a covariance goes by 1 / size^2.
+        return replace(
+            self, start_covariance=self.start_covariance / size**2, covariance_bound=self.covariance_bound / size**2,
+            dead_zone=self.dead_zone * size, excitation=self.excitation * size, band=self.band * stretch**-1.0,
+            gain_rate=self.gain_rate * stretch**-1.0, leak_time=self.leak_time * stretch**1.0,
+        )  # fmt: skip
+
+
+LEARNING = Learning()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveSettings(LoopSettings):
     """Online recursive least squares and a redesign in every sample, with what keeps it safe.
 
-    Limits, the order of the loop and what is doubted of the plant are those of `LoopSettings`. The defaults are the
-    neck's: of another robot seconds go by its slowest pole, and what is in rad by how far its outputs go. What is given
-    counts as for a plant with the neck's static gain and reach.
+    Limits and the order of the loop are those of `LoopSettings`. The nominal plant is taken as late and as quick as
+    small moves of a neck are. The numbers of the learning are in `Learning`: of another robot seconds go by its slowest
+    pole, and what is in rad by how far its outputs go.
 
     Attributes:
         max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
         phase_margin: least phase margin [rad] of it.
-        small_move_pole: the nominal plant itself is taken as at least as fast as this [1/s]; 0: as identified.
-        forgetting: lambda of the recursion, for the samples it takes in.
-        start_covariance: diagonal of F(0); small trusts the identified plant, so that no first step is one of learning.
-        covariance_bound: on the trace of F.
-        dead_zone: errors of the band-passed angle up to this [rad] teach nothing.
-        excitation: band-passed input [rad], rms over the last second, below which nothing is learnt.
-        band: centre of the band-pass of the regression [rad/s].
         gain_range: the static gain stays within this part of the nominal one, up and down, 0.5 for half to 1.5 times.
-        pole_range: the pole stays within the nominal one divided and multiplied by this.
-        distrust: the nominal plant is used where its mean square prediction error is this many times smaller.
-        gain_rate: change of lag and gain in use [1/s].
         reference_time: time constant of the reference filter [s].
-        leak_time: over which the integral gives up what is beyond a limit [s].
     """
 
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
-    # 4 s of motion.
-    forgetting: float = 0.995
-    # One step of 15 deg teaches about as much.
-    start_covariance: float = 0.5
-    covariance_bound: float = 100.0
-    # The filtered noise of the 3DM inclinometer.
-    dead_zone: float = math.radians(0.02)
-    excitation: float = 0.05
-    # The neck's own pole, and about the crossover.
-    band: float = NeckDefault(5.0)
     gain_range: float = 0.5
-    pole_range: float = 2.0
-    distrust: float = 1.5
-    gain_rate: float = NeckDefault(1.0)
     reference_time: float = NeckDefault(0.06)
-    leak_time: float = NeckDefault(3.0)
     lead_limit: float = NeckDefault(0.8)
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
-        require_between("forgetting", self.forgetting, 0.9, 1.0)
-        require_between("start_covariance", self.start_covariance, 1e-9, 1e12)
-        require_between("covariance_bound", self.covariance_bound, 1e-6, 1e12)
-        require_between("dead_zone", self.dead_zone, 0.0, 0.1, "rad")
-        require_between("excitation", self.excitation, 0.0, 10.0, "rad")
-        require_between("band", self.band, 0.1, 50.0, "rad/s")
         require_between("gain_range", self.gain_range, 0.0, 0.9)
-        require_between("pole_range", self.pole_range, 1.0, 10.0)
-        require_between("distrust", self.distrust, 1.0, 100.0)
-        require_between("gain_rate", self.gain_rate, 0.0, 10.0, "1/s")
         require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
-        require_between("leak_time", self.leak_time, 0.1, 60.0, "s")
 
-    def design(self, model: HasTransferFunctions) -> VaryingController:
+    def design(self, model: Any, *, robot: Robot | str | Path | None = None) -> VaryingController:
         """Return the controller that starts from `model`, of one pole and a dead time in each axis.
+
+        Args:
+            model: whatever `uncertain_plant` takes but a list; its nominal plant counts.
+            robot: whose limits count, itself, a preset or a file; None: those that the model says.
 
         Raises:
             SettingsError: another model, or a box that the nominal gains do not stand.
@@ -108,37 +121,32 @@ class AdaptiveSettings(LoopSettings):
             raise SettingsError(
                 f"adaptive control starts from one model or a family; got {len(model)} models. Name one."
             )
-        robot = robot_of(model)
-        if robot.is_neck:
-            return self._designed(model, robot, self.neck_redefinition(), np.ones(len(robot.outputs.names)), 1.0)
-        uncertain = uncertain_plant(model)
+        uncertain = uncertain_plant(model, None if robot is None else find_robot(robot))
+        if uncertain.weights is None:
+            return self._designed(uncertain, LEARNING, uncertain.redefinition, np.ones(len(uncertain.names)))
         asked = self.of_robot(uncertain)
         nominal = [axis.nominal for axis in uncertain.axes.values()]
         # Inputs in such a unit that every static gain has the neck's size: what learns need not know the robot's units.
         units = np.array([_NECK_GAIN / abs(plant.static_gain) for plant in nominal])
-        T, inverse = asked.redefinition(uncertain)
+        T, inverse = uncertain.redefinition
         T, inverse = T.copy(), inverse.copy()
         T[:-1] /= units[:, None]
         inverse[:, :-1] *= units
-        size = linear_reach(nominal, robot, directions_of(model)).start / Reach().start
-        return asked._designed(model, robot, (T, inverse), units, size)
+        size = linear_reach(nominal, uncertain.robot, uncertain.weights).start / Reach().start
+        learning = LEARNING.scaled(size, max(plant.stretch for plant in nominal))
+        return asked._designed(uncertain, learning, (T, inverse), units)
 
     def _others(self, plant: UncertainPlant) -> dict[str, Any]:
         stretch = max(axis.nominal.stretch for axis in plant.axes.values())
-        usual = {"band": 1.0, "gain_rate": 1.0, "reference_time": -1.0, "leak_time": -1.0}
-        stretched = {name: float(getattr(self, name)) * stretch ** (-power) for name, power in usual.items()}
-        return {**LoopSettings._others(self, plant), **stretched}
+        return {"reference_time": float(self.reference_time) * stretch**1.0}
 
     def _designed(
-        self, model: HasTransferFunctions, robot: Robot, redefinition: tuple[Matrix, Matrix], units: Vector, size: float
+        self, uncertain: UncertainPlant, learning: Learning, redefinition: tuple[Matrix, Matrix], units: Vector
     ) -> VaryingController:
-        """Return the controller: `units` of the inputs (axes,), and how far the outputs go over the neck's."""
-        names = robot.outputs.names
-        plants = [self._plant(model, axis, unit) for axis, unit in zip(names, units.tolist(), strict=True)]
+        """Return the controller: `units` of the inputs (axes,)."""
+        names, robot = uncertain.names, uncertain.robot
+        plants = [self._plant(uncertain, axis, unit) for axis, unit in zip(names, units.tolist(), strict=True)]
         Ts = plants[0].sample_time
-        if not all(math.isclose(Ts, plant.sample_time, rel_tol=1e-9) for plant in plants):
-            each = " and ".join(f"{plant.sample_time:g} s" for plant in plants)
-            raise SettingsError(f"{' and '.join(names)} have different sample times, {each}.")
         delays = [plant.delay + self.extra_delay for plant in plants]
         kappas = [self._loop(plant, delay) for plant, delay in zip(plants, delays, strict=True)]
         worst = [
@@ -154,7 +162,7 @@ class AdaptiveSettings(LoopSettings):
             kind="adaptive",
             runtime=RUNTIMES["adaptive"],
             sample_time=Ts,
-            arrays=self._arrays(plants, delays, kappas, self.limits(robot), redefinition, size),
+            arrays=self._arrays(plants, delays, kappas, self.limits(robot), redefinition, learning),
             limits=self.limits(robot),
             order=self.order,
             parameters=(
@@ -164,16 +172,16 @@ class AdaptiveSettings(LoopSettings):
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
 
-    def _plant(self, model: HasTransferFunctions, axis: str, unit: float) -> AxisPlant:
-        plant = axis_plant(model, axis)
-        plant = replace(plant, numerator=unit * plant.numerator)
+    def _plant(self, uncertain: UncertainPlant, name: str, unit: float) -> AxisPlant:
+        axis = uncertain.axis(name)
+        plant = scaled(axis.nominal, unit)
         if plant.order != 1 or plant.denominator[1] >= 0.0:
             raise SettingsError(
-                f"{axis}: adaptive control takes a plant of one pole and a dead time; this one is of order "
+                f"{name}: adaptive control takes a plant of one pole and a dead time; this one is of order "
                 f"{plant.order}. Identify `rls` or `oe` of order 1."
             )
-        late = plant.delayed(self.least_delay)
-        return late.faster(self.small_move_pole) if self.small_move_pole > 0.0 else late
+        late, pole = plant.delayed(axis.doubts.least_delay), axis.doubts.small_move_pole
+        return late.faster(pole) if pole > 0.0 else late
 
     def _loop(self, plant: AxisPlant, delay: int) -> float:
         """Return the largest kappa up to which kappa z^-d/(z - 1) keeps both bounds."""
@@ -209,8 +217,7 @@ class AdaptiveSettings(LoopSettings):
                 if radius >= 1.0:
                     raise SettingsError(
                         f"{axis}: the nominal gains, which must hold where nothing was learnt, are not stable at a "
-                        f"corner of the box (spectral radius {radius:.4f}); lower `gain_range` or `pole_range`, or "
-                        "`max_sensitivity`."
+                        f"corner of the box (spectral radius {radius:.4f}); lower `gain_range` or `max_sensitivity`."
                     )
                 S = 1.0 / (1.0 + np.polyval(above, z) / np.polyval(below, z))
                 worst = max(worst, float(np.abs(S).max()))
@@ -220,7 +227,7 @@ class AdaptiveSettings(LoopSettings):
         """Return least and largest a, and least and largest static gain."""
         a, K = -float(plant.denominator[1]), plant.static_gain
         gains = sorted((K * (1.0 - self.gain_range), K * (1.0 + self.gain_range)))
-        return np.array([a**self.pole_range, a ** (1.0 / self.pole_range), *gains])
+        return np.array([a**LEARNING.pole_range, a ** (1.0 / LEARNING.pole_range), *gains])
 
     def _filters(self, plants: list[AxisPlant]) -> tuple[ReferenceFilter, ...]:
         """Return the reference filters, the last of co-contraction."""
@@ -231,7 +238,7 @@ class AdaptiveSettings(LoopSettings):
 
     def _arrays(
         self, plants: list[AxisPlant], delays: list[int], kappas: list[float], limits: ControllerLimits,
-        redefinition: tuple[Matrix, Matrix], size: float,
+        redefinition: tuple[Matrix, Matrix], learning: Learning,
     ) -> dict[str, Matrix]:  # fmt: skip
         """Return the arrays of the runtime by name."""
         Ts = plants[0].sample_time
@@ -241,13 +248,11 @@ class AdaptiveSettings(LoopSettings):
             redefinition=redefinition,
             constants=limits.constants(Ts),
         )
-        # Inputs and outputs have the neck's ratio: a covariance goes by 1 / size^2.
         guards = [
-            self.forgetting, self.covariance_bound / size**2, self.dead_zone * size,
-            max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * self.pole_range)),
-            self.excitation * size, math.exp(-self.band * Ts), self.distrust, min(self.gain_rate * Ts, 0.5),
-            Ts / self.leak_time,
-            min(self.start_covariance, 0.5 * self.covariance_bound) / size**2,
+            learning.forgetting, learning.covariance_bound, learning.dead_zone,
+            max(-float(plant.denominator[1]) for plant in plants) ** (1.0 / (2.0 * learning.pole_range)),
+            learning.excitation, math.exp(-learning.band * Ts), learning.distrust, min(learning.gain_rate * Ts, 0.5),
+            Ts / learning.leak_time, learning.start_covariance,
         ]  # fmt: skip
         arrays = dict(zip(LinearArrays.names(), common, strict=True)) | {
             "nominal": np.array([[-plant.denominator[1], plant.numerator[0]] for plant in plants]),

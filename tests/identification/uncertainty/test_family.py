@@ -20,6 +20,7 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
 from ...data import TRUTH, TS, Truth, neck_recording, recording_from
+from ...oracles.bake_off import exact
 
 pytestmark = pytest.mark.slow
 
@@ -132,7 +133,7 @@ def test_a_file_keeps_every_bit_and_says_what_it_is(family: Family, tmp_path: Pa
 
 
 def test_a_design_reads_it(family: Family) -> None:
-    controller = PiSettings(least_delay=0.0).design(family)
+    controller = PiSettings().design(exact(family))
     assert controller.design["pitch"]["dead_time_s"] == pytest.approx(0.06)
     observer = KalmanSettings().design(family)
     assert observer.delays == (3, 4)
