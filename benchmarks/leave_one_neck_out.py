@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import math
 import os
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -273,23 +272,11 @@ QUESTIONS = {
         "slope", (0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.07, 0.1), TRUST["nn"], learned_trusted
     ),
     "validity.learned.ratio": Question("ratio", (0.7, 1.0, 1.5, 2.0, 3.0, 5.0), TRUST["nn"], learned_trusted),
-    "observer.model_noise_std": Question(
-        "model_noise_std", tuple(np.radians(_DEGREES).tolist()), KalmanSettings(), observed
-    ),
     "observer.disturbance_noise_std": Question(
         "disturbance_noise_std", tuple(np.radians(_DEGREES).tolist()), KalmanSettings(), observed
     ),
     "observer.measurement_noise_std": Question(
         "measurement_noise_std", (None, *np.radians((0.02, 0.1, 0.25, 0.5)).tolist()), KalmanSettings(), observed
-    ),
-    "nonlinear.rest_noise_std": Question(
-        "rest_noise_std", tuple(np.radians((0.02, 0.05, 0.1, 0.2, 0.3, 0.5)).tolist()), KalmanSettings(), observed_grey
-    ),
-    "nonlinear.motion_noise_ratio": Question(
-        "motion_noise_ratio", (0.2, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0), KalmanSettings(), observed_grey
-    ),
-    "nonlinear.slew_ratio": Question(
-        "slew_ratio", (0.6, 0.8, 1.0, 1.25, 1.6, 2.2, math.inf), KalmanSettings(), observed_grey
     ),
     "mpc.taut_pole": Question("taut_pole", (6.0, 9.0, 12.0), MpcSettings(), follows),
     "mpc.least_delay": Question("least_delay", (0.08, 0.1, 0.12), MpcSettings(), follows),

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -137,16 +136,16 @@ def grid(neck: str, seed: int) -> str:
     _, log, runs = known(neck, seed)
     cells = []
     for kind, model in (("oe", OutputError().fit(log)), ("greybox", GreyBox().fit(log))):
-        names = ("measurement_noise_std", *LEVELS[kind])
-        levels: list[dict[str, Any]] = [
-            dict(zip(names, values, strict=True)) for values in product(MEASURED, *LEVELS[kind].values())
-        ]
-        tried = [KalmanSettings(), *(KalmanSettings(**item) for item in levels)]
-        errors = [error(item.design(model), runs)[0] for item in tried]
+        usual = KalmanSettings().design(model)
+        tried = [usual.noise, *((values[0] or usual.noise[0], *values[1:]) for values in
+                                product(MEASURED, *LEVELS[kind].values()))]  # fmt: skip
+        errors = [error(usual.with_noise(item), runs)[0] for item in tried]
         best = tried[int(np.argmin(errors))]
-        later = {delay: error(replace(best, sensor_delay=delay).design(model), runs)[0] for delay in DELAYS}
+        later = {
+            delay: error(KalmanSettings(sensor_delay=delay).design(model).with_noise(best), runs)[0] for delay in DELAYS
+        }
         delay = min(later, key=lambda item: later[item])
-        said = ", ".join("-" if getattr(best, name) is None else f"{getattr(best, name):.2g}" for name in names)
+        said = ", ".join(f"{level:.2g}" for level in best)
         told = error(KalmanSettings(measurement_noise_std=NOISE).design(model), runs)[0]
         cells.append(f"{kind} {errors[0]:.3f} {told:.3f}")
         for what, least in ((f"({said})", min(errors)), (f"({delay:g} s)", min(*errors, later[delay]))):

@@ -91,7 +91,7 @@ def dark(time: Vector) -> np.ndarray:
 
 def settings() -> dict[str, KalmanSettings]:
     """Return both filters by name."""
-    common = KalmanSettings(sensor="3dm-gx5-10", sample_time=PERIOD, sensor_period=2 * PERIOD, sensor_delay=ANGLE_DELAY)
+    common = KalmanSettings(sensor="3dm-gx5-10", sample_time=PERIOD, sensor_delay=ANGLE_DELAY)
     return {
         "model + disturbance": replace(common, disturbance_noise_std=DISTURBANCE_STD),
         "gyro + bias": replace(common, form="gyro", gyro_delay=RATE_DELAY),

@@ -1,4 +1,4 @@
-"""The Kalman observer: filterpy for design and offline use, a numpy runtime in loops and FMUs."""
+"""The Kalman observer: a numpy runtime in loops, FMUs and over recordings, checked against filterpy."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ class KalmanObserver(Shown):
         return kf
 
     def estimate(self, recording: Recording) -> Estimates:
-        """Run filterpy over a recording; each of its runs starts anew. Missing samples are predicted over.
+        """Filter a recording; each of its runs starts anew. Missing samples are predicted over.
 
         Raises:
             DataError: another sample time, or no gyro rates where the form needs them.

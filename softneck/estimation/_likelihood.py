@@ -14,7 +14,7 @@ from softneck.signals import Recording
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE, KALMAN_REJECTIONS, KalmanArrays
 from ._nonlinear import NonlinearObserver
-from ._offline import measured_angles, source_rows
+from ._offline import input_rows, measured_angles
 
 # Rows at the start of each run that are not scored: there the filter is still uncertain of everything.
 SETTLE = 50
@@ -48,7 +48,7 @@ class Cost:
             spoilt = outliers(z)
             z[spoilt] = np.nan
             self.outliers += int(spoilt.sum())
-            self._tables.append(_table(observer, run, z))
+            self._tables.append(input_rows(observer, run, z))
         self.rows = sum(self._run(table, observer.noise)[1] for table in self._tables)
 
     def of(self, levels: Vector) -> float:
@@ -87,16 +87,6 @@ class WalkCost:
             for missed, came, fastest in self._tables
         )
         return float(sum(costs)) / self.rows
-
-
-def _table(observer: KalmanObserver, run: Recording, z: Matrix) -> Matrix:
-    """Return the runtime's inputs row by row, as a loop would give them."""
-    sources, lost = source_rows(observer, run)
-    valid = np.ones((len(run), 1))
-    if observer.form == "gyro":
-        none = np.zeros((len(run), len(run.robot.motors.names)))
-        return np.hstack([none, z, valid, np.where(lost[:, None], np.nan, sources)])
-    return np.hstack([sources, z, valid])
 
 
 def outliers(z: Matrix) -> np.ndarray:

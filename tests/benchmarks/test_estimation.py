@@ -11,16 +11,17 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.estimation import KalmanObserver, KalmanSettings
+from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN
 from softneck.runtime import load_runtime
 
-from ..estimation.necks import neck
+from ..estimation.necks import neck, without
 
 INPUTS = np.array([0.1, 0.2, 0.3, 0.01, 0.02, 1.0])
 ROWS = 10_000
 
 
 def observer() -> KalmanObserver:
-    return KalmanSettings(frozen_samples=0).design(neck())
+    return without(KalmanSettings().design(neck()), KALMAN_FROZEN)
 
 
 def bare() -> Callable[[], None]:

@@ -28,7 +28,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 def test_every_form_becomes_a_file(call: Call, files: tuple[Path, Path]) -> None:
     for name, arguments in (
         ("model", ()),
-        ("gyro", ("--set", "form=gyro", "--set", "sample_time=0.01", "--set", "sensor_period=0.02")),
+        ("gyro", ("--set", "form=gyro", "--set", "sample_time=0.01")),
     ):
         said = call("observer", files[0], "-o", f"{name}.npz", *arguments, "--json")
         assert said.code == 0, said.err

@@ -40,7 +40,7 @@ def test_the_pi_closes_a_stable_loop_around_it(model: Model) -> None:
 def test_the_kalman_filter_follows_the_recording(model: Model) -> None:
     r = neck_recording(600, seed=9, noise=1e-3)
     found = (
-        KalmanSettings(measurement_noise_std=1e-3, model_noise_std=5e-4, disturbance_noise_std=2e-4, sensor_delay=0.0)
+        KalmanSettings(measurement_noise_std=1e-3, disturbance_noise_std=2e-4, sensor_delay=0.0)
         .design(model)
         .estimate(r)
     )

@@ -9,6 +9,7 @@ import control
 import numpy as np
 
 from softneck.estimation import KalmanObserver, KalmanSettings, LinearNeck
+from softneck.estimation._kalman_parts_runtime import KALMAN_GATE
 from softneck.runtime import Block, load_runtime
 from softneck.signals import Recording, redefine, signal
 
@@ -25,6 +26,20 @@ def neck(*, pitch_delay: int = 4, roll_delay: int = 2, gain: float = 1.0, sample
     first = control.TransferFunction([b], [1.0, -pole, *([0.0] * pitch_delay)], sample_time)
     second = control.TransferFunction([0.8 * b], [1.0, -pole, *([0.0] * roll_delay)], sample_time)
     return LinearNeck(pitch=first, roll=second)
+
+
+def with_levels(observer: Any, **levels: float) -> Any:
+    """The same filter with some other noise levels."""
+    return observer.with_noise([levels.get(name, value) for name, value in
+                                zip(observer.noise_names, observer.noise, strict=True)])  # fmt: skip
+
+
+def without(observer: Any, *places: int) -> Any:
+    """The same filter that refuses next to nothing (1e-12): places of its constants KALMAN_GATE, KALMAN_FROZEN."""
+    constants = observer.constants.copy()
+    for place in places:
+        constants[place] = -2.0 * math.log(1e-12) if place == KALMAN_GATE else 0.0
+    return observer.with_constants(constants)
 
 
 def recording(*, noise_deg: float = 0.05, rows: int = 1500, seed: int = 1) -> Recording:

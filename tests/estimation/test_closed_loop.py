@@ -13,6 +13,7 @@ from softneck.identification import Rls
 from softneck.signals import Recording, import_log, read_layout
 
 from ..data import LAYOUTS
+from .necks import with_levels
 
 
 def read(shared_data: Path, payload: str) -> Recording:
@@ -41,10 +42,8 @@ def test_the_real_inclinometer_becomes_smoother_by_less_than_a_sample_of_lag(sha
     model = Rls().fit([read(shared_data, "000")])
     # The model is of the empty platform: with a payload it misses more than the 0.15 deg of the default.
     # Judged against what the sensor says when it says it: no look-ahead over its delay.
-    settings = KalmanSettings(
-        sensor="mpu9250", sensor_delay=0.0, model_noise_std=np.radians(0.4), disturbance_noise_std=np.radians(0.2)
-    )
-    observer = settings.design(model)
+    settings = KalmanSettings(sensor="mpu9250", sensor_delay=0.0, disturbance_noise_std=np.radians(0.2))
+    observer = with_levels(settings.design(model), model_noise_std=np.radians(0.4))
     timed = 0
     for run in read(shared_data, payload).runs():
         estimates = observer.estimate(run)

@@ -11,11 +11,14 @@ import pytest
 from softneck.core import SettingsError
 from softneck.estimation import KalmanSettings, NonlinearObserver, fit_noise
 from softneck.estimation._fitted import fitted_observer, sensor_delay
+from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE
 from softneck.estimation._likelihood import SETTLE, WalkCost
 from softneck.identification import Play
 from softneck.identification.models._fitting import row_hashes
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, concatenate, signal
+
+from .necks import without
 
 TRUE = (math.radians(0.25), math.radians(0.1), 0.4)
 
@@ -24,9 +27,9 @@ TRUE = (math.radians(0.25), math.radians(0.1), 0.4)
 def observer() -> NonlinearObserver:
     training = record(signal("eq22", duration=60.0), VirtualNeck(NeckParameters.paper()), seed=1)
     model = Play(rate=6.0, widths=(0.3,), degree=2, ridge=1e-4).fit([training])
-    found = KalmanSettings(sensor_delay=0.0, frozen_samples=0, gate_level=1.0 - 1e-12).design(model)
+    found = KalmanSettings(sensor_delay=0.0).design(model)
     assert isinstance(found, NonlinearObserver)
-    return found
+    return without(found, KALMAN_GATE, KALMAN_FROZEN)
 
 
 @pytest.fixture(scope="module")

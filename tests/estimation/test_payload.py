@@ -14,6 +14,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from softneck.core import load
 from softneck.estimation import KalmanSettings, NonlinearObserver, consistency
 from softneck.estimation._fitted import fitted_observer
+from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE
 from softneck.identification import GreyBox, Model
 from softneck.identification.structured._loaded_greybox_runtime import loaded_neck
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -22,12 +23,12 @@ from softneck.signals import Recording, signal
 
 from ..foreign_necks.necks import ForeignNeck
 from ..foreign_necks.necks import record as record_foreign
-from .necks import jumping, ramped
+from .necks import jumping, ramped, without
 
 NOISE, REST, RATIO, START = math.radians(0.05), math.radians(0.1), 1.0, math.radians(40.0)
 STEP = 0.02
 # All is taken in, and the estimate is of the measurement's instant.
-PLAIN = KalmanSettings(sensor_delay=0.0, frozen_samples=0, gate_level=1.0 - 1e-12)
+PLAIN = KalmanSettings(sensor_delay=0.0)
 
 
 def log(payload: float, rows: int = 800, seed: int = 1) -> Recording:
@@ -52,8 +53,13 @@ def designed(settings: KalmanSettings, model: Model) -> NonlinearObserver:
     return found
 
 
+def plain(settings: KalmanSettings, model: Model) -> NonlinearObserver:
+    return without(designed(settings, model), KALMAN_GATE, KALMAN_FROZEN)
+
+
 def test_a_jump_moves_both_copies_as_a_ramp_of_the_motors_rate_does(model: Model, run: Recording) -> None:
-    slow, free = (designed(replace(PLAIN, slew_ratio=value), model) for value in (1.0, math.inf))
+    slow = plain(PLAIN, model)
+    free = replace(slow, slew=None)
     told, expected = slow.estimate(jumping(run)), free.estimate(ramped(jumping(run), 15.6))
     np.testing.assert_array_equal(told.outputs, expected.outputs)
     np.testing.assert_array_equal(told.covariance, expected.covariance)
@@ -79,7 +85,7 @@ class _Copy:
 
 def test_it_is_filterpys_extended_filter(model: Model, run: Recording) -> None:
     # At the heaviest payload, where it begins, the coarse model is so wrong that the gate would refuse less noise.
-    observer = designed(replace(PLAIN, measurement_noise_std=20.0 * NOISE), model)
+    observer = plain(replace(PLAIN, measurement_noise_std=20.0 * NOISE), model)
     # Walk of a tenth of the range, 1 kg, in a second.
     walk = 0.1 * math.sqrt(0.02)
     # It begins at the heaviest.
@@ -109,9 +115,9 @@ def test_it_is_filterpys_extended_filter(model: Model, run: Recording) -> None:
 
 def test_of_one_payload_it_is_the_filter_over_the_model_of_that_payload(model: Model, run: Recording) -> None:
     arrays = {name: array for name, array in model.arrays.items() if name != "payload"}
-    plain = replace(model, arrays={**arrays, "neck": loaded_neck(arrays["neck"], model.arrays["payload"], 0.4)})
+    bare = replace(model, arrays={**arrays, "neck": loaded_neck(arrays["neck"], model.arrays["payload"], 0.4)})
     one = replace(model, arrays={**model.arrays, "payload": np.r_[0.4, 0.4, model.arrays["payload"][2:]]})
-    ours, theirs = designed(PLAIN, one).estimate(run), designed(PLAIN, plain).estimate(run)
+    ours, theirs = plain(PLAIN, one).estimate(run), plain(PLAIN, bare).estimate(run)
     # The outputs one after the other, and both at once.
     np.testing.assert_allclose(ours.outputs, theirs.outputs, rtol=0, atol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-9)
@@ -138,14 +144,14 @@ def test_an_outlier_moves_neither_angle_nor_payload(model: Model, run: Recording
 @pytest.mark.parametrize("factor", [0.2, 3.0])
 def test_the_payload_stays_between_those_of_the_recordings(model: Model, run: Recording, factor: float) -> None:
     far = run.with_channels(pitch=factor * run.channels["pitch"], roll=factor * run.channels["roll"])
-    masses = designed(PLAIN, model)._rows(far)[0][:, -1]
+    masses = plain(PLAIN, model)._rows(far)[0][:, -1]
     assert masses.min() >= 0.0
     assert masses.max() <= 1.0
     assert {0.0, 1.0} & set(masses)
 
 
 def test_a_jacobi_loop_gives_it_the_set_points_a_sample_early(model: Model, run: Recording) -> None:
-    rows = [designed(replace(PLAIN, order=order), model)._rows(run)[0] for order in ("sequential", "jacobi")]
+    rows = [plain(replace(PLAIN, order=order), model)._rows(run)[0] for order in ("sequential", "jacobi")]
     np.testing.assert_array_equal(rows[0][:, [0, 1, 6]], rows[1][:, [0, 1, 6]])
 
 
