@@ -15,6 +15,7 @@ import pytest
 
 from softneck.cli import main
 from softneck.drives.running import _virtual
+from softneck.drives.simulated import SimulatedSettings
 from softneck.drives.simulated._habits import WireHabits
 from softneck.signals import read_recording
 
@@ -32,11 +33,11 @@ def strict(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> l
     made: list[WireHabits] = []
     habits = SLOW if request.param == "slow" else replace(STRICT, mode_when=request.param)
 
-    def asked() -> WireHabits:
+    def asked(**how: Any) -> SimulatedSettings:
         made.append(habits)
-        return habits
+        return SimulatedSettings(**{**how, "habits": habits})
 
-    monkeypatch.setattr(_virtual, "WireHabits", asked)
+    monkeypatch.setattr(_virtual, "SimulatedSettings", asked)
     return made
 
 

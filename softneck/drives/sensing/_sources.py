@@ -8,7 +8,7 @@ import math
 import struct
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
 from ..bus._link import Link
-from ..bus._sensor_source import SENSORS, Axes, SensorSource, axes_of, turned
+from ..bus._sensor_source import SENSORS, SensorSource, axes_of, turned
 from ..master import Frame, Tilt
 from ..master._gate import Reading, sample_of
 from ._serial import SensorError, SerialInclinometer
@@ -87,29 +87,11 @@ class CanInclinometer:
                 self._newest = sample_of([slope * _RESOLUTION for slope in slopes], valid=_NOTHING not in slopes)
 
 
-class _FirstAngle:
-    """Of a two-axis inclinometer the first angle, for a robot with one output; it sits with that axis in its plane."""
+class _Changed:
+    """A sensor whose samples are changed: it is mounted with other axes or signs, or one angle of its two is meant."""
 
-    def __init__(self, sensor: SerialInclinometer) -> None:
-        self._sensor, self.name, self.close = sensor, sensor.name, sensor.close
-
-    @property
-    def problem(self) -> str:
-        return self._sensor.problem
-
-    def take(self, frames: Sequence[Frame]) -> None:
-        self._sensor.take(frames)
-
-    def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
-        tilt = self._sensor.read(now, frames)
-        return None if tilt is None else sample_of(tilt.values[:1], tilt.rates[:1], valid=tilt.valid)
-
-
-class _Turned:
-    """A sensor that is mounted with other axes, or signs, than the robot's outputs."""
-
-    def __init__(self, sensor: Any, axes: Axes) -> None:
-        self._sensor, self._axes, self.take = sensor, axes, sensor.take
+    def __init__(self, sensor: Any, change: Callable[[Reading], Reading]) -> None:
+        self._sensor, self._change, self.take = sensor, change, sensor.take
 
     def __getattr__(self, name: str) -> Any:
         # What not every sensor has: name, problem, close.
@@ -117,7 +99,7 @@ class _Turned:
 
     def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
         sample = self._sensor.read(now, frames)
-        return None if sample is None else turned(sample, self._axes)
+        return None if sample is None else self._change(sample)
 
 
 @contextlib.contextmanager
@@ -134,7 +116,8 @@ def open_sensor(
     """
     sensor = _opened(kind, node, source, robot)
     if axes:
-        sensor = _Turned(sensor, axes_of(axes, robot.outputs.names))
+        order = axes_of(axes, robot.outputs.names)
+        sensor = _Changed(sensor, lambda sample: turned(sample, order))
     try:
         yield sensor
     finally:
@@ -155,7 +138,9 @@ def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
                     '"python".'
                 )
             sensor = SerialInclinometer(source.port, baud=source.baud, request=source.request, start=source.start)
-            return sensor if count == 2 else _FirstAngle(sensor)
+            # Of a robot with one output the sensor sits with its first axis in that plane.
+            first = lambda tilt: sample_of(tilt.values[:1], tilt.rates[:1], valid=tilt.valid)  # noqa: E731
+            return sensor if count == 2 else _Changed(sensor, first)
         case "python":
             return make_python_sensor(source.python, source.options, source.folder, outputs=count)
         case _:

@@ -14,7 +14,6 @@ import click
 
 from softneck.core import SettingsError
 from softneck.plant import NeckParameters
-from softneck.robot import Robot, find_robot
 
 from ._drives import SimulatedDrives, SimulatedSettings
 from ._habits import habits_of
@@ -22,16 +21,11 @@ from ._neck import SimulatedNeck
 from ._power import STATES
 from ._profiles import PROFILES
 from ._server import serve
-from ._springs import SimulatedSprings, SpringSettings
-
-# Of the lab's drives: static tilt by Eq. 31 [rad/rad], range [rad], current limit [A].
-_GAIN, _REACH, _CURRENT = 0.483 / 5.293, 6.0, 0.0299
 
 
 @click.command()
 @click.argument("bus", metavar="INTERFACE:CHANNEL")
 @click.option("--neck", default="paper", show_default=True, help="paper, lab, rough or a neck file (.toml).")
-@click.option("--robot", help="Instead of a neck: a robot's preset or file; its motors turn springs here.")
 @click.option("--profile", type=click.Choice(list(PROFILES)), default="ipos2015", show_default=True)
 @click.option("--homed", is_flag=True, help="As if `softneck drives commission --only zero` had been run.")
 @click.option("--seed", type=int, default=0, show_default=True, help="Seed of the inclinometer's noise.")
@@ -45,12 +39,10 @@ _GAIN, _REACH, _CURRENT = 0.483 / 5.293, 6.0, 0.0299
     help="How strict the drives are, such as sdo_latency=0.05; again for more (docs/reference/drives.md).",
 )
 def main(
-    bus: str, neck: str, robot: str | None, profile: str, homed: bool, seed: int, report: bool, cycle: float,
+    bus: str, neck: str, profile: str, homed: bool, seed: int, report: bool, cycle: float,
     habits: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C.
-
-    With --robot as many drives as it has motors, from node 1 on.
 
     SIGUSR1 presses the hardware stop at the drives' Enable inputs, SIGUSR2 unplugs the inclinometer; sent again they
     release it and plug it in.
@@ -63,34 +55,14 @@ def main(
         common["habits"] = habits_of(habits)
     except SettingsError as error:
         raise click.BadParameter(str(error), param_hint="--habit") from error
-    virtual = (
-        SimulatedNeck(NeckParameters.preset(neck), SimulatedSettings(**common))
-        if robot is None
-        else _springs(find_robot(robot), common)
-    )
+    virtual = SimulatedNeck(NeckParameters.preset(neck), SimulatedSettings(**common))
     # All that compiles at its first call does so before the drives answer.
     virtual.move()
     virtual.sample(0.0)
     gc.freeze()
     with can.Bus(interface=interface, channel=channel) as opened, signals(virtual):
-        count = {3: "three"}.get(len(virtual.drives), str(len(virtual.drives)))
-        click.echo(f"{count} {profile} drives on {bus}; Ctrl-C ends them", err=True)
+        click.echo(f"three {profile} drives on {bus}; Ctrl-C ends them", err=True)
         serve(opened, virtual, report=_print if report else None)
-
-
-def _springs(robot: Robot, common: dict[str, Any]) -> SimulatedSprings:
-    weights = robot.weights()
-    if weights is None:
-        raise click.ClickException(f"robot {robot.label()}: nothing can stand for it before its directions are known.")
-    count, lab = len(robot.motors.names), SimulatedSettings()
-    each = {name: getattr(lab, name)[:1] * count for name in ("gear", "counts_per_turn", "peak_current", "slow_loop")}
-    settings = SimulatedSettings(
-        nodes=tuple(range(1, count + 1)), reversed=tuple(sign < 0.0 for sign in robot.motors.sign), **each, **common
-    )
-    springs = SpringSettings(
-        outputs=robot.outputs.names, weights=_GAIN * weights, reach=(_REACH,) * count, current_limit=(_CURRENT,) * count
-    )
-    return SimulatedSprings(springs, settings)
 
 
 def _print(now: float, neck: SimulatedDrives, row: int) -> None:

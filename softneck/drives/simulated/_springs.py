@@ -47,20 +47,18 @@ class SpringSettings:
         winch_radius: [m].
         pretension_current: which holds a tendon at P = 0 [A].
         noise_std: of the sensor [rad]; a sensor without any noise would look frozen.
-
-    What is not given is the lab's: motors, gears, winches, and the neck's lag.
     """
 
     outputs: tuple[str, ...]
     weights: Matrix
     reach: tuple[float, ...]
     current_limit: tuple[float, ...]
-    pole: float = 5.293
-    torque_constant: float = 0.0839
-    efficiency: float = 0.81
-    winch_radius: float = 0.0075
-    pretension_current: float = 0.0151
-    noise_std: float = 1e-5
+    pole: float
+    torque_constant: float
+    efficiency: float
+    winch_radius: float
+    pretension_current: float
+    noise_std: float
 
     def __post_init__(self) -> None:
         if self.weights.shape != (len(self.outputs), len(self.reach)):
