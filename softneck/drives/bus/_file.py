@@ -286,22 +286,17 @@ class DrivesFile(Shown):
                 f"[supervision] `baseline` is of samples every {b.cycle * b.sample_cycles:g} s on a bus of "
                 f"{b.cycle:g} s; these are {sample_time:g} s and {self.cycle:g} s. Record one for them."
             )
-        scales = [drive.scale for drive in self.drives]
-        k = [scale.counts_per_radian for scale in scales]
-        neck = self.neck
-        n = [
-            internal_to_current(1, scale) * neck.torque_constant * neck.efficiency * scale.gear / neck.winch_radius
-            for scale in scales
-        ]
-        if self.profile == "ds402":
-            raise_per_mille = [math.copysign(1e-3 * 0.06, scale.counts_per_radian) for scale in scales]
-            n = [unit * neck.torque_constant * neck.efficiency * scale.gear / neck.winch_radius
-                 for unit, scale in zip(raise_per_mille, scales, strict=True)]  # fmt: skip
+        scales, neck = [drive.scale for drive in self.drives], self.neck
+        # A ds402 drive tells its current in thousandths of the motor's rated one.
+        units = [math.copysign(1e-3 * 0.06, scale.counts_per_radian) if self.profile == "ds402" else
+                 internal_to_current(1, scale) for scale in scales]  # fmt: skip
+        n = [unit * neck.torque_constant * neck.efficiency * scale.gear / neck.winch_radius
+             for unit, scale in zip(units, scales, strict=True)]  # fmt: skip
         bus = BusSettings(
             nodes=self.nodes, cycle=self.cycle, guarding=guarding, guard_cycles=self.guard_cycles, late_modes=late_modes
         )
         return MasterSettings(
-            counts_per_radian=tuple(k),
+            counts_per_radian=tuple(scale.counts_per_radian for scale in scales),
             newton_per_unit=tuple(n),
             sample_cycles=round(ratio),
             bus=bus,
