@@ -172,12 +172,12 @@ def command(
     if named is not None and (guess or layout_file is not None):
         raise SettingsError("--motor, --position and --output are the layout; leave out --guess and --layout.")
     job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known, named)
-    if ours:
-        _run_log(job, layout=asked)
-        return
-    if not asked and sample_time is not None:
-        _resample(job, robot)
-        return
+    alone = ours or (not asked and sample_time is not None)
+    if ours and asked:
+        raise SettingsError(f"{log}: is a log of softneck, whose columns are known; leave out --layout and --guess.")
+    if alone and html is not None:
+        what = "log of softneck" if ours else "recording"
+        raise SettingsError(f"--html shows what a layout or a guess made of a log; a {what} needs neither.")
     if robot_out is not None:
         if guess or layout_file is not None or (robot is not None and named is None):
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
@@ -186,13 +186,16 @@ def command(
         if (said := said_robot(log, log.suffix.lower())) is not None:
             raise SettingsError(f"{log}: is a recording of robot {said.label()} already, which commands take as it is.")
         guess = named is None
-    if named is None and guess == (layout_file is not None):
+    if not alone and named is None and guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given (a recording needs --resample)"
         raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
     recording_suffix(path)
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
+    if alone:
+        _finish(job, *(_run_log(log) if ours else _recorded(log, robot)))
+        return
     facts: dict[str, Any] = {}
     whose = find_robot(robot, beside=log)
     if robot_out is not None or named is not None or (layout_file is None and not whose.is_neck):
@@ -206,33 +209,37 @@ def command(
     else:
         layout, proposed = read_layout(layout_file, robot=whose), None
         imported = import_log(log, layout)
-    _finish(job, imported, layout, proposed, facts)
+    _finish(job, imported, facts, layout, proposed)
 
 
-def _resample(job: _Job, robot: str | None) -> None:
-    """Bring a recording to another sample time."""
-    from softneck.signals import read_recording, write_recording
+def _recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any]]:
+    """Return a recording that is to be brought to another sample time."""
+    from softneck.signals import read_recording
     from softneck.signals.importing._log import ImportResult
-    from softneck.signals.recording._files import recording_suffix
 
-    if job.html is not None:
-        raise SettingsError("--html shows what a layout or a guess made of a log; a recording needs neither.")
-    recording_suffix(job.path)
-    refuse_existing(job.path, force=job.replace)
-    before = read_recording(job.log, robot=robot)
-    imported = _at_sample_time(job, ImportResult(before, ()))
-    write_recording(job.path, imported.recording, force=job.replace)
-    _tell(job.path, imported, {"sample_time_before_s": before.sample_time}, job.as_json)
+    before = read_recording(log, robot=robot)
+    return ImportResult(before, ()), {"sample_time_before_s": before.sample_time}
 
 
-def _finish(job: _Job, imported: ImportResult, layout: Layout, proposed: Guess | None, facts: dict[str, Any]) -> None:
+def _run_log(log: Path) -> tuple[ImportResult, dict[str, Any]]:
+    """Return the recording of a run on drives."""
+    from softneck.drives import read_run_log  # the drives take a while to import
+    from softneck.signals.importing._log import ImportResult
+
+    run = read_run_log(log)
+    notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
+    return ImportResult(run.recording(), notes), {}
+
+
+def _finish(
+    job: _Job, imported: ImportResult, facts: dict[str, Any], layout: Layout | None = None,
+    proposed: Guess | None = None,
+) -> None:  # fmt: skip
     """Resample where asked, write all files, and say what was done."""
     from softneck.signals import write_recording
-    from softneck.signals.recording._files import require_samples
 
     imported = _at_sample_time(job, imported)
-    require_samples(imported.recording)
-    if job.html is not None:
+    if job.html is not None and layout is not None:
         job.texts[job.html] = (_preview(job, layout, proposed, imported), job.force)
         facts["html"] = str(job.html)
     job.write({job.path: (lambda path: write_recording(path, imported.recording, force=True), job.replace)})
@@ -271,34 +278,8 @@ def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: Import
     )
 
 
-def _run_log(job: _Job, *, layout: bool) -> None:
-    """Import the log of a run on drives."""
-    from softneck.drives import read_run_log  # the drives take a while to import
-    from softneck.signals import write_recording
-    from softneck.signals.importing._log import ImportResult
-    from softneck.signals.recording._files import recording_suffix
-
-    if layout:
-        raise SettingsError(
-            f"{job.log}: is a log of softneck, whose columns are known; leave out --layout and --guess."
-        )
-    if job.html is not None:
-        raise SettingsError("--html shows what a layout or a guess made of a log; a log of softneck needs neither.")
-    recording_suffix(job.path)
-    refuse_existing(job.path, force=job.replace)
-    run = read_run_log(job.log)
-    notes = (f"{job.log}: {run.cut}: imported up to the cut",) if run.cut else ()
-    imported = _at_sample_time(job, ImportResult(run.recording(), notes))
-    write_recording(job.path, imported.recording, force=job.replace)
-    _tell(job.path, imported, {}, job.as_json)
-
-
 def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, Any]]:
-    """Guess a layout, ask about what is not sure, and import by it.
-
-    Raises:
-        DataError: what a recording needs was not found; the proposal and the preview are written as far as they go.
-    """
+    """Guess a layout, ask about what is not sure, and import by it."""
     import tomli_w
 
     from softneck.signals import guess_layout, import_log
@@ -351,26 +332,24 @@ def _of_robot(
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
     remarks: dict[str, str] = {}
+    found = None
     if job.named is not None:
         found = robot_of_columns(job.log, job.named, robot=robot if known else None, sample_time=job.clock)
-        layout = found.layout
-        if robot_out is not None or found.robot.hash != robot.hash:
-            file = robot_out or job.beside(".robot.toml")
-            refuse_existing(file, force=job.force if robot_out else job.replace)
-            text = f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
-            job.texts[file] = (text + tomli_w.dumps(found.robot.as_dict()), job.force if robot_out else job.replace)
-            facts["robot_file"] = str(file)
     elif robot_out is not None:
         refuse_existing(robot_out, force=job.force)
         found = guess_robot(job.log)
         remarks[found.robot.set_points[0]] = found.remark
-        layout, text = found.layout, f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
-        job.texts[robot_out] = (text + tomli_w.dumps(found.robot.as_dict()), job.force)
-        facts |= {"robot_file": str(robot_out), "reasons": list(found.lines)}
+        facts["reasons"] = list(found.lines)
         for line in found.lines:
             note(line)
-    else:
-        layout = layout_for(job.log, robot)
+    layout = layout_for(job.log, robot) if found is None else found.layout
+    if found is not None and (robot_out is not None or found.robot.hash != robot.hash):
+        file = robot_out or job.beside(".robot.toml")
+        force = job.replace if robot_out is None else job.force
+        refuse_existing(file, force=force)
+        text = f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
+        job.texts[file] = (text + tomli_w.dumps(found.robot.as_dict()), force)
+        facts["robot_file"] = str(file)
     text = layout_toml(layout, remarks=remarks)
     job.texts[proposal] = (text, job.replace)
     imported = import_log(job.log, layout)

@@ -178,11 +178,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
 
 
 def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
-    """Return what a foreign log seems to hold; `error` is why it is not a recording, where it has a recording's ending.
-
-    Raises:
-        DataError, FileFormatError: it is a recording with a fault, or no log either.
-    """
+    """Return what a foreign log seems to hold; `error` is why a file with a recording's ending is not one."""
     from softneck.signals import guess_layout
 
     try:

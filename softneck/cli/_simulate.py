@@ -205,9 +205,6 @@ def replay_log(log: Path, *, as_json: bool) -> None:
     """Feed what a run saw to the same core and controller again, and compare every frame out, bit for bit.
 
     A log that is cut is replayed up to the cut, which is said. Nothing is sent to any bus.
-
-    Raises:
-        CheckFailedError: a frame differs, with the first one.
     """
     from softneck.drives import read_run_log, replay
     from softneck.drives.logs._log_file import changed_files

@@ -77,7 +77,9 @@ def command(
         comparison = compare(loaded, recordings, rules=rules, progress=report)
     results = list(comparison.validations)
     if html is not None:
-        write_page(html, _page(results), force=force)
+        from softneck.report import validation_page  # it draws in all of the project, which the table does not need
+
+        write_page(html, validation_page(results), force=force)
     if as_json:
         print_json(comparison.as_dict())
     else:
@@ -110,9 +112,3 @@ def _horizons(text: str) -> tuple[int | str, ...]:
         else:
             raise SettingsError(f"--horizon takes numbers of samples and `inf`, such as 1,5,25,inf; got `{word}`.")
     return tuple(dict.fromkeys(horizons))
-
-
-def _page(results: list[Validation]) -> str:
-    from softneck.report import validation_page  # it draws in all of the project, which the table does not need
-
-    return validation_page(results)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, Vector, require_one_of
+from softneck.core import DataError, Vector, require_one_of, to_si
 from softneck.core._shown import Shown
 
-from ._style import BLUE, GREY
+from ._style import BLUE, GREY, looks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -225,3 +225,21 @@ def _draw_curve(ax: Axes, curve: Curve) -> None:
             ax.step(x, y, where="post", color=colour, lw=curve.width, label=name)
         case _:
             ax.plot(x, y, ls=_DASHES.get(curve.style, "-"), color=colour, lw=curve.width, label=name)
+
+
+def signals_figure(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str], title: str) -> Figure:
+    """Draw channels, those of one unit in one panel; angles, by whatever time, in degrees."""
+    groups: dict[str, list[str]] = {}
+    for name in columns:
+        groups.setdefault(units[name], []).append(name)
+    panels = []
+    for unit, names in groups.items():
+        seen = unit.replace("rad", "deg") if unit.startswith("rad") else unit
+        scale = to_si("deg")[0] if seen != unit else 1.0
+        curves = [
+            Curve(time, columns[name] / scale, name, colour, style)
+            for name, (colour, style) in zip(names, looks(), strict=False)
+        ]
+        what = names[0].rpartition("_")[0] or "value" if len(names) > 1 else names[0]
+        panels.append(Panel(curves, f"{what} [{seen or '-'}]"))
+    return chart_figure(Chart(title, panels))

@@ -11,6 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot
+from softneck.signals import Recording
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel, chart_figure
@@ -56,9 +57,6 @@ def timeline(time: Vector, run: np.ndarray | None = None) -> Timeline:
         time: (rows,) [s]; may start anew where a run does.
         run: (rows,) number of the run or stretch of each row; a row after a step that is not a sample time starts a
             stretch as well.
-
-    Raises:
-        DataError: no rows, or another length of `run`.
     """
     time = np.asarray(time, dtype=np.float64)
     shape = time.shape if run is None else run.shape
@@ -92,29 +90,12 @@ _ZERO = Level(0.0, dashed=False)
 _OUTPUT_COLOURS = (BLUE, ORANGE, GREEN, SKY)
 
 
-def recording_chart(
-    time: Vector,
-    set_points: Matrix,
-    outputs: Matrix,
-    title: str,
-    *,
-    run: np.ndarray | None = None,
-    robot: Robot = NECK,
-) -> Chart:
-    """Describe an experiment.
-
-    Args:
-        time: (time,) [s].
-        set_points: (time, motors) in SI, of a neck (time, 3) [rad], held between samples.
-        outputs: (time, outputs) in SI, of a neck pitch and roll [rad]; drawn in the robot's display unit, of a neck
-            degrees; NaN where a sample was missed.
-        title: of the chart.
-        run: (time,) numbers of the runs; None where there is one.
-        robot: whose motors and outputs these are.
-    """
-    line = timeline(time, run)
+def recording_chart(recording: Recording, title: str) -> Chart:
+    """Describe an experiment: set-points, held between samples, and outputs, in the units in which people see them."""
+    robot, outputs = recording.robot, recording.outputs
+    line = timeline(recording.time, recording.run)
     unit, drawn = robot.motors.unit, robot.outputs.display_unit
-    sent = set_points / to_si(unit)[0]
+    sent = recording.set_points / to_si(unit)[0]
     motors = [
         Curve(line.x, line.spread(sent[:, j]), f"motor {j + 1}", ALL_MOTOR_COLOURS[j], "step", 0.9)
         for j in range(sent.shape[1])
@@ -283,9 +264,6 @@ def residual_chart(
         title: of the chart.
         caption: for under the chart.
         robot: whose outputs and motors these are.
-
-    Raises:
-        DataError: shapes do not fit.
     """
     lags, values, bounds = autocorrelation
     cross_lags, cross, cross_bounds = cross_correlation
@@ -409,9 +387,6 @@ def pareto_chart(
         labels: of the axes.
         title: of the chart.
         caption: for under the chart.
-
-    Raises:
-        DataError: no run has both metrics.
     """
     curves = []
     for (name, (x, y)), (colour, _) in zip(groups.items(), looks(), strict=False):
@@ -431,9 +406,6 @@ def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *
         values: metric -> name of a group -> (n,); values that are not finite are left out.
         title: of the chart.
         caption: for under the chart.
-
-    Raises:
-        DataError: no value is finite.
     """
     panels = []
     for metric, groups in values.items():

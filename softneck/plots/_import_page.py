@@ -51,12 +51,8 @@ def import_page(
     sections = [_doubts(doubts, problems, lines, first), _made(frame, layout, recording)]
     if charts[:-1]:
         sections.append(Section("Raw and made", charts=[chart for chart in charts if chart is not None]))
-    left_out = [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]
-    if left_out:
-        rows = [[*line.split(": because ", 1), ""][:2] for line in left_out]
-        sections.append(
-            Section("Left out", tables=[Table("Columns that were not used", ["column", "why"], rows, text=2)])
-        )
+    if left_out := [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]:
+        sections.append(Section("Left out", text=left_out))
     return page(
         f"Import of {log.name}", sections, verdict=_verdict(doubts, problems, recording),
         holds=False if problems else None if doubts else True,

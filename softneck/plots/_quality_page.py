@@ -71,7 +71,7 @@ def quality_page(recording: Recording, quality: Quality, title: str) -> str:
     sections = [
         Section("Findings", charts=[faults], findings=_findings(quality)),
         Section("Channels", tables=[_channels(quality)]),
-        Section("Excitation", text=[spectrum], tables=[_inputs(quality), _conditions(quality)]),
+        Section("Excitation", text=[spectrum, *quality.numbers()]),
     ]
     return page(
         title, sections, verdict=_verdict(recording, quality), holds=quality.severity != "warning",
@@ -116,34 +116,6 @@ def _channels(quality: Quality) -> Table:
         tail = [_number(shown["quantum"]), "-" if channel.command else _number(shown["noise_std"])]
         rows.append([name, *numbers, channel.unit, *tail, *counts])
     return Table("Channels: steps and noise in the channel's unit, faults in rows", head, rows)
-
-
-def _inputs(quality: Quality) -> Table:
-    spectrum = quality.spectrum
-    rows = [
-        [
-            name,
-            f"{low:+.3g}",
-            f"{high:+.3g}",
-            unit,
-            _number(100 * spectrum.below_bandwidth[i]),
-            _number(spectrum.highest[i]),
-            _number(spectrum.crest[i]),
-        ]
-        for i, (name, (low, high, unit)) in enumerate(quality.inputs.items())
-    ]
-    below = f"power below {spectrum.bandwidth:.3g} rad/s [%]"
-    head = ["input", "lowest", "highest", "unit", below, "real power up to [rad/s]", "crest"]
-    return Table("Inputs", head, rows)
-
-
-def _conditions(quality: Quality) -> Table:
-    rows = [
-        [axis, str(c.rows), "infinite" if np.isinf(c.number) else f"{c.number:.3g}", ", ".join(c.weakest)]
-        for axis, c in quality.conditioning.items()
-    ]
-    head = ["axis", "rows", "condition", "least told apart"]
-    return Table("Regressor of Eq. 21, every column at mean 0 and standard deviation 1", head, rows)
 
 
 def _number(value: float | None) -> str:

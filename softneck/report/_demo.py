@@ -17,7 +17,7 @@ from softneck.identification import INFINITE, Model, Validation
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plots import Chart, Section, Table, neck_view, page, write_page
 from softneck.plots._charts import loop_chart, recording_chart, validation_chart
-from softneck.signals import Recording, write_recording
+from softneck.signals import write_recording
 
 from ._packaging import (
     TOLERANCE,
@@ -313,11 +313,9 @@ def _fits(demo: Demo) -> Section:
 
 def _experiment_section(experiments: Experiments) -> Section:
     recordings = {"identification": experiments.identification, **experiments.judged}
-    return Section("Experiment", charts=[_chart(recording, _TITLES[name]) for name, recording in recordings.items()])
-
-
-def _chart(recording: Recording, title: str) -> Chart:
-    return recording_chart(recording.time, recording.set_points, recording.outputs, title, run=recording.run)
+    return Section(
+        "Experiment", charts=[recording_chart(recording, _TITLES[name]) for name, recording in recordings.items()]
+    )
 
 
 def _model_section(models: Mapping[str, Model]) -> Section:

@@ -103,27 +103,21 @@ def paper_charts(found: Reproduction) -> dict[str, Chart]:
     experiments, tests = found.experiments, found.experiments.tests
     whole = concatenate([experiments.identification, experiments.validation])
     charts = {
-        "4": _recorded("4. Input and output signals", whole),
+        "4": recording_chart(whole, "Figure 4. Input and output signals"),
         "5": _redefined(experiments.identification),
         "6": _step_responses(found.models["rls"]),
         "7": _linear_excerpt(found),
-        "8": _recorded("8. Signals of the validation", experiments.validation),
+        "8": recording_chart(experiments.validation, "Figure 8. Signals of the validation"),
         "9 and 10": _outputs("9 and 10. Validation", found, "validation"),
     }
     for test, first in zip(TESTS, (11, 14, 17), strict=True):
-        charts[f"{first}"] = _recorded(f"{first}. {_TITLES[test]}, signals", tests[test])
+        charts[f"{first}"] = recording_chart(tests[test], f"Figure {first}. {_TITLES[test]}, signals")
         numbers = f"{first + 1} and {first + 2}"
         charts[numbers] = _outputs(f"{numbers}. {_TITLES[test]}", found, test)
     for numbers, test in ((_FIRST, "rotation"), ("22 and 23", "sine")):
         title = f"{numbers}. {_TITLES[test]}, free run with measured motors"
         charts[numbers] = _outputs(title, found, test, measured_motors=True)
     return charts
-
-
-def _recorded(title: str, recording: Recording) -> Chart:
-    return recording_chart(
-        recording.time, recording.set_points, recording.outputs, f"Figure {title}", run=recording.run
-    )
 
 
 def _redefined(recording: Recording) -> Chart:

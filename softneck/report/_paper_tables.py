@@ -54,7 +54,7 @@ PAPER_HEAD = [
 PAPER_NOTE = (
     "Fit 100 (1 - |y - yhat| / |y - mean y|) in %. SM and NN of Tables 3 and 4 are one step ahead, RLS a free run; "
     "section 7.4 is a free run with measured motors. SM's norm has no weights and the units of the paper's logs, "
-    "motors in rad and angles in deg; `scaling` is SM with weights chosen for free run. `Other necks` is the span of "
+    "motors in rad and angles in deg. `Other necks` is the span of "
     "the same estimator, trained anew, over the other plants; rough is the one that a line follows no better than "
     "the paper's neck. A figure of the paper inside these needs no other cause; "
     "`unexplained`: none tried here."
@@ -72,7 +72,6 @@ class Entry:
         paper, ours: fits [%]; ours is None where the free run diverged.
         rough: the same on the preset `rough` [%]; None where it diverged, or the preset is not among the other necks.
         other_necks: least and largest fit over the other necks [%], or None.
-        other_scaling: ours with the other scaling of the regressor [%], or None.
     """
 
     where: str
@@ -85,7 +84,6 @@ class Entry:
     ours: float | None
     rough: float | None
     other_necks: tuple[float, float] | None
-    other_scaling: float | None
 
     @property
     def verdict(self) -> str:
@@ -97,9 +95,6 @@ class Entry:
         fits = [self.ours, *(self.other_necks or ())]
         if min(fits) <= self.paper <= max(fits):
             return "the plant's: within necks"
-        fits += [] if self.other_scaling is None else [self.other_scaling]
-        if min(fits) <= self.paper <= max(fits):
-            return "plant and scaling"
         return f"unexplained: ours {'higher' if self.ours > self.paper else 'lower'}"
 
     def as_dict(self) -> dict[str, Any]:
@@ -109,8 +104,6 @@ class Entry:
     def row(self) -> list[str]:
         """Return the cells under `PAPER_HEAD`."""
         span = "-" if self.other_necks is None else f"{self.other_necks[0]:.1f} to {self.other_necks[1]:.1f}"
-        if self.other_scaling is not None:
-            span += f"; scaling {self.other_scaling:.1f}"
         held = "" if self.persistence is None else _number(self.persistence)
         return [
             self.where,
@@ -151,7 +144,6 @@ def _entries(found: Reproduction) -> Iterator[Entry]:
                     ours=_fit(found.judged, key, axis, configuration),
                     rough=_fit(found.others[ROUGH], key, axis, configuration) if ROUGH in found.others else None,
                     other_necks=_span(found.others, key, axis, configuration),
-                    other_scaling=_fit(found.rescaled, key, axis, configuration) if key in found.rescaled else None,
                 )
 
 

@@ -16,7 +16,6 @@ from softneck.identification.validation._validation import Rules, judge, judged_
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import loop_chart, recording_chart, validation_chart
 from softneck.robot._search import FILE
-from softneck.signals import Recording
 
 from ._project import Project
 from ._study_page import study_sections
@@ -39,7 +38,7 @@ def project_page(project: Project, *, progress: Progress = silent) -> str:
     kept = [section for section in sections if section is not None]
     sentence, holds = _sentence(project)
     return page(
-        title, [_overview(project), *kept], verdict=sentence, holds=holds,
+        title, kept, verdict=sentence, holds=holds,
         footer=f"softneck report, {now}. All plots and tables are in this file.",
     )  # fmt: skip
 
@@ -75,30 +74,6 @@ def _shortly(doubts: Sequence[str]) -> str:
     return f"{doubts[0].partition(' sure): ')[0]} sure){more}"
 
 
-def _overview(project: Project) -> Section:
-    loops = [result for result in project.loops.values() if result.limits]
-    held = sum(result.holds for result in loops)
-    certified = sum(_certifies(content) for content in project.certificates.values())
-    lines = [
-        ("recordings", len(project.recordings), "-"),
-        ("models", len(project.models), "-"),
-        ("uncertain plants", len(project.families), "-"),
-        ("observers and controllers", len(project.observers) + len(project.controllers), "-"),
-        ("certificates", len(project.certificates), _verdict(certified, len(project.certificates))),
-        ("FMUs", len(project.fmus), "-"),
-        ("loops", len(project.loops), _verdict(held, len(loops))),
-        ("studies", len(project.studies), "-"),
-        ("files that could not be read or run", len(project.problems), "fails" if project.problems else "-"),
-    ]
-    rows = [[name, str(count), verdict] for name, count, verdict in lines]
-    table = Table("What is there", ["", "number", "verdict"], rows)
-    return Section("Overview", tables=[table])
-
-
-def _verdict(held: int, of: int) -> str:
-    return "-" if not of else "holds" if held == of else "fails"
-
-
 def _data(project: Project) -> Section | None:
     if not project.recordings:
         return None
@@ -111,7 +86,7 @@ def _data(project: Project) -> Section | None:
         ])  # fmt: skip
         findings += [[name, str(finding)] for finding in found.findings if finding.severity != "ok"]
         if len(charts) < _MOST_CHARTS:
-            charts.append(_recorded(name, recording))
+            charts.append(recording_chart(recording, name))
     head = ["recording", "rows", "runs", "length [s]", "sample time [ms]", "worst finding"]
     tables = [Table("Recordings", head, rows)]
     if findings:
@@ -120,12 +95,6 @@ def _data(project: Project) -> Section | None:
     if unsure:
         tables.insert(0, Table("What is not sure", ["file", "taken"], unsure, text=2))
     return Section("Data", tables=tables, charts=charts)
-
-
-def _recorded(name: str, recording: Recording) -> Chart:
-    return recording_chart(
-        recording.time, recording.set_points, recording.outputs, name, run=recording.run, robot=recording.robot
-    )
 
 
 def _models(project: Project, progress: Progress) -> Section | None:

@@ -55,7 +55,6 @@ class Reproduction:
         experiments: recordings on the `paper` preset.
         models: nlsm, nn and rls of those.
         judged: (model, data) -> scores on the `paper` preset.
-        rescaled: the same for set membership with weights chosen for free run instead of the paper's units.
         others: name of another neck -> its scores.
         seconds: it all took.
     """
@@ -64,7 +63,6 @@ class Reproduction:
     experiments: Experiments
     models: Mapping[str, Model]
     judged: Verdicts
-    rescaled: Verdicts
     others: Mapping[str, Verdicts]
     seconds: float
 
@@ -79,7 +77,6 @@ def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
     begin = time.monotonic()
     experiments = record_experiments(NeckParameters.paper(), duration=settings.duration, tell=tell)
     models = _models(experiments, settings, tell)
-    rescaled = SetMembership().fit(experiments.identification, progress=tell("identify nlsm, weights for free run"))
     others: dict[str, Verdicts] = {}
     for name, neck in _other_necks(settings.other_necks).items():
         recorded = record_experiments(neck, duration=settings.duration, tell=lambda text, n=name: tell(f"{n}: {text}"))
@@ -93,7 +90,6 @@ def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
         experiments=experiments,
         models=models,
         judged=judge(models, experiments, tell=tell),
-        rescaled=judge({"nlsm": rescaled}, experiments, tell=tell),
         others=others,
         seconds=time.monotonic() - begin,
     )

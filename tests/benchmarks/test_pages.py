@@ -14,6 +14,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from softneck.plots import Section, page
 from softneck.plots._charts import recording_chart, residual_chart, validation_chart
+from softneck.signals import Recording
 
 from ..browser import shown
 
@@ -44,7 +45,7 @@ def validation_html(rows: int) -> str:
     charts = [
         validation_chart(t, y, runs, "Measured and predicted", bounds=(y - 0.05, y + 0.05)),
         validation_chart(t, y, {f"model {k}": y + k * e for k in range(3)}, "Free runs"),
-        recording_chart(t, motors, y, "Recording"),
+        recording_chart(Recording.from_arrays(motors, y), "Recording"),
         residual_chart(
             (lags, 0.01 * rng.standard_normal((2, 26)), np.full(2, 0.015)),
             (cross_lags, 0.01 * rng.standard_normal((2, 3, 51)), np.full((2, 3), 0.03)),

@@ -9,6 +9,7 @@ from matplotlib.patches import Rectangle
 from softneck.core import DataError, SettingsError
 from softneck.plots import Chart, Curve, Level, Panel, chart_figure
 from softneck.plots._charts import recording_chart, timeline, validation_chart
+from softneck.signals import Recording
 
 
 def _wave(columns: int, rows: int = 100) -> np.ndarray:
@@ -95,8 +96,7 @@ def test_borders_of_runs_at_one_sample_time_come_from_the_run_numbers() -> None:
 
 
 def test_a_recording_is_drawn_with_held_set_points_in_degrees() -> None:
-    t = np.arange(100) * 0.02
-    chart = recording_chart(t, _wave(3), _wave(2), "r", run=np.repeat([0, 1], 50))
+    chart = recording_chart(Recording.from_arrays(_wave(3), _wave(2), run=np.repeat([0, 1], 50)), "r")
     top, bottom = chart.panels
     assert {curve.style for curve in top.curves} == {"step"}
     y = bottom.curves[0].y

@@ -41,7 +41,7 @@ def recording() -> Recording:
 
 def test_a_recording_has_all_motors_and_outputs_in_the_robot_s_units(recording: Recording) -> None:
     r = recording
-    motors, outputs = recording_chart(r.time, r.set_points, r.outputs, "x", robot=r.robot).panels
+    motors, outputs = recording_chart(r, "x").panels
     assert [curve.label for curve in motors.curves] == [f"motor {j}" for j in range(1, 6)]
     assert len({curve.colour for curve in motors.curves}) == 5
     assert (motors.y_label, outputs.y_label) == ("set-point [bar]", "output [mm]")

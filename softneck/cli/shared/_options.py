@@ -79,22 +79,14 @@ def output_option(what: str, metavar: str, *, required: bool = False) -> Callabl
 
 
 def target(output: Path | None, default: str, *, force: bool, ending: str | None = None) -> tuple[Path, bool]:
-    """Return where to write and whether what stands there may be replaced: always under build/.
-
-    Raises:
-        SettingsError: another ending than `ending`, by which files are known.
-    """
+    """Return where to write and whether what stands there may be replaced: always under build/."""
     if output is not None and ending is not None and output.suffix.lower() != ending:
         raise SettingsError(f"{output}: must end in `{ending}`, by which softneck recognises the file.")
     return (output, force) if output is not None else (Path("build") / default, True)
 
 
 def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any) -> Any:
-    """Return `settings_class` with `KEY=VALUE` assignments and `more`, both checked against its fields.
-
-    Raises:
-        SettingsError: no `=`, an unknown key, or a value that does not fit.
-    """
+    """Return `settings_class` with `KEY=VALUE` assignments and `more`, both checked against its fields."""
     values: dict[str, Any] = {}
     fields = {field.name for field in dataclasses.fields(settings_class)}
     for assignment in assignments:
@@ -116,11 +108,7 @@ def in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
 
 
 def sample_time_of(text: str, option: str) -> float:
-    """Return a sample time [s] as an option says it.
-
-    Raises:
-        SettingsError: no positive number.
-    """
+    """Return a sample time [s] as an option says it."""
     value = value_of(text)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
         raise SettingsError(f"{option} takes a sample time in seconds, such as 0.02; got `{text}`.")

@@ -77,9 +77,6 @@ def possible(plants: tuple[str, ...]) -> str:
 
     Args:
         plants: files of the models that `tune` is given.
-
-    Raises:
-        SettingsError: what is asked cannot be, and no requirement is to blame.
     """
     refused = impossible(plants)
     if refused:

@@ -30,10 +30,6 @@ def project_of_loop(loop_file: Path, folder: Path) -> dict[str, str]:
     Args:
         loop_file: the loop; its parts are taken from `fmus/`.
         folder: of the project, whose robot says how noisy its sensor is.
-
-    Raises:
-        FileFormatError: not a loop file.
-        SettingsError: a loop with another reference than a step.
     """
     robot = find_robot(beside=folder / "loop.toml")
     loop = _over_fmus(_read(loop_file), robot)

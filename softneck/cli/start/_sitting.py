@@ -55,11 +55,7 @@ class Sitting:
 
     @classmethod
     def read(cls, *, as_json: bool) -> Sitting:
-        """Return the sitting of the working folder, a new one where there is none.
-
-        Raises:
-            FileFormatError: its file is damaged.
-        """
+        """Return the sitting of the working folder, a new one where there is none."""
         path = Path(FILE)
         if not path.is_file():
             return cls(as_json=as_json)
@@ -81,11 +77,7 @@ class Sitting:
             temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
     def do(self, step: Step) -> None:
-        """Run a step unless it is done; what it found is in `done` then.
-
-        Raises:
-            SoftneckError: it cannot be done, or nothing that comes after could be believed.
-        """
+        """Run a step unless it is done; what it found is in `done` then."""
         entry = self.done.get(step.key, {})
         reads = {name: _hash(name) for name in step.reads}
         same = entry.get("asked") == step.asked and entry.get("reads") == reads

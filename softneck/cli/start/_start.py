@@ -197,11 +197,7 @@ def _shortened(said: str, advice: str = "") -> str:
 
 @contextlib.contextmanager
 def _project(folder: Path) -> Iterator[None]:
-    """Make `folder` the working folder; where nothing was made in it, nothing of it is left.
-
-    Raises:
-        OutputFileError: it holds something else, or cannot be written.
-    """
+    """Make `folder` the working folder; where nothing was made in it, nothing of it is left."""
     if folder.exists() and not folder.is_dir():
         raise SettingsError(f"{folder}: is a file; name a folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():

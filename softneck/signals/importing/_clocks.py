@@ -29,11 +29,7 @@ _FEW, _OFTEN, _NEARLY_ALL, _PIECE, _WHOLE = 3, 10, 0.9, 150, 0.2
 
 
 def time_of(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple[str, ...]]:
-    """Return (time,) [s] of the columns of a time's source, and what was done; times since 1970 count from the first.
-
-    Raises:
-        DataError: a cell is neither number nor date.
-    """
+    """Return (time,) [s] of a time's source, and what was done; times since 1970 count from the first."""
     if source.unit == DATE:
         column, name = columns[0], str(source.terms[0].column)
         return seconds(column, name), (f"time counts from the first date, {column.iloc[0]}",) if len(column) else ()
@@ -62,9 +58,6 @@ def merged(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
 
     Set-points and flags keep the last value before; other channels are interpolated linearly between their neighbours,
     and are missed where those are far apart. Rows before the first set-point are left out.
-
-    Raises:
-        DataError: an output or a set-point was never told.
     """
     told = {name: np.isfinite(values) for name, values in samples.channels.items()}
     silent = [name for name, there in told.items() if not there.any()]
@@ -78,7 +71,7 @@ def merged(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
     for name, values in samples.channels.items():
         found[name] = np.full(values.size, np.nan)
         for rows in samples.runs():
-            part = _held(values[rows]) if is_held(name) else _between(samples.time[rows], values[rows])
+            part = last_values(values[rows]) if is_held(name) else _between(samples.time[rows], values[rows])
             found[name][rows] = part
         if is_held(name):
             keep &= np.isfinite(found[name])
@@ -88,7 +81,7 @@ def merged(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
     return Samples(samples.time, samples.run, found).rows(keep), note
 
 
-def _held(values: Vector) -> Vector:
+def last_values(values: Vector) -> Vector:
     """Return each value until the next one; NaN before the first."""
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(values.size), -1))
     return np.where(last >= 0, values[last], np.nan)
@@ -187,9 +180,6 @@ def turns(quaternion: Matrix) -> dict[str, Vector]:
     They are the first two of yaw, pitch and roll in this order (z, y', x''), which ROS and aviation use:
     `x = atan2(2 (w x + y z), 1 - 2 (x^2 + y^2))`, `y = asin(2 (w y - z x))` (Diebel 2006, sec. 8.11). A row without
     numbers is a missed sample, and so is one of zeros.
-
-    Raises:
-        DataError: most rows are no quaternions: their length is not about 1.
     """
     length = np.sqrt((quaternion * quaternion).sum(axis=1))
     sound = np.abs(length - 1.0) < 0.1

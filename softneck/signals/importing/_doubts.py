@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 
 from softneck.core import SettingsError
 
-from ..recording._channels import MOTOR_POSITIONS, MOTORS, OUTPUTS, SET_POINTS
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS
 from ._draft import Draft, say
 from ._guess_units import Unit
 from ._layout import Layout
@@ -15,9 +15,8 @@ from ._layout_text import ONE_AXIS
 
 #: Below it a guess is asked about, or marked.
 SURE = 0.9
-_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 _TILT = (*OUTPUTS, "inclination", "orientation", "pitch_reference", "roll_reference")
-_GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": _VELOCITIES}
+_GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": MOTOR_VELOCITIES}
 _AS_LOGGED = "as logged"
 # However surely the motors say so: a log that says otherwise by its titles is worth a question.
 _MOST_SURE = 0.89
@@ -131,11 +130,7 @@ def one_axis_doubt(axis: str) -> Doubt:
 
 
 def settled(layout: Layout, doubt: Doubt, choice: str) -> Layout:
-    """Return the layout where a doubt was settled by one of its choices.
-
-    Raises:
-        SettingsError: not one of them.
-    """
+    """Return the layout where a doubt was settled by one of its choices."""
     if choice not in doubt.choices:
         raise SettingsError(f"{doubt.about}: `{choice}` is none of {', '.join(doubt.choices) or 'no choices'}.")
     if doubt.about == "rows of one time stamp":

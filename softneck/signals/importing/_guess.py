@@ -12,7 +12,7 @@ from softneck.core import DataError
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 
-from ..recording._channels import MOTOR_POSITIONS, MOTORS, NECK, OUTPUTS, SET_POINTS
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS
 from ..recording._redefinition import redefine
 from ..recording._resampling import jitter
 from ._column_shapes import lagged
@@ -37,7 +37,6 @@ from ._layout_text import layout_toml
 from ._sample_time import SampleTime, estimate_sample_time
 from ._table_format import sniff
 
-_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 _NO_CHANNELS = ("time", "run", "inclination", "orientation")
 # Half a second at 20 ms: the platform answers within it.
 _NECK_LAG = 25
@@ -204,7 +203,7 @@ def _clocked(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple[Layo
 
 
 def _estimated(draft: Draft, found: dict[str, Unit]) -> SampleTime | None:
-    names = [name for name in (*MOTOR_POSITIONS, *_VELOCITIES) if name in draft.picks]
+    names = [name for name in (*MOTOR_POSITIONS, *MOTOR_VELOCITIES) if name in draft.picks]
     factors = {"deg": np.pi / 180, "deg/s": np.pi / 180, "rpm": np.pi / 30}
     channels = {name: factors.get(found[name].name, 1.0) * draft.values(name) for name in names}
     try:

@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import SoftneckError
 from softneck.robot import Robot
 
-from ..recording._channels import MOTOR_POSITIONS, MOTORS, OUTPUTS, SET_POINTS, parse_column
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column
 from ..recording._redefinition import redefine
 from ._clocks import turns
 from ._column_shapes import lagged
@@ -20,7 +20,6 @@ from ._draft import Draft, Pick, say
 from ._layout import Column, Quaternion, Term
 from ._sample_time import velocity_period
 
-_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 # `imu.orientation.x`, `quat_w`, `qx`, `rotation[2]`: what it is of, and which part.
 _PART = re.compile(r"(?P<of>.*?(?:quat\w*|orientation|attitude|rotation|\bq|_q))[._ \[]?(?P<part>[wxyz])\]?")
 _NECK_LAG = 25
@@ -89,8 +88,8 @@ def stand_ins(draft: Draft) -> None:
             # Positions and velocities tell the sample time where nothing else does.
             if "time" in draft.picks:
                 del draft.picks[there]
-    elif draft.has(_VELOCITIES):
-        for asked, speed in zip(SET_POINTS, _VELOCITIES, strict=True):
+    elif draft.has(MOTOR_VELOCITIES):
+        for asked, speed in zip(SET_POINTS, MOTOR_VELOCITIES, strict=True):
             pick = draft.picks[speed]
             why = f"no set-points or positions were logged, so the velocities, summed up, are the inputs ({pick.why})"
             sure = min(_STAND_IN, pick.confidence)
@@ -242,11 +241,11 @@ def _follow(draft: Draft, family: Family) -> float:
 
 def _velocities(draft: Draft, own: set[Column]) -> None:
     """Take named velocities, or a command of speed less its error where that is the rate of the positions."""
-    if draft.has(_VELOCITIES):
+    if draft.has(MOTOR_VELOCITIES):
         return
     named = _families(draft, "velocity", own)
     if named:
-        _take(draft, _VELOCITIES, named[0])
+        _take(draft, MOTOR_VELOCITIES, named[0])
         return
     if not draft.has(MOTOR_POSITIONS):
         return
@@ -262,7 +261,7 @@ def _velocities(draft: Draft, own: set[Column]) -> None:
             )
             if agree > _RATE:
                 why = f"their difference is the rate of the position (correlation {agree:.2f} or more)"
-                for channel, c, e in zip(_VELOCITIES, command, error, strict=True):
+                for channel, c, e in zip(MOTOR_VELOCITIES, command, error, strict=True):
                     draft.picks[channel] = Pick((Term(c), Term(e, -1.0)), why)
                     draft.passed_over.pop(c, None)
                 return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..recording._channels import MOTOR_POSITIONS, MOTORS, SET_POINTS
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS
 from ._column_shapes import (
     FOLLOWS,
     answers,
@@ -21,7 +21,6 @@ from ._column_shapes import (
 from ._draft import Draft, Pick
 from ._layout import Term
 
-_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 # More columns than this are a dump of something, and all pairs of them are too many.
 _MOST = 40
 # A term that adds less than this part of the motion is noise of the fit.
@@ -78,7 +77,7 @@ def _clock(draft: Draft) -> None:
 
 
 def _rates(draft: Draft) -> None:
-    if draft.has(MOTOR_POSITIONS) or draft.has(_VELOCITIES):
+    if draft.has(MOTOR_POSITIONS) or draft.has(MOTOR_VELOCITIES):
         return
     free = {name: draft.moving[name] for name in draft.free()[:_MOST]}
     found = rates(free, draft.runs())
@@ -87,7 +86,7 @@ def _rates(draft: Draft) -> None:
     positions, velocities, agree = found
     for names, columns, what in (
         (MOTOR_POSITIONS, positions, "has three rates beside it"),
-        (_VELOCITIES, velocities, "is one"),
+        (MOTOR_VELOCITIES, velocities, "is one"),
     ):
         for channel, column in zip(names, columns, strict=True):
             draft.pick(

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTORS, OUTPUTS, SET_POINTS, file_unit
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, file_unit
 from ._draft import Draft
 from ._sample_time import velocity_period
 from .formats._dates import DATE
@@ -102,7 +102,6 @@ def _normal(distance: float, spread: float) -> float:
     return -0.5 * (distance / spread) ** 2 - log(spread)
 
 
-_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 _REFERENCES = ("pitch_reference", "roll_reference")
 _TILTED = ("pitch", "roll", "inclination", *_REFERENCES)
 # The paper's sample time [s], which decides where the data leave it open; sample times of loggers lie around it by a
@@ -309,18 +308,18 @@ def _why(reaches: dict[str, float], titled: dict[str, str], group: str, verdict:
 
 def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
     """Take the unit in which rates and positions agree at a period next to the time column's, or to 20 ms."""
-    if not draft.has(_VELOCITIES) or _VELOCITIES[0] in found:
+    if not draft.has(MOTOR_VELOCITIES) or MOTOR_VELOCITIES[0] in found:
         return
     if not draft.has(MOTOR_POSITIONS):
         if SET_POINTS[0] in draft.picks and draft.picks[SET_POINTS[0]].integrate:
-            found.update({name: found[asked] for name, asked in zip(_VELOCITIES, SET_POINTS, strict=True)})
+            found.update({name: found[asked] for name, asked in zip(MOTOR_VELOCITIES, SET_POINTS, strict=True)})
         return
     factors = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0}
     angle = np.pi / 180.0 if found[MOTOR_POSITIONS[0]][0] == "deg" else 1.0
     run = draft.runs()
     periods = [
         angle * velocity_period(draft.values(p), draft.values(v), run)[0]
-        for p, v in zip(MOTOR_POSITIONS, _VELOCITIES, strict=True)
+        for p, v in zip(MOTOR_POSITIONS, MOTOR_VELOCITIES, strict=True)
     ]
     period = float(np.median(periods))
     nominal = nominal_step(draft, found)
@@ -328,7 +327,7 @@ def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
         return
     unit = min(factors, key=lambda name: abs(np.log(period / factors[name] / nominal)))
     why = f"in it they agree with the positions at {1e3 * period / factors[unit]:.3g} ms a sample"
-    for name in _VELOCITIES:
+    for name in MOTOR_VELOCITIES:
         found[name] = Unit(unit, 1.0, why, 0.97)
 
 

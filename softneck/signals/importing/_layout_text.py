@@ -121,9 +121,6 @@ def doubts_in(path: str | Path) -> tuple[str, ...]:
     """Return what a layout file marks as not sure, as `what (80 % sure): why`, which outputs there are first.
 
     Who looked and found a guess right removes its remark.
-
-    Raises:
-        FileFormatError: no text, or too long for a layout.
     """
     try:
         text = settings_text(path)

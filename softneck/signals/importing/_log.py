@@ -80,12 +80,7 @@ def import_log(path: str | Path, layout: Layout) -> ImportResult:
 
 
 def read_log(source: Path, layout: Layout) -> pd.DataFrame:
-    """Return a log's table, by what the file is.
-
-    Raises:
-        FileFormatError: no such file or no table.
-        DataError: the layout names a variable or a sheet that is not there.
-    """
+    """Return a log's table, by what the file is."""
     kind, form = format_of(source), layout.form
     if layout.variable is not None and kind != "mat":
         raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
@@ -133,11 +128,7 @@ def _imported(frame: pd.DataFrame, layout: Layout) -> ImportResult:
 
 
 def _refuse_range(layout: Layout, channels: Mapping[str, Vector]) -> tuple[str, ...]:
-    """Return a warning where set-points go further than the motors' range.
-
-    Raises:
-        DataError: motors go so far beyond it, for more than some glitches of an encoder, that the unit is wrong.
-    """
+    """Return a warning where set-points go further than the motors' range."""
     motors, robot = layout.robot.motors, layout.robot
     warnings: list[str] = []
     for name in (*robot.set_points, *robot.motor_positions):

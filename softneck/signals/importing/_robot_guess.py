@@ -74,12 +74,7 @@ def is_of_another_robot(path: str | Path) -> bool:
 
 
 def guess_robot(path: str | Path) -> RobotGuess:
-    """Return the robot that a log's titles speak of: motors by their words, and all else that moves as outputs.
-
-    Raises:
-        FileFormatError: no such file, or no table.
-        DataError: columns without titles, no motor, no output, or more than a robot can have.
-    """
+    """Return the robot that a log's titles speak of: motors by their words, and all else that moves as outputs."""
     table = sniff(path, fewest=2)
     time, run, rest = _clock(table)
     motors = [title for title in rest if _words(title) & _MOVERS]
@@ -114,11 +109,6 @@ def robot_of_columns(
         named: its columns, in the order of the robot's channels.
         robot: whose they are; None: the neck where they are its own, else one is proposed.
         sample_time: [s] of a log without a clock.
-
-    Raises:
-        FileFormatError: no such file, or no table.
-        DataError: no such column, one without numbers, other numbers of them than the robot has, no clock.
-        SettingsError: no motor, no output, a column twice, a sample time beside a clock.
     """
     table = sniff(path, fewest=2)
     if not named.motors or not named.outputs:
@@ -193,12 +183,7 @@ def _proposed(
 
 
 def layout_for(path: str | Path, robot: Robot) -> Layout:
-    """Return the layout of a log whose titles are the robot's channels, or the names of its motors and outputs.
-
-    Raises:
-        FileFormatError: no such file, or no table.
-        DataError: a column is not there.
-    """
+    """Return the layout of a log whose titles are the robot's channels, or the names of its motors and outputs."""
     table = sniff(path, fewest=2)
     time, run, rest = _clock(table)
     found = {" ".join(_WORD.findall(_UNIT.sub("", title).lower())): title for title in rest}
@@ -259,11 +244,7 @@ def _clock_unit(table: SniffResult, column: Column) -> str:
 
 
 def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column]) -> str:
-    """Return the unit that titles name; 1 where none does.
-
-    Raises:
-        DataError: units of two quantities, which one robot's motors or outputs cannot have.
-    """
+    """Return the unit that titles name; 1 where none does."""
     named = [_unit_of(table, title) or "1" for title in titles]
     if len({to_si(unit)[1] for unit in named}) > 1:
         raise DataError(

@@ -44,9 +44,6 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
     Args:
         channels: with motor_position_j [rad] and motor_velocity_j [rad/s], each (time,).
         run: (time,) numbers of the runs.
-
-    Raises:
-        DataError: no motor has both, or none whose two agree.
     """
     periods = []
     for j in (1, 2, 3):

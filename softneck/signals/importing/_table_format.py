@@ -14,6 +14,7 @@ import numpy as np
 from softneck.core import DataError, FileFormatError, Vector
 
 from ..recording._files import WHITESPACE, read_table
+from ._clocks import last_values
 from ._layout import Column, Layout
 from .formats._dates import is_date, seconds
 from .formats._encodings import encoding_of, format_of
@@ -69,12 +70,7 @@ class SniffResult:
 
 
 def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
-    """Read a log of unknown form, of at least `fewest` columns: those that a recording of its robot needs.
-
-    Raises:
-        FileFormatError: no such file, or no table.
-        DataError: a table of fewer columns than a recording needs.
-    """
+    """Read a log of unknown form, of at least `fewest` columns: those that a recording of its robot needs."""
     source = Path(path)
     frame, form, lines, units = _form(source, fewest)
     columns: dict[Column, Vector] = {}
@@ -98,7 +94,7 @@ def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
         )
     if form.merge or _is_sparse(columns):
         form = replace(form, merge=True)
-        columns = {name: _last_values(values) for name, values in columns.items()}
+        columns = {name: last_values(values) for name, values in columns.items()}
     named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
     return SniffResult(columns, tuple(words), form, lines, named, frozenset(dates), frame)
 
@@ -139,12 +135,6 @@ def _is_sparse(columns: dict[Column, Vector]) -> bool:
     absent = [np.isnan(values) for values in columns.values()]
     patterns = {gaps.tobytes() for gaps in absent if gaps.mean() > 0.2}
     return len(patterns) > 1 and float(np.any(absent, axis=0).mean()) > 1.0 - _WHOLE_ROWS
-
-
-def _last_values(values: Vector) -> Vector:
-    seen = np.isfinite(values)
-    last = np.maximum.accumulate(np.where(seen, np.arange(values.size), -1))
-    return np.where(last >= 0, values[last], np.nan)
 
 
 def _seconds(column: pd.Series) -> Vector | None:

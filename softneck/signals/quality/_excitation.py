@@ -1,4 +1,4 @@
-"""What the inputs tell: spectrum against the bandwidth, condition of Eq. 21's regressor, correlation.
+"""What the inputs tell: spectrum against the bandwidth, and correlation.
 
 Inputs are a neck's theta_i, phi_i and delta_i, and the set-points of another robot's motors.
 """
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from softneck.core import Matrix, Vector
 
@@ -62,31 +61,10 @@ class Spectrum:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class Conditioning:
-    """Condition of one axis's regressor matrix (Eq. 21) with every column at mean 0 and standard deviation 1.
-
-    Attributes:
-        axis: name of the output.
-        rows: regressors without a missed sample.
-        columns: names of the regressor's columns.
-        number: largest by smallest singular value; infinite where a column is constant or depends on others.
-        weakest: the columns that the least excited direction is made of.
-    """
-
-    axis: str
-    rows: int
-    columns: tuple[str, ...]
-    number: float
-    weakest: tuple[str, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return what JSON holds; an infinite number becomes null there."""
-        return {"number": self.number, "rows": self.rows, "columns": self.columns, "weakest": self.weakest}
-
-
 def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     """Return the spectrum of the inputs, averaged over runs by their rows."""
+    from scipy.signal import welch
+
     neck = recording.robot.is_neck
     runs = [redefine(run.set_points) if neck else run.set_points for run in recording.runs()]
     segment = _SEGMENT
@@ -100,7 +78,7 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
         if len(u) >= 8:
             # Runs shorter than a segment are padded with zeros, so that all have the same frequencies.
             length = min(size, len(u))
-            density += len(u) * welch(u, recording.sample_time, length, size)
+            density += len(u) * welch(u, 1.0 / recording.sample_time, nperseg=length, nfft=size, axis=0)[1]
             rows += len(u)
     omega = 2.0 * np.pi * f
     density /= 2.0 * np.pi * max(rows, 1)
@@ -108,27 +86,6 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     names = INPUTS if neck else recording.robot.set_points
     ranges = np.column_stack([pooled.min(axis=0), pooled.max(axis=0)])
     return Spectrum(names, bandwidth, omega, density, *_shares(omega, density, bandwidth), _crest(pooled), ranges)
-
-
-def welch(u: Matrix, sample_time: float, length: int, size: int) -> Matrix:
-    """Return the one-sided power spectral density (size // 2 + 1, columns) per Hz by Welch's method (1967).
-
-    As `scipy.signal.welch` with its defaults, whose import takes ten times as long as all else here.
-
-    Args:
-        u: (time, columns), at least `length` rows.
-        sample_time: [s].
-        length: of a segment; each overlaps the next by half and is weighted by Hann's window.
-        size: of the Fourier transform, which pads each segment with zeros.
-    """
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)
-    segments = sliding_window_view(u, length, axis=0)[:: length - length // 2]
-    centred = segments - segments.mean(axis=-1, keepdims=True)
-    power = np.abs(np.fft.rfft(centred * window, n=size, axis=-1)) ** 2
-    density = power.mean(axis=0).T * (sample_time / (window @ window))
-    # What stands at negative frequencies, too; zero and half the sample rate have no such twin.
-    density[1 : (size + 1) // 2] *= 2.0
-    return density
 
 
 def _shares(omega: Vector, density: Matrix, bandwidth: float) -> tuple[Vector, Vector]:
@@ -150,43 +107,6 @@ def _crest(inputs: Matrix) -> Vector:
     deviation = inputs - inputs.mean(axis=0)
     std = deviation.std(axis=0)
     return np.divide(np.abs(deviation).max(axis=0), std, out=np.full_like(std, np.nan), where=std > 1e-9)
-
-
-def conditioning(recording: Recording, axis: str) -> Conditioning:
-    """Return the condition of Eq. 21's regressor for `axis`, row by row within each run.
-
-    The columns are y(k-1), u_j(k-2), u_j(k-3) and M_j(k-3); without logged positions the last ones would repeat
-    the set-points and are left out.
-    """
-    motors = range(1, len(recording.robot.motors.names) + 1)
-    names = ["y(k-1)", *(f"u{j}(k-{lag})" for j in motors for lag in (2, 3))]
-    if recording.has_motor_positions:
-        names += [f"M{j}(k-3)" for j in motors]
-    parts = [_regressors(run, axis) for run in recording.runs() if len(run) > 3]
-    X = np.concatenate(parts) if parts else np.zeros((0, len(names)))
-    X = X[np.isfinite(X).all(axis=1)]
-    if len(X) < len(names):
-        return Conditioning(axis, len(X), tuple(names), float("inf"), ())
-    scale = X.std(axis=0)
-    still = scale <= 1e-9 * np.maximum(1.0, np.abs(X).max(axis=0))
-    if still.any():
-        return Conditioning(axis, len(X), tuple(names), float("inf"), _named(names, still))
-    _, singular, Vt = np.linalg.svd((X - X.mean(axis=0)) / scale, full_matrices=False)
-    number = float("inf") if singular[-1] <= 1e-12 * singular[0] else float(singular[0] / singular[-1])
-    return Conditioning(axis, len(X), tuple(names), number, _named(names, np.abs(Vt[-1]) > 0.3))
-
-
-def _regressors(run: Recording, axis: str) -> Matrix:
-    """Return the rows k = 3 .. end of Eq. 21."""
-    y, u = run.channels[axis], run.set_points
-    columns = [y[2:-1], *(u[3 - lag : len(u) - lag, j] for j in range(u.shape[1]) for lag in (2, 3))]
-    if run.has_motor_positions:
-        columns += list(run.motor_positions[:-3].T)
-    return np.column_stack(columns)
-
-
-def _named(names: list[str], chosen: np.ndarray) -> tuple[str, ...]:
-    return tuple(name for name, take in zip(names, chosen, strict=True) if take)
 
 
 def correlation(recording: Recording) -> Matrix:

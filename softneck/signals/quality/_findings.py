@@ -15,7 +15,8 @@ from softneck.robot import Robot
 
 from ..recording._recording import Recording
 from ._channel_faults import ChannelQuality, Stretch, check_channel, count_rows
-from ._excitation import BANDWIDTH, Conditioning, Spectrum, conditioning, correlation, spectrum
+from ._excitation import BANDWIDTH, Spectrum, correlation, spectrum
+from ._poor_excitation import independent_motions
 
 SEVERITIES = ("ok", "note", "warning")
 # A loop must stop when the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a
@@ -25,8 +26,6 @@ _LONG_GAP, _MANY_MISSED = 0.1, 0.05
 _COARSE = 100.0
 # Pair correlation: two motors share half and nine tenths of their variance.
 _RELATED, _ALIKE = 0.7, 0.95
-# Eq. 22 gives 450, closed-loop steps 10,000; from a million on, what tells two columns apart is below any encoder.
-_ILL, _SINGULAR = 1e3, 1e6
 # An input without power beyond half the bandwidth says nothing of the neck's pole at about 5 1/s. It reaches the
 # bandwidth where its power does but for a line of the spectrum, which is 0.15 of the neck's 4 rad/s wide.
 _SLOW, _REACHED = 0.5, 0.95
@@ -72,7 +71,7 @@ class Quality(Shown):
         sample_time: [s].
         channels: name -> faults of that channel.
         spectrum: of a neck's theta_i, phi_i, delta_i; of another robot's set-points.
-        conditioning: output -> condition of Eq. 21's regressor.
+        directions: in how many directions the set-points move, as `independent_motions` counts them.
         correlation: (motors, motors) between the motors' set-points.
     """
 
@@ -81,7 +80,7 @@ class Quality(Shown):
     sample_time: float
     channels: dict[str, ChannelQuality]
     spectrum: Spectrum
-    conditioning: dict[str, Conditioning]
+    directions: int
     correlation: Matrix
 
     @property
@@ -103,29 +102,25 @@ class Quality(Shown):
             "channels": {name: channel.as_dict() for name, channel in self.channels.items()},
             "bandwidth_rad_s": self.spectrum.bandwidth,
             "excitation": self.spectrum.as_dict(),
-            "condition": {axis: condition.as_dict() for axis, condition in self.conditioning.items()},
+            "directions": self.directions,
             "correlation": {"channels": self.robot.set_points, "matrix": self.correlation},
         }
 
     def lines(self) -> tuple[str, ...]:
         """Return the report as lines: the numbers, then one line for each finding."""
-        return (*self._numbers(), "", *(str(finding) for finding in self.findings))
+        return (*self.numbers(), "", *(str(finding) for finding in self.findings))
 
     def text(self) -> str:
         """Return the report as text."""
         return "\n".join(self.lines())
 
-    @property
-    def inputs(self) -> dict[str, tuple[float, float, str]]:
-        """Return the lowest and highest value of each input of the spectrum, and their unit."""
-        unit = self.robot.motors.unit
-        shown = (self.spectrum.ranges / to_si(unit)[0]).tolist()
-        return {name: (low, high, unit) for name, (low, high) in zip(self.spectrum.inputs, shown, strict=True)}
-
-    def _numbers(self) -> list[str]:
+    def numbers(self) -> list[str]:
+        """Return a line on each input, and on noise, correlation and steps."""
         spectrum, unit = self.spectrum, self.robot.outputs.display_unit
         lines = []
-        for i, (name, (low, high, of_input)) in enumerate(self.inputs.items()):
+        of_input = self.robot.motors.unit
+        ranges = (spectrum.ranges / to_si(of_input)[0]).tolist()
+        for i, (name, (low, high)) in enumerate(zip(spectrum.inputs, ranges, strict=True)):
             power = f"{_percent(spectrum.below_bandwidth[i])} of its power below {spectrum.bandwidth:.3g} rad/s, "
             power += f"real power up to {spectrum.highest[i]:.3g} rad/s, "
             judged = "" if np.isnan(spectrum.bandwidth) else power
@@ -133,9 +128,7 @@ class Quality(Shown):
             lines.append(f"{name}: {low:+.3g} to {high:+.3g} {of_input}, {judged}crest factor {crest}")
         measured = [self.channels[name] for name in self.robot.outputs.names]
         noise = ", ".join(f"{channel.name} {channel.shown(channel.noise):.3g} {unit}" for channel in measured)
-        condition = ", ".join(f"{axis} {c.number:.3g}" for axis, c in self.conditioning.items())
         lines.append(f"noise (standard deviation): {noise}")
-        lines.append(f"condition of Eq. 21's regressor, columns at unit variance: {condition}")
         if pairs := _pairs(self):
             which = ", ".join(f"{i + 1}-{j + 1}" for i, j in pairs)
             lines.append(f"correlation of motors {which}: {', '.join(_number(self.correlation[p]) for p in pairs)}")
@@ -170,7 +163,7 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
         sample_time=recording.sample_time,
         channels={name: check_channel(recording, name) for name in recording.channels},
         spectrum=spectrum(recording, bandwidth),
-        conditioning={axis: conditioning(recording, axis) for axis in recording.robot.outputs.names},
+        directions=independent_motions(recording),
         correlation=correlation(recording),
     )
 
@@ -178,7 +171,7 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
 def findings(quality: Quality) -> tuple[Finding, ...]:
     """Return all that there is to say, warnings first; a topic without fault says "ok" once."""
     said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality)]
-    said += [*_excitation(quality), *_conditioning(quality), *_ranges(quality), *_correlation(quality)]
+    said += [*_excitation(quality), *_directions(quality), *_ranges(quality), *_correlation(quality)]
     topics = {finding.topic for finding in said if finding.severity != "ok"}
     moved = "pitch and roll are excited" if quality.robot.is_neck else "every motor moves"
     clean = _CLEAN | {"excitation": f"{moved} up to the bandwidth of {quality.spectrum.bandwidth:.3g} rad/s."}
@@ -192,7 +185,7 @@ _CLEAN = {
     "clipping": "no channel has flat tops.",
     "outliers": "no spikes in outputs and motor positions.",
     "quantisation": "every channel has more than 100 levels in its range.",
-    "regressors": "the columns of Eq. 21's regressor can be told apart.",
+    "directions": "the motors move in as many directions as there are.",
     "correlation": "the motors move independently enough.",
 }
 
@@ -289,18 +282,13 @@ def _power(spectrum: Spectrum, i: int, moved: str, robot: str) -> Iterator[Findi
         yield Finding("note", "excitation", name, f"has {above}, where the {robot} hardly moves.", advice)
 
 
-def _conditioning(quality: Quality) -> Iterator[Finding]:
-    worst = max(quality.conditioning.values(), key=lambda condition: condition.number)
-    if worst.rows < len(worst.columns):
-        yield Finding("warning", "regressors", "", "too few rows for a regressor of Eq. 21.", "Record longer.")
-    elif worst.number > _ILL:
-        size = f"{worst.number:.2g}" if np.isfinite(worst.number) else "infinite (columns depend on each other)"
-        message = (
-            f"the condition of Eq. 21's regressor is {size}; least told apart: {', '.join(worst.weakest) or 'all'}."
-        )
+def _directions(quality: Quality) -> Iterator[Finding]:
+    motors = len(quality.robot.set_points)
+    if 0 < quality.directions < motors:
+        message = f"the motors move along {quality.directions} direction(s) only, of {motors}."
         needs = "theta_i and phi_i" if quality.robot.is_neck else "the robot's directions"
         advice = f"A linear model in {needs} needs no more; others want motors that move independently."
-        yield Finding("warning" if worst.number > _SINGULAR else "note", "regressors", "", message, advice)
+        yield Finding("note", "directions", "", message, advice)
 
 
 def _ranges(quality: Quality) -> Iterator[Finding]:

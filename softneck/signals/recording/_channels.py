@@ -14,6 +14,7 @@ MOTORS = (1, 2, 3)
 #: Names of the three channels with the motors' set-points of a neck.
 SET_POINTS = NECK.set_points
 MOTOR_POSITIONS = NECK.motor_positions
+MOTOR_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
 # [rad] The motors stay within 6 rad: two turns are another unit, and in degrees hardly a move.
 MOTOR_TURNS = 4.0 * math.pi
 OUTPUTS = NECK.outputs.names
@@ -100,11 +101,7 @@ def is_held(channel: str) -> bool:
 
 
 def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
-    """Return (channel, factor to SI) of a column title such as `pitch [deg]`; motors by number or by name.
-
-    Raises:
-        DataError: no such channel, no unit, or a unit of another quantity.
-    """
+    """Return (channel, factor to SI) of a column title such as `pitch [deg]`; motors by number or by name."""
     table = _table(robot)
     match = _COLUMN.match(title.strip())
     if match is None:

@@ -175,9 +175,6 @@ def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> 
         thing: a recording, its file, a DataFrame or a dict of columns with units in their titles, an array (time,
             motors and outputs, or motors alone) in SI at the robot's sample time, or a list of them.
         robot: whose it is, as `read_recording` takes it; an array needs one.
-
-    Raises:
-        DataError: anything else, or recordings that do not go together.
     """
     if isinstance(thing, str | Path):
         return read_recording(thing, robot=robot)
@@ -219,11 +216,7 @@ def from_frame(frame: object, robot: Robot | str | Path | None = None) -> Record
 
 
 def said_robot(source: Path, suffix: str) -> Robot | None:
-    """Return the robot that a file says it is of, or None.
-
-    Raises:
-        DataError: what it says is no robot.
-    """
+    """Return the robot that a file says it is of, or None."""
     said: object = None
     try:
         if suffix == ".parquet" and source.is_file():
@@ -245,11 +238,7 @@ def said_robot(source: Path, suffix: str) -> Robot | None:
 
 
 def _whose(source: Path, said: Robot | None, given: str | Path | Robot | None) -> Robot:
-    """Return the robot of a file: the one given, else that of `robot.toml`, else what it says, else the neck.
-
-    Raises:
-        DataError: it says another than the one given or found.
-    """
+    """Return the robot of a file: the one given, else that of `robot.toml`, else what it says, else the neck."""
     found = find_robot(given, beside=source) if given is not None or robot_file_of(source) is not None else said
     found = Robot.preset("neck") if found is None else found
     if said is not None and said.hash != found.hash:
@@ -270,11 +259,7 @@ class TextForm:
 
 
 def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
-    """Read a table as text-free columns of floats where they are numbers.
-
-    Raises:
-        FileFormatError: no such file, or it is not a table.
-    """
+    """Read a table as text-free columns of floats where they are numbers."""
     import pandas as pd
 
     require_file(source)
@@ -372,9 +357,6 @@ def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: 
         name: of the column, for the error.
         missing: whether samples may be missing.
         nan_words: whether a missing sample may be written as `NaN`, as MATLAB and numpy write it.
-
-    Raises:
-        DataError: text, a written-out NaN, or an empty cell where none is allowed.
     """
     if isinstance(column, np.ndarray):
         return _numbers_only(column, name, missing=missing)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Vector, resolve, to_si
+from softneck.core import DataError, Vector, resolve
 from softneck.core._errors import require_package
 
 if TYPE_CHECKING:
@@ -102,22 +102,4 @@ def dataset(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str
 def signals_figure(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str], title: str) -> Figure:
     """Draw channels, those of one unit in one panel; angles, by whatever time, in degrees."""
     # The plots stand above the signals: by their names, as the kinds are.
-    chart, curve, panel, draw = (resolve(f"softneck.plots:{n}") for n in ("Chart", "Curve", "Panel", "chart_figure"))
-    looks = resolve("softneck.plots._style:looks")
-    groups: dict[str, list[str]] = {}
-    for name in columns:
-        groups.setdefault(units[name], []).append(name)
-    panels = [_panel(curve, panel, looks(), names, time, columns, unit) for unit, names in groups.items()]
-    return draw(chart(title, panels))
-
-
-def _panel(
-    curve: Any, panel: Any, looks: Any, names: Sequence[str], time: Vector, columns: Mapping[str, Vector], unit: str
-) -> Any:
-    shown = unit.replace("rad", "deg") if unit.startswith("rad") else unit
-    scale = to_si("deg")[0] if shown != unit else 1.0
-    drawn = [
-        curve(time, columns[name] / scale, name, colour, style)
-        for name, (colour, style) in zip(names, looks, strict=False)
-    ]
-    return panel(drawn, f"{names[0].rpartition('_')[0] or 'value' if len(names) > 1 else names[0]} [{shown or '-'}]")
+    return resolve("softneck.plots._chart:signals_figure")(time, columns, units, title)

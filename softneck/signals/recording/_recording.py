@@ -187,7 +187,7 @@ class Recording(Shown):
         chart, figure = (
             resolve(f"softneck.plots.{name}") for name in ("_charts:recording_chart", "_chart:chart_figure")
         )
-        return figure(chart(self.time, self.set_points, self.outputs, title, run=self.run, robot=self.robot))
+        return figure(chart(self, title))
 
     def __len__(self) -> int:
         return self.time.size
@@ -255,37 +255,6 @@ class Recording(Shown):
             raise DataError(f"{len(self)} rows cannot be split at {fraction:g}: one part would be empty.")
         return concatenate(heads), concatenate(tails)
 
-    def folds(self, count: int) -> tuple[tuple[Recording, Recording], ...]:
-        """Return `count` pairs (to train on, held out): each row is held out once, borders of runs stay borders.
-
-        Several runs are dealt out whole, so that the folds have about as many rows; one run is cut into blocks that
-        follow each other, and what lies before and after a block are two runs.
-
-        Raises:
-            DataError: fewer than 2 folds, or more than there are runs (or rows of the one run).
-        """
-        parts = self.runs()
-        most = len(parts) if len(parts) > 1 else len(self)
-        if not 2 <= count <= most:
-            what = f"{len(parts)} runs" if len(parts) > 1 else f"{most} rows"
-            raise DataError(f"{what} make 2 to {most} folds; got {count}.")
-        if len(parts) == 1:
-            edges = np.linspace(0, len(self), count + 1).round().astype(int).tolist()
-            return tuple(self._block(start, stop) for start, stop in itertools.pairwise(edges))
-        folds = _dealt([len(part) for part in parts], count)
-        return tuple(
-            (
-                concatenate([part for k, part in enumerate(parts) if k not in fold]),
-                concatenate([parts[k] for k in fold]),
-            )
-            for fold in folds
-        )
-
-    def _block(self, start: int, stop: int) -> tuple[Recording, Recording]:
-        """Return what lies around the rows `start` to `stop`, as runs of their own, and those rows."""
-        around = [self.rows(*edge) for edge in ((0, start), (stop, len(self))) if edge[0] < edge[1]]
-        return concatenate(around), concatenate([self.rows(start, stop)])
-
     def with_channels(self, **channels: Vector) -> Recording:
         """Return the same recording with channels added or replaced."""
         return replace(self, channels={**self.channels, **channels})
@@ -322,17 +291,6 @@ class Recording(Shown):
                 )
         if self.run.shape != (len(self),):
             raise DataError(f"`run` has shape {self.run.shape}; time has {(len(self),)}.")
-
-
-def _dealt(rows: Sequence[int], count: int) -> list[list[int]]:
-    """Return which runs of `rows` rows go to each fold: the longest first, to the fold with the fewest rows."""
-    folds: list[list[int]] = [[] for _ in range(count)]
-    total = [0] * count
-    for k in sorted(range(len(rows)), key=lambda k: -rows[k]):
-        least = total.index(min(total))
-        folds[least].append(k)
-        total[least] += rows[k]
-    return [sorted(fold) for fold in folds]
 
 
 def concatenate(recordings: Sequence[Recording], *, names: Sequence[str] = ()) -> Recording:

@@ -49,11 +49,7 @@ class Samples:
 
 
 def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tuple[str, ...]]:
-    """Return one row for each time stamp of a run, by the layout's rule `first` or `last`, and a note.
-
-    Raises:
-        DataError: a stamp stands twice and there is no rule.
-    """
+    """Return one row for each time stamp of a run, by the layout's rule `first` or `last`, and a note."""
     same = (np.diff(samples.time) == 0) & (np.diff(samples.run) == 0)
     if not same.any():
         return samples, ()
@@ -108,11 +104,7 @@ def jitter(time: Vector) -> tuple[float, float, float] | None:
 
 
 def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
-    """Return the samples with a new run after each gap, and notes; pieces shorter than 10 samples are dropped.
-
-    Raises:
-        DataError: no piece is long enough.
-    """
+    """Return the samples with a new run after each gap, and notes; pieces shorter than 10 samples are dropped."""
     step = np.diff(samples.time)
     inside = np.diff(samples.run) == 0
     gap, bound = gaps(samples)

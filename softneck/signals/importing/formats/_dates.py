@@ -34,9 +34,6 @@ def seconds(column: pd.Series, name: str) -> Vector:
 
     Times of day that fall by more than 12 h have passed midnight. Day and month are told apart by a number above 12; a
     log of less than a day is the same in either order.
-
-    Raises:
-        DataError: a cell is no date.
     """
     import pandas as pd
 

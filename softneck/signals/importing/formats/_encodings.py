@@ -48,11 +48,7 @@ ENCODINGS = ("utf-8", "cp1252", "utf-16", "utf-16-le", "utf-16-be", "utf-32")
 
 
 def format_of(source: Path) -> str:
-    """Return which of `FORMATS` a file is, by its content.
-
-    Raises:
-        FileFormatError: no such file, a folder, an empty file, or something that is no log, with what to do instead.
-    """
+    """Return which of `FORMATS` a file is, by its content."""
     if source.is_dir():
         inside = sorted(path.name for path in source.iterdir() if path.suffix.lower() in (".mcap", ".csv"))
         hint = f"name a file in it, such as {source / inside[0]}" if inside else "name a file in it"
@@ -90,11 +86,7 @@ def _zipped(source: Path) -> str:
 
 
 def encoding_of(source: Path) -> tuple[str, str | None]:
-    """Return a text's encoding, one of `ENCODINGS`, and why where it is not UTF-8.
-
-    Raises:
-        FileFormatError: no text in any of them.
-    """
+    """Return a text's encoding, one of `ENCODINGS`, and why where it is not UTF-8."""
     require_table(source, zeros=True)
     with source.open("rb") as file:
         head = file.read(_HEAD)

@@ -83,9 +83,6 @@ def read_mat5(data: bytes) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the real numeric arrays of a file by their names; structures and cells are opened.
 
     A field is `structure.field`; an element of a cell, or of an array of structures, `name{1}`.
-
-    Raises:
-        ValueError, struct.error, zlib.error: the file is damaged.
     """
     if not is_mat5(data):
         raise ValueError("neither version 5 nor 7.3; save it with -v7")
@@ -152,13 +149,7 @@ _MAX_ELEMENTS = 10_000
 
 
 def mat_arrays(source: Path) -> dict[str, np.ndarray]:
-    """Return all arrays (rows, columns) of numbers in a MAT file by their names.
-
-    Raises:
-        FileFormatError: no MAT file.
-        DataError: a variable lies in another file or declares an impossible size.
-        SettingsError: of version 7.3, and h5py is not installed.
-    """
+    """Return all arrays (rows, columns) of numbers in a MAT file by their names."""
     try:
         hdf5 = _is_hdf5(source)
         if hdf5:
@@ -257,9 +248,6 @@ def table_of(source: Path, arrays: Arrays, variable: str | None, wanted: tuple[s
             names, and matrices beside them (time, n) as `name(:,1)` to `name(:,n)`. What cells of structures hold,
             one experiment in each, is joined below each other with the column `run`.
         wanted: the columns that are needed; vectors of another length are left out.
-
-    Raises:
-        DataError: the variable is not there or is not a matrix of numbers, or vectors differ in length.
     """
     import pandas as pd
 

@@ -87,11 +87,6 @@ def mcap_table(source: Path) -> pd.DataFrame:
     """Return a row for each message in the order of time, NaN where a topic said nothing.
 
     Time is that of the messages' headers where they have one that follows the logger's, else the logger's.
-
-    Raises:
-        SettingsError: the packages that read it are not installed.
-        FileFormatError: no MCAP file, or damaged.
-        DataError: no message holds numbers.
     """
     for package in ("mcap", "mcap_ros2"):
         require_package(package)

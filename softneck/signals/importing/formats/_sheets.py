@@ -35,13 +35,7 @@ Cells = Sequence[Sequence[object]]
 
 
 def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
-    """Return a sheet's name and its rows of cells; without a name the sheet with most cells.
-
-    Raises:
-        SettingsError: the package that reads them is not installed.
-        FileFormatError: no spreadsheet.
-        DataError: no such sheet.
-    """
+    """Return a sheet's name and its rows of cells; without a name the sheet with most cells."""
     require_package("python_calamine")
     import python_calamine as calamine
 
