@@ -34,7 +34,7 @@ class TuneRequirements:
         track: the loops that are judged besides.
         bounds: all requirements, those of `certificate` first; the reserve is taken off.
         reserve: metric -> what is kept back of its limit for a robot that is not quite as its models.
-        stated: metrics that somebody asks something of; the others are as the defaults have them.
+        stated: metrics and keys of [track] that somebody asks something of; the others are as the defaults have them.
         table: of a requirements file that asks `tune` and `verify` for the same: limits as asked, the reserve beside.
     """
 
@@ -128,7 +128,8 @@ def make_tune_requirements(
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
         table={"version": VERSION, **merged},
-        stated=frozenset(metric for metric, entry in table.get("require", {}).items() if entry is not False),
+        stated=frozenset(metric for metric, entry in table.get("require", {}).items() if entry is not False)
+        | frozenset(f"track.{key}" for key in table.get("track", {})),
     )  # fmt: skip
 
 
@@ -139,9 +140,15 @@ def default_text() -> str:
 
 
 def with_certificate(asked: TuneRequirements, certificate: Requirements) -> TuneRequirements:
-    """Return them with other requirements for `verify`, such as ones stretched to another robot."""
+    """Return them with those of `verify` scaled to another robot; noise and delay of [track] scale as well."""
     own = tuple(item for item in asked.bounds if item.metric.startswith("track."))
-    return replace(asked, certificate=certificate, bounds=(*certificate.bounds, *own))
+    usual = {"noise_deg": certificate.step["noise_deg"], "delay_ms": certificate.scale[0] * asked.track["delay_ms"]}
+    free = {key: value for key, value in usual.items() if f"track.{key}" not in asked.stated}
+    track = {**asked.track, **free}
+    return replace(
+        asked, certificate=certificate, bounds=(*certificate.bounds, *own), track=track,
+        table={**asked.table, "track": track},
+    )  # fmt: skip
 
 
 def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:

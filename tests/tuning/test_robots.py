@@ -58,6 +58,17 @@ def test_a_default_that_is_quieter_than_the_noise_of_a_neck_refuses_no_other_rob
     refuse_impossible(asked, model)
 
 
+def test_noise_and_delay_of_the_noisy_loops_are_the_robots_own() -> None:
+    model = plant(BELLOWS)
+    asked, stated = (task_of({"model": model}, table, 0).asked for table in ({}, {"track": {"delay_ms": 7.0}}))
+    time, _ = asked.certificate.scale
+    assert time != 1.0
+    assert asked.track["delay_ms"] == 20.0 * time  # a neck's 20 ms
+    assert asked.track["noise_deg"] == asked.certificate.step["noise_deg"]
+    assert asked.table["track"] == asked.track
+    assert stated.track == {**asked.track, "delay_ms": 7.0}
+
+
 def test_the_recordings_cocontraction_is_told_to_controllers_in_the_unit_of_the_motors() -> None:
     model = plant(BELLOWS)
     recorded = {"tested": {"conditions": [{"payload_kg": [0.0, 0.0], "cocontraction": [1.4e5, 1.8e5]}]}}
