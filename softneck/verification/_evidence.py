@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -129,7 +128,7 @@ def gather(
     linear = []
     for number, (name, law) in enumerate(controller.laws.items()):
         progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
-        linear.append(_linear(name, law, plants, sources, controller.extra, w, asked, detailed=number == 0))
+        linear.append(_linear(name, law, plants, sources, controller.extra, w, asked))
     progress(0.5, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test = StepTest(
@@ -164,14 +163,12 @@ def gather(
 
 def _linear(
     name: str, law: LinearLaw, plants: Plants, necks: list[UncertainNeck], extra: int, w: Vector, asked: Requirements,
-    *, detailed: bool,
 ) -> LinearEvidence:  # fmt: skip
     seed, generations = int(asked.sampling["seed"]), int(asked.sampling["search_generations"])
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    wanted = detailed or any(item.metric == "robust.sensitivity" for item in asked.bounds)
-    parts = [structured(neck, law, extra=extra, performance=wanted) for neck in necks]
+    parts = [structured(neck, law, extra=extra) for neck in necks]
     return LinearEvidence(name, law, tried, table, found, parts)
 
 
@@ -276,8 +273,6 @@ def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
         for row in rows:
             about = _structured_describer(row, part.name)
             _add(evidence, "robust.mu", Values(np.array([row.mu]), about))
-            if not math.isnan(row.worst_sensitivity):
-                _add(evidence, "robust.sensitivity", Values(np.array([row.worst_sensitivity]), about))
 
 
 def evidence_of(part: LinearEvidence, name: str, describe: Describe) -> Values:

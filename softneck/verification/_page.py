@@ -134,13 +134,10 @@ def _first(found: Verification, certificate: str, stepped: Chart) -> Section:
 def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]:
     title = f" at {part.name}" if part.name else ""
     mu = [
-        [
-            neck.name, row.axes, f"{row.mu:.3f}",
-            number(None if math.isnan(row.worst_sensitivity) else row.worst_sensitivity),
-        ]
+        [neck.name, row.axes, f"{row.mu:.3f}"]
         for neck, rows in zip(found.necks, part.structured, strict=True) for row in rows
     ]  # fmt: skip
-    head = ["plants", "axis", "mu, bound", "worst Ms, bound"]
+    head = ["plants", "axis", "mu, bound"]
     return [
         Section(
             f"Frequency responses{title}",

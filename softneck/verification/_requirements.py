@@ -90,7 +90,6 @@ def metric_names(robot: Robot) -> tuple[str, ...]:
         *(f"{axis}.{name}" for axis in ("axes", *robot.outputs.names) for name in _AXIS_METRICS),
         "mimo.disk_margin",
         "robust.mu",
-        "robust.sensitivity",
         *(f"step.{shown.of(name)}" for name in METRICS),
         *(f"neck.{shown.of(name)}" for name in _NECK_METRICS),
     )

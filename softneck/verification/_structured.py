@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.design.robust._mu import Structure, mu_upper, worst_gains
+from softneck.design.robust._mu import Structure, mu_upper
 from softneck.identification.uncertainty._measured import response_of
 
 from ._linear import LinearLaw, inverse, loops, radii
@@ -133,7 +133,7 @@ _DELAYS, _POLES = 15, 5
 # What lies between those is covered by this part more; and a complex change of this size is always allowed for, which
 # makes peaks of purely real uncertainty wider than a point.
 _ROOM, _LEAST = 1.01, 0.01
-_FREQUENCIES, _PERFORMANCE_FREQUENCIES = 90, 24
+_FREQUENCIES = 90
 # Between which the peaks of a real scalar alone are looked for: 0.2 % apart, so that a dead time of 0.1 s turns by
 # 0.03 rad at the most from one to the next.
 _FINE = 4000
@@ -147,13 +147,11 @@ class StructuredResult:
         axes: "pitch", "roll", or "both" (of more than two "all") where they are coupled.
         frequency: (m,) [rad/s].
         upper: (m,) bound of mu for stability.
-        worst_sensitivity: that no plant of the box exceeds (skewed mu); inf where stability itself is not certain.
     """
 
     axes: str
     frequency: Vector
     upper: Vector
-    worst_sensitivity: float
 
     @property
     def mu(self) -> float:
@@ -161,14 +159,13 @@ class StructuredResult:
         return float(self.upper.max())
 
 
-def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int, performance: bool) -> list[StructuredResult]:
+def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int) -> list[StructuredResult]:
     """Return the bounds of each axis, or of both together where plant or controller couple them.
 
     Args:
         neck: with its box.
         law: the controller's linear form.
         extra: samples of delay that the loop's order adds.
-        performance: whether the worst sensitivity is bounded too.
     """
     Ts = neck.sample_time
     results = []
@@ -182,14 +179,10 @@ def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int, performance: 
         if not _middle_is_stable(neck, law, axes, extra):
             # The bound grows the box from a stable middle; without one there is nothing to grow.
             never = np.full(w.size, math.inf)
-            results.append(StructuredResult(name, w, never, math.inf))
+            results.append(StructuredResult(name, w, never))
             continue
         upper = mu_upper(M, Structure.of(blocks))[0]
-        sensitivity = math.nan
-        if performance:
-            at = np.union1d(np.geomspace(max(0.3, low), -high, _PERFORMANCE_FREQUENCIES), peaks[peaks > 0.3])
-            sensitivity = max(_worst_sensitivity(neck, law, at, axes, extra))
-        results.append(StructuredResult(name, w, upper, sensitivity))
+        results.append(StructuredResult(name, w, upper))
     return results
 
 
@@ -217,9 +210,9 @@ def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], 
 
 
 def interconnection(
-    neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, *, judged: int | None = None
+    neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Return M (m, rows, columns) over `w` [rad/s] and its blocks; `judged` adds the sensitivity of that axis last."""
+    """Return M (m, rows, columns) over `w` [rad/s] and its blocks."""
     n = len(axes)
     parts = [_axis(neck.axes[i], w, neck.sample_time, extra) for i in axes]
     X = np.eye(n) if n == 1 else mixing(neck.cross, n)
@@ -238,13 +231,7 @@ def interconnection(
     keep = [r for k, i in enumerate(axes) for r in _uncertain(neck, i, 3 * k)]
     M = M[:, keep][:, :, keep]
     blocks = [blocks[r] for r in keep]
-    if judged is None:
-        return M, blocks
-    # e = y + d: from d to e stands S; from w, S H; from d to z, F V S.
-    d = list(axes).index(judged)
-    top = np.concatenate([M, (F @ V @ S)[:, keep][:, :, [d]]], axis=2)
-    bottom = np.concatenate([(S @ H)[:, [d]][:, :, keep], S[:, [d]][:, :, [d]]], axis=2)
-    return np.concatenate([top, bottom], axis=1), blocks
+    return M, blocks
 
 
 def _uncertain(neck: UncertainNeck, axis: int, start: int) -> list[int]:
@@ -301,11 +288,3 @@ def _delay_weight(box: Any, middle: float, z: np.ndarray, Ts: float) -> Vector:
     poles = np.unique(np.linspace(box.low[1], box.high[1], _POLES))
     changes = [np.abs(_delay_factor(p, L, z, Ts) / base - 1.0) for p, L in itertools.product(poles, delays)]
     return np.maximum(_ROOM * np.max(changes, axis=0), _LEAST)
-
-
-def _worst_sensitivity(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int) -> list[float]:
-    peaks = []
-    for axis in axes:
-        M, blocks = interconnection(neck, law, w, axes, extra, judged=axis)
-        peaks.append(float(worst_gains(M, blocks).max()))
-    return peaks

@@ -7,7 +7,6 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.design import mu_bounds
-from softneck.design.robust._mu import worst_gains
 
 COMPLEX, REAL = (1, 0), (-1, 0)
 # The descent ends where a smoothed maximum is off by log(n)/3000 of the bound: 0.1 %, doubled for its own tolerance.
@@ -113,14 +112,3 @@ def test_real_perturbations_that_make_it_singular_are_no_smaller_than_the_bound_
 def test_what_does_not_fit_is_refused(M: np.ndarray, blocks: list[tuple[int, int]], match: str) -> None:
     with pytest.raises(SettingsError, match=match):
         mu_bounds(M, blocks)
-
-
-def test_worst_gain_of_an_uncertain_gain() -> None:
-    """(1 + delta/2)/(s + 1) has gain 1.5 at most, at rest; stability is not certain where |delta| may pass the pole."""
-    s = 1j * np.array([0.0, 1.0])
-    G = 1.0 / (s + 1.0)
-    M = np.moveaxis(np.array([[0.0 * G, 1.0 + 0.0 * G], [0.5 * G, G]]), -1, 0)
-    # The bound is found by halves to 1 %.
-    np.testing.assert_allclose(worst_gains(M, [REAL]), 1.5 * np.abs(G), rtol=1e-2)
-    M[:, 0, 0] = 2.0
-    assert np.isinf(worst_gains(M, [REAL])).all()

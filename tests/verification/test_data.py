@@ -335,11 +335,10 @@ def test_a_tested_family_holds_no_plant_that_its_recordings_exclude_and_reaches_
 @pytest.mark.parametrize("weight", [0.1, 0.3])
 def test_mu_over_the_weight_of_axes_apart_is_the_largest_of_each(weight: float) -> None:
     neck = replace(neck_of_family(on_data(weight=weight), "f"), cross=np.zeros(2))
-    found = structured(neck, LAW, extra=0, performance=True)
+    found = structured(neck, LAW, extra=0)
     alone = axis_on_data(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0)
     # 90 frequencies in two decades: 5 % apart, and the peak is flat; the other grid adds half its step.
     assert found[0].mu == pytest.approx(alone.mu, rel=0.03)
-    assert found[0].worst_sensitivity == pytest.approx(alone.margins["sensitivity"], rel=0.05)
 
 
 @pytest.mark.slow

@@ -184,7 +184,7 @@ def test_a_loop_that_is_stable_at_all_corners_but_not_inside_is_caught_by_the_se
 
 def test_where_the_search_finds_an_unstable_plant_the_bound_proves_nothing() -> None:
     neck, law = _hidden()
-    for row in structured(neck, law, extra=0, performance=False):
+    for row in structured(neck, law, extra=0):
         assert row.mu > 1.0
 
 
@@ -195,8 +195,7 @@ def test_bounds_enclose_what_was_sampled() -> None:
     law = LinearLaw.of(pi().ss())
     drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 2, 3))
     drawn[:50] = np.sign(drawn[:50])
-    peak = margins(all_plants([neck], 60, 0), law, W)["pitch.sensitivity"].max()
-    row = structured(neck, law, extra=0, performance=True)[0]
+    row = structured(neck, law, extra=0)[0]
     middle, widths = (np.stack([getattr(box, name) for box in neck.axes]) for name in ("middle", "widths"))
 
     def unstable(scale: float) -> bool:
@@ -207,7 +206,6 @@ def test_bounds_enclose_what_was_sampled() -> None:
     assert row.mu < 1.0
     assert not unstable(1.0 / row.mu)
     assert unstable(2.4)  # the bound is not that of a loop that nothing unsettles
-    assert row.worst_sensitivity >= peak
 
 
 def one_pole(gain: float, pole: float, late: int) -> LinearNeck:
@@ -225,7 +223,7 @@ def test_mu_of_gain_alone_is_that_of_the_gain_margin(model: LinearNeck) -> None:
     neck = neck_of_model(model, "m", {"gain": r, "pole": 0.0, "delay": 0.0})
     law = LinearLaw.of(pi().ss())
     margin = float(margins(nominal_plants([neck])[0], law, W)["pitch.gain_margin"][0])
-    row = structured(neck, law, extra=0, performance=False)[0]
+    row = structured(neck, law, extra=0)[0]
     # The 1 % of complex dead time that is always there widens the peak, and costs as much here.
     assert r / (margin - 1.0) <= row.mu <= 1.2 * r / (margin - 1.0)
 

@@ -12,7 +12,6 @@ on the complex blocks, the real ones at values that are tried.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -139,51 +138,6 @@ def mu_upper(M: Array, structure: Structure) -> tuple[Vector, Matrix, Matrix]:
         best, where = np.where(better, value, best), np.where(better[:, None], theta, where)
     n = x.shape[1]
     return size * np.sqrt(np.maximum(best, 0.0)), np.exp(where[:, :n]), where[:, n:]
-
-
-def worst_gains(M: Array, blocks: Blocks) -> Vector:
-    """Return the largest gain (m,) from the last inputs to the last outputs over all `|Delta| <= 1`, from above.
-
-    The least gamma with `mu [M11 M12; M21/gamma M22/gamma] <= 1` (skewed mu, Smith and Fan 1991); inf where stability
-    is not certain.
-
-    Args:
-        M: (m, rows, columns); the first rows and columns belong to Delta, the others are judged.
-        blocks: of Delta.
-    """
-    inside = Structure.of(blocks)
-    nz, nw = inside.out_of.shape[0], inside.into.shape[0]
-    outputs, inputs = M.shape[1] - nz, M.shape[2] - nw
-    structure = Structure.of([*blocks, (inputs, outputs)])
-    inner = mu_upper(M[:, :nz, :nw], inside)[0]
-    certain = inner < 1.0
-
-    def fits(gamma: Vector, which: Array) -> Array:
-        scaled = M[which].copy()
-        scaled[:, nz:] /= gamma[:, None, None]
-        return mu_upper(scaled, structure)[0] <= 1.0
-
-    gamma = np.full(M.shape[0], math.inf)
-    which = np.flatnonzero(certain)
-    if which.size == 0:
-        return gamma
-    low = np.maximum(np.linalg.norm(M[which, nz:, nw:], 2, axis=(1, 2)), 1e-12)
-    high = 2.0 * low
-    short = np.ones(which.size, dtype=bool)
-    for _ in range(20):
-        short = ~fits(high, which)
-        if not short.any():
-            break
-        low, high = np.where(short, high, low), np.where(short, 4.0 * high, high)
-    else:
-        high = np.where(short, math.inf, high)
-    # To 1 %: the bound itself is no sharper.
-    for _ in range(9):
-        middle = np.sqrt(low * high)
-        ok = fits(middle, which)
-        low, high = np.where(ok, low, middle), np.where(ok, middle, high)
-    gamma[which] = high
-    return gamma
 
 
 class _EigenvalueProblem:
