@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -152,9 +151,9 @@ def _facts(choice: Choice, path: Path) -> dict:
                 "kind": one.kind,
                 "seconds": one.seconds,
                 "failure": one.failure or None,
-                "fit": _finite(one.fit),
+                "fit": one.fit,
                 "worst": one.worst or None,
-                "scores": {name: _finite(fit) for name, fit in one.scores.items()},
+                "scores": dict(one.scores),
                 "standard_errors": dict(one.errors),
                 "numbers": one.numbers,
                 "stopped_early": one.model is not None and not one.whole,
@@ -163,11 +162,6 @@ def _facts(choice: Choice, path: Path) -> dict:
             for one in choice.ranking
         ],
     }
-
-
-def _finite(fit: float) -> float | None:
-    """Return what JSON can hold."""
-    return fit if isfinite(fit) else None
 
 
 def _page(choice: Choice) -> str:

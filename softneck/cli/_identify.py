@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,7 +95,12 @@ def command(
             force=force, as_json=as_json,
         )  # fmt: skip
         return
-    _refuse_options_of_auto(kind, html=html is not None, refit=refit)
+    if html is not None:
+        raise SettingsError(
+            f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
+        )
+    if refit:
+        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
@@ -108,8 +112,7 @@ def command(
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
     poor = poor_excitation(head)
     if as_json:
-        facts = {"excitation": poor, "guarded_form": _guarded_form(kind, recordings)}
-        print_json(_facts(path, model, held_out) | facts)
+        print_json(_facts(path, model, held_out) | {"excitation": poor})
     else:
         click.echo(f"{path}\n{model.summary()}")
         if held_out is None:
@@ -121,24 +124,6 @@ def command(
         why, advice = still or why, "" if still or held_out is None else left_out(held_out)
         advice = advice or (poor[0] if poor else _ANOTHER)
         raise CheckFailedError(f"{path}: no model of the rows held out: {why}. {advice}")
-
-
-def _guarded_form(kind: str, recordings: tuple[Path, ...]) -> str | None:
-    """Return the command that trains the guarded form of a learned kind, None where there is none."""
-    from softneck.identification.uncertainty._guarded import OF
-
-    if kind not in OF:
-        return None
-    return shlex.join(["softneck", "identify", "guarded", *map(str, recordings), "--set", f"of={kind}"])
-
-
-def _refuse_options_of_auto(kind: str, *, html: bool, refit: bool) -> None:
-    if html:
-        raise SettingsError(
-            f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
-        )
-    if refit:
-        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
 
 
 def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:

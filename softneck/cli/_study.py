@@ -52,7 +52,7 @@ def command(
     from softneck.cosim.studies._store import read_description, write_worst
     from softneck.plots import write_page
     from softneck.report import study_page
-    from softneck.report._study_page import failures
+    from softneck.report._study_page import failures, study_head, study_rows
 
     require_trusted(study_file, trust=trust)
     study = load_study(study_file)
@@ -64,7 +64,8 @@ def command(
     if as_json:
         print_json(_summary(runs, folder, study.objectives, paths))
     else:
-        print_table(str(folder), *_table(runs, list(study.vary), study.objectives))
+        keys = list(study.vary)
+        print_table(str(folder), study_head(keys, study.objectives), study_rows(runs, keys, study.objectives))
         failed = sum(failures(runs))
         note(f"{len(runs)} runs, {failed} failed; report: {folder / 'report.html'}")
     if all(failures(runs)):
@@ -77,12 +78,6 @@ def _anew(study: Study, folder: Path, output: Path | None, force: bool) -> bool:
 
     there = output is None and (folder / DESCRIPTION).is_file()
     return force or (there and read_description(folder).get("digest") != study.digest)
-
-
-def _table(runs: pd.DataFrame, keys: list[str], objectives: tuple[str, ...]) -> tuple[list[str], list[list[str]]]:
-    from softneck.report._study_page import study_head, study_rows
-
-    return study_head(keys, objectives), study_rows(runs, keys, objectives)
 
 
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:

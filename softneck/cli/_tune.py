@@ -11,7 +11,7 @@ from softneck.core import CheckFailedError, file_hash
 from softneck.robot._opened import opened
 
 from .shared._console import note, print_json, print_table, progress
-from .shared._options import common_options
+from .shared._options import common_options, requirements_option
 
 if TYPE_CHECKING:
     from softneck.tuning._tune import Tuned
@@ -23,21 +23,10 @@ _BUDGET = 160
 _MARGINS = ("stability.", "axes.", "mimo.", "robust.")
 
 
-def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
-    from softneck.tuning._requirements import default_text
-
-    if value:
-        click.echo(default_text(), nl=False)
-        context.exit()
-
-
 @click.command("tune", epilog="Example: softneck tune family.npz greybox.npz --requirements wanted.toml -o build/tune")
 @click.argument("plants", metavar="FAMILY|MODEL...", nargs=-1, required=True, type=_PATH)
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
-@click.option(
-    "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=_print_requirements,
-    help="Print the default requirements and exit.",
-)  # fmt: skip
+@requirements_option("softneck.tuning._requirements:default_text")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller to search. [default: all but nmpc and custom]")
 @click.option(
     "--budget", type=click.IntRange(min=1), default=_BUDGET, show_default=True, metavar="EVALUATIONS",

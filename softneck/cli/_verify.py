@@ -13,21 +13,13 @@ from softneck.loop._loop import ORDERS
 from softneck.robot._opened import opened
 
 from .shared._console import note, print_json, print_table, progress
-from .shared._options import common_options, output_option, target
+from .shared._options import common_options, output_option, requirements_option, target
 
 if TYPE_CHECKING:
     from softneck.verification import Verification
 
 
 _PATH = click.Path(path_type=Path)
-
-
-def _print_requirements(context: click.Context, _: click.Parameter, value: bool) -> None:
-    from softneck.verification._requirements import default_text
-
-    if value:
-        click.echo(default_text(), nl=False)
-        context.exit()
 
 
 @click.command(
@@ -37,10 +29,7 @@ def _print_requirements(context: click.Context, _: click.Parameter, value: bool)
 @click.argument("controller", type=_PATH)
 @click.argument("plants", metavar="MODEL|FAMILY|NECK|FMU...", nargs=-1, required=True, type=_PATH)
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
-@click.option(
-    "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=_print_requirements,
-    help="Print the default requirements and exit.",
-)  # fmt: skip
+@requirements_option("softneck.verification._requirements:default_text")
 @click.option("--observer", type=_PATH, help="Observer of the loops over the virtual neck; hashed like the controller.")
 @click.option(
     "--order", type=click.Choice(ORDERS), help="Order of the loop. [default: that of the controller's design]"
@@ -103,7 +92,10 @@ def command(
     contents = found.contents(loops)
     write_certificate(path, contents, force=replace)
     if html is not None:
-        _write_page(html, found, controller, path, force=force)
+        from softneck.plots import write_page
+        from softneck.verification import verification_page
+
+        write_page(html, verification_page(found, controller.name, path.name), force=force)
     if as_json:
         print_json(contents)
     else:
@@ -111,13 +103,6 @@ def command(
     if not found.holds:
         listed = ", ".join(verdict.requirement.metric for verdict in found.failed)
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
-
-
-def _write_page(html: Path, found: Verification, controller: Path, certificate: Path, *, force: bool) -> None:
-    from softneck.plots import write_page
-    from softneck.verification import verification_page
-
-    write_page(html, verification_page(found, controller.name, certificate.name), force=force)
 
 
 def _print(path: Path, found: Verification, folder: Path) -> None:

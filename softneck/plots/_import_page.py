@@ -98,8 +98,8 @@ def _made(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> S
         unit = file_unit(name, layout.robot) if name not in ("inclination", "orientation", "time") else ""
         made = _span(recording.channels[name] / to_si(unit)[0], unit) if there and recording is not None else ""
         how = ("turned round" if source.sign < 0 else "") + (" summed up" if source.integrate else "")
-        rows.append([name, _from(source), _raw_span(frame, source), made, how.strip()])
-    head = ["channel", "from", "as logged", "in the recording", ""]
+        rows.append([name, _from(source), made, how.strip()])
+    head = ["channel", "from", "in the recording", ""]
     return Section("What was made of it", text=text, tables=[Table("Channels", head, rows, text=2)])
 
 
@@ -118,12 +118,6 @@ def _column(frame: pd.DataFrame, name: str | int) -> Vector:
 
     cells = frame[name] if name in frame.columns else frame.iloc[:, int(name)]
     return np.asarray(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
-
-
-def _raw_span(frame: pd.DataFrame, source: Source) -> str:
-    if len(source.terms) != 1 or source.unit == "date":
-        return ""
-    return _span(_column(frame, source.terms[0].column), source.unit)
 
 
 def _span(values: Vector, unit: str) -> str:

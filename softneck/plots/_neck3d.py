@@ -11,7 +11,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector, require_between, require_positive, to_si
+from softneck.core import DataError, Matrix, to_si
 from softneck.robot import Robot
 from softneck.signals import Recording
 from softneck.signals.recording._channels import file_unit
@@ -22,13 +22,7 @@ LINK_LENGTH, ATTACHMENT_RADIUS = 0.107, 0.052
 _FRAME_TIME = 0.02
 
 
-def neck_view(
-    recording: Recording,
-    *,
-    title: str = "The neck",
-    link_length: float = LINK_LENGTH,
-    attachment_radius: float = ATTACHMENT_RADIUS,
-) -> str:
+def neck_view(recording: Recording, *, title: str = "The neck") -> str:
     """Return an HTML page that plays the neck, or another robot bent by tendons, of a recording or simulation result.
 
     The two angles (one: in a plane) give the bend of a link of constant curvature; `compression` shortens it where it
@@ -37,30 +31,33 @@ def neck_view(
     Args:
         recording: its first run is played.
         title: of the page.
-        link_length, attachment_radius: of the drawing [m].
 
     Raises:
         DataError: no sample of the angles, a tilt beyond 90 deg, or a robot that is not bent by tendons.
     """
     if why := not_drawn(recording.robot):
         raise DataError(why)
-    require_positive("link_length", link_length, "m")
-    require_between("attachment_radius", attachment_radius, 1e-3, 1.0, "m")
     run = recording.runs()[0]
     keep = slice(None, None, max(1, round(_FRAME_TIME / run.sample_time)))
     angles = _held(run.outputs[keep], run.robot)
     unit = file_unit(run.robot.set_points[0], run.robot)
+    tensions = [f"tension_{j + 1}" for j in range(len(run.robot.motors.names))]
+    taut = all(name in run.channels for name in tensions)
+    pulls = np.maximum(run.motor_positions / to_si(unit)[0], 0.0)
+    if taut:
+        pulls = np.nan_to_num(np.column_stack([run.channels[name] for name in tensions]))
+    compression = np.nan_to_num(run.channels.get("compression", np.zeros(len(run))))
     frames = {
         "time": _rounded(run.time[keep] - run.time[0], 4),
         "bend": _rounded(bend_of(np.column_stack([angles, np.zeros(len(angles))])[:, :2]), 5),
         "angles": _rounded(np.degrees(angles), 2),
-        "compression": _rounded(_channel(run, "compression", keep), 6),
-        "pull": _rounded(_pulls(run, unit)[keep], 3),
-        "unit": "N" if _has_tensions(run) else unit,
+        "compression": _rounded(compression[keep], 6),
+        "pull": _rounded(pulls[keep], 3),
+        "unit": "N" if taut else unit,
         "names": run.robot.outputs.names,
         "tendons": run.robot.directions.angles_deg,
-        "length": link_length,
-        "radius": attachment_radius,
+        "length": LINK_LENGTH,
+        "radius": ATTACHMENT_RADIUS,
     }
     template = files("softneck.plots").joinpath("_neck3d.html").read_text(encoding="utf-8")
     # `</` inside a script would end it; in JSON `<\/` is the same text.
@@ -98,26 +95,6 @@ def _held(angles: Matrix, robot: Robot) -> Matrix:
         raise DataError(f"{names} exceeds 90 deg; a neck does not bend so far. Are the angles in degrees?")
     last = np.maximum.accumulate(np.where(good, np.arange(good.size), int(np.argmax(good))))
     return angles[last]
-
-
-def _has_tensions(run: Recording) -> bool:
-    return all(name in run.channels for name in _tensions(run))
-
-
-def _tensions(run: Recording) -> list[str]:
-    return [f"tension_{j + 1}" for j in range(len(run.robot.motors.names))]
-
-
-def _pulls(run: Recording, unit: str) -> Matrix:
-    if not _has_tensions(run):
-        return np.maximum(run.motor_positions / to_si(unit)[0], 0.0)
-    return np.nan_to_num(np.column_stack([run.channels[name] for name in _tensions(run)]))
-
-
-def _channel(run: Recording, name: str, keep: slice) -> Vector:
-    if name not in run.channels:
-        return np.zeros(run.time[keep].size)
-    return np.nan_to_num(run.channels[name][keep])
 
 
 def _rounded(values: np.ndarray, digits: int) -> list:

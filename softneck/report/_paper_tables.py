@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -118,22 +118,15 @@ class Entry:
         ]
 
 
-def paper_entries(reproduction: Reproduction) -> list[Entry]:
+def paper_entries(found: Reproduction) -> list[Entry]:
     """Return every figure of Tables 3 and 4 and of section 7.4 beside ours."""
-    return list(_entries(reproduction))
-
-
-def _entries(found: Reproduction) -> Iterator[Entry]:
-    published = (
-        (_ONE_STEP, ONE_STEP),
-        (_FREE, FREE_RUN),
-        (_MEASURED, FREE_RUN_MEASURED),
-    )
+    entries = []
+    published = ((_ONE_STEP, ONE_STEP), (_FREE, FREE_RUN), (_MEASURED, FREE_RUN_MEASURED))
     for configuration, figures in published:
         for (model, data), pair in figures.items():
             for axis, figure in zip(AXES, pair, strict=True):
                 key = (model, data)
-                yield Entry(
+                entries.append(Entry(
                     where=_WHERE_FREE[data] if configuration == _MEASURED else _WHERE[data],
                     model=model,
                     data=data,
@@ -144,7 +137,8 @@ def _entries(found: Reproduction) -> Iterator[Entry]:
                     ours=_fit(found.judged, key, axis, configuration),
                     rough=_fit(found.others[ROUGH], key, axis, configuration) if ROUGH in found.others else None,
                     other_necks=_span(found.others, key, axis, configuration),
-                )
+                ))  # fmt: skip
+    return entries
 
 
 def _fit(judged: Verdicts, key: tuple[str, str], axis: str, configuration: str) -> float | None:

@@ -66,12 +66,11 @@ class Project:
         return not any((*found, self.certificates, self.loops, self.studies, self.problems))
 
 
-def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progress = silent) -> Project:
-    """Read all files of a project; loops are simulated, studies are taken as they stand.
+def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
+    """Read all files of a project; loops are simulated unless they name Python, studies are taken as they stand.
 
     Args:
         folder: of the project.
-        run_loops: whether to run the loop files; one that names Python is never run.
         progress: called with the part done and a word.
 
     Raises:
@@ -89,7 +88,7 @@ def read_project(folder: str | Path, *, run_loops: bool = True, progress: Progre
             if path.name.endswith(_LAYOUT) or path.name == FILE:
                 if found := doubts_in(path):
                     project.doubts[name] = found
-            elif run_loops or path.suffix.lower() != ".toml":
+            else:
                 _READERS[path.suffix.lower()](project, path, name)
         except SoftneckError as error:
             project.problems[name] = str(error).removeprefix(f"{path}: ")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,10 +39,6 @@ class ClosedLoop:
     file: Any = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
-
-    def with_limits(self, limits: Mapping[str, float]) -> ClosedLoop:
-        """Return the same with limits that every loop must hold."""
-        return replace(self, limits=dict(limits))
 
     def __call__(self, loop_file: str | Path | None = None, **settings: Any) -> Outcome:
         """Run a loop and hold it to the limits of the markers.

@@ -40,5 +40,5 @@ def closed_loop(request: pytest.FixtureRequest) -> ClosedLoop:
         limits |= marker.kwargs
     name = re.sub(r"[^\w.-]+", "_", request.node.nodeid.partition("::")[2] or request.node.name).strip("_")
     plots = request.config.rootpath / "build" / "closed_loop"
-    loop = ClosedLoop(folder=request.path.parent, plot=plots / f"{name}.png", file=file, settings=settings)
-    return loop.with_limits(limits)
+    plot = plots / f"{name}.png"
+    return ClosedLoop(folder=request.path.parent, plot=plot, file=file, settings=settings, limits=limits)

@@ -133,11 +133,3 @@ def test_warnings_of_libraries_do_not_leak(call: Call, recording: Path, monkeypa
                     call("identify", "rls", recording, "-o", f"{asked}.npz")
             else:
                 assert "inaccurate" not in call("identify", "rls", recording, "-o", f"{asked}.npz").err
-
-
-def test_a_learned_kind_says_that_a_guarded_form_exists(call: Call, recording: Path) -> None:
-    facts = json.loads(call("identify", "play", recording, "-o", "play.npz", "--tolerance", 5, "--json").out)
-    assert facts["guarded_form"] == f"softneck identify guarded {recording} --set of=play"
-    assert facts["findings"]["validity_within_deg"] == [5.0, 5.0]
-    facts = json.loads(call("identify", "rls", recording, "-o", "rls.npz", "--json").out)
-    assert facts["guarded_form"] is None

@@ -57,6 +57,20 @@ set_option = click.option(
 )
 
 
+def requirements_option(default_text: str) -> Callable:
+    """Return the option that prints the default requirements: the text of a function by its dotted path."""
+
+    def show(context: click.Context, _: click.Parameter, value: bool) -> None:
+        if value:
+            click.echo(resolve(default_text)(), nl=False)
+            context.exit()
+
+    text = "Print the default requirements and exit."
+    return click.option(
+        "--print-requirements", is_flag=True, is_eager=True, expose_value=False, callback=show, help=text
+    )
+
+
 def columns_options(function: Callable) -> Callable:
     """Add the options that name the columns of a log."""
     for option, name, what in (

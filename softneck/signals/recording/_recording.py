@@ -28,24 +28,17 @@ MAX_JITTER = 0.02
 _ROUNDING = 1e-9
 
 
-def uneven(time: Vector, sample_time: float, run: np.ndarray, *, tolerance: float = MAX_JITTER) -> np.ndarray:
-    """Return (time - 1,) which steps inside a run are off `sample_time` [s] by more than `tolerance` of it."""
-    off = np.abs(np.diff(time) - sample_time) > max(tolerance * sample_time, _ROUNDING)
+def uneven(time: Vector, sample_time: float, run: np.ndarray) -> np.ndarray:
+    """Return (time - 1,) which steps inside a run are off `sample_time` [s] by more than a logger's jitter."""
+    off = np.abs(np.diff(time) - sample_time) > max(MAX_JITTER * sample_time, _ROUNDING)
     return off & (np.diff(run) == 0)
 
 
-def check_times(time: Vector, sample_time: float, run: np.ndarray, *, tolerance: float = MAX_JITTER) -> None:
-    """Raise DataError where `time` (time,) runs backwards or jumps inside a run.
-
-    Args:
-        time: [s].
-        sample_time: [s].
-        run: (time,) numbers of the runs.
-        tolerance: how much of a sample time a step may be off.
-    """
+def check_times(time: Vector, sample_time: float, run: np.ndarray) -> None:
+    """Raise DataError where `time` (time,) [s] runs backwards or jumps inside a run."""
     check_rising(time, run)
     step = np.diff(time)
-    jump = uneven(time, sample_time, run, tolerance=tolerance)
+    jump = uneven(time, sample_time, run)
     if jump.any():
         row = int(np.argmax(jump)) + 1
         raise DataError(
