@@ -39,6 +39,8 @@ from ._sensors import find_sensor
 
 ORDERS = ("sequential", "jacobi")
 # Sample times and delays that are whole multiples but for the rounding of decimal fractions.
+# Set-points that an observer keeps to predict over its sensor's delay [samples].
+_MOST_LEAD = 1000
 _ROUNDING = 1e-6
 _WHAT = "an observer"
 _NECK_PERIOD = 0.02
@@ -108,8 +110,8 @@ class KalmanSettings:
         for name, unit in (("measurement_noise_std", "rad"), ("sample_time", "s")):
             if getattr(self, name) is not None:
                 require_positive(name, getattr(self, name), unit)
-        require_between("sensor_delay", self.sensor_delay, 0.0, 1.0, "s")
-        require_between("gyro_delay", self.gyro_delay, 0.0, 1.0, "s")
+        require_between("sensor_delay", self.sensor_delay, 0.0, 1e6, "s")
+        require_between("gyro_delay", self.gyro_delay, 0.0, 1e6, "s")
         if self.gyro_delay > self.sensor_delay and not isinstance(self.sensor_delay, NeckDefault):
             raise SettingsError(
                 f"`gyro_delay` {self.gyro_delay:g} s must be at most `sensor_delay`, {self.sensor_delay:g} s: the "
@@ -274,6 +276,10 @@ class KalmanSettings:
         divider = max(1, math.floor(1.0 / (rate * period) + 1e-6))
         timeout = _MISSED * divider
         lead = self.sensor_delay / period
+        if lead > _MOST_LEAD:
+            raise SettingsError(
+                f"`sensor_delay` of {self.sensor_delay:g} s is {lead:.0f} samples of {period:g} s; at most {_MOST_LEAD}."
+            )
         lead = round(lead) if abs(lead - round(lead)) < _ROUNDING else lead
         gap = (reach or Reach()).rate * period
         found = np.zeros(KALMAN_MORE_LAGS + max(len(lags) - 2, 0))

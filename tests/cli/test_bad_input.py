@@ -125,7 +125,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
         ("na=two", "`na` must be a whole number between 1 and 100; got 'two'"),
         ("na=true", "`na` must be a whole number"),
         ("forgetting=nan", "`forgetting` must be a finite number; got nan"),
-        ("delay=5", "`delay` must be between 0 and 2 [s]; got 5"),
+        ("delay=-5", "`delay` must be between 0 and 1e+06 [s]; got -5"),
         ("delay=late", "`delay` must be a finite number [s]; got late"),
         ("structure=luck", "`structure` must be one of siso, miso, mimo; got 'luck'"),
     ],

@@ -279,7 +279,7 @@ class OutputError:
         require_whole("nf", self.nf, 1, 10)
         require_whole("nb", self.nb, 1, 100)
         if self.delay is not None:
-            require_between("delay", self.delay, 0.0, 2.0, "s")
+            require_between("delay", self.delay, 0.0, 1e6, "s")
         require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
         if self.intervals and (self.nf, self.nb) != (1, 1):

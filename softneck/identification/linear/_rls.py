@@ -216,7 +216,7 @@ class Rls:
         require_whole("na", self.na, 1, 100)
         require_whole("nb", self.nb, 1, 100)
         if self.delay is not None:
-            require_between("delay", self.delay, 0.0, 2.0, "s")
+            require_between("delay", self.delay, 0.0, 1e6, "s")
         require_positive("max_delay", self.max_delay, "s")
         require_forgetting(self.forgetting)
         require_one_of("structure", self.structure, STRUCTURES)
