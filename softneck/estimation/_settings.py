@@ -38,9 +38,9 @@ from ._reach import linear_reach, simulated_reach
 from ._sensors import find_sensor
 
 ORDERS = ("sequential", "jacobi")
-# Sample times and delays that are whole multiples but for the rounding of decimal fractions.
 # Set-points that an observer keeps to predict over its sensor's delay [samples].
 _MOST_LEAD = 1000
+# Sample times and delays that are whole multiples but for the rounding of decimal fractions.
 _ROUNDING = 1e-6
 _WHAT = "an observer"
 _NECK_PERIOD = 0.02
@@ -278,7 +278,8 @@ class KalmanSettings:
         lead = self.sensor_delay / period
         if lead > _MOST_LEAD:
             raise SettingsError(
-                f"`sensor_delay` of {self.sensor_delay:g} s is {lead:.0f} samples of {period:g} s; at most {_MOST_LEAD}."
+                f"`sensor_delay` of {self.sensor_delay:g} s is {lead:.0f} samples of {period:g} s; at most "
+                f"{_MOST_LEAD} fit."
             )
         lead = round(lead) if abs(lead - round(lead)) < _ROUNDING else lead
         gap = (reach or Reach()).rate * period
