@@ -25,7 +25,8 @@ from benchmarks.mpc_following import AT, CIRCLE_S, PREVIEW, SETTLED, STEP, STEP_
 from benchmarks.promises import AMPLITUDES, LARGEST, Sensed
 from softneck.core import KINDS, Vector, resolve
 from softneck.core._kinds import kinds_of
-from softneck.design import MpcSettings, NmpcSettings
+from softneck.design import NmpcSettings
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, Model, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
@@ -95,7 +96,7 @@ def designed(cell: Cell) -> tuple[Any, NonlinearObserver | None]:
     where, ahead = (cell.robot, cell.seed), PREVIEW if preview else 0.0
     if kind == "mpc":
         # A wish, as the default is: a limit that cannot be kept would be given up with all others.
-        wish = MpcSettings(preview=ahead, minimum_tautness=NeckDefault(TAUT[cell.robot]), payload_tautness=0.0)
+        wish = MpcNumbers(preview=ahead, minimum_tautness=NeckDefault(TAUT[cell.robot]), payload_tautness=0.0)
         return wish.over(observed(*where)[1]).design(family(*where)), observed(*where)[1]
     if kind == "nmpc":
         settings = NmpcSettings(minimum_tautness=TAUT[cell.robot], preview=ahead)

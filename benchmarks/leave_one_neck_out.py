@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 
 import softneck
 from softneck.core import KINDS, Vector, load, resolve
-from softneck.design import MpcSettings
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings
 from softneck.identification import INFINITE, GreyBox, Model, Network, NeuralStateSpace, OutputError, Rls, validate
 from softneck.identification.models._arrays import members
@@ -278,15 +278,12 @@ QUESTIONS = {
     "observer.measurement_noise_std": Question(
         "measurement_noise_std", (None, *np.radians((0.02, 0.1, 0.25, 0.5)).tolist()), KalmanSettings(), observed
     ),
-    "mpc.taut_pole": Question("taut_pole", (6.0, 9.0, 12.0), MpcSettings(), follows),
-    "mpc.least_delay": Question("least_delay", (0.08, 0.1, 0.12), MpcSettings(), follows),
-    "mpc.reference_time": Question("reference_time", (0.0, 0.05, 0.1, 0.2), MpcSettings(), follows),
-    "mpc.minimum_tautness": Question("minimum_tautness", (None, 0.0, 0.5, 0.75), MpcSettings(), follows),
-    "mpc.tautness_weight": Question(
-        "tautness_weight", (0.03, 0.1, 0.3, 1.0, 10.0), MpcSettings(tautness_weight=0.3), follows
-    ),
-    "mpc.payload_tautness": Question("payload_tautness", (0.0, 1.5, 3.0), MpcSettings(), follows),
-    "mpc.max_sensitivity": Question("max_sensitivity", (1.4, 1.5, 1.6), MpcSettings(), follows),
+    "mpc.taut_pole": Question("taut_pole", (6.0, 9.0, 12.0), MpcNumbers(), follows),
+    "mpc.least_delay": Question("least_delay", (0.08, 0.1, 0.12), MpcNumbers(), follows),
+    "mpc.reference_time": Question("reference_time", (0.0, 0.05, 0.1, 0.2), MpcNumbers(), follows),
+    "mpc.minimum_tautness": Question("minimum_tautness", (None, 0.0, 0.5, 0.75), MpcNumbers(), follows),
+    "mpc.payload_tautness": Question("payload_tautness", (0.0, 1.5, 3.0), MpcNumbers(), follows),
+    "mpc.max_sensitivity": Question("max_sensitivity", (1.4, 1.5, 1.6), MpcNumbers(), follows),
     "observer.sensor_delay": Question("sensor_delay", (0.0, 0.03, 0.04, 0.05, 0.06, 0.07), KalmanSettings(), observed),
 }
 

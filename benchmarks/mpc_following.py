@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector, load
-from softneck.design import MpcController, MpcSettings
+from softneck.design import MpcController
 from softneck.design.linear._rise import rise_time
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference, metrics, run_loop
@@ -165,7 +166,7 @@ def run(on: Specimen, controller: MpcController, reference: Reference, duration:
     )  # fmt: skip
 
 
-def followed(on: Specimen, settings: MpcSettings, payload: float, seed: int = 0) -> Followed:
+def followed(on: Specimen, settings: MpcNumbers, payload: float, seed: int = 0) -> Followed:
     """Return what the controller of these settings does under a payload [kg]."""
     plain = settings.design(on.family)
     same = replace(settings, preview=PREVIEW, bandwidth=plain.design["bandwidth_rad_s"])
@@ -199,7 +200,7 @@ def rms_deg(result: LoopResult, reference: Reference, since: float) -> float:
     return float(np.degrees(np.sqrt(np.mean(errors**2, axis=0)).max()))
 
 
-def told(settings: MpcSettings, payload: float) -> MpcSettings:
+def told(settings: MpcNumbers, payload: float) -> MpcNumbers:
     """Return the settings of a controller that knows its payload [kg] without an observer: to the bit the same."""
     more, least = settings.payload_tautness * payload, settings.minimum_tautness
     if least is None or settings.payload_tautness == 0.0:
@@ -255,7 +256,7 @@ def main() -> None:
     changed = {
         key: None if value == "None" else float(value) for key, value in (item.split("=") for item in options.set)
     }
-    settings = MpcSettings(**changed)  # type: ignore[arg-type]
+    settings = MpcNumbers(**changed)  # type: ignore[arg-type]
     heads = ("neck", "kg", "overshoot [%]", "rise [s]", "steady rms [deg]", "circle [deg]", "with preview [deg]")
     if options.inclined:
         heads = ("neck", "kg", *(f"from {least:g} deg: overshoot [%], rise [s]" for least in INCLINATIONS))

@@ -30,7 +30,10 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from softneck.core import Matrix, Vector
-from softneck.design import MpcSettings, NmpcSettings, PiSettings
+from softneck.design import PiSettings
+from softneck.design.predictive._nmpc import NmpcNumbers
+from softneck.design.predictive._scale import TAUTNESS_LEVER
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Network
 from softneck.loop import BlockPart, Loop, LoopResult, RecordingReference, run_loop
 from softneck.loop._reference_parts import AheadReference
@@ -41,8 +44,8 @@ from tests.oracles.neck_table import NeckSteps
 TS = 0.02
 LIMIT = math.radians(15.0)
 TAUTNESS = -0.2
-LEVER = MpcSettings().tautness_lever * redefinition_matrix(TENDON_ANGLES)[:2].T
-SLEW, POSITION = MpcSettings().slew_limit, MpcSettings().position_limit
+LEVER = TAUTNESS_LEVER * redefinition_matrix(TENDON_ANGLES)[:2].T
+SLEW, POSITION = 12.5, 6.0
 ORIENTATIONS = (0.0, 45.0, 90.0, 225.0)
 PARTS = ("limits", "steady", "rotation")
 # Part of the first turn of test 3: three seconds of rise, then one turn at 1.2 rad/s.
@@ -52,7 +55,7 @@ SOFT: dict[str, Any] = {"angle_limit": LIMIT, "minimum_tautness": TAUTNESS}
 # Chosen on the rotation at 0, 0.5 and 1 kg with one seed: a tautness below -0.1 rad lets the tendons hang at 1 kg, one
 # above it meets the drives' current limit at 0 kg.
 FOLLOWING: dict[str, Any] = {
-    "preview": 0.6, "max_sensitivity": 2.2, "worst_sensitivity": 4.0, "reference_time": 0.05, "minimum_tautness": -0.1,
+    "preview": 0.6, "max_sensitivity": 2.2, "reference_time": 0.05, "minimum_tautness": -0.1,
 }  # fmt: skip
 
 
@@ -63,7 +66,7 @@ def pi(_part: str) -> Any:
 
 def mpc(part: str) -> Any:
     """Return linear predictive control on the family over the payloads."""
-    settings = MpcSettings(**(FOLLOWING if part == "rotation" else SOFT))
+    settings = MpcNumbers(**(FOLLOWING if part == "rotation" else SOFT))
     return settings.design(neck_table.family("paper"))
 
 
@@ -71,7 +74,7 @@ def nmpc(part: str) -> Any:
     """Return nonlinear predictive control over a network of the neck without payload; it knows no tautness."""
     following: dict[str, Any] = {"preview": 0.6, "bandwidth": 12.0, "reference_time": 0.05}
     asked: dict[str, Any] = following if part == "rotation" else {"angle_limit": LIMIT}
-    settings = NmpcSettings(**asked)
+    settings = NmpcNumbers(**asked)
     return settings.design(Network().fit(neck_table.recordings("paper")[0]))
 
 

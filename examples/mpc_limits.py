@@ -23,6 +23,8 @@ from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plots import Chart, Curve, Level, Panel, chart_figure
 
+# Motor that one radian of the neck takes up [rad/rad].
+LEVER = 6.93
 TS = 0.02
 # Eq. 31 of the paper, sampled: exp(-0.08 s) 27.691/(s + 5.293) deg/rad.
 _A = math.exp(-5.293 * TS)
@@ -56,12 +58,12 @@ class Run:
 def run(rows: int = 300) -> Run:
     """Close the loop over the virtual neck, by hand: plant, then controller."""
     # Eq. 31 is what the paper identified; on our neck it is 20 % off, which the controller must find out.
-    settings = MpcSettings(angle_limit=LIMIT, slew_limit=SLEW, minimum_tautness=TAUT)
+    settings = MpcSettings(angle_limit=LIMIT, minimum_tautness=TAUT)
     controller = settings.design(LinearNeck(pitch=TILT, roll=TILT))
     part, neck = controller.part(), BlockPart(VirtualNeck(NeckParameters.paper()).block(noise_seed=1))
     names = [port.name for port in neck.outputs]
     seen = neck.start(0.0, {})
-    motors, lever = part.start(0.0, {}), settings.tautness_lever * controller.arrays[8][:2].T
+    motors, lever = part.start(0.0, {"slew_limit": SLEW}), LEVER * controller.arrays[8][:2].T
     plant_inputs = np.array([port.start for port in neck.inputs])
     log, plans = [], {}
     for k in range(rows):

@@ -10,7 +10,6 @@ from .linear._pid import PidSettings as PidSettings
 from .linear._ports import ControllerLimits as ControllerLimits
 from .plants._uncertain import uncertain_plant as uncertain_plant
 from .predictive._controller import MpcController as MpcController
-from .predictive._disturbance import MeasuredDisturbance as MeasuredDisturbance
 from .predictive._nmpc import NmpcController as NmpcController
 from .predictive._nmpc import NmpcSettings as NmpcSettings
 from .predictive._settings import MpcSettings as MpcSettings

@@ -14,8 +14,9 @@ from softneck.core import FileFormatError, SettingsError, load, read_archive
 from softneck.design import CustomSettings, LqgSettings, MpcController, MpcSettings, PidSettings, makeweight, mixsyn
 from softneck.design.linear._linear_parts_runtime import LinearArrays
 from softneck.design.linear._rise import rise_time
-from softneck.design.plants._coupled import CoupledPlant, coupled_plant
+from softneck.design.plants._coupled import CoupledPlant, _coupled, coupled_plant
 from softneck.design.plants._coupled_axis import closed, responses, times
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
@@ -24,7 +25,7 @@ from softneck.signals import redefinition_matrix, signal
 from ..oracles.bake_off import bake_off_plant, exact
 
 TS = 0.02
-LIMITS: dict[str, Any] = {"position_limit": 6.0, "slew_limit": 12.0}
+NECK = Robot.preset()
 SIZES = [(2, 2), (3, 2), (4, 3), (3, 1)]
 
 
@@ -79,7 +80,7 @@ def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
     """One filter and one regulator for two axes that do not touch are those of each axis."""
     gains = (1.0, 1.0)  # so that both axes of the searches end at the same filter
     settings = LqgSettings(reference_time=0.2)
-    each, whole = settings.design(exact(neck(gains))), settings._whole(taken(neck(gains), asked=True))
+    each, whole = settings.design(exact(neck(gains))), settings._whole(_coupled(neck(gains), NECK, NECK.weights()))
     z = np.exp(1j * np.array([0.3, 3.0, 30.0]) * TS)
     # Riccati equations of twice the order.
     np.testing.assert_allclose(whole.ss()(z), each.ss()(z), rtol=1e-7, atol=1e-9)
@@ -92,7 +93,7 @@ def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
 @pytest.mark.parametrize(("inputs", "outputs"), SIZES)
 @pytest.mark.parametrize(
     "settings",
-    [LqgSettings(), pytest.param(MpcSettings(**LIMITS, bandwidth=4.0), marks=pytest.mark.slow)],
+    [LqgSettings(), pytest.param(MpcSettings(bandwidth=4.0), marks=pytest.mark.slow)],
     ids=["lqg", "mpc"],
 )
 def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, outputs: int, tmp_path: Path) -> None:
@@ -101,7 +102,7 @@ def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, 
                            outputs=[f"y{i}" for i in range(outputs)])  # fmt: skip
     robot = within(inputs, outputs)
     robot = replace(robot, outputs=replace(robot.outputs, names=tuple(G.output_labels)))
-    controller = settings.design(G, robot=robot) if isinstance(settings, LqgSettings) else settings.design(G)
+    controller = settings.design(G, robot=robot)
     controller.save(tmp_path / "k.npz")
     block = load(tmp_path / "k.npz").block()
     assert [port.name for port in block.outputs] == [f"motor_setpoint_{j + 1}" for j in range(inputs)]
@@ -193,8 +194,8 @@ def mimo() -> Any:
 @pytest.mark.parametrize("settings", [LqgSettings(), MpcSettings(bandwidth=5.0)], ids=["lqg", "mpc"])
 def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, mimo: Any) -> None:
     controller = settings.design(mimo.ss())
-    plants = taken(mimo, asked=True).own_rows
-    late = tuple(row.delayed(0.08 if isinstance(settings, LqgSettings) else settings.least_delay) for row in plants)
+    plants = taken(mimo.ss()).own_rows
+    late = tuple(row.delayed(0.08 if isinstance(settings, LqgSettings) else 0.1) for row in plants)
     made = controller.ss()
     A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)
     assert np.abs(np.linalg.eigvals(A)).max() < 1.0
@@ -205,7 +206,7 @@ def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(setting
 
 def test_a_file_whose_inputs_are_neither_its_own_nor_those_of_all_is_refused(tmp_path: Path) -> None:
     """Compiled text would read beyond the array."""
-    MpcSettings(**LIMITS, bandwidth=3.0, horizon=8, moves=3).design(plant(3, 2)).save(tmp_path / "mpc.npz")
+    MpcNumbers(bandwidth=3.0, horizon=8, moves=3).design(plant(3, 2), robot=within(3, 2)).save(tmp_path / "mpc.npz")
     header, arrays = read_archive(tmp_path / "mpc.npz")
     n = arrays["model_A"].shape[1]
     more = {name: np.hstack([arrays[name], arrays[name][:, :n]]) for name in ("model_B", "rest")}
@@ -213,9 +214,7 @@ def test_a_file_whose_inputs_are_neither_its_own_nor_those_of_all_is_refused(tmp
         MpcController.from_archive(header, {**arrays, **more})
 
 
-@pytest.mark.parametrize(
-    "settings", [LqgSettings(), MpcSettings(bandwidth=5.0, reference_time=0.0)], ids=["lqg", "mpc"]
-)
+@pytest.mark.parametrize("settings", [LqgSettings(), MpcNumbers(bandwidth=5.0, reference_time=0.0)], ids=["lqg", "mpc"])
 def test_what_it_says_of_itself_is_in_the_robots_own_inputs(settings: Any) -> None:
     """`ss()` goes to theta_i and phi_i of Eq. 9 and 10, whatever the inputs are that it was designed in."""
     G = neck(across=0.4)
@@ -256,5 +255,3 @@ def test_what_cannot_be_is_one_line(settings: Any, source: Any, message: str) ->
 def test_other_kinds_say_who_takes_it() -> None:
     with pytest.raises(SettingsError, match="`lqg`, `mpc` and `custom` take systems of any size"):
         PidSettings().design(plant(3, 2))
-    with pytest.raises(SettingsError, match="`coupled` needs one model with a state space"):
-        MpcSettings(coupled=True).design([neck()])

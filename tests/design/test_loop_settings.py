@@ -27,6 +27,7 @@ from softneck.design import (
     PiSettings,
     design_controller,
 )
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.estimation._axis import axis_plant
 from softneck.robot import Robot
@@ -109,7 +110,7 @@ class OwnNeck:
 
 @pytest.mark.parametrize(
     "settings",
-    [PiSettings(), AdaptiveSettings(), MpcSettings(bandwidth=5.0, horizon=8, moves=3), KalmanSettings()],
+    [PiSettings(), AdaptiveSettings(), MpcNumbers(bandwidth=5.0, horizon=8, moves=3), KalmanSettings()],
     ids=lambda settings: type(settings).__name__,
 )
 def test_files_of_a_neck_with_a_file_of_its_own_carry_it(settings: Any, tmp_path: Path) -> None:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from softneck.core import SettingsError, load
-from softneck.design import MeasuredDisturbance, MpcController, MpcSettings
+from softneck.core import FileFormatError, load, read_archive
+from softneck.design import MpcController, MpcSettings
 from softneck.design.predictive._mpc_state_runtime import MpcArrays
-from softneck.robot import Robot
+from softneck.design.predictive._settings import MpcNumbers
 
 from .mpc_neck import Neck
 from .test_mpc_speed import identified
@@ -22,7 +23,7 @@ PER_KG = 2.0
 
 @pytest.fixture(scope="module")
 def told() -> MpcController:
-    return MpcSettings(bandwidth=6.0, payload_tautness=PER_KG).design(identified())
+    return MpcNumbers(bandwidth=6.0, payload_tautness=PER_KG).design(identified())
 
 
 @pytest.fixture(scope="module")
@@ -64,18 +65,24 @@ def test_what_comes_later_is_followed_slowly_and_what_is_lost_stays(told: MpcCon
 def test_files_say_it_only_where_it_is_asked(told: MpcController, untold: MpcController, tmp_path: Path) -> None:
     columns = [MpcArrays(item.arrays).disturbances.shape[1] for item in (untold, told)]
     assert columns == [3, 4]
-    known = MeasuredDisturbance(name="base_tilt_pitch", unit="rad", pitch=1.0)
-    assert "tautness" not in known.saved()
     told.save(tmp_path / "mpc.npz")
     again: Any = load(tmp_path / "mpc.npz")
-    assert again.disturbances == told.disturbances
     np.testing.assert_array_equal(moved(Neck(again), [1.0] * 60), moved(Neck(told), [1.0] * 60))
 
 
-def test_tautness_for_a_payload_needs_one_without() -> None:
-    with pytest.raises(SettingsError, match="`payload_tautness` adds to `minimum_tautness`, which is not set"):
-        MpcSettings(bandwidth=6.0, payload_tautness=1.0, minimum_tautness=None).design(identified())
-    with pytest.raises(SettingsError, match=r"`payload_tautness` must be between 0 and 12 \[rad/kg\]; got -1"):
-        MpcSettings(payload_tautness=-1.0)
-    with pytest.raises(SettingsError, match="`tautness` of `payload` is of necks"):
-        MeasuredDisturbance(name="payload", tautness=1.0).on(Robot.preset("finger"))
+def test_where_no_tautness_is_wished_for_a_payload_asks_for_none() -> None:
+    none = MpcNumbers(bandwidth=6.0, payload_tautness=1.0, minimum_tautness=None).design(identified())
+    assert "payload" not in {port.name for port in none.block().inputs}
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"), [(2, 3.0, "scenarios"), (15, 0.01, "tightened limits"), (9, 0.0, "measured")]
+)
+def test_files_of_what_went_say_so(told: MpcController, place: int, value: float, said: str, tmp_path: Path) -> None:
+    old = replace(told, arrays=tuple(array.copy() for array in told.arrays))
+    MpcArrays(old.arrays).constants[place] = value
+    told.save(tmp_path / "mpc.npz")
+    header, arrays = read_archive(tmp_path / "mpc.npz")
+    arrays = {**arrays, "constants": MpcArrays(old.arrays).constants}
+    with pytest.raises(FileFormatError, match=f"{said}.* went after softneck 0.2.0, which still reads the file"):
+        MpcController.from_archive(header, arrays)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import control
@@ -12,6 +13,7 @@ import pytest
 from softneck.core import FileFormatError, SettingsError, load
 from softneck.design import MpcController, MpcSettings
 from softneck.design.predictive import _mpc_state_runtime as rt
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import LinearNeck
 
 from ..oracles.bake_off import bake_off_neck, block_stepper, run_bake_off
@@ -52,8 +54,8 @@ def test_what_the_observer_is_ahead_is_dead_time_that_nobody_sees(look_ahead: fl
     least = 5 - samples
     numbers = np.append(np.asarray(tf.den[0][0])[:2], np.zeros(least))
     sooner = control.TransferFunction(tf.num[0][0], numbers, TS)
-    known = MpcSettings(bandwidth=6.0, least_delay=0.1, look_ahead=look_ahead).design(late)
-    seen = MpcSettings(bandwidth=6.0, least_delay=0.0).design(LinearNeck(pitch=sooner, roll=sooner))
+    known = MpcNumbers(bandwidth=6.0, least_delay=0.1, look_ahead=look_ahead).design(late)
+    seen = MpcNumbers(bandwidth=6.0, least_delay=0.0).design(LinearNeck(pitch=sooner, roll=sooner))
     for name, mine, its in zip(rt.MpcArrays.names(), known.arrays, seen.arrays, strict=True):
         # The same numbers from the same steps.
         np.testing.assert_allclose(mine, its, rtol=1e-12, atol=1e-12, err_msg=name)
@@ -64,14 +66,12 @@ def test_the_tuning_keeps_what_it_was_asked() -> None:
     assert max(asked.design["sensitivity"]) <= 1.4
     looser = MpcSettings(max_sensitivity=1.8).design(bake_off_neck())
     assert looser.design["bandwidth_rad_s"] > asked.design["bandwidth_rad_s"]
-    slow = MpcSettings(reference_time=None, overshoot_pct=1.0, bandwidth=8.0).design(bake_off_neck())
-    assert 0.0 <= slow.design["reference_time_s"] < 1.0
 
 
 @pytest.mark.slow
 def test_the_bake_off_is_won() -> None:
     # The issue's figures; the plants are the facts' 75, the prediction is for their longest dead time.
-    settings = MpcSettings(bandwidth=8.5, max_sensitivity=2.2, reference_time=0.31, least_delay=0.1, lead_limit=12.0)
+    settings = MpcNumbers(bandwidth=8.5, max_sensitivity=2.2, reference_time=0.31, least_delay=0.1, lead_limit=12.0)
     row = run_bake_off(block_stepper(settings.design(bake_off_neck()).block())).row
     assert row["worst_overshoot_pct"] <= 2.0
     assert row["nominal_settling_s"] <= 0.95
@@ -80,12 +80,10 @@ def test_the_bake_off_is_won() -> None:
 @pytest.mark.parametrize(
     ("settings", "match"),
     [
-        ({"horizon": 0}, "`horizon` must be"),
-        ({"moves": 31}, "`moves` must be"),
-        ({"cocontraction_weight": -1.0}, "`cocontraction_weight` must be positive"),
-        ({"slack_weight": 0.0}, "`slack_weight` must be positive"),
+        ({"bandwidth": -1.0}, "`bandwidth` must be positive"),
+        ({"preview": 5.0}, "`preview` must be between"),
         ({"minimum_tautness": 6.5}, "contradict each other"),
-        ({"position_limit": math.nan}, "`position_limit`"),
+        ({"lead_limit": math.nan}, "`lead_limit`"),
         ({"max_sensitivity": 1.01}, "`max_sensitivity`"),
         ({"order": "parallel"}, "`order`"),
     ],
@@ -108,10 +106,8 @@ def test_models_it_cannot_use_are_refused() -> None:
 @pytest.mark.slow
 def test_review_tells_what_is_doubtful() -> None:
     assert MpcSettings(bandwidth=8.0).design(bake_off_neck()).review() == []
-    short = MpcSettings(bandwidth=8.0, horizon=4, moves=2, lead_limit=0.1, angle_limit=0.8, position_limit=2.0).design(
-        bake_off_neck()
-    )
-    text = "\n".join(short.review())
+    short = MpcNumbers(bandwidth=8.0, horizon=4, moves=2, lead_limit=0.1, angle_limit=0.8).design(bake_off_neck())
+    text = "\n".join(replace(short, position_limit=2.0).review())
     assert "not longer than the dead time" in text
     assert "slew limit is never reached" in text
     assert "beyond what the motors reach" in text

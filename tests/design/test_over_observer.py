@@ -9,7 +9,9 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.design import MpcSettings, NmpcSettings
-from softneck.design.predictive._observed import _gain, taut_from
+from softneck.design.predictive._nmpc import NmpcNumbers
+from softneck.design.predictive._predicted import _gain, taut_from
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings
 from softneck.identification import GreyBox, Model
 from softneck.signals import Recording, redefinition_matrix, signal
@@ -49,16 +51,16 @@ def test_what_the_observer_says_is_taken_where_nobody_says_other(model: Model, o
     found = MpcSettings().over(observer)
     assert (found.look_ahead, observer.lead) == (pytest.approx(0.05), pytest.approx(0.05))
     assert found.payload_tautness == taut_from(model, 1.0, INVERSE)
-    mine = MpcSettings(look_ahead=0.0, payload_tautness=0.7).over(observer)
+    mine = MpcNumbers(look_ahead=0.0, payload_tautness=0.7).over(observer)
     assert (mine.look_ahead, mine.payload_tautness) == (0.0, 0.7)
     assert MpcSettings(minimum_tautness=None).over(observer).payload_tautness == 0.0
-    assert NmpcSettings().over(observer) == NmpcSettings(look_ahead=observer.lead)
+    assert NmpcSettings().over(observer) == NmpcNumbers(look_ahead=observer.lead)
 
 
 def test_the_controller_is_that_of_the_same_settings_given(observer: Any) -> None:
     found = MpcSettings(bandwidth=6.0).over(observer)
     ours = found.design(identified())
-    given = MpcSettings(bandwidth=6.0, look_ahead=0.05, payload_tautness=float(found.payload_tautness))
+    given = MpcNumbers(bandwidth=6.0, look_ahead=0.05, payload_tautness=float(found.payload_tautness))
     for mine, theirs in zip(ours.arrays, given.design(identified()).arrays, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert [port.name for port in ours.block().inputs][-1] == "payload"
@@ -67,15 +69,15 @@ def test_the_controller_is_that_of_the_same_settings_given(observer: Any) -> Non
 
 def test_a_linear_observer_says_its_look_ahead_alone() -> None:
     model = identified()
-    assert MpcSettings().over(KalmanSettings().design(model)) == MpcSettings(look_ahead=0.0)
+    assert MpcSettings().over(KalmanSettings().design(model)) == MpcNumbers(look_ahead=0.0)
     assert MpcSettings().over(KalmanSettings(sensor_delay=0.04).design(model)).look_ahead == pytest.approx(0.04)
 
 
 def test_a_late_sensor_takes_no_more_than_half_of_the_least_delay(model: Model) -> None:
     late = KalmanSettings(sensor_delay=0.08).design(model)
     assert MpcSettings().over(late).look_ahead == pytest.approx(0.05)
-    assert MpcSettings(least_delay=0.2).over(late).look_ahead == pytest.approx(0.08)
-    assert MpcSettings(look_ahead=0.08).over(late).look_ahead == 0.08
+    assert MpcNumbers(least_delay=0.2).over(late).look_ahead == pytest.approx(0.08)
+    assert MpcNumbers(look_ahead=0.08).over(late).look_ahead == 0.08
     # The nonlinear plan is over a model that has its dead time, not over one that hides it.
     assert NmpcSettings().over(late).look_ahead == pytest.approx(0.08)
 

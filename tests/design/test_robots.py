@@ -14,9 +14,10 @@ from softneck import identify, load, record
 from softneck.core import DataError, SettingsError
 from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
-from softneck.design import MpcSettings, PiSettings, design_controller
+from softneck.design import PiSettings, design_controller
 from softneck.design.plants._uncertain import uncertain_plant
 from softneck.design.predictive._predicted import settings_for, settings_of_robot
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
@@ -209,11 +210,8 @@ def test_keys_of_studies_and_faults_know_the_robot() -> None:
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        (
-            {"tendon_angles": (0.0, 2.0, 4.0)},
-            r"`tendon_angles` are of necks; those of `antagonist` \(\w{8}\) are in its robot file",
-        ),
-        ({"minimum_tautness": 0.1}, r"`minimum_tautness` of robot `antagonist` .* needs tendons at known angles"),
+        ({"tendon_angles": (0.0, 2.0, 4.0)}, r"`tendon_angles` is the robot's: robot.toml says it"),
+        ({"minimum_tautness": 0.1}, r"`minimum_tautness` is for necks; `antagonist` .* is none"),
     ],
 )
 def test_what_predictive_control_has_for_necks_only_is_refused(setting: dict[str, Any], said: str) -> None:
@@ -225,11 +223,11 @@ def test_what_predictive_control_has_for_necks_only_is_refused(setting: dict[str
 def test_a_predictive_controller_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     """The same rows are the same problem, however long a sample takes."""
     slow = replace(plant(BELLOWS), sample_time=sample_time)
-    asked = settings_of_robot(settings_for(MpcSettings(), slow), uncertain_plant(slow))
+    asked = settings_of_robot(settings_for(MpcNumbers(), slow), uncertain_plant(slow))
     # 0.6 s of a neck's 0.2 s: three time constants of -1 / log(0.9) = 9.5 samples.
     assert (asked.horizon, asked.moves) == (28, 10)
     assert asked.reference_time == pytest.approx(-sample_time / math.log(POLE))
-    given = settings_of_robot(settings_for(MpcSettings(horizon=20, moves=5), slow), uncertain_plant(slow))
+    given = settings_of_robot(settings_for(MpcNumbers(horizon=20, moves=5), slow), uncertain_plant(slow))
     assert (given.horizon, given.moves) == (20, 5)
 
 
@@ -265,7 +263,7 @@ def test_a_predictive_controller_does_the_same_in_all_units(tmp_path: Path) -> N
 def test_a_predictive_controller_of_four_chambers_keeps_their_pressures() -> None:
     """Three lengths around 30 mm, from the edge of the range on: no pressure below zero."""
     model = plant(BELLOWS, gain=1e-7, rest=0.03)
-    controller = design_controller("mpc", model, slew_limit=10.0, bandwidth=6.0)
+    controller = design_controller("mpc", model, bandwidth=6.0)
     assert "set-points 0 to 3 bar, slew 10 bar/s" in controller.summary()
     result = closed(model, controller, duration=6.0, x=41.0, y_mm=43.0, z=49.0, at_s=0.0, cocontraction=1.0)
     for name in ("x", "y", "z"):

@@ -16,6 +16,7 @@ from softneck.core import Matrix, SettingsError
 from softneck.cosim import simulate
 from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.design import NmpcController, NmpcSettings
+from softneck.design.predictive._nmpc import NmpcNumbers
 from softneck.fmu import build_fmu
 from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play
 from softneck.plant import VirtualNeck
@@ -81,17 +82,12 @@ def test_the_limits_of_a_necks_own_file_hold_where_they_are_stricter(tmp_path: P
     again = load(tmp_path / "c.npz")
     assert again.block().initial_state().parameters[:2].tolist() == [4.0, 5.0]
     assert again.robot.motors.setpoint_max == (4.0,) * 3
-    # What is given is given.
-    assert NmpcSettings(position_limit=5.0).design(model).block().parameters[0].start == 5.0
-    with pytest.raises(SettingsError, match=r"`position_limit` must be between 0\.01 and 6"):
-        NmpcSettings(position_limit=7.0).design(model)
 
 
 def test_an_antagonist_follows_within_the_limits_that_are_given() -> None:
-    model = lag(Robot.preset("antagonist"))
-    controller = NmpcSettings(horizon=8, moves=3, slew_limit=8.0, position_limit=1.0).design(model)
-    # 8 rad/s beyond a neck's range are given in the unit of the motors: nothing of a neck's is checked.
-    assert NmpcSettings(horizon=8, moves=3, position_limit=50.0).design(model).limits.position_limit == 50.0
+    preset = Robot.preset("antagonist")
+    motors = replace(preset.motors, setpoint_min=(-1.0, -1.0), setpoint_max=(1.0, 1.0), rate_limit=(8.0, 8.0))
+    controller = NmpcSettings(horizon=8, moves=3).design(lag(replace(preset, motors=motors)))
     y, P = plainly(controller, [0.12, 0.2], 60, start=0.0)
     assert y[-1, 0] == pytest.approx(0.12, abs=1e-3)
     # 0.12 rad by 0.08 rad/rad of P1 - P2, around the co-contraction asked for.
@@ -120,18 +116,16 @@ def test_a_length_of_two_chambers_in_bar_and_mm(tmp_path: Path) -> None:
 def test_it_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     """The same rows are the same problem, however long a sample takes."""
     found = {"pitch": {"static_gain": 0.16, "pole": 0.1 / sample_time, "delay": 3}}
-    asked = NmpcSettings()._of_robot(found, sample_time)
+    asked = NmpcNumbers().of_robot(found, sample_time)
     # 10 samples to the pole: a neck's at 20 ms, whose 20 samples hold a dead time of 4.
     assert (asked.horizon, asked.moves, asked.window) == (19, 10, 8)
     assert asked.reference_time == pytest.approx(10.0 * sample_time)
     assert asked.bandwidth == pytest.approx(8.0 * 0.2 / (10.0 * sample_time))
-    given = NmpcSettings(horizon=12, bandwidth=3.0)._of_robot(found, sample_time)
+    given = NmpcNumbers(horizon=12, bandwidth=3.0).of_robot(found, sample_time)
     assert (given.horizon, given.bandwidth) == (12, 3.0)
 
 
 def test_what_is_of_necks_is_refused() -> None:
-    with pytest.raises(SettingsError, match=r"`tendon_angles` are of necks; those of `antagonist` .* are in its robot"):
-        NmpcSettings(tendon_angles=(0.0, 2.0, 4.0)).design(lag(Robot.preset("antagonist")))
     with pytest.raises(
         SettingsError, match=r"`angle_limit` is for outputs that are angles; those of `pusher` .* are in mm"
     ):

@@ -15,11 +15,11 @@ from softneck.design import (
     FopiSettings,
     HinfSettings,
     LqgSettings,
-    MpcSettings,
     NmpcSettings,
     PidSettings,
     PiSettings,
 )
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.fmu.describe._modelled_drives import with_modelled_drives
 from softneck.identification import (
@@ -173,7 +173,7 @@ def _custom() -> Block:
 
 
 def _mpc() -> Block:
-    return MpcSettings(bandwidth=6.0, moves=5, angle_limit=0.5).design(_linear()).block()
+    return MpcNumbers(bandwidth=6.0, moves=5, angle_limit=0.5).design(_linear()).block()
 
 
 def _nmpc() -> Block:

@@ -20,7 +20,7 @@ from fmpy.fmi1 import FMICallException
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
 
-from softneck.design import MpcSettings
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.fmu import build_compiled_fmu, build_fmu, unpacked
 from softneck.runtime import Block
 
@@ -74,7 +74,7 @@ def test_a_compiled_fmu_computes_what_the_block_does(kind: str, path: Path, runn
 
 @pytest.mark.slow
 def test_a_payload_pulls_tendons_tauter_in_c_as_well(tmp_path: Path, running: Any) -> None:
-    settings = MpcSettings(bandwidth=6.0, moves=5, minimum_tautness=0.2, payload_tautness=1.0)
+    settings = MpcNumbers(bandwidth=6.0, moves=5, minimum_tautness=0.2, payload_tautness=1.0)
     block = settings.design(bake_off_neck()).block()
     path = tmp_path / "mpc.fmu"
     build_compiled_fmu(block, path)

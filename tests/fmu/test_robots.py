@@ -17,7 +17,8 @@ from fmpy.validation import validate_fmu
 from softneck.core import Matrix, SettingsError
 from softneck.cosim import make_loop
 from softneck.cosim.parts._fmu_part import drive_fmu
-from softneck.design import MpcSettings, PiSettings
+from softneck.design import PiSettings
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.describe._description import terminals
@@ -208,7 +209,7 @@ def test_a_robot_s_virtual_plant_is_an_fmu(backend: str, fmi: int, tmp_path: Pat
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS[1:])
 @pytest.mark.parametrize("kind", slow_but(["pi", "mpc"], ["pi"], nightly=["mpc"]))
 def test_a_controller_of_two_motors_is_an_fmu(kind: str, backend: str, fmi: int, tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"pi": PiSettings(), "mpc": MpcSettings(bandwidth=5.0, horizon=8, moves=3)}
+    settings: dict[str, Any] = {"pi": PiSettings(), "mpc": MpcNumbers(bandwidth=5.0, horizon=8, moves=3)}
     controller = settings[kind].design(model("oe", False)).block()
     path = built(controller, tmp_path / "Controller.fmu", backend, fmi)
     rng = np.random.default_rng(1)

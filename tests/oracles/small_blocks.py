@@ -82,7 +82,7 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
         "fopi": lambda: design.FopiSettings(crossover=4.0).design(linear),
         "lqg": lambda: design.LqgSettings().design(linear),
         "custom": lambda: design.CustomSettings(controller=K).design(linear),
-        "mpc": lambda: design.MpcSettings(bandwidth=6.0, moves=5, angle_limit=0.5).design(linear),
+        "mpc": lambda: design.MpcSettings(bandwidth=6.0, angle_limit=0.5).design(linear),
         "nmpc": lambda: design.NmpcSettings(horizon=8, moves=3, angle_limit=0.5).design(made["play"]),
     }
 

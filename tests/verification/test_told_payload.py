@@ -10,7 +10,7 @@ import control
 import numpy as np
 import pytest
 
-from softneck.design import MpcSettings
+from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.identification import GreyBox
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
@@ -44,7 +44,7 @@ def test_verify_has_the_estimate_of_an_observer_in_the_loops_of_an_mpc() -> None
     """By hand, to the bit: the observer over a model of several payloads tells the controller what it thinks."""
     model = GreyBox(evaluations=2, sensor_delay=2).fit([log("eq22", 0.0), log("eq22", 1.0)])
     observer = KalmanSettings().design(model)
-    settings = MpcSettings(bandwidth=6.0, minimum_tautness=0.5, payload_tautness=2.0)
+    settings = MpcNumbers(bandwidth=6.0, minimum_tautness=0.5, payload_tautness=2.0)
     controller, deaf = settings.design(neck()), replace(settings, payload_tautness=0.0).design(neck())
     found = verify(controller, {"line": neck()}, make_requirements(ASKED), observer=observer)
     runs: list[Any] = found.evidence.necks

@@ -90,17 +90,3 @@ def reference_numbers(given: Any) -> tuple[float | None, float]:
     if lead > 0.0 and not time:
         raise SettingsError("a `reference_time` of [T2, lead] needs a T2 above 0.")
     return time, lead
-
-
-def stricter_limits(neck: Robot, limits: dict[str, float]) -> dict[str, float]:
-    """Return the limits with those of the neck's own file, where these are stricter than a default."""
-    motors = neck.motors
-    files = {"slew_limit": motors.rate_limit, "position_limit": motors.setpoint_max}
-    for name, values in files.items():
-        if values is not None and isinstance(limits[name], NeckDefault):
-            limits[name] = min(limits[name], *values)
-    lowest = -limits["position_limit"] if motors.setpoint_min is None else max(motors.setpoint_min)
-    # Down to the same limit there is no need of a rule.
-    if lowest > -limits["position_limit"] and isinstance(limits["least_position"], NeckDefault):
-        limits["least_position"] = max(limits["least_position"], lowest)
-    return limits

@@ -237,35 +237,6 @@ def limits_of(robot: Robot, *, lead_limit: float, least_cocontraction: float) ->
     )  # fmt: skip
 
 
-def robot_limits(robot: Robot, given: Mapping[str, float]) -> ControllerLimits:
-    """Return the limits of another robot than the neck: those `given` in the unit of its motors, else its file's.
-
-    Where no lead is given, set-points may run ahead of the motors as far as these go.
-
-    Raises:
-        SettingsError: a limit that neither says.
-    """
-    factor, motors = to_si(robot.motors.unit)[0], robot.motors
-    limits = {name: factor * value for name, value in given.items()}
-    ranges = motor_ranges(robot, limits.get("position_limit"))
-    if ranges is None:
-        raise _not_given(robot, "motors.setpoint_min` and `setpoint_max", "position_limit")
-    if "slew_limit" not in limits and motors.rate_limit is None:
-        raise _not_given(robot, "motors.rate_limit", "slew_limit")
-    most = float(np.abs(ranges).max())
-    usual = {"position_limit": most, "lead_limit": 2.0 * most, "least_position": -most, "least_cocontraction": -most}
-    if motors.rate_limit is not None:
-        usual["slew_limit"] = factor * min(motors.rate_limit)
-    return ControllerLimits(robot=robot, **{**usual, **limits})
-
-
-def _not_given(robot: Robot, key: str, setting: str) -> SettingsError:
-    return SettingsError(
-        f"robot {robot.label()} gives no `{key}`, which a controller needs; add it, or give `{setting}` in "
-        f"{robot.motors.unit}."
-    )
-
-
 def require_limits(limits: Mapping[str, float]) -> None:
     """Raise SettingsError for limits that are none of any robot: how far its motors go is known when it is."""
     for name, value in limits.items():

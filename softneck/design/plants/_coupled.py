@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.estimation._axis import AXES, directions_of, robot_of
+from softneck.estimation._axis import AXES
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.robot import Robot
 from softneck.robot._channels import Motors, Outputs
@@ -69,12 +69,11 @@ class CoupledPlant:
         return {name: UncertainAxis(row, (row,)) for name, row in zip(self.names, rows, strict=True)}
 
 
-def coupled_plant(source: Any, *, asked: bool = False, robot: Robot | None = None) -> CoupledPlant | None:
+def coupled_plant(source: Any, *, robot: Robot | None = None) -> CoupledPlant | None:
     """Return the coupled plant of a `control` system of any size; None for what is a plant for each axis.
 
     Args:
         source: a discrete system from motors, or a neck's redefined inputs, to outputs; else whatever a design takes.
-        asked: whether an identified model is to be taken with all that it says between its axes.
         robot: whose plant a `control` system is; None: a neck's, or one with the names of its signals.
 
     Raises:
@@ -86,19 +85,11 @@ def coupled_plant(source: Any, *, asked: bool = False, robot: Robot | None = Non
     if isinstance(source, control.StateSpace | control.TransferFunction):
         system: Any = control.ss(source)
         neck = _is_necks(system) if robot is None else robot.is_neck
-        if neck and (system.ninputs == 1 or not (asked or _crosses(system))):
+        if neck and (system.ninputs == 1 or not _crosses(system)):
             return None
         whose = robot or (Robot.preset() if neck else _robot(system))
         return _coupled(system, whose, whose.weights(), named=robot is None and not neck)
-    if not asked:
-        return None
-    if not hasattr(source, "ss"):
-        raise SettingsError(
-            f"`coupled` needs one model with a state space, or a control.StateSpace; got {type(source).__name__}. "
-            "Identify `rls` with `structure=mimo`, or leave `coupled` out."
-        )
-    robot = robot_of(source)
-    return _coupled(source.ss(), robot, None if robot.is_neck else directions_of(source))
+    return None
 
 
 def _is_necks(system: Any) -> bool:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -12,30 +11,6 @@ from softneck.core import SettingsError
 
 # Of the paper's loop [s].
 USUAL_PERIOD = 0.02
-
-S = TypeVar("S", bound=Any)
-
-
-def held(settings: S, plant: Any, usual: float = USUAL_PERIOD) -> tuple[S, Any]:
-    """Return the settings and the plant with each continuous `control` system of it made discrete by a zero-order hold.
-
-    At the samples both agree, as set-points are held in between. What is not continuous stays as it is, and so do then
-    the settings; else they, and with them the controller's file, hold the `sample_time` that was taken.
-
-    Args:
-        settings: of a controller.
-        plant: whatever a design takes.
-        usual: what stands where `sample_time` is None [s].
-
-    Raises:
-        SettingsError: a `sample_time` for what has one, or a system that has no state space.
-    """
-    if not _any_continuous(plant):
-        if settings.sample_time is not None:
-            raise SettingsError("`sample_time` is for continuous plants, and this one has its own; leave it out.")
-        return settings, plant
-    period = usual if settings.sample_time is None else settings.sample_time
-    return replace(settings, sample_time=period), _sampled(plant, period)
 
 
 def discrete(plant: Any, period: float) -> tuple[float | None, Any]:

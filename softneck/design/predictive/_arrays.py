@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +15,10 @@ from ._scale import Scale
 
 # Radians: a motor resolves 1.3e-4 rad, a soft limit is judged at 1e-6.
 _TOLERANCE = 1e-10
+# Rows that the solver adds and drops in a sample; beyond them the plan of the sample before goes on.
+_BUDGET = 100
+# An estimated payload trembles: co-contraction follows it as slowly as nobody waits for [s].
+_SEEN = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,40 +29,35 @@ class Tuning:
         trust: of the output-disturbance observer in what is measured, see `observer_gains`.
         reference_time: time constant of the reference filters [s].
         preview: samples that the reference is known ahead.
-        budget: iterations that the solver may take.
         coast: samples without measurement until the motors are held.
-        disturbances: (k, outputs + 2) of each measured one its gains on the outputs, its time constant [s], and the
-            tautness that it wishes for [rad].
+        payload_tautness: that a kilogram wishes for [rad/kg]; 0: no payload is told.
         scale: of another robot than the neck.
     """
 
     trust: float
     reference_time: float
     preview: int = 0
-    budget: int = 100
     coast: int = 25
-    disturbances: Matrix = field(default_factory=lambda: np.zeros((0, 4)))
+    payload_tautness: float = 0.0
     scale: Scale | None = None
 
 
 def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix, ...]:
     """Return the arrays in the order of `MpcArrays`."""
     p, n = problem, problem.order
-    plants = [plant for scenario in p.scenarios for plant in scenario.axes]
+    plants, told = p.axes, tuning.payload_tautness > 0.0
     Ts = plants[0].sample_time
     AH = np.linalg.solve(found.H, found.A.T).T
     angle_at = 4.0
-    constants = np.array([  # in the order of MPC_TS to MPC_TAUT_BACK
-        Ts, p.rows, len(p.scenarios), n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
-        min(round(tuning.reference_time / Ts), tuning.preview), len(tuning.disturbances), tuning.budget, _TOLERANCE,
+    constants = np.array([  # in the order of MPC_TS to MPC_NUMBERS
+        Ts, p.rows, 1.0, n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
+        min(round(tuning.reference_time / Ts), tuning.preview), float(told), _BUDGET, _TOLERANCE,
         tuning.coast, angle_at, angle_at + float(p.angles), 0.0, 0.0,
         *(() if tuning.scale is None else tuning.scale.numbers()),
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
-    disturbances = np.zeros((max(1, len(tuning.disturbances)), p.outputs + 2))
-    for row, (*gains, time, taut) in zip(disturbances, tuning.disturbances.tolist(), strict=False):
-        row[:] = *gains, math.exp(-Ts / time) if time > 0.0 else 0.0, taut
-    poles = np.array([disturbance_pole(plant, p.disturbance_time) for plant in plants])
+    payload = [*[0.0] * p.outputs, *([math.exp(-Ts / _SEEN), tuning.payload_tautness] if told else [0.0])]
+    poles = np.array([disturbance_pole(plant) for plant in plants])
     made = {
         "constants": constants,
         "model_A": np.vstack([padded(plant, n)[0] for plant in plants]),
@@ -67,8 +66,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
         "observer": observer_gains(poles, tuning.trust),
         "rest": np.array([rest_states(plant, n).T.ravel() for plant in plants]),
         "delays": np.array([float(plant.delay) for plant in plants]),
-        # Files are as they were where nothing asks for tautness.
-        "disturbances": disturbances if disturbances[:, -1].any() else disturbances[:, :-1].copy(),
+        "disturbances": np.array([payload]),
         "filters": np.full(p.outputs + 1, keep),
         "T": p.T,
         "starts": np.array(p.starts, dtype=np.float64),

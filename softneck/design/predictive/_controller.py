@@ -20,10 +20,8 @@ from ..linear._controller import assumed_lines, robot_in
 from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
 from ..plants._held import held_line
 from . import _mpc_state_runtime as rt
-from ._disturbance import MeasuredDisturbance
 from ._lti import lti
-from ._part import MpcPart
-from ._program import MpcInfo, explain
+from ._program import MpcInfo, MpcPart, explain
 from ._scale import runtime_of
 
 if TYPE_CHECKING:
@@ -46,7 +44,6 @@ class MpcController(Shown):
         position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
         angle_limit: soft, of pitch and roll [rad], or None.
         minimum_tautness: soft, of each tendon [rad], or None.
-        disturbances: that are measured.
         order: of the loop it is for.
         design: JSON values: the settings and what was found.
         robot: whose controller it is; of another than the neck all limits are in SI.
@@ -60,7 +57,6 @@ class MpcController(Shown):
     least_position: float
     angle_limit: float | None
     minimum_tautness: float | None
-    disturbances: tuple[MeasuredDisturbance, ...]
     order: str
     design: Mapping[str, Any]
     robot: Robot = field(default_factory=Robot.preset)
@@ -73,9 +69,8 @@ class MpcController(Shown):
             replace(port, name=f"{port.name}_ahead", description=f"{port.description} {self.preview:g} s from now")
             for port in controller_inputs(self.robot)[: len(self.robot.outputs.names)]
         ) if self.preview > 0.0 else ()  # fmt: skip
-        measured = tuple(
-            Port(name=item.name, unit=item.unit, description="measured disturbance") for item in self.disturbances
-        )
+        told = rt.MpcArrays(self.arrays).constants[rt.MPC_PAYLOAD] > 0.0
+        measured = (Port(name="payload", unit="kg", description="measured disturbance"),) if told else ()
         starts = (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, -MAX_MOTOR)
         limits, neck = limit_ports(starts, self.robot)[:4], self.robot.is_neck
         soft: tuple[Port, ...] = ()
@@ -140,8 +135,7 @@ class MpcController(Shown):
             "delay added to the plant for it",
             f"  {a.H.shape[0]} unknowns ({int(q[rt.MPC_MOVES])} moves of {a.T.shape[1]} motors, "
             f"{int(q[rt.MPC_SLACKS])} slacks), {a.kinds.shape[0]} rows, "
-            f"horizon {settings.get('horizon')} samples after the dead time, "
-            f"{int(q[rt.MPC_SCENARIOS])} scenario(s)",
+            f"horizon {settings.get('horizon')} samples after the dead time",
             self._limits_line(),
             f"  bandwidth {d.get('bandwidth_rad_s', 0.0):.3g} rad/s, "
             f"observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
@@ -179,7 +173,6 @@ class MpcController(Shown):
             "kind": "mpc",
             "sample_time": self.sample_time,
             **{name: getattr(self, name) for name in _LIMITS},
-            "disturbances": [item.saved() for item in self.disturbances],
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
@@ -195,6 +188,10 @@ class MpcController(Shown):
         items = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in rt.MpcArrays.names()}
         if not all(np.isfinite(item).all() for item in items.values()):
             raise FileFormatError("the controller's arrays are not finite; design it again.")
+        if gone := _gone(items):
+            raise FileFormatError(
+                f"{gone} of `mpc` went after softneck 0.2.0, which still reads the file; design it again."
+            )
         found = rt.MpcArrays.lengths(items)
         if found["entries"] not in (found["n"], found["n"] * found["outputs"]):
             raise FileFormatError("its array `model_B` is of other inputs; design the controller again.")
@@ -202,11 +199,23 @@ class MpcController(Shown):
             sample_time=float(header["sample_time"]),
             arrays=tuple(items.values()),
             **{name: None if header[name] is None else float(header[name]) for name in _LIMITS},  # type: ignore[arg-type]
-            disturbances=tuple(MeasuredDisturbance(**item) for item in header["disturbances"]),
             order=str(header["order"]),
             design=dict(header["design"]),
             robot=robot_in(header),
         )
+
+
+def _gone(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return what of a file of an earlier version no controller does any more; "" if nothing."""
+    q, m = arrays["constants"].ravel(), arrays["T"].shape[0] - 1
+    known = arrays["disturbances"]
+    if q.size < rt.MPC_NUMBERS or known.ndim != 2 or known.shape[1] <= m:
+        return ""  # damaged, which its lengths say
+    if q[2] != 1.0:
+        return "scenarios"
+    if q[15] != 0.0 or q[16] != 0.0:
+        return "tightened limits"
+    return "measured disturbances" if known[:, :m].any() or q[rt.MPC_PAYLOAD] != float(known.shape[1] > m + 1) else ""
 
 
 def _observer_line(settings: Mapping[str, Any]) -> list[str]:
@@ -282,6 +291,4 @@ def _limits(c: MpcController) -> list[str]:
             f"minimum_tautness {c.minimum_tautness:g} rad is above rest: the neck is compressed all the time, and a "
             "co-contraction reference below that is never reached."
         )
-    if not np.isfinite(a.K).all():
-        lines.append("the arrays are damaged; design it again.")
     return lines

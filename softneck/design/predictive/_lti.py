@@ -72,7 +72,7 @@ def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     soft = [_FREE] * int(q[rt.MPC_TAUT_AT] - q[rt.MPC_ANGLE_AT])
     parameters = np.array([_FREE, _FREE, _FREE, -_FREE, *soft, -_FREE])
     ahead = m if q[rt.MPC_AHEAD] > 0 else 0
-    ports = flags + 2 + ahead + int(q[rt.MPC_DISTURBANCES])
+    ports = flags + 2 + ahead + int(q[rt.MPC_PAYLOAD])
 
     def image(state_at: int, input_at: int) -> tuple[Vector, Vector]:
         state, u = np.zeros(numbers.size), np.zeros(ports)

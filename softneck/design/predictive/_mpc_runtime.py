@@ -12,7 +12,6 @@ from softneck.design.linear._rest_runtime import initialise as initialise
 from softneck.design.predictive._dual_runtime import qp_solve
 from softneck.design.predictive._mpc_state_runtime import (
     MPC_ANGLE_AT,
-    MPC_ANGLE_BACK,
     MPC_BUDGET,
     MPC_NO_BOUND,
     MPC_NUMBERS,
@@ -25,7 +24,6 @@ from softneck.design.predictive._mpc_state_runtime import (
     MPC_ROW_SLACK,
     MPC_SOFT,
     MPC_TAUT_AT,
-    MPC_TAUT_BACK,
     MPC_TOLERANCE,
     MPC_TS,
     MpcArrays,
@@ -44,7 +42,7 @@ def step(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray, 
     """Compute the set-points for now, and the state for the next sample.
 
     inputs: pitch, roll and co-contraction reference, pitch, roll, motor_position_1..3, healthy, enabled; with preview
-    pitch_reference_ahead, roll_reference_ahead; then measured disturbances. The outputs of another robot stand for
+    pitch_reference_ahead, roll_reference_ahead; where it is told the payload. The outputs of another robot stand for
     pitch and roll.
     outputs: motor_setpoint_1..3.
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position [rad]; where set,
@@ -88,12 +86,12 @@ def mpc_bounds(
         elif kind == MPC_ROW_SLACK:
             low = 0.0
         elif kind == MPC_ROW_ANGLE_HIGH:
-            # Soft limits, tightened by their back-off; the slack is a variable of the row.
-            high = mpc_angle(p, parameters, int(p.kinds[i, 1])) - q[MPC_ANGLE_BACK] - free[i]
+            # Soft limits: the slack is a variable of the row.
+            high = mpc_angle(p, parameters, int(p.kinds[i, 1])) - free[i]
         elif kind == MPC_ROW_ANGLE_LOW:
-            low = q[MPC_ANGLE_BACK] - mpc_angle(p, parameters, int(p.kinds[i, 1])) - free[i]
+            low = -mpc_angle(p, parameters, int(p.kinds[i, 1])) - free[i]
         else:
-            low = parameters[int(q[MPC_TAUT_AT])] + q[MPC_TAUT_BACK] - free[i]
+            low = parameters[int(q[MPC_TAUT_AT])] - free[i]
         lower[i] = low
         upper[i] = high
 

@@ -1,9 +1,9 @@
 """What a predictive controller knows and remembers, and how it moves on: models, disturbances, references, past inputs.
 
-Each scenario s has, for each axis, a model `x+ = A x + B v(k - d)`, `y = x[0] + o` that runs on the inputs alone; the
-models stand behind each other, i = outputs s + axis. v is the redefined input of the axis, of a coupled plant those of
-all axes: B and `rest` have n columns for each. The output disturbance o follows what was measured: `o+ = o + r`,
-`r+ = a r` with a the plant's slowest pole, which is what a load makes of the angle that comes on at the plant's input.
+Each axis has a model `x+ = A x + B v(k - d)`, `y = x[0] + o` that runs on the inputs alone; v is the redefined input of
+the axis, of a coupled plant those of all axes: B and `rest` have n columns for each. The output disturbance o follows
+what was measured: `o+ = o + r`, `r+ = a r` with a the plant's slowest pole: what a load at the plant's input makes of
+the angle.
 
 Of another robot than the neck all this is in units in which it has a neck's size (see `_scale`): `mpc_inputs` and
 `mpc_limits` come from SI, `mpc_give` goes back.
@@ -27,24 +27,21 @@ MPC_SOFT = 2.0
 MPC_PLAN = 3.0
 MPC_HOLDING = 4.0
 
-# Numbers of `constants`, in this order.
+# Numbers of `constants`, in this order; 2, 15 and 16 are those of what earlier versions had: 1, 0 and 0.
 MPC_TS = 0
 MPC_ROWS = 1
-MPC_SCENARIOS = 2
 MPC_ORDER = 3
 MPC_PAST = 4
 MPC_MOVES = 5
 MPC_SLACKS = 6
 MPC_AHEAD = 7
 MPC_LEAD = 8  # samples by which references are taken early, to make up for their filters
-MPC_DISTURBANCES = 9
+MPC_PAYLOAD = 9  # 1 where a payload is told
 MPC_BUDGET = 10
 MPC_TOLERANCE = 11
 MPC_COAST = 12  # samples without measurement until the motors are held
 MPC_ANGLE_AT = 13  # places of two parameters; those whose limit is not set are not there
 MPC_TAUT_AT = 14
-MPC_ANGLE_BACK = 15  # how much soft limits are tightened
-MPC_TAUT_BACK = 16
 # Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
 # units in SI, that of the motors, and one for each output and for each redefined input.
 MPC_NUMBERS = 17
@@ -58,11 +55,6 @@ MPC_ROW_ANGLE_LOW = 4.0
 MPC_ROW_TAUT = 5.0
 
 
-def mpc_disturbance_rows(constants: np.ndarray) -> int:
-    """Return the rows of `disturbances`: no array is empty."""
-    return max(1, int(constants[MPC_DISTURBANCES]))
-
-
 def mpc_outputs(T: np.ndarray) -> int:
     """Return the number of outputs: the redefined inputs are one more, co-contraction."""
     return T.shape[0] - 1
@@ -74,18 +66,18 @@ def mpc_motors(T: np.ndarray) -> int:
 
 
 class MpcArrays(Arrays):
-    """The models of S scenarios, and the QP `min 1/2 z'Hz + (F theta)'z, lower <= A z + E theta <= upper`."""
+    """The models, and the QP `min 1/2 z'Hz + (F theta)'z, lower <= A z + E theta <= upper`."""
 
     _z, _m = "motors * moves + slacks", "(references - 1)"
-    _theta = f"{_m} * S * (n + 2) + {_m} * L + motors + 2"
+    _theta = f"{_m} * (n + 2) + {_m} * L + motors + 2"
     constants = array("numbers", "see MPC_TS to MPC_NUMBERS")
-    model_A = array(f"{_m} * S * n, n", "A of each model, below each other")
-    model_B = array(f"{_m} * S, entries", "B of each model, one input behind the other")
-    observer = array(f"{_m} * S, 3", "gains on o and r, and the pole a")
-    rest = array(f"{_m} * S, entries", "x at rest under inputs of one")
-    delays = array(f"{_m} * S", "d, dead times [samples]")
+    model_A = array(f"{_m} * n, n", "A of each model, below each other")
+    model_B = array(f"{_m}, entries", "B of each model, one input behind the other")
+    observer = array(f"{_m}, 3", "gains on o and r, and the pole a")
+    rest = array(f"{_m}, entries", "x at rest under inputs of one")
+    delays = array(_m, "d, dead times [samples]")
     disturbances = array(
-        "channels, columns", "of each measured one: gains on the outputs, pole of its filter, where asked for tautness"
+        "1, columns", "zero for each output, the pole of its filter, where told the tautness that it wants"
     )
     filters = array("references", "poles of the reference filters")
     T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
@@ -100,15 +92,13 @@ class MpcArrays(Arrays):
     F = array(f"{_z}, {_theta}", "")
     scale = array("1", "the largest entry of H, at least one")
     L = value("constants", MPC_ROWS)  # samples of which the reference is needed
-    S = value("constants", MPC_SCENARIOS)
     n = value("constants", MPC_ORDER)
     D = value("constants", MPC_PAST)  # the longest dead time
     moves = value("constants", MPC_MOVES)
     slacks = value("constants", MPC_SLACKS)
     ahead = value("constants", MPC_AHEAD)  # samples that the reference is known ahead
     lead = value("constants", MPC_LEAD)
-    measured = value("constants", MPC_DISTURBANCES)  # disturbances
-    channels = value("constants", function=mpc_disturbance_rows)
+    told = value("constants", MPC_PAYLOAD)
     outputs = value("T", function=mpc_outputs, written=True)
     motors = value("T", function=mpc_motors, written=True)
 
@@ -128,9 +118,9 @@ class MpcState(StateVector):
     held = cells("motors", "set-points of now [rad]")
     filtered = cells("outputs + 1", "references behind their filters [rad]")
     seen = cells("outputs + 1", "references last seen [rad]")
-    disturbances = cells("measured, 2", "of each measured one: its value, and that behind its filter")
-    models = cells("outputs * S, n", "x of each model")
-    offsets = cells("outputs * S, 2", "o [rad] and r [rad/sample] of each model")
+    payload = cells("2 * told", "payload [kg], and that behind its filter")
+    models = cells("outputs, n", "x of each model")
+    offsets = cells("outputs, 2", "o [rad] and r [rad/sample] of each model")
     past = cells("D, outputs", "inputs v, newest first [rad]")
     coming = cells("outputs, ahead", "references to come [rad]")
     plan = cells("motors * moves + slacks", "z: moves of the motors [rad], then slacks")
@@ -140,9 +130,9 @@ class MpcState(StateVector):
 class MpcTheta(StateVector):
     """The parameter of the QP."""
 
-    models = cells("outputs * S, n", "x(k + d) of each model")
-    offsets = cells("outputs * S, 2", "o and r of each model")
-    wanted = cells("outputs, L", "pitch and roll at k + 1 .. k + L, less what measured disturbances will add [rad]")
+    models = cells("outputs, n", "x(k + d) of each model")
+    offsets = cells("outputs, 2", "o and r of each model")
+    wanted = cells("outputs, L", "pitch and roll at k + 1 .. k + L [rad]")
     held = cells("motors", "set-points of now [rad]")
     cocontraction = cells("", "wanted [rad]")
     one = cells("", "1")
@@ -168,7 +158,7 @@ def mpc_inputs(p: MpcArrays, inputs: np.ndarray) -> np.ndarray:
 def mpc_limits(p: MpcArrays, x: MpcState, parameters: np.ndarray) -> np.ndarray:
     """Return the parameters in the units of the robot's size; each output has one of its own for the angles' limit.
 
-    What is measured adds to the tautness that is wished for.
+    A payload that is told adds to the tautness that is wished for.
     """
     limits = parameters.copy()
     if p.numbers > MPC_NUMBERS:
@@ -178,9 +168,8 @@ def mpc_limits(p: MpcArrays, x: MpcState, parameters: np.ndarray) -> np.ndarray:
         taut = int(p.constants[MPC_TAUT_AT])
         if taut < limits.shape[0]:
             limits[taut] /= unit
-    if p.columns > p.outputs + 1:
-        for j in range(p.measured):
-            limits[int(p.constants[MPC_TAUT_AT])] += p.disturbances[j, p.outputs + 1] * x.disturbances[j, 1]
+    if p.told > 0:
+        limits[int(p.constants[MPC_TAUT_AT])] += p.disturbances[0, p.outputs + 1] * x.payload[1]
     return limits
 
 
@@ -233,11 +222,11 @@ def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
 
 
 def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
-    """Take in references and measured disturbances; one that is not finite leaves what was."""
+    """Take in references and the payload; one that is not finite leaves what was."""
     for i in range(p.outputs + 1):
         if math.isfinite(inputs[i]):
             x.seen[i] = mpc_reference(p, i, inputs[i])  # pyright: ignore[reportArgumentType]  (a number)
-    # Of the measured disturbances in `inputs`: behind the preview, where there is one.
+    # Of the payload in `inputs`: behind the preview, where there is one.
     first = 2 * p.outputs + 3 + p.motors
     if p.ahead > 0:
         coming = first
@@ -252,35 +241,25 @@ def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
             value = inputs[coming + axis]
             if math.isfinite(value):
                 row[p.ahead - 1] = mpc_reference(p, axis, value)  # pyright: ignore[reportArgumentType]
-    for i in range(p.measured):
-        value = inputs[first + i]
-        x.disturbances[i, 0] = value if math.isfinite(value) else x.disturbances[i, 0]
+    if p.told > 0:
+        value = inputs[first]
+        x.payload[0] = value if math.isfinite(value) else x.payload[0]
         if x.started == 0.0:
-            x.disturbances[i, 1] = x.disturbances[i, 0]
-
-
-def mpc_added(p: MpcArrays, x: MpcState, axis: int) -> float:
-    """Return what the measured disturbances add to an angle now."""
-    total = 0.0
-    for i in range(p.measured):
-        total += p.disturbances[i, axis] * x.disturbances[i, 1]
-    return total
+            x.payload[1] = x.payload[0]
 
 
 def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> None:
     """Start as if the neck had always stood where it is under the held set-points: no bump."""
     v = np.dot(p.T, x.held)
-    for s in range(p.S):
-        for axis in range(p.outputs):
-            i = p.outputs * s + axis
-            for j in range(p.n):
-                x.models[i, j] = mpc_driven(p, p.rest, i, j, v)
-            x.offsets[i, 0] = 0.0
-            x.offsets[i, 1] = 0.0
-            if measured:
-                # What the angle is beyond that is a disturbance, there to stay.
-                x.offsets[i, 0] = inputs[p.outputs + 1 + axis] - x.models[i, 0] - mpc_added(p, x, axis)
-            x.filtered[axis] = x.models[i, 0] + x.offsets[i, 0] + mpc_added(p, x, axis)
+    for i in range(p.outputs):
+        for j in range(p.n):
+            x.models[i, j] = mpc_driven(p, p.rest, i, j, v)
+        x.offsets[i, 0] = 0.0
+        x.offsets[i, 1] = 0.0
+        if measured:
+            # What the angle is beyond that is a disturbance, there to stay.
+            x.offsets[i, 0] = inputs[p.outputs + 1 + i] - x.models[i, 0]
+        x.filtered[i] = x.models[i, 0] + x.offsets[i, 0]
     x.filtered[p.outputs] = v[p.outputs]
     for i in range(p.D):
         for axis in range(p.outputs):
@@ -292,10 +271,9 @@ def mpc_align(p: MpcArrays, x: MpcState, inputs: np.ndarray, measured: bool) -> 
 
 def mpc_correct(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take the measured angles in."""
-    for i in range(p.outputs * p.S):
+    for i in range(p.outputs):
         # x runs on its inputs alone: only o and r answer to what was measured.
-        axis = i % p.outputs
-        error = inputs[p.outputs + 1 + axis] - mpc_added(p, x, axis) - x.models[i, 0] - x.offsets[i, 0]
+        error = inputs[p.outputs + 1 + i] - x.models[i, 0] - x.offsets[i, 0]
         x.offsets[i, 0] += p.observer[i, 0] * error
         x.offsets[i, 1] += p.observer[i, 1] * error
 
@@ -314,7 +292,7 @@ def mpc_filter(p: MpcArrays, x: MpcState) -> None:
 def mpc_driven(p: MpcArrays, gains: np.ndarray, i: int, j: int, v: np.ndarray) -> float:
     """Return what the inputs v do to state j of model i by `gains`: those of all axes where the plant is coupled."""
     if p.entries == p.n:
-        return gains[i, j] * v[i % p.outputs]
+        return gains[i, j] * v[i]
     total = 0.0
     for axis in range(p.outputs):
         total += gains[i, axis * p.n + j] * v[axis]
@@ -333,7 +311,7 @@ def mpc_model(p: MpcArrays, i: int, v: np.ndarray, now: np.ndarray, after: np.nd
 def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
     """Fill theta."""
     now, after = np.empty(p.n), np.empty(p.n)
-    for i in range(p.outputs * p.S):
+    for i in range(p.outputs):
         now[:] = x.models[i]
         # The inputs of the dead time are given, oldest first.
         for back in range(int(p.delays[i]), 0, -1):
@@ -352,23 +330,16 @@ def mpc_parameter(p: MpcArrays, x: MpcState, theta: MpcTheta) -> None:
                 asked = x.coming[axis, min(i + p.lead, p.ahead) - 1]
             value = a * value + (1.0 - a) * asked
             theta.wanted[axis, i - 1] = value
-        for j in range(p.measured):
-            # A measured disturbance is taken to stay as well; its effect comes through its filter.
-            w, z, keep = x.disturbances[j, 0], x.disturbances[j, 1], p.disturbances[j, p.outputs]
-            for i in range(p.L):
-                z = keep * z + (1.0 - keep) * w
-                # Off the target instead of onto every model's angle: the same error.
-                theta.wanted[axis, i] -= p.disturbances[j, axis] * z
     theta.held[:] = x.held
     theta.cocontraction = x.filtered[p.outputs]
     theta.one = 1.0
 
 
 def mpc_predict(p: MpcArrays, x: MpcState) -> None:
-    """Move models, past inputs and disturbances on to the next sample."""
+    """Move models, past inputs, disturbances and the payload's filter on to the next sample."""
     v = np.dot(p.T, x.held)
     now = np.empty(p.n)
-    for i in range(p.outputs * p.S):
+    for i in range(p.outputs):
         back = int(p.delays[i])
         now[:] = x.models[i]
         if back > 0:
@@ -384,6 +355,6 @@ def mpc_predict(p: MpcArrays, x: MpcState) -> None:
     if p.D > 0:
         for axis in range(p.outputs):
             x.past[0, axis] = v[axis]
-    for i in range(p.measured):
-        keep = p.disturbances[i, p.outputs]
-        x.disturbances[i, 1] = keep * x.disturbances[i, 1] + (1.0 - keep) * x.disturbances[i, 0]
+    if p.told > 0:
+        keep = p.disturbances[0, p.outputs]
+        x.payload[1] = keep * x.payload[1] + (1.0 - keep) * x.payload[0]

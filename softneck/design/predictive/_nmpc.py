@@ -4,27 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import (
+    FileFormatError,
     Matrix,
     SettingsError,
     Vector,
     require_between,
-    require_one_of,
     require_whole,
     to_si,
     write_archive,
 )
 from softneck.core._shown import Shown
 from softneck.estimation import AxisPlant
-from softneck.estimation._settings import ORDERS
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._linear_systems import weights_of
@@ -36,14 +35,14 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
-from ..linear._ports import LIMITS, MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, require_limits
+from ..linear._ports import LIMITS, MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_part import NmpcPart, SampleSolution, explain
-from ._nmpc_prepared import NonlinearProblem, controller_arrays
+from ._nmpc_prepared import BUDGET, SLACK_WEIGHT, NonlinearProblem, controller_arrays
 from ._nmpc_probe import plant_of, probed, require_horizon, risen
-from ._observed import over
-from ._scale import SizedPlant, limits_of, sized_plant
-from ._tuning import move_weight, require_given, require_rise, require_solvable, samples_ahead, spaced_starts
+from ._predicted import over
+from ._scale import TAUTNESS_LEVER, SizedPlant, predictive_limits, sized_plant
+from ._tuning import move_weight, require_given, require_solvable, samples_ahead, spaced_starts
 
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
@@ -52,86 +51,58 @@ NONLINEAR_KINDS = ("nn", "play", "greybox", "nss")
 # and 8 samples.
 _HORIZON, _WINDOW = 0.32, 0.16
 _LONGEST = 100
+# What earlier versions let set, and files of theirs may hold; none of it is another number here.
+_GONE = {
+    "converged": False, "disturbance_time": None, "cocontraction_weight": 1.0, "slack_weight": SLACK_WEIGHT,
+    "budget": BUDGET, "tautness_lever": TAUTNESS_LEVER, "order": "sequential",
+    "tendon_angles": TENDON_ANGLES.tolist(),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NmpcSettings(Shown):
-    """Nonlinear predictive control of all axes over `nn`, `play`, `greybox` or `nss`.
-
-    The defaults are the neck's. Of another robot times are stretched by its slowest pole, limits are those of its file,
-    and those given are in the unit of its motors. Weights count as for a plant of the neck's size.
+    """Nonlinear predictive control of all axes over `nn`, `play`, `greybox` or `nss`, in sequential loops.
 
     One Gauss-Newton iteration for each sample, from the shifted plan of the sample before (real-time iteration, Diehl
-    et al. 2005).
+    et al. 2005). The defaults are the neck's; of another robot times are stretched by its slowest pole. Limits of the
+    motors are those of the robot's file; what is given is in the unit of its motors.
 
     Attributes:
         bandwidth: of the linear loop without dead time that has the same weights [rad/s].
-        window: samples over which the output disturbance is estimated.
-        disturbance_time: time constant of the disturbance's rate [s]; None for the model's own.
-        reference_time: time constant of the reference filter [s].
-        rise_s: time [s] in which a step rises from 10 to 90 %, in the place of `reference_time`, as if bandwidth and
-            filter were two lags; where the bandwidth is too slow for it, that is raised.
+        rise_s: time [s] in which a step rises from 10 to 90 %, as if bandwidth and reference filter were two lags;
+            where the bandwidth is too slow for it, that is raised. None: a filter of 0.2 s.
         preview: how far ahead the reference is known [s].
         horizon: N, samples from now, the dead time among them.
         moves: times at which the motors move.
-        position_limit, slew_limit, lead_limit, least_position: of each motor [rad], [rad/s], [rad], [rad].
+        lead_limit: how far a set-point may be from its motor [rad].
         angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
         minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], a wish that
             co-contraction is raised for, with its weight; None for none. Models that have not seen tendons hang are
             wrong where they do. For necks.
-        tautness_lever: motor angle that one radian of neck takes up [rad/rad].
-        cocontraction_weight: on the error of co-contraction, against that of the tilt's inputs, squared.
-        slack_weight: on violations of soft limits, against errors of the angles, squared.
-        budget: iterations of the QP solver.
-        look_ahead: by how much the observer of the loop runs ahead of its sensor [s]; whole samples of it count.
-        order: of the loop; "jacobi" needs a model that was identified with its delays.
-        tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
     bandwidth: float = NeckDefault(8.0)
-    window: int = NeckCount(8)
-    disturbance_time: float | None = None
-    reference_time: float = NeckDefault(0.2)
     rise_s: float | None = None
     preview: float = 0.0
     horizon: int = NeckCount(20)
     moves: int = NeckCount(10)
-    position_limit: float = NeckDefault(6.0)
-    slew_limit: float = NeckDefault(12.5)
     lead_limit: float = NeckDefault(1.0)
-    least_position: float = NeckDefault(-6.0)
     angle_limit: float | None = None
     minimum_tautness: float | None = None
-    tautness_lever: float = NeckDefault(6.93)
-    cocontraction_weight: float = 1.0
-    slack_weight: float = 1e3
-    budget: int = 200
-    look_ahead: float = NeckDefault(0.0)
-    order: str = "sequential"
-    tendon_angles: tuple[float, float, float] = tuple(TENDON_ANGLES.tolist())
 
     def __post_init__(self) -> None:
-        require_given(self, {"bandwidth": "rad/s", "angle_limit": "rad", "disturbance_time": "s",
-                             "cocontraction_weight": "", "slack_weight": ""})  # fmt: skip
-        require_whole("window", self.window, 2, 100)
-        require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
-        require_rise(self.rise_s, self.reference_time)
+        require_given(self, {"bandwidth": "rad/s", "lead_limit": "", "angle_limit": "rad"})
+        if self.rise_s is not None:
+            require_between("rise_s", self.rise_s, 0.001, 1e6, "s")
         require_between("preview", self.preview, 0.0, 1e6, "s")
         require_whole("horizon", self.horizon, 2, 100)
         require_whole("moves", self.moves, 1, self.horizon)
-        require_limits({name: getattr(self, name) for name in LIMITS[:4]})
         if self.minimum_tautness is not None:
             require_between("minimum_tautness", self.minimum_tautness, -MAX_MOTOR, MAX_MOTOR, "rad")
-        require_between("tautness_lever", self.tautness_lever, 0.0, 100.0, "rad/rad")
-        require_whole("budget", self.budget, 1, 10_000)
-        require_between("look_ahead", self.look_ahead, 0.0, 1.0, "s")
-        require_one_of("order", self.order, ORDERS)
-        if self.order != "sequential":
-            raise SettingsError("nonlinear predictive control is for `order=sequential`, as on the hardware.")
 
-    def over(self, observer: Any) -> NmpcSettings:
-        """Return the settings for a loop with this observer, which says `look_ahead`."""
-        return over(self, observer)
+    def over(self, observer: Any) -> NmpcNumbers:
+        """Return the settings for a loop with this observer: how far it looks ahead."""
+        return over(NmpcNumbers.of(self), observer)
 
     def design(self, model: Model) -> NmpcController:
         """Return the controller for an identified nonlinear `model`.
@@ -146,35 +117,37 @@ class NmpcSettings(Shown):
                 "For a linear model use `softneck design mpc`."
             )
         robot = model.robot
-        if not robot.is_neck and self.tendon_angles != NmpcSettings().tendon_angles:
-            raise SettingsError(f"`tendon_angles` are of necks; those of {robot.label()} are in its robot file.")
-        if not robot.is_neck and self.minimum_tautness is not None:
-            raise SettingsError(f"`minimum_tautness` of `nmpc` is for necks; {robot.label()} is none. Leave it out.")
-        limits = limits_of(self, robot)
+        limits = predictive_limits(self, robot)
         directions = None if robot.is_neck else weights_of(model)
         pulled = max(0.0, self.minimum_tautness or 0.0)
-        found = probed(model, self._redefinition(directions, robot)[1], limits, pulled)
-        per_motor = to_si(robot.motors.unit)[0]
-        own = replace(self, **{name: getattr(limits, name) / per_motor for name in LIMITS[:4]})
-        own = own if robot.is_neck else own._of_robot(found, model.sample_time)
-        own = risen(own)
+        found = probed(model, redefinition(directions, robot)[1], limits, pulled)
+        own = NmpcNumbers.of(self)
+        own = risen(own if robot.is_neck else own.of_robot(found, model.sample_time))
         require_horizon(own, [plant_of(item, model.sample_time, robot.is_neck) for item in found.values()])
         require_solvable(own.moves, len(robot.motors.names))
-        return NmpcController(
-            settings=own,
-            model=model,
-            found=found,
-            directions=directions,
-        )
+        return NmpcController(settings=own, limits=limits, model=model, found=found, directions=directions)
 
-    def _redefinition(self, directions: Matrix | None, robot: Robot) -> tuple[Matrix, Matrix]:
-        """Return T from motors to redefined inputs, and its inverse."""
-        if directions is not None:
-            return redefinition_of(directions, robot.outputs.names)
-        T = redefinition_matrix(np.array(self.tendon_angles))
-        return T, np.linalg.inv(T)
 
-    def _of_robot(self, found: Mapping[str, Mapping[str, float]], sample_time: float) -> NmpcSettings:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class NmpcNumbers(NmpcSettings):
+    """Settings, and the numbers that follow from plant and observer.
+
+    Attributes:
+        window: samples over which the output disturbance is estimated.
+        reference_time: time constant of the reference filter [s].
+        look_ahead: by how much the observer of the loop runs ahead of its sensor [s]; whole samples of it count.
+    """
+
+    window: int = NeckCount(8)
+    reference_time: float = NeckDefault(0.2)
+    look_ahead: float = NeckDefault(0.0)
+
+    @classmethod
+    def of(cls, settings: NmpcSettings) -> Self:
+        """Return the settings with these numbers."""
+        return cls(**{field.name: getattr(settings, field.name) for field in fields(settings)})
+
+    def of_robot(self, found: Mapping[str, Mapping[str, float]], sample_time: float) -> Self:
         """Return the settings for another robot, times stretched by its slowest plant near rest."""
         plants = [plant_of(item, sample_time, neck=False) for item in found.values()]
         stretch = max(plant.stretch for plant in plants)
@@ -191,18 +164,28 @@ class NmpcSettings(Shown):
         return replace(self, **changed)
 
 
+def redefinition(directions: Matrix | None, robot: Robot) -> tuple[Matrix, Matrix]:
+    """Return T from motors to redefined inputs, and its inverse."""
+    if directions is not None:
+        return redefinition_of(directions, robot.outputs.names)
+    T = redefinition_matrix()
+    return T, np.linalg.inv(T)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class NmpcController(Shown):
     """A nonlinear predictive controller of all outputs; `NmpcSettings.design` makes it.
 
     Attributes:
-        settings: what was asked; limits in the unit of the motors.
+        settings: what was asked, and the numbers that follow.
+        limits: what its set-points may do.
         model: that it predicts with.
         found: static gain, pole and dead time of the model near rest, by axis.
         directions: (outputs, motors) of the motors in each output of another robot than the neck.
     """
 
-    settings: NmpcSettings
+    settings: NmpcNumbers
+    limits: ControllerLimits
     model: Model
     found: Mapping[str, Mapping[str, float]]
     directions: Matrix | None = None
@@ -218,13 +201,6 @@ class NmpcController(Shown):
     def robot(self) -> Robot:
         """Whose controller it is."""
         return self.model.robot
-
-    @property
-    def limits(self) -> ControllerLimits:
-        """What its set-points may do."""
-        per_motor = to_si(self.robot.motors.unit)[0]
-        given = {name: per_motor * getattr(self.settings, name) for name in LIMITS[:4]}
-        return ControllerLimits(robot=self.robot, **given, least_cocontraction=-given["position_limit"])
 
     @property
     def preview(self) -> float:
@@ -269,14 +245,14 @@ class NmpcController(Shown):
             return None
         names = self.robot.outputs.names
         axes = {name: UncertainAxis(plant, (plant,)) for name, plant in zip(names, self._near_rest, strict=True)}
-        T = self.settings._redefinition(self.directions, self.robot)
+        T = redefinition(self.directions, self.robot)
         return sized_plant(UncertainPlant(axes, self.robot, self.directions), self.limits, T)
 
     def problem(self) -> NonlinearProblem:
         """Return what is asked, in numbers."""
         s, plants, scale = self.settings, self.plants(), None
         if self._sized is None:
-            T, inverse = s._redefinition(None, self.robot)
+            T, inverse = redefinition(None, self.robot)
         else:
             (T, inverse), scale = self._sized.redefinition, self._sized.scale
         weights = np.tile([1.0 / plant.static_gain**2 for plant in plants], (s.horizon, 1))
@@ -290,7 +266,7 @@ class NmpcController(Shown):
             T_inverse=inverse,
             weights=weights,
             move_weight=1.5 * max(move_weight(plant, s.bandwidth) for plant in plants),
-            cocontraction_weight=s.cocontraction_weight,
+            cocontraction_weight=1.0,
             scale=scale,
             look=samples_ahead(s.look_ahead, self.sample_time),
         )
@@ -339,7 +315,7 @@ class NmpcController(Shown):
         """Return some lines for people."""
         s, robot = self.settings, self.robot
         lines = [
-            f"nmpc controller over {self.model.kind}, {1e3 * self.sample_time:g} ms, {s.order} order",
+            f"nmpc controller over {self.model.kind}, {1e3 * self.sample_time:g} ms, sequential order",
             f"  {len(robot.motors.names) * s.moves} unknowns, horizon {s.horizon} samples, bandwidth "
             f"{s.bandwidth:.4g} rad/s, disturbance over {s.window} samples, "
             "one iteration a sample",
@@ -359,14 +335,10 @@ class NmpcController(Shown):
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller with its model to one `.npz` file."""
         model, arrays = nested(self.model)
-        settings = asdict(self.settings)
-        # Files say what they said before where nobody asks for what came later.
-        taut = ("minimum_tautness", "tautness_lever") if settings["minimum_tautness"] is None else ()
-        for name in ("rise_s", *taut, *(() if settings["look_ahead"] else ("look_ahead",))):
-            del settings[name]
         header = {
             "kind": "nmpc",
-            "settings": settings,
+            "settings": asdict(self.settings),
+            **self.limits.header(),
             "found": {axis: dict(values) for axis, values in self.found.items()},
             "model": model,
             **({} if self.directions is None else {"directions": self.directions.tolist()}),
@@ -378,7 +350,17 @@ class NmpcController(Shown):
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NmpcController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
         model = nested_model(header["model"], arrays)
-        settings = dict(header["settings"])
-        settings["tendon_angles"] = tuple(settings["tendon_angles"])
+        settings, robot = dict(header["settings"]), model.robot
+        for name, usual in _GONE.items():
+            if (value := settings.pop(name, usual)) != usual:
+                raise FileFormatError(
+                    f"`{name}` = {value} went after softneck 0.2.0, which still reads the file; design it again."
+                )
+        per_motor, given = to_si(robot.motors.unit)[0], header
+        if "position_limit" in settings:  # of versions before 0.3, in the unit of the motors
+            given = {name: per_motor * settings.pop(name) for name in LIMITS[:4]}
         directions = np.array(header["directions"]) if "directions" in header else None
-        return cls(settings=NmpcSettings(**settings), model=model, found=header["found"], directions=directions)
+        return cls(
+            settings=NmpcNumbers(**settings), limits=ControllerLimits.from_header(given, robot), model=model,
+            found=header["found"], directions=directions,
+        )  # fmt: skip

@@ -15,12 +15,14 @@ from softneck.runtime import Block
 
 from ._nmpc_state_runtime import NMPC_NO_BOUND
 from ._prediction import idle_moves
-from ._scale import Scale
+from ._scale import TAUTNESS_LEVER, Scale
 
 # Samples without measurement until the motors hold, and samples after which a model has settled; of another robot those
 # of a neck at 20 ms, stretched by its slowest pole.
 COAST = 25
 SETTLE = 200
+# On violations of soft limits against errors of the angles, squared; iterations of the QP's solver.
+SLACK_WEIGHT, BUDGET = 1e3, 200
 # A neck's [s].
 NECK_SAMPLE = 0.02
 
@@ -106,8 +108,6 @@ class Preparation:
         p = self.problem = controller.problem()
         plants = self.plants = controller.plants()
         pole = max(float(-plant.denominator[1]) for plant in plants)
-        if s.disturbance_time is not None:
-            pole = math.exp(-Ts / s.disturbance_time)
         self.gains = estimate_gains(pole, s.window)
         self.future = disturbance_ahead(pole, p.horizon)
         self.ahead = round(s.preview / Ts)
@@ -156,15 +156,15 @@ def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
     s, prepared = controller.settings, Preparation(controller)
     p, block = prepared.problem, controller.model.block()
     start = block.initial_state(use_measurement=0.0, noise_std=0.0)
-    slack = 0.0 if s.angle_limit is None else s.slack_weight * float(p.weights[0].max())
+    slack = 0.0 if s.angle_limit is None else SLACK_WEIGHT * float(p.weights[0].max())
     scale, stretch = p.scale, max(plant.stretch for plant in prepared.plants)
     coast, settle = COAST, SETTLE
     if scale is not None:
         coast, settle = (max(1, round(n * NECK_SAMPLE * stretch / controller.sample_time)) for n in (COAST, SETTLE))
     constants = np.array([
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
-        p.cocontraction_weight, slack, s.angle_limit or 0.0, s.budget, coast, settle,
-        len(block.outputs), -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness, s.tautness_lever,
+        p.cocontraction_weight, slack, s.angle_limit or 0.0, BUDGET, coast, settle,
+        len(block.outputs), -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness, TAUTNESS_LEVER,
         p.look,
         *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),
     ])  # fmt: skip

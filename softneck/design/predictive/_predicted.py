@@ -1,4 +1,7 @@
-"""The plant that is predicted, its samples, and the defaults that it has: of a neck, or another robot."""
+"""The plant that is predicted, its samples, and what a design takes for given of it: of a neck, or another robot.
+
+And what it takes from its loop's observer: look-ahead, and how taut a payload wants tendons.
+"""
 
 from __future__ import annotations
 
@@ -12,14 +15,16 @@ import numpy as np
 from softneck.core import Matrix, SettingsError
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import HasTransferFunctions, robot_of
+from softneck.identification import Model
+from softneck.robot import Robot
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._redefined import redefinition_of
+from softneck.signals import redefinition_matrix
 
 from ..plants._coupled import CoupledPlant, coupled_plant
 from ..plants._coupled_axis import AnyAxis, CoupledAxis, times
 from ..plants._uncertain import UncertainPlant, uncertain_plant
-from ._disturbance import with_payload
-from ._scale import SizedPlant, refuse_what_is_for_necks
+from ._scale import SizedPlant
 from ._tuning import Pair, samples_ahead
 
 # What stands for the defaults of an identified neck where the plant is one's own or another robot's.
@@ -32,6 +37,16 @@ _HORIZON = 0.6
 _LONGEST = 200
 # That many samples of a family judge robustness; they are spread evenly over all.
 _JUDGES = 12
+
+# Small moves that tell whether tendons hang [rad of a redefined input], and how long the model settles before [s].
+_MOVE, _SETTLED = 0.3, 3.0
+# Tendons are taut where such a move does this part of the most that it does anywhere.
+_TAUT = 0.9
+# Co-contractions that are tried, from rest on [rad].
+_STEP, _MOST = 0.25, 4.0
+
+# Part of `least_delay` that is a sensor's at most.
+_BEHIND = 0.5
 
 
 class _Settings(Protocol):
@@ -50,37 +65,20 @@ class _Settings(Protocol):
 S = TypeVar("S", bound=Any)
 
 
-def identified(model: Any) -> bool:
-    """Return whether a model comes from recordings; another is what somebody says it is."""
-    return hasattr(model, "findings")
-
-
 def settings_for(settings: S, model: HasTransferFunctions) -> S:
-    """Return the settings for what was identified of a neck, or for any other plant.
-
-    Raises:
-        SettingsError: tautness for a payload where none is wished for without.
-    """
-    settings = replace(settings, disturbances=with_payload(settings.disturbances, settings.payload_tautness))
-    if not (robot_of(model).is_neck and identified(model)):
+    """Return the settings for what was identified of a neck, or for any other plant."""
+    if not (robot_of(model).is_neck and hasattr(model, "findings")):
         settings = _with(settings, _BELIEVED)
-    if settings.minimum_tautness is None and any(item.tautness for item in settings.disturbances):
-        raise SettingsError("`payload_tautness` adds to `minimum_tautness`, which is not set; give it, such as 0.5.")
-    return settings
+    # It adds to a tautness that is wished for.
+    return settings if settings.minimum_tautness is not None else replace(settings, payload_tautness=0.0)
 
 
 def settings_of_robot(settings: S, plant: UncertainPlant | CoupledPlant) -> S:
-    """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks.
-
-    Raises:
-        SettingsError: what is for necks only.
-    """
-    refuse_what_is_for_necks(settings, plant.robot)
+    """Return the settings for another robot: seconds stretched by its slowest pole, nothing that is known of necks."""
     stretch = max(axis.nominal.stretch for axis in plant.axes.values())
     horizon = min(max(3, round(_HORIZON * stretch / plant.sample_time)), _LONGEST)
-    others = {"least_delay": 0.0, "small_move_pole": 0.0, "horizon": horizon}
-    if settings.reference_time is not None:
-        others["reference_time"] = stretch * settings.reference_time
+    others = {"least_delay": 0.0, "small_move_pole": 0.0, "horizon": horizon,
+              "reference_time": stretch * settings.reference_time}  # fmt: skip
     if isinstance(settings.moves, NeckCount):
         length = horizon if isinstance(settings.horizon, NeckCount) else settings.horizon
         others["moves"] = min(int(settings.moves), length)
@@ -121,13 +119,13 @@ def with_taken(made: S, settings: Any, model: HasTransferFunctions) -> S:
     return replace(made, design={**made.design, "assumed": taken})
 
 
-def plant_of(model: Any, *, coupled: bool) -> Any:
+def plant_of(model: Any, robot: Robot | None) -> Any:
     """Return what is to be predicted of a model or a `control` system: one plant for each axis, or a coupled one."""
-    whole = coupled_plant(model, asked=coupled)
+    whole = coupled_plant(model, robot=robot)
     if whole is not None:
         return whole
     # A system, or a list of them, is of a neck whose axes do not answer to each other.
-    return model if hasattr(model, "tf") else uncertain_plant(model)
+    return model if hasattr(model, "tf") else uncertain_plant(model, robot)
 
 
 def weighed(plant: UncertainPlant | CoupledPlant) -> tuple[Matrix, Matrix]:
@@ -183,3 +181,49 @@ def samples_of(model: Any, axis: str) -> list[AxisPlant]:
     if isinstance(model, SizedPlant):
         return list(model.axes[axis].samples)
     return [axis_plant(LinearNeck(pitch=tf, roll=tf), axis) for tf in model.samples(axis)]
+
+
+def over(settings: S, observer: Any) -> S:
+    """Return settings for a loop with this observer; what was given stays.
+
+    Args:
+        settings: of `mpc` or `nmpc`.
+        observer: whose `lead` becomes `look_ahead`, of `mpc` at most half of `least_delay`; if it tells a payload, its
+            model says `payload_tautness`.
+
+    Raises:
+        SettingsError: what is no observer.
+    """
+    if not hasattr(observer, "lead"):
+        raise SettingsError(f"an observer is needed, of `softneck observer`; got {type(observer).__name__}.")
+    found: dict[str, float] = {}
+    if isinstance(settings.look_ahead, NeckDefault):
+        # What `least_delay` adds stands for a dead time that recordings hide, and no sensor is later for that.
+        found["look_ahead"] = min(observer.lead, _BEHIND * getattr(settings, "least_delay", math.inf))
+    told, wished = getattr(observer, "payloads", None), settings.minimum_tautness is not None
+    asks = isinstance(getattr(settings, "payload_tautness", None), NeckDefault)
+    if asks and wished and told is not None and told[1] > 0.0 and observer.robot.is_neck:
+        inverse = np.linalg.inv(redefinition_matrix())
+        # On top of `minimum_tautness`: what is in reserve without payload is there with it.
+        found["payload_tautness"] = taut_from(observer.model, told[1], inverse) / told[1]
+    return replace(settings, **found)
+
+
+def taut_from(model: Model, payload: float, inverse: Matrix) -> float:
+    """Return the least co-contraction [rad] from rest on at which small moves do under a payload what they can."""
+    tried = np.arange(0.0, _MOST + _STEP / 2, _STEP)
+    gains = np.array([_gain(model, payload, common, inverse) for common in tried])
+    return float(tried[np.argmax(gains >= _TAUT * gains.max())])
+
+
+def _gain(model: Model, payload: float, common: float, inverse: Matrix) -> float:
+    """Return the mean static gain of small moves to both sides, of all axes."""
+    block, rows = model.block(), round(_SETTLED / model.sample_time)
+    motors, found = inverse.shape[0], []
+    for axis in range(len(model.robot.outputs.names)):
+        inputs = np.full((3 * rows, len(block.inputs)), np.nan)
+        for part, side in enumerate((0.0, 1.0, -1.0)):
+            inputs[part * rows : (part + 1) * rows, :motors] = common + side * _MOVE * inverse[:, axis]
+        _, outputs = block.run(block.initial_state(use_measurement=0.0, payload=payload), inputs)
+        found.append(abs(outputs[2 * rows - 1, axis] - outputs[-1, axis]) / (2.0 * _MOVE))
+    return float(np.mean(found))

@@ -16,20 +16,12 @@ from . import _mpc_state_runtime as rt
 _LARGEST_CONDITION = 1e12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scenario:
-    """What the neck may be: a plant for each axis and how much this counts in the cost."""
-
-    axes: tuple[AnyAxis, ...]
-    weight: float
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Problem:
     """What is asked of the controller, in numbers.
 
     Attributes:
-        scenarios: the first is the nominal one.
+        axes: a plant for each output.
         horizon: N, samples after each axis' dead time.
         starts: samples at which the motors may move.
         T: (outputs + 1, motors) of Eq. 9-11, of a neck with 3 motors and 2 outputs.
@@ -41,11 +33,10 @@ class Problem:
         tautness_weight: on a lack of tautness [1/rad^2].
         angles: whether angles are limited.
         tautness: (motors, outputs) how much an angle loosens each tendon [rad/rad]; None for no limit.
-        disturbance_time: of the output disturbance's rate [s]; None for the plant's own.
         guard: samples after the dead time from which on limits of angles are looked at.
     """
 
-    scenarios: tuple[Scenario, ...]
+    axes: tuple[AnyAxis, ...]
     horizon: int
     starts: tuple[int, ...]
     T: Matrix
@@ -57,7 +48,6 @@ class Problem:
     tautness_weight: float
     angles: bool = False
     tautness: Matrix | None = None
-    disturbance_time: float | None = None
     guard: int = 1
 
     @property
@@ -78,12 +68,12 @@ class Problem:
     @property
     def order(self) -> int:
         """n, states of an axis."""
-        return max(plant.order for s in self.scenarios for plant in s.axes)
+        return max(plant.order for plant in self.axes)
 
     @property
     def dead_time(self) -> int:
         """D, the longest dead time in samples."""
-        return max(plant.delay for s in self.scenarios for plant in s.axes)
+        return max(plant.delay for plant in self.axes)
 
     @property
     def rows(self) -> int:
@@ -110,7 +100,7 @@ class Problem:
     def parameters(self) -> int:
         """Length of theta, see `_mpc_state_runtime`."""
         m = self.outputs
-        return m * len(self.scenarios) * (self.order + 2) + m * self.rows + self.motors + 2
+        return m * (self.order + 2) + m * self.rows + self.motors + 2
 
     @property
     def ends(self) -> tuple[int, ...]:
@@ -169,10 +159,8 @@ def rest_states(plant: AnyAxis, n: int) -> Matrix:
     return np.linalg.solve(np.eye(n) - A, B)
 
 
-def disturbance_pole(plant: AnyAxis, time: float | None = None) -> float:
-    """Return a of the output disturbance: the plant's slowest pole, by its size, or that of a time constant [s]."""
-    if time is not None:
-        return float(np.clip(np.exp(-plant.sample_time / time), 0.1, 0.999))
+def disturbance_pole(plant: AnyAxis) -> float:
+    """Return a of the output disturbance: the plant's slowest pole, by its size."""
     # Below 0.1 a rate would be gone within a sample, and the observer has to divide by it.
     return float(np.clip(np.abs(np.roots(plant.denominator)).max(initial=0.0), 0.1, 0.995))
 
@@ -182,12 +170,12 @@ def expression(problem: Problem) -> dict[str, Any]:
     import casadi as ca
 
     p = problem
-    S, n, L, N = len(p.scenarios), p.order, p.rows, p.horizon
+    n, L, N = p.order, p.rows, p.horizon
     M, m = p.motors, p.outputs
     z, theta = ca.SX.sym("z", p.variables), ca.SX.sym("theta", p.parameters)
-    at = m * S * n
-    offset = [(theta[at + 2 * i], theta[at + 2 * i + 1]) for i in range(m * S)]
-    at += 2 * m * S
+    at = m * n
+    offset = [(theta[at + 2 * i], theta[at + 2 * i + 1]) for i in range(m)]
+    at += 2 * m
     wanted = [theta[at + axis * L : at + (axis + 1) * L] for axis in range(m)]
     at += m * L
     held, common = theta[at : at + M], theta[at + M]
@@ -204,28 +192,25 @@ def expression(problem: Problem) -> dict[str, Any]:
 
     asked = _asked_moves(p, wanted)
     cost = sum((p.move_weight * ca.sumsqr(move - own) for move, own in zip(moves, asked, strict=True)), ca.SX(0))
-    angles: list[list[list[Any]]] = []
-    for s, scenario in enumerate(p.scenarios):
-        ends, paths = [], []
-        for axis, plant in enumerate(scenario.axes):
-            A, _ = padded(plant, n)
-            B = np.vstack([inputs_of(plant, axis, m), np.zeros((n - plant.order, m))])
-            level, rate = offset[m * s + axis]
-            a = disturbance_pole(plant, p.disturbance_time)
-            x = theta[(m * s + axis) * n : (m * s + axis + 1) * n]
-            path = []
-            for i, v in enumerate(inputs):
-                x = ca.mtimes(ca.DM(A), x) + ca.mtimes(ca.sparsify(ca.DM(B)), v[:m])
-                path.append(x[0] + level + rate * (1.0 - a ** (plant.delay + 1 + i)) / (1.0 - a))
-            errors = [path[i] - wanted[axis][plant.delay + i] for i in range(N - 1)]
-            cost += scenario.weight * p.output_weight[axis] * sum(e**2 for e in errors)
-            paths.append(path)
-            # With the plant's own pole all but 1e-2 of it is there; a slower one is extrapolated no further.
-            drift = rate * (1.0 - a ** (plant.delay + N)) / (1.0 - a)
-            goal = wanted[axis][plant.delay + N - 1] - level - drift
-            ends.append((x, plant, goal / plant.static_gain))
-        cost += scenario.weight * _terminal(p, scenario, ends, motors[-1], common)
-        angles.append(paths)
+    ends, angles = [], []
+    for axis, plant in enumerate(p.axes):
+        A, _ = padded(plant, n)
+        B = np.vstack([inputs_of(plant, axis, m), np.zeros((n - plant.order, m))])
+        level, rate = offset[axis]
+        a = disturbance_pole(plant)
+        x = theta[axis * n : (axis + 1) * n]
+        path = []
+        for i, v in enumerate(inputs):
+            x = ca.mtimes(ca.DM(A), x) + ca.mtimes(ca.sparsify(ca.DM(B)), v[:m])
+            path.append(x[0] + level + rate * (1.0 - a ** (plant.delay + 1 + i)) / (1.0 - a))
+        errors = [path[i] - wanted[axis][plant.delay + i] for i in range(N - 1)]
+        cost += p.output_weight[axis] * sum(e**2 for e in errors)
+        angles.append(path)
+        # With the plant's own pole all but 1e-2 of it is there.
+        drift = rate * (1.0 - a ** (plant.delay + N)) / (1.0 - a)
+        goal = wanted[axis][plant.delay + N - 1] - level - drift
+        ends.append((x, plant, goal / plant.static_gain))
+    cost += _terminal(p, ends, motors[-1], common)
     cost += p.cocontraction_weight * sum((v[m] - common) ** 2 for v in inputs[:-1])
     if len(p.idle):
         # What neither tilts nor co-contracts is held at zero, or it would be anywhere.
@@ -249,7 +234,7 @@ def _asked_moves(p: Problem, wanted: list[Any]) -> list[Any]:
     ends = (*p.starts[1:], p.horizon)
     middles = [-0.5, *(0.5 * (start + end) for start, end in zip(p.starts, ends, strict=True))]
     levels = []
-    for axis, plant in enumerate(p.scenarios[0].axes):
+    for axis, plant in enumerate(p.axes):
         places = np.clip(plant.delay + np.array(middles), 0.0, p.rows - 1.0)
         low = np.floor(places).astype(int)
         high = np.minimum(low + 1, p.rows - 1)
@@ -278,29 +263,28 @@ def _hard_rows(
 
 
 def _soft_rows(
-    p: Problem, angles: list[list[list[Any]]], motors: list[Any], slack: list[Any], rows: list[Any],
+    p: Problem, angles: list[list[Any]], motors: list[Any], slack: list[Any], rows: list[Any],
     kinds: list[tuple[float, float]],
 ) -> None:  # fmt: skip
-    """Append limits of angles in all scenarios, and of tautness in the nominal one."""
+    """Append limits of angles and of tautness."""
     if p.angles:
-        for paths in angles:
-            for axis in range(p.outputs):
-                for i in p.checked:
-                    rows += [paths[axis][i - 1] - slack[0], paths[axis][i - 1] + slack[0]]
-                    kinds += [(rt.MPC_ROW_ANGLE_HIGH, float(axis)), (rt.MPC_ROW_ANGLE_LOW, float(axis))]
+        for axis in range(p.outputs):
+            for i in p.checked:
+                rows += [angles[axis][i - 1] - slack[0], angles[axis][i - 1] + slack[0]]
+                kinds += [(rt.MPC_ROW_ANGLE_HIGH, float(axis)), (rt.MPC_ROW_ANGLE_LOW, float(axis))]
     if p.tautness is not None:
         for i in p.ends:
             for j in range(p.motors):
-                loosened = sum(p.tautness[j, axis] * angles[0][axis][i - 1] for axis in range(p.outputs))
+                loosened = sum(p.tautness[j, axis] * angles[axis][i - 1] for axis in range(p.outputs))
                 rows.append(motors[i - 1][j] - loosened + slack[-1])
                 kinds.append((rt.MPC_ROW_TAUT, float(j)))
 
 
-def _terminal(p: Problem, scenario: Scenario, ends: list[Any], motors: Any, common: Any) -> Any:
+def _terminal(p: Problem, ends: list[Any], motors: Any, common: Any) -> Any:
     """Return the cost to go after the horizon, of an LQR without limits (Riccati), around where it comes to rest."""
     import casadi as ca
 
-    P = terminal_matrix(p, scenario)
+    P = terminal_matrix(p)
     n = p.order
     goal = ca.mtimes(ca.DM(p.T_inverse), ca.vertcat(*(end[2] for end in ends), common))
     goals = ca.vertcat(*(end[2] for end in ends))
@@ -312,7 +296,7 @@ def _terminal(p: Problem, scenario: Scenario, ends: list[Any], motors: Any, comm
     return ca.bilin(ca.DM(P), error, error)
 
 
-def terminal_matrix(p: Problem, scenario: Scenario) -> Matrix:
+def terminal_matrix(p: Problem) -> Matrix:
     """Return P, square over m n states and the motors, of the Riccati equation with moves as inputs."""
     from scipy.linalg import solve_discrete_are
 
@@ -320,14 +304,13 @@ def terminal_matrix(p: Problem, scenario: Scenario) -> Matrix:
     at = m * n  # of the motors
     A, B = np.eye(at + M), np.zeros((at + M, M))
     Q = np.zeros_like(A)
-    for axis, plant in enumerate(scenario.axes):
+    for axis, plant in enumerate(p.axes):
         a, b = padded(plant, n)
         place, moved = slice(axis * n, (axis + 1) * n), p.T[:m] if isinstance(plant, CoupledAxis) else p.T[[axis]]
         A[place, place], A[place, at:] = a, b @ moved
         B[place] = b @ moved
         Q[axis * n, axis * n] = p.output_weight[axis]
     B[at:] = np.eye(M)
-    # Of the scenarios' weights, which sum to one, each carries its part of co-contraction and moves.
     Q[at:, at:] = p.cocontraction_weight * np.outer(p.T[m], p.T[m])
     if len(p.idle):
         Q[at:, at:] += p.cocontraction_weight * p.idle.T @ p.idle

@@ -18,10 +18,8 @@ from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.runtime._bundle import sized
-from softneck.signals import redefinition_matrix
 
-from ..linear._loop_settings import stricter_limits
-from ..linear._ports import LIMITS, MAX_REFERENCE, ControllerLimits, robot_limits
+from ..linear._ports import MAX_MOTOR, MAX_REFERENCE, ControllerLimits, limits_of
 from ..plants._coupled import CoupledPlant
 from ..plants._coupled_axis import CoupledAxis
 from ..plants._uncertain import UncertainAxis, UncertainPlant
@@ -35,6 +33,9 @@ if TYPE_CHECKING:
 _NECK_GAIN = math.radians(27.69 / 5.293)
 # Of theta_i = P_1 - P_2 / 2 - P_3 / 2 (Eq. 9).
 _NECK_WEIGHT = math.sqrt(1.5)
+# Motor that one radian of a neck takes up [rad/rad]: radius of the tendons' attachment over that of the winch,
+# 52 mm / 7.5 mm (lab code; paper, section 3.1).
+TAUTNESS_LEVER = 6.93
 # Beyond all bounds.
 _FREE = 1e12
 
@@ -81,14 +82,6 @@ class SizedPlant:
         """Whether there are samples beside the nominal plant."""
         return all(len(axis.samples) > 1 for axis in self.axes.values())
 
-    def lever(self, motor_per_output: float) -> Matrix:
-        """Return (motors, outputs) how much an output loosens each tendon, from that of one at angle 0 [rad/rad]."""
-        weights = self.robot.weights()
-        if self.scale is None:
-            return motor_per_output * redefinition_matrix()[:-1].T
-        shape = np.zeros_like(self.redefinition[0][:-1]) if weights is None else weights
-        return motor_per_output * shape.T * self.scale.outputs / self.scale.motors
-
     def tf(self, output: str) -> control.TransferFunction:
         """Return the nominal plant of an axis."""
         return self.axes[output].nominal.tf()
@@ -98,17 +91,13 @@ class SizedPlant:
         return [plant.tf() for plant in self.axes[output].samples]
 
 
-def limits_of(settings: Any, robot: Robot) -> ControllerLimits:
-    """Return the limits of a predictive controller: what its settings give in the unit of the motors, and the file.
+def predictive_limits(settings: Any, robot: Robot) -> ControllerLimits:
+    """Return the limits of a predictive controller: what the robot's file says, and the lead of its settings.
 
     Raises:
         SettingsError: one that the robot does not have, that its file does not give, or that contradicts another.
     """
-    given = {name: getattr(settings, name) for name in LIMITS[:4]}
-    if robot.is_neck:
-        limits = ControllerLimits(robot=robot, **stricter_limits(robot, given))
-    else:
-        limits = robot_limits(robot, {name: v for name, v in given.items() if not isinstance(v, NeckDefault)})
+    limits = limits_of(robot, lead_limit=settings.lead_limit, least_cocontraction=NeckDefault(-MAX_MOTOR))
     unit, angle = robot.motors.unit, settings.angle_limit
     if angle is not None:
         if robot.is_neck:
@@ -118,7 +107,9 @@ def limits_of(settings: Any, robot: Robot) -> ControllerLimits:
                 f"`angle_limit` is for outputs that are angles; those of {robot.label()} are in "
                 f"{robot.outputs.unit}. Leave it out."
             )
-    taut, most = getattr(settings, "minimum_tautness", None), limits.position_limit / to_si(unit)[0]
+    taut, most = settings.minimum_tautness, limits.position_limit / to_si(unit)[0]
+    if taut is not None and not robot.is_neck and not isinstance(taut, NeckDefault):
+        raise SettingsError(f"`minimum_tautness` is for necks; {robot.label()} is none. Leave it out.")
     if taut is not None and taut >= most:
         raise SettingsError(
             f"`minimum_tautness` {taut:g} {unit} and `position_limit` {most:g} {unit} contradict each other: no motor "
@@ -183,17 +174,3 @@ def unbound(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
     free = [*[-_FREE] * motors, *[_FREE] * motors, *[-_FREE] * (m + 1), *[_FREE] * (m + 1)]
     constants = np.concatenate([a.constants[: rt.MPC_NUMBERS], free, np.ones(2 * m + 1)])
     return tuple(constants if name == "constants" else item for name, item in zip(a.names(), arrays, strict=True))
-
-
-def refuse_what_is_for_necks(settings: Any, robot: Robot) -> None:
-    """Raise SettingsError for settings of `MpcSettings` that mean nothing for another robot than the neck."""
-    usual = type(settings)()
-    if settings.tendon_angles != usual.tendon_angles:
-        raise SettingsError(f"`tendon_angles` are of necks; those of {robot.label()} are in its robot file.")
-    if settings.minimum_tautness is not None and (
-        robot.directions.kind != "tendons" or isinstance(settings.tautness_lever, NeckDefault)
-    ):
-        raise SettingsError(
-            f"`minimum_tautness` of robot {robot.label()} needs tendons at known angles (`angles_deg`), and "
-            "`tautness_lever`, the motor that a tendon takes up for each unit of an output; give both or neither."
-        )

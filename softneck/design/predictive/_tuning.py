@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, require_positive
+from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.estimation import AxisPlant
-from softneck.robot._neck_default import NeckDefault
 
 from ..linear._margins import LOWEST, frequencies
 from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
@@ -30,7 +29,6 @@ _THINNING = 5
 _NARROWED = 7
 # A step response is judged over this long [s].
 _HORIZON = 4.0
-_SLOWEST_FILTER = 2.0
 # With 180 a sample of 20 ms was over before half of the answers came, with 90 none of them took a tenth of it.
 _MOST_UNKNOWNS = 120
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
@@ -137,38 +135,6 @@ def observer_trust(
     return math.exp(low)
 
 
-def reference_time(arrays: tuple[Matrix, ...], families: list[Pair], extra_delay: int, *, overshoot: float) -> float:
-    """Return the least time constant [s] of the reference filter with which no plant overshoots by more than this part.
-
-    Raises:
-        SettingsError: none does that is fast enough.
-    """
-    Ts = families[0][0].sample_time
-    low, high = 0, round(_SLOWEST_FILTER * slowness(families[0]) / Ts)
-
-    def keeps(samples: int) -> bool:
-        parts = system(with_filter(arrays, samples * Ts))
-        return all(_peak(parts, pair, extra_delay) <= 1.0 + overshoot for pair in families)
-
-    if not keeps(high):
-        raise SettingsError("no reference filter keeps the overshoot; ask for less `max_sensitivity` or `bandwidth`.")
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (low, middle) if keeps(middle) else (middle, high)
-    return 0.0 if keeps(low) else high * Ts
-
-
-def _peak(parts: tuple[Matrix, Matrix, Matrix, Matrix], pair: Pair, extra_delay: int) -> float:
-    """Return the largest angle after unit steps of both references, without limits."""
-    A, B, C = closed(parts, pair, extra_delay)
-    u, x, peak = np.ones(len(pair)), np.zeros(A.shape[0]), 0.0
-    drive = B @ u
-    for _ in range(math.ceil(_HORIZON * slowness(pair) / pair[0].sample_time)):
-        x = A @ x + drive
-        peak = max(peak, float((C @ x).max()))
-    return peak
-
-
 def rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int) -> float:
     """Return in what time [s] a step of each reference alone rises from 10 to 90 %, no limit acting; of the slowest
     axis, infinite where one does not rise."""
@@ -223,15 +189,6 @@ def require_solvable(moves: int, motors: int) -> None:
             f"`moves` {moves} of {motors} motors are {moves * motors} unknowns, and the solver takes at most "
             f"{_MOST_UNKNOWNS} within a sample; ask for at most {_MOST_UNKNOWNS // motors} moves, `horizon` may stay."
         )
-
-
-def require_rise(asked: float | None, filter_time: float | None) -> None:
-    """Raise SettingsError for a rise time [s] that is none, or beside a reference filter that is given as well."""
-    if asked is None:
-        return
-    require_between("rise_s", asked, 0.001, 1e6, "s")
-    if filter_time is not None and not isinstance(filter_time, NeckDefault):
-        raise SettingsError("`rise_s` sets the reference filter; give it or `reference_time`, not both.")
 
 
 def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
