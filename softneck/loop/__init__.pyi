@@ -17,4 +17,3 @@ from ._result import check_limits as check_limits
 from ._result import metrics as metrics
 from ._run import LoopRun as LoopRun
 from ._run import run_loop as run_loop
-from ._state import LoopState as LoopState

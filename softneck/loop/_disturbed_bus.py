@@ -85,7 +85,6 @@ class FaultStages:
 
     Attributes:
         lists, arrays: the same, for interpreted and for compiled rows.
-        memories: (rows, signals) what each fault remembers between rows, for `LoopState`.
     """
 
     def __init__(
@@ -117,10 +116,6 @@ class FaultStages:
         for acting, span in adding:
             if not acting.drawn:
                 self._added[acting.first : acting.last, span] = acting.amount(0)
-        self.memories = tuple(
-            memory[code[7] : code[7] + acting.lag * len(acting.slots)].reshape(acting.lag, -1)
-            for acting, code in zip(self._acting, codes, strict=True)
-        )
         numbers = (most, self._added, memory)
         self.lists = (tuple(detours), codes, slots, *numbers)
         table = np.array(codes, dtype=np.int64).reshape(-1, 9)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from softneck.core import DataError, Vector
+from softneck.core import Vector
 from softneck.runtime import Block, Port, load_runtime
 
 
@@ -81,14 +81,3 @@ class BlockPart:
     def memory(self) -> tuple[Vector, Vector, Vector]:
         """Parameters, state and outputs, as the runtime changes them in place."""
         return self._parameters, self._state, self._outputs
-
-    def get_state(self) -> bytes:
-        """Return the state vector and the outputs, to the bit."""
-        return np.concatenate([self._state, self._outputs]).astype("<f8").tobytes()
-
-    def set_state(self, state: bytes) -> None:
-        """Go on from what `get_state` returned; raise DataError if it is of another block."""
-        values = np.frombuffer(state, dtype="<f8")
-        if values.size != self._state.size + self._outputs.size:
-            raise DataError(f"the state of the {self.role} has {values.size} values; this {self.block.kind} differs.")
-        self._state[:], self._outputs[:] = values[: self._state.size], values[self._state.size :]

@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, require_positive, to_si
+from softneck.core import SettingsError, Vector, require_positive, to_si
 from softneck.core._budget import require_steps
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
@@ -50,15 +50,6 @@ class AheadReference:
 
     def close(self) -> None:
         """Do nothing: it holds nothing."""
-
-    def get_state(self) -> bytes:
-        """Return nothing: a function of time remembers nothing."""
-        return b""
-
-    def set_state(self, state: bytes) -> None:
-        """Take nothing; raise DataError for the state of something else."""
-        if state:
-            raise DataError("a reference ahead has no state; this one is of another part.")
 
     def _at(self, time: float) -> Vector:
         return np.array([*self.reference(time), 1.0, *self.reference(time + self.ahead)[: self._count]])

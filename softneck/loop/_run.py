@@ -1,4 +1,4 @@
-"""One run of a loop: started, advanced row by row, saved, resumed, judged."""
+"""One run of a loop: started, advanced row by row."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from ._disturbed_bus import place_faults
 from ._loop import Loop
 from ._part import Part
 from ._result import LoopResult
-from ._rows import Rows, can_compile, cycle, late
-from ._state import LoopState, SaveablePart
+from ._rows import Rows, can_compile, cycle
 from ._system import System
 from ._wiring import BusSignal, Wiring, reference_ports, wire
 
@@ -53,7 +52,6 @@ def run_loop(
     *,
     on_step: StepCallback | None = None,
     pace: float | None = None,
-    resume: LoopState | None = None,
     keep: bool = False,
     compiled: bool = False,
 ) -> LoopResult:
@@ -64,7 +62,6 @@ def run_loop(
         report: called now and then with the done fraction, 0 to 1.
         on_step: called after each row; it stops the run by returning True.
         pace: run at this multiple of real time; as fast as possible if not given.
-        resume: go on from here instead of t = 0.
         keep: leave the parts loaded for the next run; `loop.close()` releases them.
         compiled: run all rows as one compiled function where all parts are blocks and nobody watches the steps: the
             same bits, much sooner once it is compiled; other loops run as always.
@@ -75,8 +72,6 @@ def run_loop(
     """
     run = LoopRun(loop, compiled=compiled)
     try:
-        if resume is not None:
-            run.restore(resume)
         run.advance(report=report, on_step=on_step, pace=pace)
     except BaseException:
         run.close()
@@ -96,7 +91,7 @@ class LoopRun:
     """
 
     def __init__(self, loop: Loop | System, *, compiled: bool = False) -> None:
-        """Wire `loop`; the parts start with the first `advance` or `restore`.
+        """Wire `loop`; the parts start with the first `advance`.
 
         `compiled` takes compiled rows where all parts are blocks.
         """
@@ -115,7 +110,6 @@ class LoopRun:
         self._columns = _columns(self._wiring) if closed else _plain_columns(self._wiring)
         self._table = np.empty((self.rows, self._wiring.start.size))
         self._reference = _reference_table(loop, self.step, self.rows) if isinstance(loop, Loop) else None
-        self._late = [i for i, part in enumerate(self._parts.values()) if late(part)]
         self._compile = compiled and can_compile(self._parts)
         self._begun: Rows | None = None
 
@@ -187,41 +181,6 @@ class LoopRun:
         for name, slot in self._columns.items():
             signals[name], units[name] = _in_si(self._table[: self.row, slot], by_slot[slot].port)
         return LoopResult(np.arange(self.row) * self.step, signals, units, self.step, self.loop.robot)
-
-    def state(self) -> LoopState:
-        """Return all that the run remembers.
-
-        Raises:
-            SettingsError: a part that cannot save its state.
-        """
-        running = self._start()
-        parts = {name: _saved(name, part).get_state() for name, part in self._parts.items()}
-        return LoopState(
-            row=self.row, order=self.loop.order, step=self.step, bus=running.bus.copy(),
-            pending={running.names[i]: running.held[i].copy() for i in self._late},
-            memories=tuple(memory.copy() for memory in self._faults.memories), table=self._table[: self.row].copy(),
-            parts=parts,
-        )  # fmt: skip
-
-    def restore(self, state: LoopState) -> None:
-        """Go on from `state`, which a loop like this one saved, here or in another process.
-
-        Raises:
-            DataError: the state is of another loop.
-        """
-        running, memories = self._start(), self._faults.memories
-        state.check(order=self.loop.order, step=self.step, bus=running.bus, memories=memories, parts=set(self._parts))
-        if state.row > self.rows:
-            raise DataError(f"the state is at row {state.row}; this loop ends at row {self.rows}: make it longer.")
-        for name, part in self._parts.items():
-            _saved(name, part).set_state(state.parts[name])
-        self.row = state.row
-        running.bus[:] = state.bus
-        for i in self._late:
-            running.held[i][:] = state.pending[running.names[i]]
-        for memory, saved in zip(memories, state.memories, strict=True):
-            memory[:] = saved
-        self._table[: self.row] = state.table
 
     def _start(self) -> Rows:
         if self._begun is None:
@@ -300,12 +259,6 @@ def _signal_name(item: BusSignal, taken: Mapping[str, int], faulty: set[str]) ->
     if item.part == "plant" and name in faulty:
         return f"plant_{name}"
     return name if name not in taken else f"{item.part}_{name}"
-
-
-def _saved(name: str, part: Part) -> SaveablePart:
-    if not isinstance(part, SaveablePart):
-        raise SettingsError(f"the {name} cannot save its state; give it `get_state` and `set_state`, or use an FMU.")
-    return part
 
 
 def _wait_until(moment: float) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.cosim import FmuError, FmuPart, IsolatedPart, load_loop, simulate
-from softneck.loop import BlockPart, Loop, LoopRun, LoopState, SensorFault, StepReference
+from softneck.loop import BlockPart, Loop, SensorFault, StepReference
 
 from ._foreign import NAMES, build_foreign
 
@@ -94,44 +92,6 @@ def test_faults_of_the_sensor_work_on_it(version: int, foreign: dict[int, Path],
     result = simulate(loop)
     bias = result["pitch_measured"] - result["pitch"]
     np.testing.assert_allclose(bias, np.where(result.signals.time > 0.49, np.radians(2.0), 0.0), atol=1e-13)
-
-
-@pytest.mark.parametrize("version", [2, 3])
-def test_its_state_resumes_in_another_instance(
-    version: int, foreign: dict[int, Path], toys: Any, tmp_path: Path
-) -> None:
-    def loop(kind: type) -> Loop:
-        return Loop(
-            plant=plant(foreign[version], kind), controller=BlockPart(toys.pi()), reference=StepReference(pitch=0.1),
-            duration=1.0,
-        )  # fmt: skip
-
-    whole = simulate(loop(FmuPart))
-    with LoopRun(loop(FmuPart)) as run:
-        run.advance(20)
-        run.state().save(tmp_path / "state.npz")
-    resumed = simulate(loop(IsolatedPart), resume=LoopState.load(tmp_path / "state.npz"))
-    np.testing.assert_array_equal(resumed["pitch"], whole["pitch"])
-
-
-_RESUME = """
-import sys
-from softneck.cosim import load_loop, simulate
-from softneck.loop import LoopState
-result = simulate(load_loop(sys.argv[1]), resume=LoopState.load(sys.argv[2]))
-print([value.hex() for value in result["pitch"].tolist()])
-"""
-
-
-def test_a_loop_over_our_fmus_resumes_in_another_process(loop_file: Path, tmp_path: Path) -> None:
-    setup = load_loop(loop_file)
-    whole = simulate(setup)
-    with LoopRun(setup.loop) as run:
-        run.advance(80)
-        run.state().save(tmp_path / "state.npz")
-    command = [sys.executable, "-c", _RESUME, str(loop_file), str(tmp_path / "state.npz")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == str([value.hex() for value in whole["pitch"].tolist()])
 
 
 # A child process takes a second or two to start: not every kind of trouble with every version.

@@ -15,7 +15,6 @@ from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import (
     BlockPart,
     Loop,
-    LoopRun,
     ReferenceBlock,
     RotationReference,
     SensorFault,
@@ -92,20 +91,6 @@ def test_parts_of_other_rates_and_a_reference_that_is_a_part(loop: Callable[...,
         loop(plant=neck, reference=wanted, order="jacobi"),
     ):
         _same(run_loop(case), run_loop(case, compiled=True))
-
-
-def test_a_state_goes_from_one_to_the_other(loop: Callable[..., Loop]) -> None:
-    fault = make_fault("sensor_delay", {"delay_s": 0.06, "start_s": 0.5})
-    case = loop(faults=(fault, make_fault("measurement_noise", _KEYS["measurement_noise"])))
-    whole = run_loop(case)
-    for first, second in ((True, False), (False, True), (True, True)):
-        with LoopRun(case, compiled=first) as run:
-            run.advance(37)
-            state = run.state()
-        with LoopRun(case, compiled=second) as run:
-            run.restore(state)
-            run.advance()
-            _same(whole, run.result())
 
 
 def test_progress_is_reported(loop: Callable[..., Loop]) -> None:

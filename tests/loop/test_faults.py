@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
-from softneck.loop import Fault, Loop, LoopResult, LoopRun, MotorFault, NeckFault, SensorFault, SineReference, run_loop
+from softneck.loop import Fault, Loop, LoopResult, MotorFault, NeckFault, SensorFault, SineReference, run_loop
 from softneck.loop._faults import FAULT_KINDS, make_fault
 from softneck.runtime import Port
 
@@ -180,45 +180,6 @@ def test_faults_on_one_signal_act_in_their_order() -> None:
     second = run(SensorFault(kind="freeze", start=1.0), SensorFault(kind="bias", size=0.1, start=1.0))
     assert set(first["pitch_measured"][50:]) == {first["pitch_measured"][49]}
     assert second["pitch_measured"][60] == pytest.approx(second["pitch_measured"][49] + 0.1, abs=1e-15)
-
-
-@pytest.mark.parametrize("kind", ["sensor_delay", "sensor_freeze", "motor_slow", "measurement_noise"])
-@pytest.mark.parametrize("cut", [30, 60])
-def test_a_run_saved_and_resumed_inside_a_fault_is_bit_equal(kind: str, cut: int) -> None:
-    fault = make_fault(kind, {**EVERY[kind], "start_s": 1.0, "duration_s": 0.5})
-    loop = Loop(plant=Remembering(), controller=Remembering.controller(), reference=WISH, duration=3.0, faults=(fault,))
-    whole = run_loop(loop)
-    with LoopRun(loop) as begun:
-        begun.advance(cut)
-        state = begun.state()
-    resumed = run_loop(loop, resume=state)
-    for name, values in whole.signals.items():
-        np.testing.assert_array_equal(resumed[name], values, err_msg=name)
-
-
-class Remembering(FunctionPart):
-    """The lag plant, whose state can be saved."""
-
-    def __init__(self) -> None:
-        plain = lag_plant()
-        super().__init__("plant", plain.inputs, plain.outputs, plain._function)
-
-    def get_state(self) -> bytes:
-        return np.array(self._state).tobytes()
-
-    def set_state(self, state: bytes) -> None:
-        self._state[:] = np.frombuffer(state).tolist()
-
-    @staticmethod
-    def controller() -> Remembering:
-        plain, made = p_controller(gain=4.0), Remembering()
-        made.role, made.inputs, made.outputs, made._function = (
-            "controller",
-            plain.inputs,
-            plain.outputs,
-            plain._function,
-        )
-        return made
 
 
 @pytest.mark.parametrize(

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from softneck.core import DataError, FileFormatError, SettingsError, read_archive, write_archive
-from softneck.loop import BlockPart, Loop, LoopRun, LoopState, StepReference, run_loop
+from softneck.core import DataError, SettingsError
+from softneck.loop import Loop, StepReference, run_loop
 from softneck.loop._run import LoopStep
-from softneck.runtime import Block, Port
+from softneck.runtime import Port
 
 from ._parts import FunctionPart, lag_plant, p_controller, ports
 
@@ -144,56 +141,7 @@ def test_pacing_waits_for_each_row(monkeypatch: pytest.MonkeyPatch) -> None:
         run_loop(loop_with(), pace=0.0)
 
 
-@pytest.fixture
-def blocks(toy_blocks: Callable[[], tuple[Block, Block]]) -> Loop:
-    neck, pi = toy_blocks()
-    return Loop(plant=BlockPart(neck), controller=BlockPart(pi), reference=STEP, duration=2.0)
-
-
-@pytest.mark.parametrize("order", ["sequential", "jacobi"])
-@pytest.mark.parametrize("cut", [0, 1, 37, 99, 100])
-def test_saved_and_resumed_is_one_run_to_the_bit(order: str, cut: int, blocks: Loop, tmp_path: Path) -> None:
-    loop = Loop(plant=blocks.plant, controller=blocks.controller, reference=STEP, duration=2.0, order=order)
-    whole = run_loop(loop)
-    with LoopRun(loop) as run:
-        run.advance(cut)
-        run.state().save(tmp_path / "state.npz")
-    resumed = run_loop(loop, resume=LoopState.load(tmp_path / "state.npz"))
-    assert set(resumed.signals) == set(whole.signals)
-    for name, values in whole.signals.items():
-        np.testing.assert_array_equal(resumed[name], values, err_msg=name)
-
-
-def test_a_state_of_another_loop_is_refused(blocks: Loop, tmp_path: Path) -> None:
-    with LoopRun(blocks) as run:
-        run.advance(60)
-        state = run.state()
-    other = Loop(plant=blocks.plant, controller=blocks.controller, reference=STEP, duration=2.0, order="jacobi")
-    with pytest.raises(DataError, match="the state is of another loop"):
-        run_loop(other, resume=state)
-    short = Loop(plant=blocks.plant, controller=blocks.controller, reference=STEP, duration=1.0)
-    with pytest.raises(DataError, match="the state is at row 60; this loop ends at row 50"):
-        run_loop(short, resume=state)
-    with LoopRun(loop_with()) as run, pytest.raises(SettingsError, match="the plant cannot save its state"):
-        run.state()
-    with pytest.raises(FileFormatError, match="no such file"):
-        LoopState.load(tmp_path / "absent.npz")
-
-
 def test_ports_with_units_of_the_same_kind_connect_and_others_do_not() -> None:
     speed = FunctionPart("controller", (Port(name="pitch_reference", unit="m"),), ports("half"), lambda *_: [0.0])
     with pytest.raises(SettingsError, match=r"is in \[rad\] but `pitch_reference` of the filter in \[m\]"):
         run_loop(loop_with(others={"filter": speed}))
-
-
-def test_a_saved_state_whose_parts_have_another_order_is_refused(blocks: Loop, tmp_path: Path) -> None:
-    with LoopRun(blocks) as run:
-        run.advance(3)
-        run.state().save(tmp_path / "s.npz")
-    header, arrays = read_archive(tmp_path / "s.npz")
-    assert LoopState.load(tmp_path / "s.npz").row == 3
-    # An earlier version's has no such number; its arrays have the same lengths.
-    earlier = {name: value for name, value in header.items() if name != "parts_version"}
-    write_archive(tmp_path / "old.npz", earlier, arrays)
-    with pytest.raises(FileFormatError, match=r"another version of softneck.*run the loop from its start"):
-        LoopState.load(tmp_path / "old.npz")

@@ -14,7 +14,7 @@ from softneck.core import SettingsError, Vector, silent, to_si
 from softneck.core._progress import shown_progress
 from softneck.identification.models._validity import farthest, held
 from softneck.loop import Loop as Loop  # the room hands it on
-from softneck.loop import LoopResult, LoopState, Part, run_loop
+from softneck.loop import LoopResult, Part, run_loop
 from softneck.loop._part import BlockPart
 from softneck.loop._run import StepCallback
 from softneck.loop._system import System
@@ -30,7 +30,6 @@ def simulate(
     report: Callable[[float], None] | None = None,
     on_step: StepCallback | None = None,
     pace: float | None = None,
-    resume: LoopState | None = None,
     keep: bool = False,
     compiled: bool = False,
 ) -> Result:
@@ -43,7 +42,6 @@ def simulate(
         report: called now and then with the done fraction; a bar in a terminal if not given.
         on_step: called after each row with a `LoopStep`; it stops the run by returning True.
         pace: run at this multiple of real time; as fast as possible if not given.
-        resume: go on from this state instead of t = 0.
         keep: leave the FMUs loaded, so that the next run of the same loop resets them; `loop.close()` ends it.
         compiled: run loops whose parts are all blocks (softneck files, the virtual neck, no FMUs) as one compiled
             function: the same bits, sooner after a second of compiling, which is kept.
@@ -71,7 +69,7 @@ def simulate(
     with shown_progress("simulate", None if report is None else lambda done, _: report(done)) as tell:
         result = run_setup(
             _opened(loop), report=None if tell is silent else lambda done: tell(done, ""), on_step=on_step, pace=pace,
-            resume=resume, keep=keep, compiled=compiled,
+            keep=keep, compiled=compiled,
         )  # fmt: skip
     # A plant without validity is told in `remarks` and by the command: no warning for every model made by hand.
     for remark in result.remarks if np.any(result.signals.signals.get("validity", 0.0)) else ():
@@ -85,14 +83,13 @@ def run_setup(
     report: Callable[[float], None] | None = None,
     on_step: StepCallback | None = None,
     pace: float | None = None,
-    resume: LoopState | None = None,
     keep: bool = False,
     compiled: bool = False,
 ) -> Result:
     """Run a loop as `simulate` does, whose remarks the caller tells."""
     plain = setup if isinstance(setup, System) else setup.loop
     begin = time.perf_counter()
-    signals = run_loop(plain, report, on_step=on_step, pace=pace, resume=resume, keep=keep, compiled=compiled)
+    signals = run_loop(plain, report, on_step=on_step, pace=pace, keep=keep, compiled=compiled)
     wall = time.perf_counter() - begin
     if isinstance(setup, System):
         return Result(signals=signals, wall_time=wall, order=plain.order, closed=False)
