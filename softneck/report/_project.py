@@ -20,7 +20,7 @@ from softneck.cosim.studies._store import read_description
 from softneck.identification.models._directions import bandwidth_of
 from softneck.robot._search import FILE
 from softneck.signals import Recording, assess_quality, import_log, read_layout, read_recording
-from softneck.signals.importing._layout_text import doubts_in
+from softneck.signals.importing._layout import doubts_in
 
 # Folders that are no part of a project, beside those whose name begins with a dot.
 _SKIPPED = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")

@@ -8,9 +8,9 @@ from .excitation._signals import signal_names as signal_names
 from .importing._guess import Guess as Guess
 from .importing._guess import guess_layout as guess_layout
 from .importing._layout import Layout as Layout
+from .importing._layout import layout_toml as layout_toml
 from .importing._layout import parse_layout as parse_layout
 from .importing._layout import read_layout as read_layout
-from .importing._layout_text import layout_toml as layout_toml
 from .importing._log import import_log as import_log
 from .quality._findings import Quality as Quality
 from .quality._findings import assess_quality as assess_quality

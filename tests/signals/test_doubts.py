@@ -14,7 +14,7 @@ from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.signals import Guess, guess_layout, import_log, parse_layout
 from softneck.signals.importing._doubts import percent
 from softneck.signals.importing._guess_units import UNITS, judge
-from softneck.signals.importing._layout_text import doubts_in
+from softneck.signals.importing._layout import doubts_in
 
 from ..data import neck_recording
 

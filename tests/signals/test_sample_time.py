@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError
 from softneck.signals import import_log, read_layout
-from softneck.signals.importing._sample_time import estimate_sample_time
+from softneck.signals.importing._clocks import estimate_sample_time
 
 from ..data import LAYOUTS
 

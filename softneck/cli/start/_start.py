@@ -255,7 +255,7 @@ def _loosened() -> dict[str, dict[str, float]]:
 
 def _doubts() -> dict[str, list[str]]:
     """Return layout -> what the import was not sure of, and nobody settled since."""
-    from softneck.signals.importing._layout_text import doubts_in
+    from softneck.signals.importing._layout import doubts_in
 
     files = [*sorted(Path("recordings").glob("*.layout.toml")), *filter(Path.is_file, [Path("robot.toml")])]
     found = {path.as_posix(): doubts_in(path) for path in files}

@@ -10,8 +10,8 @@ import numpy as np
 from softneck.core import Matrix, Vector
 
 from ..recording._redefinition import redefine
+from ._clocks import velocity_period
 from ._layout import Column
-from ._sample_time import velocity_period
 
 # Enough rows to tell, whatever the length of the log.
 _ROWS = 20_000

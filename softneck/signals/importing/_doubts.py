@@ -10,8 +10,7 @@ from softneck.core import SettingsError
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS
 from ._draft import Draft, say
 from ._guess_units import Unit
-from ._layout import Layout
-from ._layout_text import ONE_AXIS
+from ._layout import ONE_AXIS, Layout
 
 #: Below it a guess is asked about, or marked.
 SURE = 0.9

@@ -15,6 +15,7 @@ from softneck.robot import Robot
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS
 from ..recording._redefinition import redefine
 from ..recording._resampling import jitter
+from ._clocks import SampleTime, estimate_sample_time
 from ._column_shapes import lagged
 from ._doubts import (
     ONE_AXIS,
@@ -32,9 +33,7 @@ from ._draft import Draft, say
 from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, stand_ins
 from ._guess_shapes import by_shapes
 from ._guess_units import Unit, nominal_step, units
-from ._layout import Column, Layout, Source, Term
-from ._layout_text import layout_toml
-from ._sample_time import SampleTime, estimate_sample_time
+from ._layout import Column, Layout, Source, Term, layout_toml
 from ._table_format import sniff
 
 _NO_CHANNELS = ("time", "run", "inclination", "orientation")

@@ -13,12 +13,11 @@ from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column
 from ..recording._redefinition import redefine
-from ._clocks import turns
+from ._clocks import turns, velocity_period
 from ._column_shapes import lagged
 from ._column_titles import plain
 from ._draft import Draft, Pick, say
 from ._layout import Column, Quaternion, Term
-from ._sample_time import velocity_period
 
 # `imu.orientation.x`, `quat_w`, `qx`, `rotation[2]`: what it is of, and which part.
 _PART = re.compile(r"(?P<of>.*?(?:quat\w*|orientation|attitude|rotation|\bq|_q))[._ \[]?(?P<part>[wxyz])\]?")

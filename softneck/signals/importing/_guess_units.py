@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, file_unit
+from ._clocks import velocity_period
 from ._draft import Draft
-from ._sample_time import velocity_period
 from .formats._dates import DATE
 
 _DEGREE = pi / 180.0

@@ -16,9 +16,8 @@ from ..recording._channels import may_miss
 from ..recording._files import integers, numbers, read_table
 from ..recording._recording import Recording, check_rising, median_step, uneven
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
-from ._clocks import clocked, filled, integrated, merged, pitch_roll, time_of, turns
+from ._clocks import clocked, estimate_sample_time, filled, integrated, merged, pitch_roll, time_of, turns
 from ._layout import Column, Layout, Source
-from ._sample_time import estimate_sample_time
 from ._table_format import without_remarks
 from .formats._encodings import format_of
 from .formats._mat import mat_arrays, table_of

@@ -14,7 +14,7 @@ from softneck.core import OutputFileError
 from softneck.fmu.compiled import _library
 from softneck.robot import Robot
 from softneck.signals import Recording
-from softneck.signals.importing._layout_text import doubts_in
+from softneck.signals.importing._layout import doubts_in
 
 from ..conftest import Call
 
