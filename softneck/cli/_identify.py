@@ -77,7 +77,7 @@ def command(
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
     from softneck.identification._identify import identified
-    from softneck.signals.quality._poor_excitation import poor_excitation, stands_still
+    from softneck.signals.quality._excitation import poor_excitation, stands_still
     from softneck.signals.recording._files import opened_recording
 
     if tolerance is not None:

@@ -31,7 +31,7 @@ def command(html: Path | None, seed: int, necks: int, force: bool, as_json: bool
     from softneck.plots import write_page
     from softneck.report import ReproduceSettings, paper_page, reproduce
     from softneck.report._paper_page import LINEAR_HEAD, grouped, linear_facts, linear_rows
-    from softneck.report._paper_tables import PAPER_HEAD, PAPER_NOTE, paper_entries
+    from softneck.report._reproduce import PAPER_HEAD, PAPER_NOTE, paper_entries
 
     if html is not None:
         refuse_existing(html, force=force)

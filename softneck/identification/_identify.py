@@ -17,7 +17,7 @@ from softneck.plant._calibration import Calibration
 from softneck.plant._calibration import calibrate as calibrated
 from softneck.robot import Robot
 from softneck.signals import Recording, concatenate, signal
-from softneck.signals.quality._poor_excitation import stands_still
+from softneck.signals.quality._excitation import stands_still
 from softneck.signals.recording._files import RecordingLike, names_of, opened_recording
 from softneck.signals.recording._recording import conditions
 

@@ -35,7 +35,7 @@ from ._packaging import (
     package,
     record_experiments,
 )
-from ._paper_tables import FREE_RUN, FREE_RUN_MEASURED, ONE_STEP
+from ._reproduce import FREE_RUN, FREE_RUN_MEASURED, ONE_STEP
 
 FULL_DURATION = 200.0
 

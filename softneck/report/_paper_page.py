@@ -14,8 +14,7 @@ from softneck.plots._style import BLUE, ORANGE
 from softneck.signals import Recording, concatenate, redefine
 
 from ._packaging import TESTS
-from ._paper_tables import AXES, LINEAR, NAMES, PAPER_HEAD, PAPER_NOTE, Entry, paper_entries
-from ._reproduce import Reproduction
+from ._reproduce import AXES, LINEAR, NAMES, PAPER_HEAD, PAPER_NOTE, Entry, Reproduction, paper_entries
 
 _PLANT = (
     "The plant is a virtual neck (preset `paper`), not the paper's hardware. What could be the plant's shows in the "

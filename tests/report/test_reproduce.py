@@ -11,8 +11,7 @@ from softneck.core import silent
 from softneck.identification import nrmse_fit
 from softneck.report import ReproduceSettings, paper_page, reproduce
 from softneck.report._paper_page import grouped, linear_facts, paper_charts
-from softneck.report._paper_tables import paper_entries
-from softneck.report._reproduce import Reproduction
+from softneck.report._reproduce import Reproduction, paper_entries
 
 pytestmark = pytest.mark.slow
 

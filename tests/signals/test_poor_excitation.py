@@ -8,7 +8,7 @@ import pytest
 from softneck.core import DataError
 from softneck.identification import Network, NeuralStateSpace, OutputError, Play
 from softneck.signals import Recording, redefinition_matrix, signal
-from softneck.signals.quality._poor_excitation import explained, independent_motions, poor_excitation, stands_still
+from softneck.signals.quality._excitation import explained, independent_motions, poor_excitation, stands_still
 
 from ..data import neck_recording, recording_from
 

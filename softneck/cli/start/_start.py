@@ -152,7 +152,7 @@ def _before(step: Step, sitting: Sitting, *, guided: bool) -> None:
 def _lacks(sitting: Sitting) -> list[str]:
     """Return what the recordings of a sitting cannot teach, where they are imported."""
     from softneck.signals import read_recording
-    from softneck.signals.quality._poor_excitation import poor_excitation
+    from softneck.signals.quality._excitation import poor_excitation
 
     files = [Path(key.partition(": ")[2]) for key in sitting.ran if key.startswith("import")]
     found = [(file, line) for file in files if file.is_file() for line in poor_excitation(read_recording(file))]

@@ -13,7 +13,7 @@ from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, Sof
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.signals import Recording
-from softneck.signals.quality._poor_excitation import poor_excitation
+from softneck.signals.quality._excitation import poor_excitation
 
 from ..models._arrays import members
 from ..models._fitting import one_recording

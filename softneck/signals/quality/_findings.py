@@ -15,8 +15,7 @@ from softneck.robot import Robot
 
 from ..recording._recording import Recording
 from ._channel_faults import ChannelQuality, Stretch, check_channel, count_rows
-from ._excitation import BANDWIDTH, Spectrum, correlation, spectrum
-from ._poor_excitation import independent_motions
+from ._excitation import BANDWIDTH, Spectrum, correlation, independent_motions, spectrum
 
 SEVERITIES = ("ok", "note", "warning")
 # A loop must stop when the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a
