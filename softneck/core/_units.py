@@ -33,6 +33,22 @@ _TO_SI: dict[str, tuple[float, str]] = {
 }
 
 
+#: SI unit -> its exponents of base units, by name; FMI and SSP count rad among them.
+SI_BASES: dict[str, dict[str, int]] = {
+    "rad": {"rad": 1},
+    "rad/s": {"rad": 1, "s": -1},
+    "s": {"s": 1},
+    "m": {"m": 1},
+    "m/s": {"m": 1, "s": -1},
+    "kg": {"kg": 1},
+    "N": {"kg": 1, "m": 1, "s": -2},
+    "Pa": {"kg": 1, "m": -1, "s": -2},
+    "A": {"A": 1},
+    "V": {"A": -1, "kg": 1, "m": 2, "s": -3},
+    "1": {},
+}
+
+
 def to_si(unit: str) -> tuple[float, str]:
     """Return (factor, SI unit) such that SI value = factor * value; raise DataError for an unknown unit.
 

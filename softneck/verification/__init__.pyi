@@ -6,4 +6,3 @@ from ._requirements import read_requirements as read_requirements
 from ._verify import Verification as Verification
 from ._verify import verify as verify
 from ._worst import linear_plant as linear_plant
-from ._worst import virtual_neck as virtual_neck

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
 from softneck.loop._result import shown_unit
-from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port
@@ -127,11 +126,6 @@ def linear_plant(
             Port(name="noise_seed", description="seed of that noise", minimum=0.0),
         ),
     )  # fmt: skip
-
-
-def virtual_neck() -> Block:
-    """Return the virtual neck `paper` as a plant at 20 ms; loop files that earlier versions wrote name it."""
-    return VirtualNeck(NeckParameters.paper()).block()
 
 
 def write_linear(

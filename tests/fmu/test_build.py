@@ -17,7 +17,7 @@ from fmpy.validation import validate_fmu
 from softneck import load
 from softneck.core import OutputFileError, SettingsError, to_si
 from softneck.fmu import FmuInfo, build_fmu, fmu_info
-from softneck.fmu.describe._description import _UNITS
+from softneck.fmu.describe._description import _SHOWN
 from softneck.runtime import Block, Port
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -190,9 +190,9 @@ def test_what_is_told_of_a_model_escapes_what_it_was_told(toys: Any) -> None:
         assert text in info.documentation
 
 
-@pytest.mark.parametrize("unit", [unit for unit, (_, shown) in _UNITS.items() if shown])
+@pytest.mark.parametrize("unit", list(_SHOWN))
 def test_the_unit_that_a_tool_displays_is_the_same_quantity(unit: str) -> None:
-    shown = _UNITS[unit][1]
+    shown = _SHOWN[unit]
     assert shown is not None
     name, factor = shown
     to_unit, si = to_si(name)

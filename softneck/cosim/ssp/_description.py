@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck.core import DataError, to_si
+from softneck.core._units import SI_BASES
 from softneck.runtime import Port
 
 _SPACES = {
@@ -14,16 +15,6 @@ _SPACES = {
     "xmlns:ssc": "http://ssp-standard.org/SSP1/SystemStructureCommon",
     "xmlns:ssv": "http://ssp-standard.org/SSP1/SystemStructureParameterValues",
     "xmlns:oms": "https://raw.githubusercontent.com/OpenModelica/OMSimulator/master/schema/oms.xsd",
-}
-# Exponents of the SI base units (SSP's own attributes; it counts rad among them).
-_BASE = {
-    "rad": {"rad": "1"},
-    "rad/s": {"rad": "1", "s": "-1"},
-    "s": {"s": "1"},
-    "m": {"m": "1"},
-    "kg": {"kg": "1"},
-    "N": {"kg": "1", "m": "1", "s": "-2"},
-    "Pa": {"kg": "1", "m": "-1", "s": "-2"},
 }
 # Drawing: signals flow from left to right, the observer below on the way back. Units are those of the canvas.
 _PLACES = {"reference": (0, 2), "controller": (1, 2), "plant": (2, 2), "observer": (1, 0)}
@@ -169,7 +160,8 @@ def _units(root: Element, components: Sequence[Component]) -> None:
             SubElement(unit, "ssc:BaseUnit")  # a foreign FMU's own unit: known by name only
             continue
         scale = {} if factor == 1.0 else {"factor": repr(factor)}
-        SubElement(unit, "ssc:BaseUnit", {**_BASE.get(si, {}), **scale})
+        base = {name: str(power) for name, power in SI_BASES.get(si, {}).items()}
+        SubElement(unit, "ssc:BaseUnit", {**base, **scale})
 
 
 def _corner(name: str, number: int) -> tuple[float, float]:

@@ -7,27 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from softneck.core import DataError, SettingsError, to_si
+from softneck.core._units import SI_BASES
 from softneck.runtime import Port
 
 from ._parse import Affine, Binding, Component, Connector, Structure, SystemNode, Unit, Value
 
 # An element by the names on the way to it, and one of its connectors.
 Place = tuple[tuple[str, ...], str]
-# Our SI units in SSP's base units, for what the archive's own list does not have.
-_BASES = {
-    "rad": (("rad", 1),),
-    "rad/s": (("rad", 1), ("s", -1)),
-    "s": (("s", 1),),
-    "m": (("m", 1),),
-    "m/s": (("m", 1), ("s", -1)),
-    "kg": (("kg", 1),),
-    "N": (("kg", 1), ("m", 1), ("s", -2)),
-    "Pa": (("kg", 1), ("m", -1), ("s", -2)),
-    "A": (("A", 1),),
-    "V": (("A", -1), ("kg", 1), ("m", 2), ("s", -3)),
-    "1": (),
-}
-
 # Kinds of connectors at which a connection can begin only, and end only, seen from outside of their element.
 _GIVES = ("output", "calculatedParameter")
 _TAKES = ("input", "parameter", "structuralParameter")
@@ -245,7 +231,7 @@ class _Flattening:
             factor, si = to_si(name or "1")
         except DataError:
             return None
-        return Unit(tuple(sorted(_BASES[si])), factor) if si in _BASES else None
+        return Unit(tuple(sorted(SI_BASES[si].items())), factor) if si in SI_BASES else None
 
     def _bind(self, path: tuple[str, ...], bindings: tuple[Binding, ...]) -> None:
         for binding in bindings:

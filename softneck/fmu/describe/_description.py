@@ -13,6 +13,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck import __version__
 from softneck.core import SettingsError, to_si
+from softneck.core._units import SI_BASES
 from softneck.runtime import Block, Port
 
 from ._describe import FmuInfo
@@ -22,16 +23,8 @@ from ._modelled_drives import with_modelled_drives
 REFERENCE_LIMIT = 0.8
 _NONE = ("", "1")
 _TIME = "time"
-# unit -> exponents of the SI base units and (usual display unit, factor to it).
-_UNITS: dict[str, tuple[dict[str, str], tuple[str, float] | None]] = {
-    "rad": ({"rad": "1"}, ("deg", 180.0 / math.pi)),
-    "rad/s": ({"rad": "1", "s": "-1"}, ("deg/s", 180.0 / math.pi)),
-    "s": ({"s": "1"}, None),
-    "m": ({"m": "1"}, ("mm", 1e3)),
-    "kg": ({"kg": "1"}, None),
-    "N": ({"kg": "1", "m": "1", "s": "-2"}, None),
-    "Pa": ({"kg": "1", "m": "-1", "s": "-2"}, None),
-}
+# SI unit -> usual display unit, factor to it.
+_SHOWN = {"rad": ("deg", 180.0 / math.pi), "rad/s": ("deg/s", 180.0 / math.pi), "m": ("mm", 1e3)}
 TERMINALS = "terminalsAndIcons/terminalsAndIcons.xml"
 _TERMINALS = {
     "motors": "Set-points and positions of the motors",
@@ -162,7 +155,7 @@ def _unit_definitions(root: Element, block: Block) -> None:
     definitions = SubElement(root, "UnitDefinitions")
     for name in used:
         unit = SubElement(definitions, "Unit", name=name)
-        base = _UNITS.get(name, ({}, None))[0]  # nothing of a unit that FMUs only name
+        base = {key: str(power) for key, power in SI_BASES.get(name, {}).items()}  # none of a unit that has only a name
         if base:
             SubElement(unit, "BaseUnit", base)
         shown = {_display_unit(port) for port in ports if port.unit == name}
@@ -258,7 +251,7 @@ def _display_unit(port: Port) -> tuple[str, float]:
     """Return the unit in which people see a port, and what its values are multiplied by for that."""
     if port.display_unit:
         return port.display_unit, 1.0 / to_si(port.display_unit)[0]
-    return _UNITS.get(port.unit, ({}, None))[1] or (port.unit, 1.0)
+    return _SHOWN.get(port.unit, (port.unit, 1.0))
 
 
 def terminals(block: Block) -> dict[str, list[str]]:
