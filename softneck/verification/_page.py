@@ -7,18 +7,191 @@ from typing import Any
 
 import numpy as np
 
-from softneck.plots import Chart, Section, Table, page
+from softneck.core import Vector, to_si
+from softneck.loop._result import shown_unit
+from softneck.plots import Chart, Curve, Level, Panel, Section, Table, page
+from softneck.plots._style import BLUE, GREEN, GREY, ORANGE
+from softneck.robot import Robot
 
-from ._charts import (
-    frequency_charts,
-    gain_unit,
-    mu_charts,
-    neck_chart,
-    step_chart,
-)
-from ._evidence import LinearEvidence
-from ._plants import mixing
+from ._evidence import Evidence, LinearEvidence
+from ._linear import inverse, loops
+from ._neck_loops import NeckRun, direction
+from ._plants import Plants, mixing
+from ._steps import Steps
 from ._verify import Verdict, Verification
+
+RED, PURPLE = "#D55E00", "#CC79A7"
+# Of 1 to 8 motors.
+SERIES = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, "#56B4E9", "#F0E442")
+# Responses that an envelope is taken over; more would not be seen.
+_MOST = 240
+_FREQUENCY = "frequency [rad/s]"
+_CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: the plant with the least disk margin."
+# What no robot's numbers in SI reach: pressures have some 1e6 Pa.
+_LARGEST = 1e9
+
+
+def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
+    """Return Bode envelopes of the open loops, the gang of four of each axis, and their sensitivities."""
+    rows = _chosen(part)
+    P, L = loops(part.plants.take(rows), part.law, w)
+    S = inverse(np.eye(len(part.plants.axes)) + L)
+    PS, CS = S @ P, -part.law.feedback(w) @ S
+    charts = [_bode(part, rows, S, w)]
+    for i, axis in enumerate(part.plants.axes):
+        own = S[..., i, i]
+        gang = {
+            "|S|, from load at the angle": np.abs(own), "|T|, from reference to angle": np.abs(1.0 - own),
+            "|PS|, from load at the input [rad/rad]": np.abs(PS[..., i, i]),
+            "|CS|, from noise to input [rad/rad]": np.abs(CS[..., i, i]),
+        }  # fmt: skip
+        worst = _worst_in(part, rows, f"{axis}.disk_margin")
+        panels = [_envelope(w, values, name, worst) for name, values in gang.items()]
+        charts.append(
+            Chart(
+                f"Gang of four: {axis}", panels, _FREQUENCY, columns=2, row_height=2.6,
+                caption=_CAPTION,
+            )
+        )  # fmt: skip
+    return charts
+
+
+def _chosen(part: LinearEvidence) -> np.ndarray:
+    """Return the rows that are drawn: the first, an even choice, and the worst ones."""
+    n = len(part.plants)
+    rows = np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))
+    worst = [int(np.argmin(part.margins[f"{axis}.disk_margin"])) for axis in part.plants.axes]
+    return np.unique(np.concatenate([[0], rows, worst]))
+
+
+def _worst_in(part: LinearEvidence, rows: np.ndarray, metric: str) -> int:
+    return int(np.argmin(part.margins[metric][rows]))
+
+
+def _bode(part: LinearEvidence, rows: np.ndarray, S: np.ndarray, w: Vector) -> Chart:
+    panels = []
+    for i, axis in enumerate(part.plants.axes):
+        L = 1.0 / S[..., i, i] - 1.0
+        worst = _worst_in(part, rows, f"{axis}.disk_margin")
+        phase = np.degrees(np.unwrap(np.angle(L), axis=1))
+        # All start near the phase of an integrator.
+        phase -= 360.0 * np.round((phase[:, :1] + 90.0) / 360.0)
+        panels.append(_envelope(w, np.abs(L), f"|L| of {axis}", worst, level=1.0))
+        panels.append(
+            _envelope(w, phase, f"phase of {axis} [deg]", worst, level=-180.0, log=False, y_range=(-540.0, 30.0))
+        )
+    return Chart(
+        "Bode envelopes of the open loops", panels, _FREQUENCY, columns=2, row_height=2.6,
+        caption=_CAPTION,
+    )  # fmt: skip
+
+
+def _envelope(
+    w: Vector, values: np.ndarray, label: str, worst: int, *, level: float | None = None, log: bool = True,
+    y_range: tuple[float, float] | None = None,
+) -> Panel:  # fmt: skip
+    shown = np.maximum(values, 1e-6) if log else values
+    curves = [
+        Curve(w, shown.min(axis=0), "all plants", "#56B4E9", "band", upper=shown.max(axis=0)),
+        Curve(w, shown[worst], "worst", RED, width=1.2),
+        Curve(w, shown[0], "nominal", "black", width=1.2),
+    ]
+    levels = () if level is None else (Level(level),)
+    if log and y_range is None:
+        top = float(shown.max())
+        y_range = (max(float(shown.min()), 1e-3 * min(top, 1.0)), 1.3 * top)
+    return Panel(curves, label, levels=levels, log_x=True, log_y=log, y_range=y_range)
+
+
+def gain_unit(robot: Robot) -> tuple[str, float]:
+    """Return in which unit static gains are shown, and its factor from SI."""
+    motors = 1.0 if robot.is_neck else to_si(robot.motors.unit)[0]
+    unit, factor = shown_unit(robot)
+    return f"{unit}/{robot.motors.unit}", motors * (math.degrees(1.0) if factor is None else 1.0 / factor)
+
+
+def mu_charts(part: LinearEvidence) -> list[Chart]:
+    """Return the structured singular value over frequency with its bounds; nothing where the middle is not stable."""
+    panels = []
+    for rows in part.structured:
+        for row in rows:
+            if not np.isfinite(row.upper).all():
+                continue
+            curves = [Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4)]
+            levels = [Level(1.0, "certain below", RED)]
+            top = max(1.1, 1.1 * float(row.upper.max()))
+            panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
+    return (
+        [Chart("Structured singular value for stability of the box", panels, _FREQUENCY, row_height=2.4)]
+        if panels
+        else []
+    )
+
+
+def step_chart(steps: Steps, plants: Plants, robot: Robot) -> Chart:
+    """Return the steps of all plants, the worst drawn through, and what its motors did."""
+    t = steps.time
+    panels = []
+    finite: np.ndarray = np.asarray(np.isfinite(steps.angles).all(axis=2))
+    worst = int(np.argmax(steps.metrics["overshoot_pct"]))
+    axis_of = int(steps.worse["overshoot_pct"][worst])
+    unit, factor = shown_unit(robot)
+
+    def shown(y: np.ndarray) -> np.ndarray:
+        return np.degrees(y) if factor is None else y / factor
+
+    for i, axis in enumerate(plants.axes):
+        y = shown(steps.angles[i][finite[i]]) if finite[i].any() else np.zeros((1, t.size))
+        row = worst if i == axis_of else int(np.argmax(np.where(finite[i], np.max(steps.angles[i], axis=1), -np.inf)))
+        settling = int(np.argmax(steps.metrics["load_rms_deg"]))
+        curves = [
+            Curve(t, y.min(axis=0), "all plants", "#56B4E9", "band", upper=y.max(axis=0)),
+            Curve(t, shown(_drawable(steps.angles[i, settling])), "worst under the load", ORANGE),
+            Curve(t, shown(_drawable(steps.angles[i, row])), "worst overshoot", RED, width=1.2),
+            Curve(t, shown(_drawable(steps.angles[i, 0])), "nominal", "black", width=1.2),
+        ]
+        panels.append(Panel(curves, f"{axis} [{unit}]"))
+    per = 1.0 if robot.is_neck else to_si(robot.motors.unit)[0]
+    motors = [
+        Curve(t, _drawable(steps.motors[axis_of, worst, :, j]) / per, f"motor {j + 1}", colour, "step")
+        for j, colour in zip(range(len(robot.motors.names)), SERIES, strict=False)
+    ]
+    panels.append(Panel(motors, f"set-point [{robot.motors.unit}]", title=f"motors on {plants.names[worst]}"))
+    return Chart("Steps against every plant, then a load", panels, row_height=2.6)
+
+
+def _drawable(y: Vector) -> Vector:
+    """Return `y` without what is too large to draw."""
+    return np.where(np.isfinite(y) & (np.abs(y) < _LARGEST), y, np.nan)
+
+
+def neck_chart(evidence: Evidence, robot: Robot) -> Chart:
+    """Return all loops over the virtual neck: the way along the step, the worst overshoot drawn through."""
+    runs = [run for run in evidence.necks if run.result is not None]
+    if not runs:
+        raise ValueError("no loop over the virtual neck came to its end")
+    worst = max(runs, key=lambda run: run.metrics["overshoot_pct"])
+    slow = max(runs, key=lambda run: run.metrics["settling_s"])
+    along = {id(run): _along(run) for run in runs}
+    table = np.array(list(along.values()))
+    t = runs[0].result.time if runs[0].result is not None else np.zeros(0)
+    curves = [
+        Curve(t, table.min(axis=0), "all loops", "#56B4E9", "band", upper=table.max(axis=0)),
+        Curve(t, along[id(slow)], f"slowest: {slow.name}", ORANGE),
+        Curve(t, along[id(worst)], f"largest overshoot: {worst.name}", RED, width=1.2),
+        Curve(t, table[0], runs[0].name, "black", width=1.2),
+    ]
+    what = "virtual neck" if robot.is_neck else f"virtual {robot.name}"
+    return Chart(f"Steps of the {what}", [Panel(curves, "true angle along the step [deg]")], row_height=3.4)
+
+
+def _along(run: NeckRun) -> Vector:
+    if run.result is None:
+        return np.zeros(0)
+    robot = run.result.robot
+    shares = zip(direction(run.orientation, robot), robot.outputs.names, strict=True)
+    return np.degrees(np.sum([share * run.result.angle(name) for share, name in shares], axis=0))
+
 
 _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
 

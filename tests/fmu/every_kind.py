@@ -21,7 +21,7 @@ from softneck.design import (
 )
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, LinearNeck
-from softneck.fmu.describe._modelled_drives import with_modelled_drives
+from softneck.fmu.describe._description import with_modelled_drives
 from softneck.identification import (
     GreyBox,
     Model,

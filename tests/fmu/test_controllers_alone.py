@@ -16,7 +16,7 @@ import pytest
 from softneck.core import KINDS, Matrix, load, read_archive
 from softneck.design import NmpcSettings
 from softneck.fmu import build_compiled_fmu, build_fmu
-from softneck.fmu.describe._modelled_drives import with_modelled_drives
+from softneck.fmu.describe._description import with_modelled_drives
 from softneck.identification import Play
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import Block, load_runtime

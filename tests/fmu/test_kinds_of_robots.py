@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from softneck import identify, load
-from softneck.core import kinds_of
+from softneck.core._kinds import kinds_of
 from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.fmu import build_fmu
 from softneck.plant import NeckParameters, VirtualNeck, record

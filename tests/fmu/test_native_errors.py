@@ -27,7 +27,7 @@ from softneck.fmu.compiled import _library
 from softneck.fmu.compiled._build import next_outputs
 from softneck.fmu.compiled._model_file import model_bytes
 from softneck.fmu.compiled._sources import Sources, c_sources
-from softneck.fmu.describe._modelled_drives import with_modelled_drives
+from softneck.fmu.describe._description import with_modelled_drives
 
 from .every_kind import NATIVE, block_of
 

@@ -11,7 +11,7 @@ import pytest
 
 from softneck.fmu.compiled._model_file import model_bytes
 from softneck.fmu.compiled._sources import c_sources
-from softneck.fmu.describe._modelled_drives import with_modelled_drives
+from softneck.fmu.describe._description import with_modelled_drives
 
 from .every_kind import NATIVE, block_of
 

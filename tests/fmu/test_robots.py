@@ -21,8 +21,7 @@ from softneck.design import PiSettings
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.fmu import build_compiled_fmu, build_fmu, fmu_info
 from softneck.fmu.compiled._model_file import node_of
-from softneck.fmu.describe._description import terminals
-from softneck.fmu.describe._modelled_drives import with_modelled_drives
+from softneck.fmu.describe._description import terminals, with_modelled_drives
 from softneck.identification import (
     GreyBox,
     Model,
