@@ -4,38 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
 from softneck.core._shown import Shown
-from softneck.robot import Robot
-from softneck.runtime import Block
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
 
 from ._kalman_parts_runtime import KalmanArrays
 from ._kalman_runtime import KalmanFullState
-
-
-class Filter(Protocol):
-    """What an observer says of the recordings that it takes."""
-
-    @property
-    def form(self) -> str: ...
-    @property
-    def robot(self) -> Robot: ...
-    @property
-    def sample_time(self) -> float: ...
-
-
-class LinearFilter(Filter, Protocol):
-    """What filtering a recording needs of a Kalman observer."""
-
-    @property
-    def order(self) -> str: ...
-    def block(self) -> Block: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -87,7 +66,7 @@ class Estimates(Shown):
         return self.rates[:, 1]
 
 
-def filter_recording(observer: LinearFilter, recording: Recording) -> Estimates:
+def filter_recording(observer: Any, recording: Recording) -> Estimates:
     """Return what the filter's runtime makes of each run, sample by sample as in a loop."""
     check_recording(observer, recording)
     block, m = observer.block(), len(observer.robot.outputs.names)
@@ -127,7 +106,7 @@ def measured_names(run: Recording) -> list[str]:
     return [f"{axis}_measured" if f"{axis}_measured" in run.channels else axis for axis in axes]
 
 
-def input_rows(observer: LinearFilter, run: Recording, z: Matrix) -> Matrix:
+def input_rows(observer: Any, run: Recording, z: Matrix) -> Matrix:
     """Return the runtime's inputs row by row, as a loop would give them, with the measured outputs `z`."""
     valid = np.ones((len(run), 1))
     if observer.form == "gyro":
@@ -141,7 +120,7 @@ def input_rows(observer: LinearFilter, run: Recording, z: Matrix) -> Matrix:
     return np.hstack([run.set_points[np.maximum(np.arange(len(run)) - late, 0)], z, valid])
 
 
-def check_recording(observer: Filter, recording: Recording) -> None:
+def check_recording(observer: Any, recording: Recording) -> None:
     """Raise DataError for another sample time, missing rates or another robot."""
     if not math.isclose(recording.sample_time, observer.sample_time, rel_tol=1e-6):
         raise DataError(

@@ -12,7 +12,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.estimation import KalmanSettings, LinearNeck, axis_plant
-from softneck.estimation._sensors import SENSORS
+from softneck.estimation._settings import SENSORS
 from softneck.signals import Recording
 
 from .by_filterpy import by_filterpy

@@ -28,12 +28,6 @@ if TYPE_CHECKING:
     import control
 
 
-# Half the digits of a double.
-_ILL_CONDITIONED = 1e8
-# Of the way that an input of one takes to rest, seen by the end of the horizon.
-_SEEN = 0.5
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class MpcController(Shown):
     """A linear predictive controller of all outputs; `MpcSettings.design` makes it.
@@ -231,27 +225,7 @@ _LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "angl
 
 def _review(controller: MpcController) -> list[str]:
     """Return one line for each finding."""
-    c, a = controller, rt.MpcArrays(controller.arrays)
-    q = a.constants
-    lines = []
-    settings = c.design.get("settings", {})
-    condition = float(np.linalg.cond(a.H))
-    if condition > _ILL_CONDITIONED:
-        lines.append(f"the QP is ill-conditioned ({condition:.1g}): bring the weights closer together.")
-    horizon = int(settings.get("horizon", 0))
-    delay = int(q[rt.MPC_PAST])
-    if horizon <= delay:
-        lines.append(
-            f"the horizon ({horizon} samples) is not longer than the dead time ({delay}); it is counted behind it, but "
-            "a plan that short sees no more than it has already caused: take 30."
-        )
-    lines += _limits(c)
-    n = int(q[rt.MPC_ORDER])
-    for axis, name in enumerate(c.robot.outputs.names):
-        A = a.model_A[axis * n : (axis + 1) * n]
-        radius = float(np.abs(np.linalg.eigvals(A)).max())
-        if 0.0 < radius < 1.0 and 1.0 - radius**horizon < _SEEN:
-            lines.append(f"{name}: the horizon ends before half of a move's effect is seen; lengthen it.")
+    c, lines = controller, _limits(controller)
     Ms = max(c.design.get("sensitivity", [1.0]))
     if Ms > 2.0:
         lines.append(f"Ms is {Ms:.2f}: not robust. Ask for less `max_sensitivity`.")
@@ -262,9 +236,6 @@ def _review(controller: MpcController) -> list[str]:
 
 def _limits(c: MpcController) -> list[str]:
     lines = []
-    travel = 2.0 * c.position_limit
-    if c.slew_limit * c.sample_time > travel:
-        lines.append("the slew limit lets a motor cross its range within a sample: it limits nothing.")
     if c.lead_limit < c.slew_limit * c.sample_time:
         per = to_si(c.robot.motors.unit)[0]
         lines.append(

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix
-from softneck.estimation import AxisPlant
 from softneck.identification import Model
-from softneck.runtime import Block
 
 from ._nmpc_state_runtime import NMPC_NO_BOUND
 from ._prediction import idle_moves
@@ -85,24 +83,10 @@ class NonlinearProblem:
         return np.kron(rows, np.eye(self.motors))
 
 
-class NonlinearController(Protocol):
-    """What preparation and arrays need of an `NmpcController`."""
-
-    @property
-    def settings(self) -> Any: ...
-    @property
-    def model(self) -> Model: ...
-    @property
-    def sample_time(self) -> float: ...
-    def plants(self) -> tuple[AxisPlant, ...]: ...
-    def problem(self) -> NonlinearProblem: ...
-    def block(self) -> Block: ...
-
-
 class Preparation:
     """Filters over the horizon, the moves that a moving reference asks for itself, and the disturbance's gains."""
 
-    def __init__(self, controller: NonlinearController) -> None:
+    def __init__(self, controller: Any) -> None:
         """Prepare `controller`."""
         s, Ts = controller.settings, controller.sample_time
         p = self.problem = controller.problem()
@@ -151,7 +135,7 @@ def disturbance_ahead(pole: float, horizon: int) -> Matrix:
     return np.column_stack([np.ones(horizon), (1.0 - pole**i) / (1.0 - pole)])
 
 
-def controller_arrays(controller: NonlinearController) -> tuple[Matrix, ...]:
+def controller_arrays(controller: Any) -> tuple[Matrix, ...]:
     """Return the controller's own arrays, in the order of `_nmpc_runtime`; those of the model stand behind them."""
     s, prepared = controller.settings, Preparation(controller)
     p, block = prepared.problem, controller.model.block()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -49,19 +49,6 @@ _STEP, _MOST = 0.25, 4.0
 _BEHIND = 0.5
 
 
-class _Settings(Protocol):
-    """What is read of `MpcSettings` here."""
-
-    @property
-    def least_delay(self) -> float: ...
-    @property
-    def look_ahead(self) -> float: ...
-    @property
-    def extra_delay(self) -> int: ...
-    @property
-    def taut_pole(self) -> float: ...
-
-
 S = TypeVar("S", bound=Any)
 
 
@@ -91,7 +78,7 @@ def _with(settings: S, others: Mapping[str, Any]) -> S:
     return replace(settings, **changed)
 
 
-def predicted_plants(settings: _Settings, model: HasTransferFunctions) -> Pair:
+def predicted_plants(settings: Any, model: HasTransferFunctions) -> Pair:
     """Return the plant of each output that is predicted.
 
     Raises:
@@ -143,7 +130,7 @@ def families(nominal: Pair, small_move_pole: float) -> list[Pair]:
     return [nominal] if fast == nominal else [nominal, fast]
 
 
-def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> AnyAxis:
+def _predicted(settings: Any, model: HasTransferFunctions, axis: str) -> AnyAxis:
     if isinstance(model, SizedPlant) and isinstance(model.axes[axis].nominal, CoupledAxis):
         return timed(model.axes[axis].nominal, settings)
     plant = timed(axis_plant(model, axis), settings)
@@ -155,13 +142,13 @@ def _predicted(settings: _Settings, model: HasTransferFunctions, axis: str) -> A
     return taut
 
 
-def timed(plant: AnyAxis, timing: _Settings) -> Any:
+def timed(plant: AnyAxis, timing: Any) -> Any:
     """Return a plant with the dead time that the controller sees: at least so much, less what the observer is ahead."""
     late = plant.delayed(timing.least_delay)
     return replace(late, delay=max(0, late.delay - samples_ahead(timing.look_ahead, plant.sample_time)))
 
 
-def sample_pairs(model: Any, timing: _Settings) -> list[Pair]:
+def sample_pairs(model: Any, timing: Any) -> list[Pair]:
     """Return samples of a family, axes joined by the order of their static gains; none for a single model."""
     if not hasattr(model, "samples") or (isinstance(model, SizedPlant) and not model.uncertain):
         return []
