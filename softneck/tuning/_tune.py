@@ -189,8 +189,7 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
         if hasattr(thing, "robot"):
             require_same_robot(robot_of(thing), robot, f"{first} and {name}")
     own = {name: standing_for(thing, robot) for name, thing in own.items()}
-    ends = zip(robot.outputs.min or (), robot.outputs.max or (), strict=True)
-    if own and any(not low < 0.0 < high for low, high in ends):
+    if own and not loops_start(robot):
         raise SettingsError(
             f"loops over {next(iter(own))} would begin at zero, where {robot.label()} cannot be; give linear plants "
             "alone."
@@ -201,6 +200,12 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
     return Task(
         digest="", linear=linear, own=own, asked=asked, robot=robot, cocontraction=_held(linear), seed=seed
     )  # fmt: skip
+
+
+def loops_start(robot: Robot) -> bool:
+    """Return whether loops over a robot can start: they start at zero, which its outputs' range must contain."""
+    ends = zip(robot.outputs.min or (), robot.outputs.max or (), strict=True)
+    return all(low <= 0.0 <= high for low, high in ends)
 
 
 def _asked(

@@ -236,9 +236,13 @@ def nonlinear_model() -> str | None:
 
 
 def _controller(asked: Asked) -> Iterator[Step]:
+    from softneck.tuning._tune import loops_start
+
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
+    if not loops_start(Robot.read("robot.toml")):
+        plants = (linear,)
     kinds = asked.kinds or (_KINDS if family else _KINDS + _UNCERTIFIED)
     # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
     finding = possible(plants) if asked.requirements is None else ""
