@@ -131,7 +131,7 @@ def rotation() -> RecordingReference:
     """Return the angles of test 3 on the neck without payload, free of noise (smoothed over 60 ms)."""
     rec = record(signal("rotation"), VirtualNeck(NeckSteps().parameters()), seed=1)
     pitch, roll = (gaussian_filter1d(np.asarray(rec.channels[axis]), 3.0) for axis in ("pitch", "roll"))
-    return RecordingReference(time=np.asarray(rec.time), pitch=pitch, roll=roll)
+    return RecordingReference(np.column_stack([rec.time, pitch, roll, np.zeros_like(pitch)]))
 
 
 def runs(part: str, seeds: int) -> list[tuple[Any, float, int]]:

@@ -123,8 +123,7 @@ class ReferenceBlock:
                 starts = {item.name: float(getattr(reference, item.name)) for item in fields(known)}
                 return kind, starts, np.zeros((1, 4))
         if isinstance(reference, RecordingReference):
-            third = np.zeros(reference.time.size) if reference.cocontraction is None else reference.cocontraction
-            return _RECORDED, {}, np.column_stack([reference.time, reference.pitch, reference.roll, third])
+            return _RECORDED, {}, reference.table
         return _RECORDED, {}, self._table()
 
     def _table(self) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from softneck.core import (
     DataError,
+    Matrix,
     SettingsError,
     Vector,
     require_between,
@@ -147,36 +148,35 @@ class RotationReference:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RecordingReference(Shown):
-    """Recorded angles, each held until the next; the last one is held to the end.
+    """Recorded outputs of any robot, each row held until the next; the last one is held to the end.
 
     Attributes:
-        time: (N,) [s], rising.
-        pitch, roll: (N,) [rad].
-        cocontraction: (N,) delta_i [rad]; None for zero.
+        table: (rows, outputs + 2) time [s], rising; outputs, of a neck pitch and roll [rad]; co-contraction.
     """
 
-    time: Vector
-    pitch: Vector
-    roll: Vector
-    cocontraction: Vector | None = None
+    table: Matrix
 
     def __post_init__(self) -> None:
-        columns = [self.pitch, self.roll] + ([] if self.cocontraction is None else [self.cocontraction])
-        if self.time.ndim != 1 or self.time.size == 0 or any(c.shape != self.time.shape for c in columns):
-            shapes = [self.time.shape, *(c.shape for c in columns)]
-            raise DataError(f"a recorded reference needs columns of one shape (time,) with a row; got {shapes}.")
-        if np.any(np.diff(self.time) <= 0) or not all(np.isfinite(c).all() for c in (self.time, *columns)):
+        table = self.table
+        if table.ndim != 2 or table.shape[1] < 3:
+            raise DataError(f"a recorded reference is a table (rows, outputs + 2); got the shape {table.shape}.")
+        if not len(table) or not np.isfinite(table).all() or np.any(np.diff(table[:, 0]) <= 0.0):
             raise DataError("a recorded reference must be finite with rising time; mend the recording.")
 
-    def __call__(self, time: float, /) -> Triple:
-        """Return the reference at `time`."""
+    @classmethod
+    def of(cls, time: Vector, channels: Mapping[str, Vector], names: Sequence[str]) -> RecordingReference:
+        """Return the reference that a recording holds: the references of the outputs `names`, or else they."""
+        columns = [channels.get(f"{name}_reference", channels[name]) for name in names]
+        common = channels.get("cocontraction_reference", np.zeros(time.size))
+        return cls(np.column_stack([time, *columns, common]))
+
+    def __call__(self, time: float, /) -> tuple[float, ...]:
+        """Return the reference at `time` [s]: all outputs, then co-contraction."""
         # The search only comes near, in few steps; the row itself is the runtime's to say.
-        near = max(0, int(np.searchsorted(self.time, time, side="right")) - 1)
-        k = reference_row(time, self.time[:, None], near)
-        third = 0.0 if self.cocontraction is None else float(self.cocontraction[k])
-        return float(self.pitch[k]), float(self.roll[k]), third
+        near = max(0, int(np.searchsorted(self.table[:, 0], time, side="right")) - 1)
+        return tuple(self.table[reference_row(time, self.table, near), 1:].tolist())
 
 
 _Setting = type[StepReference] | type[RampReference] | type[SineReference] | type[RotationReference]

@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import (
-    DataError,
-    Matrix,
     SettingsError,
     SoftneckError,
-    Vector,
     require_finite,
     require_one_of,
     require_positive,
@@ -20,7 +17,7 @@ from softneck.core import (
 )
 from softneck.robot import Robot
 
-from ._reference_runtime import reference_ramp, reference_rotation, reference_row, reference_sine, reference_step
+from ._reference_runtime import reference_ramp, reference_rotation, reference_sine, reference_step
 
 # Kind -> what else than values it takes, with where it begins without being told.
 _TIMES: dict[str, dict[str, float]] = {
@@ -73,26 +70,6 @@ class RobotReference:
         return tuple(value * share for value in (*self.values, self.cocontraction))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedReference:
-    """Recorded outputs, each row held until the next; the last one is held to the end.
-
-    Attributes:
-        table: (rows, outputs + 2) time [s], outputs, co-contraction.
-    """
-
-    table: Matrix
-
-    def __post_init__(self) -> None:
-        if not len(self.table) or not np.isfinite(self.table).all() or np.any(np.diff(self.table[:, 0]) <= 0.0):
-            raise DataError("a recorded reference must be finite with rising time; mend the recording.")
-
-    def __call__(self, time: float, /) -> tuple[float, ...]:
-        """Return the reference at `time` [s]: all outputs, then co-contraction."""
-        near = max(0, int(np.searchsorted(self.table[:, 0], time, side="right")) - 1)
-        return tuple(self.table[reference_row(time, self.table, near), 1:].tolist())
-
-
 def robot_reference(kind: str, values: Mapping[str, object], robot: Robot) -> RobotReference:
     """Return a reference from the keys of a loop file: `x = 10` in the display unit, `x_mm = 10`, `at_s`.
 
@@ -142,13 +119,6 @@ def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
     raise SettingsError(
         f"unknown key `{key}` of a {kind} reference; it takes {', '.join((*units, *_TIMES[kind]))} with a unit."
     )
-
-
-def recorded_reference(time: Vector, channels: Mapping[str, Vector], robot: Robot) -> RecordedReference:
-    """Return the reference that a recording of `robot` holds: its references, or else its outputs."""
-    columns = [channels.get(f"{name}_reference", channels[name]) for name in robot.outputs.names]
-    common = channels.get("cocontraction_reference", np.zeros(time.size))
-    return RecordedReference(np.column_stack([time, *columns, common]))
 
 
 def _within(key: str, name: str, value: float, robot: Robot) -> float:

@@ -225,9 +225,7 @@ def test_references_by_their_formulas() -> None:
     assert defaults == (0.2, 0.2, 3.0, 1.0)
     step = StepReference(pitch=0.1)
     assert (step(-TS)[0], step(0.0)[0]) == (0.0, 0.1)
-    held = RecordingReference(
-        time=np.array([0.0, TS]), pitch=np.ones(2), roll=np.ones(2), cocontraction=np.array([1.0, 2.0])
-    )
+    held = RecordingReference(np.array([[0.0, 1.0, 1.0, 1.0], [TS, 1.0, 1.0, 2.0]]))
     # 1 * 0.02 less half a nanosecond is row 1 already, as rounding of k * Ts may make it.
     assert [held(t)[2] for t in (0.0, TS - 1e-9, TS - 1e-10, TS)] == [1.0, 1.0, 2.0, 2.0]
 

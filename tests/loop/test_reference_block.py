@@ -22,9 +22,7 @@ EVERY: dict[str, Reference] = {
     "ramp": RampReference(pitch=0.3, roll=0.1, cocontraction=-0.5, at=0.2, rise=0.7),
     "sine": SineReference(pitch=0.3, roll=-0.2, cocontraction=0.3, frequency=0.7, at=0.1),
     "rotation": RotationReference(inclination=0.25, cocontraction=0.2, frequency=0.6, at=0.1, rise=0.5),
-    "recording": RecordingReference(
-        time=np.array([0.0, 0.05, 0.3]), pitch=np.array([0.1, 0.2, 0.3]), roll=np.array([0.0, -0.1, -0.2])
-    ),
+    "recording": RecordingReference(np.array([[0.0, 0.1, 0.0, 0.0], [0.05, 0.2, -0.1, 0.0], [0.3, 0.3, -0.2, 0.0]])),
 }
 
 

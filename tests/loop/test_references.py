@@ -39,7 +39,7 @@ def test_a_rotation_keeps_its_inclination_once_risen() -> None:
 
 def test_a_recorded_reference_holds_each_sample() -> None:
     time = np.arange(5) * 0.02
-    recorded = RecordingReference(time=time, pitch=np.arange(5.0), roll=-np.arange(5.0))
+    recorded = RecordingReference(np.column_stack([time, np.arange(5.0), -np.arange(5.0), np.zeros(5)]))
     for k in range(5):
         assert recorded(k * 0.02) == (k, -k, 0.0)
     assert recorded(0.03)[0] == 1.0
@@ -74,12 +74,14 @@ def test_wrong_references_are_refused(kind: str, values: dict[str, float], messa
 @pytest.mark.parametrize(
     ("time", "pitch", "message"),
     [
-        ([0.0, 0.1], [0.0], "columns of one shape"),
+        ([], [], "must be finite with rising time"),
         ([0.1, 0.0], [0.0, 0.0], "rising time"),
         ([0.0, 0.1], [0.0, math.nan], "must be finite"),
     ],
-    ids=["shape", "backwards", "nan"],
+    ids=["empty", "backwards", "nan"],
 )
 def test_wrong_recorded_references_are_refused(time: list[float], pitch: list[float], message: str) -> None:
     with pytest.raises(DataError, match=message):
-        RecordingReference(time=np.array(time), pitch=np.array(pitch), roll=np.zeros(len(time)))
+        RecordingReference(np.column_stack([time, pitch, np.zeros((len(time), 2))]))
+    with pytest.raises(DataError, match="is a table"):
+        RecordingReference(np.array(time))

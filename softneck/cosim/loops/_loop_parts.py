@@ -20,7 +20,7 @@ from softneck.design.linear._own import own_controller
 from softneck.loop import BlockPart, Part, RecordingReference, Reference
 from softneck.loop._reference_parts import AheadReference
 from softneck.loop._references import make_reference
-from softneck.loop._robot_references import recorded_reference, robot_reference
+from softneck.loop._robot_references import robot_reference
 from softneck.loop._wiring import Link
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
@@ -183,14 +183,8 @@ class PartOpener:
         require_same_robot(robot, recording.robot, "[reference] file and the loop")
         if len(recording.runs()) > 1:
             raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
-        channels = recording.channels
-        if not robot.is_neck:
-            return recorded_reference(recording.time - recording.time[0], channels, robot)
-        pitch, roll = (channels.get(f"{axis}_reference", channels[axis]) for axis in ("pitch", "roll"))
         time = recording.time - recording.time[0]
-        return RecordingReference(
-            time=time, pitch=pitch, roll=roll, cocontraction=channels.get("cocontraction_reference")
-        )
+        return RecordingReference.of(time, recording.channels, robot.outputs.names)
 
     def drives(self, name: Any) -> None:
         """Remember the drives file that the loop is meant for; nothing here reads it, certificates are bound to it."""
