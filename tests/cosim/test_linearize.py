@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from softneck.core import Matrix, OutputFileError, SettingsError, SoftneckError, Vector, load
-from softneck.cosim.linear._linearize import linearize, realised
+from softneck.cosim.linear._linearize import SavedBlock, linearize, realised
 from softneck.fmu import build_compiled_fmu, build_fmu
-from softneck.loop import BlockPart
 from softneck.runtime import Block
 from softneck.signals import redefinition_matrix
 
@@ -117,7 +116,7 @@ def test_pulses_and_derivatives_say_the_same() -> None:
     block = block_of("rls")
     exact = linearize(block, at=1.0)
     held = np.array([np.nan if port.missing else port.start for port in block.inputs])
-    part = BlockPart(block)
+    part = SavedBlock(block)
     part.start(0.0, {})
     for k in range(50):
         part.advance(k * TS, held)

@@ -170,7 +170,7 @@ def _of_block(block: Block, at: float, given: Mapping[str, float]) -> LinearPoin
     try:
         tangent = load_tangent(block.runtime, compiled=False)  # for once: numba would take its time
     except TangentError:
-        return _by_pulses(BlockPart(block), block.parameters, at, given, block.kind)
+        return _by_pulses(SavedBlock(block), block.parameters, at, given, block.kind)
     state = _reached_state(block, block.initial_state(**parameters), held, at)
     moved, shown = _moved(block.inputs, held), _shown(block.outputs)
     n, m = state.values.size, len(moved)
@@ -199,8 +199,20 @@ def _of_block(block: Block, at: float, given: Mapping[str, float]) -> LinearPoin
     )
 
 
+class SavedBlock(BlockPart):
+    """A block whose state can be saved, as that of an FMU."""
+
+    def get_state(self) -> tuple[Vector, Vector]:
+        """Return state and outputs."""
+        return self._state.copy(), self._outputs.copy()
+
+    def set_state(self, state: tuple[Vector, Vector]) -> None:
+        """Go on from what `get_state` returned."""
+        self._state[:], self._outputs[:] = state
+
+
 def _by_pulses(
-    part: FmuPart | BlockPart, parameters: tuple[Port, ...], at: float, given: Mapping[str, float], name: str
+    part: FmuPart | SavedBlock, parameters: tuple[Port, ...], at: float, given: Mapping[str, float], name: str
 ) -> LinearPoint:
     held, chosen = _split(part.inputs, parameters, given, name)
     part.start(0.0, chosen)

@@ -84,14 +84,6 @@ class IsolatedPart:
         message = b"A" + np.concatenate([[time], inputs]).astype("<f8").tobytes()
         return np.frombuffer(self._ask(message, f"in the step from t = {time:g} s", self.timeout)).copy()
 
-    def get_state(self) -> bytes:
-        """Return the whole state of the FMU."""
-        return self._ask(b"G", "at its state", self.timeout)
-
-    def set_state(self, state: bytes) -> None:
-        """Go on from a state that `get_state` returned."""
-        self._ask(b"P" + state, "at its state", self.timeout)
-
     def close(self) -> None:
         """End the child process."""
         child, self._child = self._child, None
@@ -199,11 +191,6 @@ def _serve(part: FmuPart, message: bytes) -> bytes:
         (time,) = struct.unpack("<d", rest[:8])
         parameters: dict[str, Any] = json.loads(rest[8:])
         return part.start(time, parameters).tobytes()
-    if what == b"G":
-        return part.get_state()
-    if what == b"P":
-        part.set_state(rest)
-        return b""
     part.close()
     return b""
 
