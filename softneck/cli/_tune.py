@@ -64,7 +64,7 @@ def command(
               evaluations.json       all judgements: the same command goes on where it was
     Defaults of speed and precision that no candidate keeps are loosened to what the best keeps, by a factor of two at
     most, and the result says so; what a --requirements file asks stands. Exit code 1 if no candidate keeps all: then it
-    says which requirement stands in the way, and what it costs.
+    says which requirement stands in the way.
     """
     from softneck.core import SettingsError
     from softneck.report._tune_files import write_tuned

@@ -14,9 +14,9 @@ from .predictive._nmpc import NmpcController as NmpcController
 from .predictive._nmpc import NmpcSettings as NmpcSettings
 from .predictive._settings import MpcSettings as MpcSettings
 from .robust._hinf import HinfSettings as HinfSettings
-from .robust._mu import mu_bounds as mu_bounds
+from .robust._mu import mu_upper as mu_upper
 from .robust._synthesis import hinfsyn as hinfsyn
 from .robust._synthesis import mixsyn as mixsyn
 from .robust._weights import makeweight as makeweight
 from .varying._adaptive import AdaptiveSettings as AdaptiveSettings
-from .varying._varying import VaryingController as VaryingController
+from .varying._adaptive import VaryingController as VaryingController

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .linear._controller import LinearController
     from .predictive._controller import MpcController
     from .predictive._nmpc import NmpcController
-    from .varying._varying import VaryingController
+    from .varying._adaptive import VaryingController
 
 # [%] Free run over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
 _LEAST_FIT = 30.0

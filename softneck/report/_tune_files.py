@@ -69,7 +69,6 @@ def tuned_values(found: Tuned, path: Path) -> dict[str, Any]:
         "pareto": [{"kind": item.kind, "settings": dict(item.settings), "metrics": _metrics(item)}
                    for item in found.front],
         "binding": found.binding,
-        "prices": [{"metric": p.metric, "limit": p.limit, "other": p.other, "least": p.least} for p in found.prices],
         "requirements": found.task.asked.lines(),
         "loosened": _loosened(found),
         "evaluations": found.evaluations,

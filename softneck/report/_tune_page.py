@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 from softneck.design.linear._controller import assumed_lines
 from softneck.plots import Chart, Curve, Panel, Section, Table, page
 from softneck.plots._style import GREY, looks
-from softneck.tuning._responses import step_response
-from softneck.tuning._result import in_words
+from softneck.tuning._result import step_response
 
 if TYPE_CHECKING:
     from softneck.tuning._search import Candidate
@@ -73,7 +72,7 @@ def notes(found: Tuned) -> list[str]:
 
 
 def stands_in_the_way(found: Tuned) -> str:
-    """Return what binds, and what it costs, in a sentence or two."""
+    """Return what binds in a sentence or two."""
     if found.holds:
         return ""
     unknown = [item for item in found.verification.failed if item.value is None]
@@ -88,8 +87,7 @@ def stands_in_the_way(found: Tuned) -> str:
     text = f"What stands in the way is {found.binding}"
     if found.nearest is not None:
         text += f": at {found.nearest:.3g} all the rest would hold"
-    told = in_words(found.prices)
-    return text + (f" ({told})." if told else ".")
+    return f"{text}."
 
 
 def _result(found: Tuned, steps: Chart) -> Section:
@@ -103,10 +101,6 @@ def _result(found: Tuned, steps: Chart) -> Section:
     rows = requirement_rows(found)
     tables = [Table("Requirements", ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
     text += notes(found)
-    if found.prices:
-        told = [[p.metric, f"{p.limit:.3g}", p.other, _text(p.least)] for p in found.prices]
-        held = "all else held" if found.prices[0].held else "all else no worse than in the best"
-        tables.append(Table(f"What it costs, {held}", ["requirement", "at", "costs", "at least"], told))
     return Section("Best controller", charts=[steps], tables=tables, method=text)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,8 +16,7 @@ from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at
 
-from ._requirements import TuneRequirements
-from ._task import Task
+from ._requirements import Task, TuneRequirements
 
 # The circle is led in over so long [s], then goes round so often, of which the last turn is judged.
 _LED, _TURNS = 2.0, 2.0
@@ -162,8 +161,3 @@ def _distances(loop: Loop, task: Task) -> Vector:
     rows = r.shape[1]
     each = [y - r[:, rows - turn - lead : rows - lead] for lead in range(leads + 1)]
     return np.degrees([math.sqrt(float((part**2).sum(axis=0).mean())) for part in each])
-
-
-def quietly(case: Case) -> Case:
-    """Return the plain step of a case, for pictures."""
-    return replace(case, noise=False, late=False, circle=False, part=1.0)

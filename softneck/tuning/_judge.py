@@ -27,7 +27,7 @@ from softneck.verification._tested import tested_axes
 from softneck.verification._verify import sources_of
 
 from ._cases import Case, cases, run_case
-from ._task import Task, has_observer
+from ._requirements import Task, has_observer
 
 #: From quick to slow; each includes what those before it found.
 LEVELS = ("linear", "all", "margins")

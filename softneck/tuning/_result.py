@@ -1,20 +1,27 @@
-"""What a search found: the front, what binds, and what each requirement costs."""
+"""What a search found: the front, what binds, defaults that are nearly kept, and what candidates do in time."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from typing import Any
 
 import numpy as np
 
+from softneck.core import SoftneckError, Vector
 from softneck.cosim.studies._store import pareto_rows
+from softneck.loop import run_loop
+from softneck.loop._result import shown_unit
 from softneck.verification._linear import LARGE
+from softneck.verification._neck_loops import judge_loop
 from softneck.verification._requirements import Requirement
+from softneck.verification._steps import StepTest, run_steps
 from softneck.verification._verify import Verdict
 
-from ._requirements import TuneRequirements
+from ._cases import Case, loop_of
+from ._judge import designed, made_ready, watched
+from ._requirements import Task, TuneRequirements
 from ._search import Candidate, ratio
 
 # What is traded, the first of each that was found; of the least ones the reciprocal counts.
@@ -23,8 +30,6 @@ _OBJECTIVES = (
     ("neck.steady_rms_", "step.steady_rms_"), ("track.circle_rms_deg",), ("track.variation_rad_s",),
     ("axes.sensitivity",), ("axes.gain_margin",),
 )  # fmt: skip
-# Limits at which the price of a requirement is told, in parts of its own, and that of the best candidate.
-_LOOSER = (1.0, 1.25, 1.5, 2.0)
 # Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
 # loosened, and beyond it is another requirement ("disk_margin 0.0151 costs sensitivity 66.7").
 _NEAR = 2.0
@@ -33,25 +38,6 @@ _NEAR = 2.0
 _LOOSENED = ("neck.rise_s", "neck.settling_s", "neck.overshoot_pct", "neck.steady_rms_", "step.rise_s",
              "step.settling_s", "step.overshoot_pct", "step.steady_rms_", "track.")  # fmt: skip
 _ROOM = 1.05
-
-
-@dataclass(frozen=True, slots=True)
-class Price:
-    """What one requirement costs another: with all others held and this one at `limit`, the other is `least`.
-
-    Attributes:
-        metric: what binds.
-        limit: to which it is loosened.
-        other: the metric that is paid with.
-        least: its best value; None where no candidate keeps all others.
-        held: whether all others are held; else they are no worse than in the best candidate.
-    """
-
-    metric: str
-    limit: float
-    other: str
-    least: float | None
-    held: bool = True
 
 
 def objectives(items: Sequence[Candidate]) -> list[str]:
@@ -154,96 +140,50 @@ def _above(value: float) -> float:
     return round(math.ceil(_ROOM * value / step - 1e-9) * step, 9)
 
 
-def prices(items: Sequence[Candidate], bounds: Sequence[Requirement], metric: str, *, tested: bool) -> list[Price]:
-    """Return the curve of what the requirement on `metric` costs: of the other that is broken most when it is held.
-
-    Where no candidate keeps all the others, they are to be no worse than in the best one. Only candidates within a
-    factor of two of every limit are compared.
-    """
-    item = next((bound for bound in bounds if bound.metric == metric), None)
-    items = [one for one in items if max(one.ratios(bounds, tested=tested).values(), default=math.inf) <= _NEAR]
-    best = min(items, key=lambda one: one.cost(bounds, tested=tested), default=None)
-    if item is None or best is None:
-        return []
-    now = best.ratios(bounds, tested=tested)
-    paid = _paid_with(items, bounds, item, tested=tested)
-    for other, rest in ((paid, {}), (_broken_beside(bounds, item, now), now)):
-        if other is None:
-            continue
-        found = []
-        for part in sorted({*_LOOSER, max(1.0, now.get(metric, 1.0))}):
-            least = _least(items, bounds, {metric: part, other.metric: math.inf}, rest, other, tested=tested)
-            limit = item.limit / part if item.bound == "min" else item.limit * part
-            found.append(Price(metric, limit, other.metric, least, held=not rest))
-        if any(price.least is not None for price in found):
-            return found
-    return []
-
-
-def _least(
-    items: Sequence[Candidate], bounds: Sequence[Requirement], allowed: Mapping[str, float], now: Mapping[str, float],
-    other: Requirement, *, tested: bool,
-) -> float | None:  # fmt: skip
-    """Return the best value of `other` of the candidates that keep what is allowed, and all else or what is now."""
-    kept = [
-        one.metrics[other.metric]
-        for one in items
-        if other.metric in one.metrics
-        and all(
-            value <= allowed.get(name, max(1.0, now.get(name, 1.0)))
-            for name, value in one.ratios(bounds, tested=tested).items()
-        )
-    ]
-    return (max(kept) if other.bound == "min" else min(kept)) if kept else None
-
-
-def _broken_beside(bounds: Sequence[Requirement], item: Requirement, now: Mapping[str, float]) -> Requirement | None:
-    """Return the requirement that the best candidate breaks most beside `item`, or its rise: speed pays for all."""
-    others = {name: value for name, value in now.items() if name != item.metric and 1.0 < value < math.inf}
-    rises = [name for name in ("neck.rise_s", "step.rise_s") if name in now and name != item.metric]
-    name = max(others, key=lambda key: others[key]) if others else next(iter(rises), None)
-    return next((bound for bound in bounds if bound.metric == name), None)
-
-
-def _paid_with(
-    items: Sequence[Candidate], bounds: Sequence[Requirement], item: Requirement, *, tested: bool
-) -> Requirement | None:
-    """Return the requirement that is broken least when `item` is held, alone if that can be."""
-    best: tuple[int, float, Requirement] | None = None
-    for one in items:
-        found = one.ratios(bounds, tested=tested)
-        if found.get(item.metric, math.inf) > 1.0:
-            continue
-        broken = {name: value for name, value in found.items() if value > 1.0}
-        if not broken:
-            continue
-        name = max(broken, key=lambda key: broken[key])
-        bound = next(bound for bound in bounds if bound.metric == name)
-        rank = (len(broken), broken[name])
-        if name in one.metrics and (best is None or rank < best[:2]):
-            best = (*rank, bound)
-    return None if best is None else best[2]
-
-
-def in_words(prices: Sequence[Price]) -> str:
-    """Return prices as a sentence, one clause for all that are paid with the same; "" where none is known."""
-    told = []
-    for (metric, other, held), alike in groupby(
-        (price for price in prices if price.least is not None),
-        key=lambda price: (price.metric, price.other, price.held),
-    ):
-        items = list(alike)
-        limits, least = (", ".join(f"{value:.3g}" for value in part if value is not None)
-                         for part in ([p.limit for p in items], [p.least for p in items]))  # fmt: skip
-        told.append(f"{metric} {limits} costs {other} {least}" + ("" if held else ", all else as it is"))
-    return "; ".join(told)
-
-
 def _small(name: str, value: float) -> float:
     return -value if name.rpartition(".")[2] in LARGE else value
 
 
-def ratio_of(item: Candidate, bound: Requirement) -> float | None:
-    """Return how far a candidate is from a bound; None where it is not known."""
-    value = item.metrics.get(bound.metric)
-    return None if value is None or math.isnan(value) else ratio(bound, value)
+def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
+    """Return time (n,) [s], output and reference (n,) of the first output, in its display unit: the heaviest payload.
+
+    Without a plant that steps, on the nominal linear one.
+    """
+    ready = made_ready(task)
+    controller = designed(task, ready, item.kind, item.settings)
+    block, order = controller.block(), str(getattr(controller, "order", "sequential"))
+    name, factor = task.robot.outputs.names[0], shown_unit(task.robot)[1]
+    per = math.radians(1.0) if factor is None else factor
+    asked = task.asked.certificate
+    if not ready.own:
+        step = asked.si(asked.step["size_deg"])
+        test = StepTest(step=step, duration=float(asked.step["duration_s"]), noise=0.0, load=0.0, seed=task.seed)
+        found = run_steps(ready.plants.take(0), block, test, workers=1, robot=task.robot, weights=ready.weights)
+        half = found.time.size // 2
+        return found.time[:half], found.angles[0, 0, :half] / per, np.full(half, step / per)
+    case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.neck["payloads_kg"]))))
+    result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, watched(task, item.kind)), compiled=True)
+    reference = result[f"{name}_reference"]
+    first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))
+    return result.time[first:] - result.time[first], result.angle(name)[first:] / per, reference[first:] / per
+
+
+def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:
+    """Return whether the plain steps keep their requirements with an observer in the loop."""
+    ready = made_ready(task)
+    controller = designed(task, ready, item.kind, item.settings)
+    block, eyes = controller.block(), observer.block()
+    order = str(getattr(controller, "order", "sequential"))
+    worst: dict[str, float] = {}
+    try:
+        for case in (case for case in ready.all if not case.circle and not case.late and case.part == 1.0):
+            loop = loop_of(case, ready.own[case.plant], block, order, task, eyes)
+            worst |= _worst(worst, judge_loop(loop)[0])
+    except SoftneckError:
+        return False
+    named = {f"neck.{task.asked.certificate.name_of(name)}": value for name, value in worst.items()}
+    return bool(named) and all(ratio(b, named[b.metric]) <= 1.0 for b in bounds if b.metric in named)
+
+
+def _worst(before: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
+    return {name: max(value, before.get(name, -math.inf)) for name, value in values.items() if not math.isnan(value)}

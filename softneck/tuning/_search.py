@@ -25,8 +25,8 @@ from softneck.verification._requirements import Requirement
 
 from ._judge import LEVELS, Judgement, judge_candidate
 from ._log import Job, Log
+from ._requirements import Task
 from ._space import COSTLY, Space
-from ._task import Task
 
 # Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
 _GENERATION = 6

@@ -23,21 +23,19 @@ from softneck.verification._neck_loops import OwnPlant, is_own_plant, named_plan
 from softneck.verification._verify import scaled, sources_of, standing_for
 
 from ._beforehand import default_rise, quickest, refuse_impossible
-from ._digest import digest_of
 from ._judge import LEVELS, designed, made_ready, watched
-from ._log import Log
+from ._log import Log, digest_of
 from ._requirements import (
+    Task,
     TuneRequirements,
     loosened,
     make_tune_requirements,
     read_tune_requirements,
     with_certificate,
 )
-from ._responses import kept_with
-from ._result import Loosened, Price, binding, front, nearest, objectives, prices
+from ._result import Loosened, binding, front, kept_with, nearest, objectives
 from ._search import Candidate, Search
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
-from ._task import Task
 
 #: Judgements of candidates that a search makes where nobody says otherwise.
 BUDGET = 160
@@ -70,7 +68,6 @@ class Tuned:
         objectives: the metrics of the front.
         binding: the requirement that stands in the way; None where nothing does.
         nearest: the value to which that alone would have to be loosened; None where that would not do.
-        prices: what it costs.
         loosened: metric -> the default that the best does not keep; the requirements of `task` have what it keeps.
         evaluations: judgements that were asked for.
         dropped: kind -> why it was not searched.
@@ -90,7 +87,6 @@ class Tuned:
     objectives: list[str]
     binding: str | None
     nearest: float | None
-    prices: list[Price]
     evaluations: int
     dropped: Mapping[str, str]
     task: Task
@@ -264,10 +260,9 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     if looped and task.own:
         holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
     stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=task.tested)
-    paid = [] if stuck is None else prices(compared, bounds, stuck, tested=task.tested)
     known = [verdict for verdict in verification.failed if verdict.value is not None]
     if not holds and stuck is None and known:
-        # The search saw nothing broken, and knows no price; the certificate of the whole box does.
+        # The search saw nothing broken; the certificate of the whole box does.
         stuck = known[0].requirement.metric
         nearest = known[0].value if len(verification.failed) == 1 else None
     found = Tuned(
@@ -278,7 +273,6 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         or (eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds)),
         verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
-        prices=paid,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
     return found if holds else _nearest(found, files, progress)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.design.robust._mu import Structure, mu_upper
+from softneck.design.robust._mu import mu_upper
 from softneck.identification.uncertainty._measured import response_of
 
 from ._linear import LinearLaw, inverse, loops, radii
@@ -181,8 +181,7 @@ def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int) -> list[Struc
             never = np.full(w.size, math.inf)
             results.append(StructuredResult(name, w, never))
             continue
-        upper = mu_upper(M, Structure.of(blocks))[0]
-        results.append(StructuredResult(name, w, upper))
+        results.append(StructuredResult(name, w, mu_upper(M, blocks)))
     return results
 
 

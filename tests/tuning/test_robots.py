@@ -20,7 +20,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.tuning import tune
 from softneck.tuning._beforehand import refuse_impossible
-from softneck.tuning._cases import loop_of, quietly
+from softneck.tuning._cases import loop_of
 from softneck.tuning._judge import made_ready
 from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
@@ -146,7 +146,9 @@ def test_every_step_is_judged_as_verify_does_and_with_a_noisy_sensor_each_direct
     robot = Robot.preset("trunk4")
     task = task_of({"model": plant(robot), "own": plant(robot).block()}, QUICK | {"track": {}}, 3)
     ready, controller = made_ready(task), PiSettings().design(plant(robot))
-    quiet = {case.orientation for case in ready.all if case == quietly(case)}
+    quiet = {
+        case.orientation for case in ready.all if case == replace(case, noise=False, late=False, circle=False, part=1.0)
+    }
     assert quiet == {case.orientation for case in ready.all if case.noise}
     assert {case.late for case in ready.all} == {False, True}
     plain = [case for case in ready.all if case.noise and case.part == 1.0 and not case.late]

@@ -18,7 +18,7 @@ from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, 
 from softneck.core._kinds import make_settings
 from softneck.tuning import tune
 from softneck.tuning._log import FILE, Job, Log
-from softneck.tuning._result import Price, binding, front, in_words, prices
+from softneck.tuning._result import binding, front
 from softneck.tuning._search import Candidate, given_out, ratio
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._tune import Tuned
@@ -240,52 +240,6 @@ def test_what_was_not_computed_does_not_bind(tested: bool) -> None:
     blind.metrics["neck.rise_s"] = 0.3
     assert blind.cost(bounds, tested=tested) > 1.0
     assert binding([blind], bounds, tested=tested) == (None, None)
-
-
-def test_prices_paid_with_the_same_are_one_clause() -> None:
-    def price(limit: float, other: str, least: float | None, held: bool = False) -> Price:
-        return Price(metric="rise", limit=limit, other=other, least=least, held=held)
-
-    paid = [
-        price(0.4, "circle", None),
-        price(0.5, "circle", 3.28),
-        price(0.6, "circle", 3.1),
-        price(2.0, "load", 1.0, True),
-    ]
-    assert in_words(paid) == "rise 0.5, 0.6 costs circle 3.28, 3.1, all else as it is; rise 2 costs load 1"
-    assert in_words(paid[:1]) == ""
-
-
-def test_what_a_requirement_costs() -> None:
-    fast = candidate(neck__rise_s=0.3, neck__overshoot_pct=7.0, axes__gain_margin=2.5)
-    slow = candidate(neck__rise_s=0.52, neck__overshoot_pct=4.9, axes__gain_margin=2.5)
-    found = prices([fast, slow], BOUNDS, "neck.overshoot_pct", tested=False)
-    assert (found[0].limit, found[0].other, found[0].least) == (5.0, "neck.rise_s", 0.52)
-    least = [price.least for price in found if price.least is not None]
-    # The looser the requirement, the less it costs.
-    assert least == sorted(least, reverse=True)
-    assert least[-1] == 0.3
-
-
-def test_where_nothing_keeps_all_the_rest_the_price_is_told_beside_what_the_best_does() -> None:
-    loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=9.9, axes__gain_margin=1.9)
-    slow = candidate(neck__rise_s=0.6, neck__overshoot_pct=6.0, axes__gain_margin=1.9)
-    worse = candidate(neck__rise_s=0.5, neck__overshoot_pct=6.0, axes__gain_margin=1.1)
-    found = prices([loud, slow, worse], BOUNDS, "neck.overshoot_pct", tested=False)
-    assert {(price.other, price.held) for price in found} == {("neck.rise_s", False)}
-    # At 5 % nothing is known; from 6 % on it costs 0.6 s: what does it in 0.5 s has less margin than the best.
-    assert [price.least for price in found if price.limit < 6.0] == [None]
-    assert {price.least for price in found if 6.0 <= price.limit < 9.9} == {0.6}
-
-
-def test_no_price_is_told_of_what_is_far_from_any_limit() -> None:
-    near = candidate(neck__rise_s=0.5, neck__overshoot_pct=6.0, axes__gain_margin=2.5)
-    slow = candidate(neck__rise_s=4.0, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
-    loose = candidate(neck__rise_s=0.3, neck__overshoot_pct=90.0, axes__gain_margin=2.5)
-    assert not prices([slow, loose], BOUNDS, "neck.overshoot_pct", tested=False)
-    found = prices([near, slow, loose], BOUNDS, "neck.overshoot_pct", tested=False)
-    assert {price.least for price in found} == {None, 0.5}
-    assert max(price.limit for price in found) <= 10.0
 
 
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:

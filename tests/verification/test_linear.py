@@ -9,7 +9,7 @@ import control
 import numpy as np
 import pytest
 
-from softneck.design import FopiSettings, PiSettings, mu_bounds
+from softneck.design import FopiSettings, PiSettings, mu_upper
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
 from softneck.identification.models._linear_systems import moved_through
@@ -37,7 +37,7 @@ def _disk(L: Any) -> float:
     at = np.exp(1j * np.geomspace(0.02, math.pi / TS, 1500) * TS)
     response = np.moveaxis(np.asarray(L(at, squeeze=False)), -1, 0)
     S = np.linalg.inv(np.eye(L.noutputs) + response)
-    return float(1.0 / mu_bounds(S - 0.5 * np.eye(L.noutputs), [(1, 0)] * L.noutputs).upper.max())
+    return float(1.0 / mu_upper(S - 0.5 * np.eye(L.noutputs), [(1, 0)] * L.noutputs).max())
 
 
 def _transfer(plants: Plants, row: int, axis: int) -> control.TransferFunction:
@@ -129,7 +129,7 @@ def test_python_control_says_the_same_margins(kind: Any) -> None:
 def test_two_complex_scalars_have_a_closed_form() -> None:
     M = np.random.default_rng(0).standard_normal((50, 2, 2, 2)) @ [1.0, 1.0j]
     # The descent ends at log(2)/3000 of the bound.
-    np.testing.assert_allclose(two_scalars(M), mu_bounds(M, [(1, 0), (1, 0)]).upper, rtol=1e-3)
+    np.testing.assert_allclose(two_scalars(M), mu_upper(M, [(1, 0), (1, 0)]), rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
 """Robust control: H-infinity synthesis, structured singular values, weights.
 
-Functions carry the field's names: `hinfsyn`, `mixsyn`, `makeweight`, `mu_bounds`.
+Functions carry the field's names: `hinfsyn`, `mixsyn`, `makeweight`, `mu_upper`.
 May import `design.linear` and `design.plants`.
 """

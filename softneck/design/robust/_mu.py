@@ -1,4 +1,4 @@
-"""Bounds of the structured singular value of many matrices at once, by our own scalings.
+"""Upper bounds of the structured singular value of many matrices at once, by our own scalings.
 
 `mu(M) = 1 / min{ |Delta| : det(I - M Delta) = 0 }` over block-diagonal Delta of a structure.
 
@@ -6,8 +6,6 @@ Upper bound: with D > 0 that commutes with the structure and a real G on its rea
 <= beta^2 D` gives `mu <= beta` (Fan, Tits and Doyle 1991, IEEE Trans. Automatic Control 36:25; without G it is
 Doyle's `min |D M D^-1|`, tight for three complex blocks or fewer). Any D and G give a valid bound; ours come from a
 quasi-Newton descent on the smoothed largest eigenvalue, whose local minima are global (the problem is quasi-convex).
-Lower bound: perturbations that do make it singular, by the power iteration (Packard and Doyle 1993, Automatica 29:71)
-on the complex blocks, the real ones at values that are tried.
 """
 
 from __future__ import annotations
@@ -24,24 +22,6 @@ Blocks = Sequence[tuple[int, int]]
 # Sharpness of the smoothed maximum, relative to the bound: the last is off by log(n)/3000, 0.05 % for n = 4.
 _SHARPNESS = (20.0, 150.0, 1000.0, 3000.0)
 _ITERATIONS = 40
-_POWER_ITERATIONS = 60
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Mu:
-    """Bounds of the structured singular value.
-
-    Attributes:
-        upper: (m,) nothing in the structure smaller than 1/upper makes `I - M Delta` singular.
-        lower: (m,) something of size 1/lower does.
-        scalings: (m, blocks) d of each block.
-        multipliers: (m, reals) g of each real scalar, in the scaled coordinates.
-    """
-
-    upper: Vector
-    lower: Vector
-    scalings: Matrix
-    multipliers: Matrix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,26 +81,18 @@ class Structure:
         return stack
 
 
-def mu_bounds(M: Array, blocks: Blocks, *, seed: int = 0, trials: int = 30) -> Mu:
-    """Return bounds of the structured singular value of M.
+def mu_upper(M: Array, blocks: Blocks) -> Vector:
+    """Return an upper bound (m,) of the structured singular value of M.
 
     Args:
         M: (rows, columns), or (m, rows, columns) for many, such as a response over frequency.
         blocks: see `Structure.of`; (-1, 0) real scalar, (1, 0) complex scalar, (rows, columns) full complex block.
-        seed, trials: of the values at which real scalars are tried for the lower bound.
 
     Raises:
         SettingsError: blocks that do not fit, or M not finite.
     """
     structure = Structure.of(blocks)
-    stack = structure.check(M)
-    upper, scalings, multipliers = mu_upper(stack, structure)
-    lower = np.minimum(mu_lower(stack, structure, seed=seed, trials=trials), upper)
-    return Mu(upper, lower, scalings, multipliers)
-
-
-def mu_upper(M: Array, structure: Structure) -> tuple[Vector, Matrix, Matrix]:
-    """Return the upper bound (m,) with its d (m, blocks) and g (m, reals); M is (m, rows, columns)."""
+    M = structure.check(M)
     reals = np.flatnonzero(structure.real)
     size = np.maximum(np.linalg.norm(M, 2, axis=(1, 2)), 1e-300)
     x = _balanced(M, structure)
@@ -136,8 +108,7 @@ def mu_upper(M: Array, structure: Structure) -> tuple[Vector, Matrix, Matrix]:
         value = problem.exact(theta)
         better = value < best
         best, where = np.where(better, value, best), np.where(better[:, None], theta, where)
-    n = x.shape[1]
-    return size * np.sqrt(np.maximum(best, 0.0)), np.exp(where[:, :n]), where[:, n:]
+    return size * np.sqrt(np.maximum(best, 0.0))
 
 
 class _EigenvalueProblem:
@@ -246,84 +217,6 @@ def _balanced(M: Array, structure: Structure) -> Matrix:
     return x - x[:, -1:]
 
 
-def mu_lower(M: Array, structure: Structure, *, seed: int = 0, trials: int = 30) -> Vector:
-    """Return the lower bound (m,); M is (m, rows, columns)."""
-    if not structure.real.any():
-        return _power(M, structure)
-    reals = np.flatnonzero(structure.real)
-    best = np.zeros(M.shape[0])
-    for values in _real_values(reals.size, seed, trials):
-        best = np.maximum(best, _along(M, structure, reals, values))
-    return best
-
-
-def _real_values(count: int, seed: int, trials: int) -> Matrix:
-    """Return the directions (n, count) in which the real scalars are tried: vertices, single ones, at random."""
-    corners = np.array(np.meshgrid(*([[-1.0, 1.0]] * min(count, 6)), indexing="ij")).reshape(min(count, 6), -1).T
-    corners = np.pad(corners, ((0, 0), (0, count - corners.shape[1])), constant_values=1.0)
-    drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (trials, count))
-    return np.vstack([corners, np.zeros((1, count)), drawn])
-
-
-def _along(M: Array, structure: Structure, reals: Array, values: Vector) -> Vector:
-    """Return 1/k of the least k found at which the reals at k values, with complex blocks up to k, make it singular.
-
-    Without complex blocks that is a real eigenvalue of `M Delta`.
-    """
-    rows = structure.out_of[:, reals].sum(axis=1) > 0.5
-    columns = structure.into[:, reals].sum(axis=1) > 0.5
-    delta = np.diag(values)
-    own = M[:, rows][:, :, columns] @ delta
-    if rows.all():
-        eigenvalues = np.linalg.eigvals(own)
-        # 1e-9: real up to rounding.
-        real = np.where(np.abs(eigenvalues.imag) < 1e-9 * (1.0 + np.abs(eigenvalues)), eigenvalues.real, 0.0)
-        return np.maximum(real.max(axis=1), 0.0)
-    rest = Structure(
-        structure.real[~structure.real], structure.out_of[~rows][:, ~structure.real],
-        structure.into[~columns][:, ~structure.real],
-    )  # fmt: skip
-    Mcc, Mcr, Mrc = M[:, ~rows][:, :, ~columns], M[:, ~rows][:, :, columns], M[:, rows][:, :, ~columns]
-    eye = np.eye(own.shape[1])
-
-    def closed(k: Vector) -> Vector:
-        inner = np.linalg.solve(eye - k[:, None, None] * own, Mrc)
-        return _power(Mcc + k[:, None, None] * (Mcr @ delta) @ inner, rest, iterations=25)
-
-    low, high = np.zeros(M.shape[0]), 1.0 / np.maximum(_power(Mcc, rest), 1e-9)
-    # Where high makes it singular by the complex blocks alone it is a bound; smaller ones are sought by halves.
-    for _ in range(14):
-        k = 0.5 * (low + high)
-        enough = closed(k) * k >= 1.0
-        low, high = np.where(enough, low, k), np.where(enough, k, high)
-    reached = closed(high) * high >= 1.0 - 1e-12
-    return np.where(reached, 1.0 / high, 0.0)
-
-
-def _power(M: Array, structure: Structure, *, iterations: int = _POWER_ITERATIONS) -> Vector:
-    """Return max rho(Q M) found over unitary-like Q of the structure, complex blocks only."""
-    m, rows = M.shape[:2]
-    out_of, into = structure.out_of, structure.into
-    if structure.real.size == 1:
-        return np.linalg.norm(M, 2, axis=(1, 2))
-    if structure.real.size == 2 and M.shape[1:] == (2, 2):
-        return two_scalars(M)
-    _, _, Vh = np.linalg.svd(M)
-    b = np.conj(Vh[:, 0])
-    w = b.copy()
-    a = np.zeros((m, rows), dtype=complex)
-    Mh = np.conj(np.swapaxes(M, 1, 2))
-    for _ in range(iterations):
-        a = _unit((M @ b[:, :, None])[:, :, 0])
-        z = _unit(a * ((_norms(w, into) / _norms(a, out_of)) @ out_of.T))
-        w = _unit((Mh @ z[:, :, None])[:, :, 0])
-        b = _unit(w * ((_norms(a, out_of) / _norms(w, into)) @ into.T))
-    unit_w, unit_a = w / (_norms(w, into) @ into.T), a / (_norms(a, out_of) @ out_of.T)
-    same = into @ out_of.T
-    Q = unit_w[:, :, None] * np.conj(unit_a)[:, None, :] * same
-    return np.abs(np.linalg.eigvals(Q @ M)).max(axis=1)
-
-
 def two_scalars(M: Array) -> Array:
     """Return the structured singular value (...) of 2 x 2 matrices for two complex scalars, exactly.
 
@@ -334,11 +227,3 @@ def two_scalars(M: Array) -> Array:
     total = np.abs(M[..., 0, 0]) ** 2 + np.abs(M[..., 1, 1]) ** 2 + 2.0 * off
     det = np.abs(M[..., 0, 0] * M[..., 1, 1] - M[..., 0, 1] * M[..., 1, 0])
     return 0.5 * (np.sqrt(total + 2.0 * det) + np.sqrt(np.maximum(total - 2.0 * det, 0.0)))
-
-
-def _norms(v: Array, blocks: Array) -> Array:
-    return np.sqrt(np.maximum((np.abs(v) ** 2) @ blocks, 1e-60))
-
-
-def _unit(v: Array) -> Array:
-    return v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-300)

@@ -3,33 +3,38 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
+from softneck.core import Matrix, SettingsError, Vector, require_between, to_si, write_archive
+from softneck.core._shown import Shown
 from softneck.estimation import AxisPlant
 from softneck.estimation._forms import Reach
 from softneck.estimation._reach import linear_reach
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.robot._search import find_robot
-from softneck.runtime import Port
+from softneck.runtime import Block, Port, State
+from softneck.runtime._bundle import sized
 
 from ..linear._assembly import ReferenceFilter, assemble, pi_axis
 from ..linear._axis_settings import slowest
+from ..linear._controller import robot_in
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
 from ..linear._margins import LOWEST, frequencies
-from ..linear._ports import ControllerLimits
+from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
 from ..linear._rise import filter_for_lag
 from ..plants._uncertain import UncertainPlant, scaled, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
-from ._varying import RUNTIMES, VaryingController
 
+_RUNTIME = "softneck.design.varying._adaptive_runtime"
+_ADAPT = Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0, minimum=0.0, maximum=1.0)
 # Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
 _SIZES = np.geomspace(1e-3, 1.0, 695)
 # The paper's static gain [rad/rad], 27.69 / 5.293 deg/rad (Eq. 31).
@@ -159,15 +164,10 @@ class AdaptiveSettings(LoopSettings):
             for axis, plant, kappa, ms, delay, unit in zip(names, plants, kappas, worst, delays, units, strict=True)
         }  # fmt: skip
         return VaryingController(
-            kind="adaptive",
-            runtime=RUNTIMES["adaptive"],
             sample_time=Ts,
             arrays=self._arrays(plants, delays, kappas, self.limits(robot), redefinition, learning),
             limits=self.limits(robot),
             order=self.order,
-            parameters=(
-                Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0, minimum=0.0, maximum=1.0),
-            ),
             lines=tuple(_line(axis, values, robot) for axis, values in found.items()),
             design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
         )
@@ -262,6 +262,98 @@ class AdaptiveSettings(LoopSettings):
             "guards": np.array(guards),
         }
         return {name: arrays[name] for name in AdaptiveArrays.names()}
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class VaryingController(Shown):
+    """A designed controller of all outputs whose gains follow what it learns.
+
+    Attributes:
+        sample_time: [s].
+        arrays: by name, in the runtime's order.
+        limits: of the set-points.
+        order: of the loop it is for.
+        lines: for `summary`.
+        design: JSON values: settings and what was found.
+    """
+
+    sample_time: float
+    arrays: Mapping[str, Matrix]
+    limits: ControllerLimits
+    order: str
+    lines: tuple[str, ...]
+    design: Mapping[str, Any]
+
+    @property
+    def kind(self) -> str:
+        """Its name in the table of kinds."""
+        return "adaptive"
+
+    @property
+    def robot(self) -> Robot:
+        """Whose controller it is."""
+        return self.limits.robot
+
+    def block(self) -> Block:
+        """Return the controller as a block of role "controller"."""
+        return Block(
+            kind=self.kind,
+            role="controller",
+            runtime=sized(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            sample_time=self.sample_time,
+            arrays=tuple(self.arrays.values()),
+            inputs=controller_inputs(self.robot),
+            outputs=controller_outputs(self.robot),
+            parameters=(*self.limits.ports(), _ADAPT),
+        )
+
+    def initial_state(self, **parameters: float) -> State:
+        """Return the state at the start; parameters are the limits by name."""
+        return self.block().initial_state(**parameters)
+
+    def step(self, state: State, inputs: ArrayLike) -> tuple[State, Vector]:
+        """Return the next state and the set-points valid now; inputs and outputs as in `block()`."""
+        return self.block().step(state, inputs)
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        head = (
+            f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
+            f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it"
+        )
+        return "\n".join([head, *self.limits.lines(self.sample_time), *self.lines])
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the controller to one `.npz` file."""
+        block = self.block()
+        header = {
+            "kind": self.kind,
+            "sample_time": self.sample_time,
+            "limits": self.limits.header(),
+            "order": self.order,
+            "names": list(self.arrays),
+            # None of them is an integer, and files of format 1 do not say so.
+            "parameters": [{k: v for k, v in asdict(_ADAPT).items() if k not in ("integer", "display_unit")}],
+            "lines": list(self.lines),
+            "design": dict(self.design),
+            "inputs": [port.name for port in block.inputs],
+            "outputs": [port.name for port in block.outputs],
+            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+            **self.robot.in_header(),
+        }
+        write_archive(path, header, self.arrays, force=force)
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> VaryingController:
+        """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        return cls(
+            sample_time=float(header["sample_time"]),
+            arrays=AdaptiveArrays.read(arrays),
+            limits=ControllerLimits.from_header(header["limits"], robot_in(header)),
+            order=str(header["order"]),
+            lines=tuple(str(line) for line in header["lines"]),
+            design=dict(header["design"]),
+        )
 
 
 def _pole(plant: AxisPlant) -> float:
