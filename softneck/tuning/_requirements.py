@@ -1,4 +1,4 @@
-"""What is tuned: requirements, those of `verify` and of loops that only tuning looks at, plants, and whose controller."""
+"""What is tuned: requirements, of `verify` and of loops that only tuning looks at, plants, and whose controller."""
 
 from __future__ import annotations
 
