@@ -112,7 +112,7 @@ def command(
 def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bool, as_json: bool) -> None:
     """Write a loop as an SSP archive."""
     from softneck.cosim import load_loop, load_ssp, write_ssp
-    from softneck.loop._system import System
+    from softneck.loop._loop import System
 
     if file.suffix.lower() not in (".toml", ".ssp"):
         raise SettingsError(f"{file}: an SSP file is made of a loop file (.toml) or of another archive (.ssp).")

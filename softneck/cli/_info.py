@@ -293,7 +293,7 @@ def _certificate(file: Path) -> dict[str, Any]:
 def _ssp(file: Path) -> dict[str, Any]:
     """Return the parts of an SSP archive; what `simulate` cannot run is refused with its words."""
     from softneck.cosim import load_ssp
-    from softneck.loop._system import System
+    from softneck.loop._loop import System
 
     read = load_ssp(file)
     if isinstance(read, System):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from softneck.cosim import Result
     from softneck.drives.logs._log_file import LoggedRun
     from softneck.drives.master._master import Pilot
-    from softneck.loop._system import System
+    from softneck.loop._loop import System
 
 
 @click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
@@ -61,7 +61,7 @@ def command(
     from softneck.cosim import load_loop, load_ssp
     from softneck.cosim.loops._loop_file import require_trusted
     from softneck.cosim.loops._simulate import run_setup
-    from softneck.loop._system import System
+    from softneck.loop._loop import System
     from softneck.plots import neck_view, write_page
     from softneck.plots._neck3d import not_drawn
     from softneck.signals import write_recording

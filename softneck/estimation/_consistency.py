@@ -14,7 +14,7 @@ from softneck.core._shown import Shown
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
-from ._likelihood import outliers
+from ._noise import outliers
 from ._nonlinear import NonlinearObserver
 from ._offline import measured_names
 

@@ -15,8 +15,7 @@ from softneck.signals import Recording, concatenate
 from ._consistency import look_ahead_error
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_LAG, KALMAN_LEAD, KALMAN_MORE_LAGS, kalman_lag
-from ._likelihood import cost_of
-from ._noise import NoiseFit, fit_noise
+from ._noise import NoiseFit, cost_of, fit_noise
 from ._nonlinear import NonlinearObserver
 from ._offline import measured_angles
 

@@ -1,4 +1,4 @@
-"""The closed loop: its parts, its reference, what goes wrong in it, and its order."""
+"""The closed loop: its parts, its reference, what goes wrong in it, its order; and parts that need not be a loop."""
 
 from __future__ import annotations
 
@@ -93,6 +93,42 @@ class Loop(Shown):
     def constants(self) -> dict[str, Mapping[str, float]]:
         """Return part -> constants for its inputs."""
         return {**self.other_inputs, "plant": self.plant_inputs}
+
+    def close(self) -> None:
+        """Release what the parts hold, such as loaded FMUs."""
+        for part in self.parts.values():
+            part.close()
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class System(Shown):
+    """Parts and their connections; nothing is connected by name, and no part must be a plant or a controller.
+
+    Attributes:
+        parts: by name.
+        connections: "part.input" -> "part.output", or a `Link` with factor and offset.
+        constants: part -> values of inputs that nobody writes.
+        parameters: part -> other values of its parameters.
+        duration: [s].
+        order: "jacobi" or "sequential", as of a `Loop`.
+    """
+
+    parts: Mapping[str, Part]
+    connections: Mapping[str, str | Link]
+    constants: Mapping[str, Mapping[str, float]]
+    duration: float
+    parameters: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    order: str = "jacobi"
+    robot: Robot = field(default_factory=Robot.preset)
+
+    def __post_init__(self) -> None:
+        require_positive("duration", self.duration, "s")
+        require_one_of("order", self.order, ORDERS)
+
+    @property
+    def faults(self) -> tuple[Fault, ...]:
+        """Return nothing: faults act on the sensor and the motors of a plant."""
+        return ()
 
     def close(self) -> None:
         """Release what the parts hold, such as loaded FMUs."""

@@ -14,11 +14,10 @@ from softneck.core._budget import require_steps
 from softneck.runtime import Port
 
 from ._disturbed_bus import place_faults
-from ._loop import Loop
+from ._loop import Loop, System
 from ._part import Part
 from ._result import LoopResult
 from ._rows import Rows, can_compile, cycle
-from ._system import System
 from ._wiring import BusSignal, Wiring, reference_ports, wire
 
 # Ratio of two sample times that should be whole; 1e-6 allows 0.02 / 0.01 in binary and nothing else.

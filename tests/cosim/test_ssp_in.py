@@ -16,7 +16,7 @@ from softneck.cosim import FmuPart, load_loop, load_ssp, simulate, study, write_
 from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.cosim.structure._flat import Flat, Line, Ports, flatten
 from softneck.cosim.structure._parse import Affine, Binding, Component, Connection, Structure, SystemNode, Value
-from softneck.loop._system import System
+from softneck.loop._loop import System
 from softneck.runtime import Port
 
 from ._foreign import build_foreign

@@ -83,7 +83,7 @@ def test_the_noise_behind_a_recording_is_found() -> None:
 
 def test_the_likelihood_is_that_of_filterpy() -> None:
     """filterpy computes it per update; ours differs by the constant log(2 pi) of two angles."""
-    from softneck.estimation._likelihood import SETTLE, Cost
+    from softneck.estimation._noise import SETTLE, Cost
 
     observer, record = observer_of(), drawn(rows=400)
     kf, expected = observer.filterpy(), 0.0

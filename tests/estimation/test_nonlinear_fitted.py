@@ -12,7 +12,7 @@ from softneck.core import SettingsError
 from softneck.estimation import KalmanSettings, NonlinearObserver, fit_noise
 from softneck.estimation._fitted import fitted_observer, sensor_delay
 from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE
-from softneck.estimation._likelihood import SETTLE, WalkCost
+from softneck.estimation._noise import SETTLE, WalkCost
 from softneck.identification import Play
 from softneck.identification.models._fitting import row_hashes
 from softneck.plant import NeckParameters, VirtualNeck, record

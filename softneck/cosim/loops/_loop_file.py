@@ -14,8 +14,8 @@ from softneck.core._budget import require_steps
 from softneck.core._shown import Shown
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
+from softneck.loop._loop import System
 from softneck.loop._reference_parts import AheadReference
-from softneck.loop._system import System
 from softneck.robot import Robot, find_robot
 
 from ..parts._fmu_part import FmuPart

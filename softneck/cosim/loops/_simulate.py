@@ -15,9 +15,9 @@ from softneck.core._progress import shown_progress
 from softneck.identification.models._validity import farthest, held
 from softneck.loop import Loop as Loop  # the room hands it on
 from softneck.loop import LoopResult, Part, run_loop
+from softneck.loop._loop import System
 from softneck.loop._part import BlockPart
 from softneck.loop._run import StepCallback
-from softneck.loop._system import System
 from softneck.robot import Robot
 
 from ._loop_file import LoopSetup, load_loop, load_ssp, make_loop

@@ -16,8 +16,7 @@ from softneck.core._units import SI_BASES
 from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu, unpacked
 from softneck.fmu.describe._description import with_modelled_drives
 from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
-from softneck.loop._loop import USE_MOTOR_POSITIONS
-from softneck.loop._system import System
+from softneck.loop._loop import USE_MOTOR_POSITIONS, System
 from softneck.loop._wiring import Link, Wiring, wire
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
