@@ -12,7 +12,7 @@ from pathlib import Path
 
 from softneck.core import SettingsError
 from softneck.core._budget import MOST_TOML, settings_text
-from softneck.robot import Robot
+from softneck.robot import Robot, find_robot
 
 from ..shared._console import note
 from ._possible import FILE, backend, lacking, possible, propose_sensor, require_known
@@ -241,7 +241,7 @@ def _controller(asked: Asked) -> Iterator[Step]:
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
-    if not loops_start(Robot.read("robot.toml")):
+    if not loops_start(find_robot(beside=Path("robot.toml"))):
         plants = (linear,)
     kinds = asked.kinds or (_KINDS if family else _KINDS + _UNCERTIFIED)
     # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
