@@ -39,11 +39,24 @@ def test_outputs_are_those_of_the_version_that_wrote_the_file(name: str) -> None
     np.testing.assert_allclose(seen / scale, expected / scale, rtol=1e-12, atol=1e-12)
 
 
+# Keys of headers that went after 0.2.0, or whose numbers stand elsewhere since.
+MOVED = {
+    "mpc": ("disturbances",),
+    "nmpc": ("settings", "position_limit", "slew_limit", "lead_limit", "least_position", "least_cocontraction"),
+}
+
+
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_file_is_saved_as_it_was(path: Path, tmp_path: Path) -> None:
     load(path).save(tmp_path / path.name)
     (header, arrays), (new_header, new_arrays) = read_archive(path), read_archive(tmp_path / path.name)
-    assert new_header == header
+    moved = MOVED.get(path.stem, ())
+    assert {k: v for k, v in new_header.items() if k not in moved} == {
+        k: v for k, v in header.items() if k not in moved
+    }
+    # What moved is read back as it was written.
+    load(tmp_path / path.name).save(tmp_path / "again.npz")
+    assert read_archive(tmp_path / "again.npz")[0] == new_header
     assert list(new_arrays) == list(arrays)
     for name, array in arrays.items():
         assert new_arrays[name].dtype == array.dtype
