@@ -18,4 +18,5 @@ def test_the_intervals_hold_what_they_say(benchmark: BenchmarkFixture, colour: f
     held = benchmark.pedantic(coverage, (range(SEEDS), colour, 2000), rounds=1)
     print({name: f"{100 * part:.1f} %" for name, part in held.items()}, f"of {SEEDS} seeds hold {NECK}")
     assert min(held.values()) >= 0.90
-    assert max(held.values()) <= 0.99
+    # Coloured noise widens them all by the longest correlation, so that some hold more than they say.
+    assert colour or max(held.values()) <= 0.99

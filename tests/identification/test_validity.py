@@ -195,8 +195,7 @@ def test_linear_systems_have_no_validity_and_derivatives_do(line: Model) -> None
 def test_validate_scores_it_on_rows_that_were_not_trained_on(line: Model) -> None:
     steps = recorded(signal("steps"))
     result = validate(line, steps, horizons=(1, "inf"))
-    assert "Brier score" in (text := validation_page([result]))
-    assert "Validity: predicted and observed" in text
+    assert "Brier score" in validation_page([result])
     found = result.as_dict()["validity"]
     assert 0.0 < found["least"] <= found["mean"] <= 1.0
     assert found["brier_base_rate"] == pytest.approx(found["held"] * (1.0 - found["held"]))
