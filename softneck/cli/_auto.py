@@ -33,7 +33,6 @@ def identify_auto(
     output: Path | None,
     *,
     train: float,
-    refit_all: bool,
     seed: int | None,
     tolerance: float | None,
     robot: str | None,
@@ -42,10 +41,8 @@ def identify_auto(
     as_json: bool,
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
-    from softneck.identification import refit
     from softneck.identification._identify import choose_kind, with_fit
     from softneck.identification.models._validity import with_tolerance
-    from softneck.identification.selection._auto import REFITTED
     from softneck.plots import write_page
     from softneck.signals import read_recording
 
@@ -64,9 +61,6 @@ def identify_auto(
     models: list[Model] = []
     for file, taken in saved.items():
         model = _model(taken)
-        if refit_all:
-            with progress(f"identify {taken.chosen.kind} on all rows", quiet=as_json) as report:
-                model = refit(taken, parts, progress=report)
         if tolerance is not None:
             model = with_tolerance(model, tolerance)
         models.append(with_fit(model, taken.chosen.judged))
@@ -82,12 +76,12 @@ def identify_auto(
     if as_json:
         facts = _facts(choice, path)
         kept = {f"{name}_model": str(file) if file in saved else None for name, file in beside.items()}
-        print_json({**facts, **kept, "refit": refit_all})
+        print_json({**facts, **kept})
         _refuse_useless(path, why, judged)
         return
     print_table(_title(parts[0].robot), _HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
-    for remark in [*said, *choice.remarks, *([REFITTED] if refit_all else [])]:
+    for remark in [*said, *choice.remarks]:
         note(remark)
     _refuse_useless(path, why, judged)
 

@@ -48,7 +48,6 @@ _KINDS += "\n  auto     tries them all and takes the best in free run"
 @output_option("model", "MODEL")
 @click.option("--train", default=0.7, show_default=True, help="Part of each run, from its start, to train on.")
 @click.option("--html", type=click.Path(path_type=Path), help="With KIND auto: write a page with the ranking.")
-@click.option("--refit", is_flag=True, help="With KIND auto: train the chosen kind again, on all rows; judged before.")
 @click.option("--seed", type=int, help="Seed of kinds that start at random.")
 @click.option(
     "--from",
@@ -66,7 +65,6 @@ def command(
     output: Path | None,
     train: float,
     html: Path | None,
-    refit: bool,
     seed: int | None,
     old: Path | None,
     tolerance: float | None,
@@ -83,15 +81,15 @@ def command(
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
     if old is not None:
-        if html is not None or refit or tolerance is not None:
-            raise SettingsError("--from takes no --html, --refit and --tolerance: the model stays what it is.")
+        if html is not None or tolerance is not None:
+            raise SettingsError("--from takes no --html and --tolerance: the model stays what it is.")
         adapt(kind, old, recordings, output, settings=settings, robot=robot, force=force, as_json=as_json)
         return
     if kind == "auto":
         if settings:
             raise SettingsError("--set: `auto` takes no settings; name the kind that they are for.")
         identify_auto(
-            recordings, output, train=train, refit_all=refit, seed=seed, tolerance=tolerance, robot=robot, html=html,
+            recordings, output, train=train, seed=seed, tolerance=tolerance, robot=robot, html=html,
             force=force, as_json=as_json,
         )  # fmt: skip
         return
@@ -99,8 +97,6 @@ def command(
         raise SettingsError(
             f"--html goes with KIND auto; for `{kind}` use `softneck validate MODEL --data REC --html`."
         )
-    if refit:
-        raise SettingsError(f"--refit goes with KIND auto; `{kind}` is trained on the part that --train says.")
     entry = find_kind(kind, "model")
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")

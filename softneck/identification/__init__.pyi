@@ -14,7 +14,6 @@ from .networks._network import Network as Network
 from .networks._state_space_network import NeuralStateSpace as NeuralStateSpace
 from .selection._auto import Choice as Choice
 from .selection._auto import choose as choose
-from .selection._auto import refit as refit
 from .set_membership._set_membership import SetMembership as SetMembership
 from .set_membership._set_membership import outside_seen as outside_seen
 from .structured._greybox import GreyBox as GreyBox

@@ -71,7 +71,7 @@ def test_auto_saves_the_best_of_the_other_sort_beside_its_choice(
 ) -> None:
     monkeypatch.setattr(_auto, "ALIKE", 1e-9)  # the better one is taken, however little better
     monkeypatch.setattr(_auto.KindTrial, "fit", property(lambda one: {"play": 90.0, "rls": 80.0}[one.kind]))
-    said = call("identify", "auto", recording, "-o", "best.npz", "--refit", "--json")
+    said = call("identify", "auto", recording, "-o", "best.npz", "--json")
     assert said.code == 0, said.err
     facts = json.loads(said.out)
     assert (facts["chosen"], facts["linear_model"]) == ("play", "best_linear.npz")
@@ -132,14 +132,6 @@ def test_auto_in_python_makes_the_same_model(call: Call, recording: Path) -> Non
     assert all(np.array_equal(arrays[name], arrays_too[name], equal_nan=True) for name in arrays)
     with pytest.raises(SettingsError, match="`auto` has no setting 'na'"):
         softneck.identify("auto", recording, na=1)
-
-
-def test_auto_trains_the_chosen_kind_on_all_rows_and_says_so(call: Call, recording: Path) -> None:
-    said = call("identify", "auto", recording, "--refit", "-o", "all.npz")
-    assert said.code == 0, said.err
-    assert "after the choice" in " ".join(said.err.split())
-    assert load("all.npz").findings["refit"]["hold_out_fit_before"] > 0.0
-    assert "--refit goes with KIND auto" in call("identify", "rls", recording, "--refit").error
 
 
 def test_auto_refuses_settings_and_nothing_held_out(call: Call, recording: Path) -> None:

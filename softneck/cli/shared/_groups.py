@@ -42,6 +42,7 @@ _NOW = {
     "observer --sensor": "--set sensor=NAME",
     "observer --gyro": "--set form=gyro",
     "identify --search": "a loop over `identify KIND --set` and `validate`",
+    "identify --refit": "softneck identify KIND REC --train 1",
     "identify --hold-out": "softneck validate MODEL --data REC",
     "identify --strategy": "a loop over `identify KIND --set` and `validate`",
     "identify --plot": "softneck validate MODEL --data REC -o PAGE.html",

@@ -16,7 +16,6 @@ from softneck.signals import Recording
 from softneck.signals.quality._excitation import poor_excitation
 
 from ..models._arrays import members
-from ..models._fitting import one_recording
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
 from ..set_membership._set_membership import noise_levels
@@ -179,7 +178,6 @@ _SIGMAS = 8.0
 _GUARD_COST = 2.0
 # So many kinds are trained on all rows at most, before the better of them is taken.
 _MOST_TRAINED = 2
-REFITTED = "trained on all rows after the choice; its scores are those of the model before, which had not seen them all"
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -191,14 +189,12 @@ class Choice(Shown):
         chosen: the one to take.
         why: sentences for people.
         remarks: what to be wary of.
-        seed: of kinds that start at random.
     """
 
     ranking: tuple[KindTrial, ...]
     chosen: KindTrial
     why: str
     remarks: tuple[str, ...]
-    seed: int = 0
 
 
 def kinds_to_try() -> tuple[str, ...]:
@@ -253,26 +249,7 @@ def choose(
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
     wary = (*poor_excitation(train), *remarks(ranking, other_excitation))
-    return Choice(ranking, chosen, why(best, alike) + guarded_why(best, chosen), wary, seed)
-
-
-@one_blas_thread
-def refit(choice: Choice, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
-    """Identify the chosen kind again, with what it is made of, from all recordings there are.
-
-    Nothing is left to judge this model by: `findings["refit"]` says so, and holds the fits of the model that was
-    chosen, which had not seen the rows held out.
-
-    Raises:
-        DataError: the chosen kind could not be identified.
-    """
-    chosen, whole = choice.chosen, one_recording(recordings)
-    if chosen.model is None:
-        raise DataError(f"{chosen.kind} was not identified, so that there is nothing to identify again.")
-    model = _anew(chosen.model, whole, choice.seed, progress)
-    said = {"hold_out_fit_before": chosen.hold_out_fit, "remark": REFITTED}
-    progress(1.0, "done")
-    return replace(model, findings={**model.findings, "refit": said})
+    return Choice(ranking, chosen, why(best, alike) + guarded_why(best, chosen), wary)
 
 
 def _wanted(kinds: Sequence[str]) -> list[str]:
@@ -409,7 +386,7 @@ class _Race:
         try:
             if one.model is None:
                 raise DataError(one.failure)
-            model = _anew(one.model, self.train, self.seed)
+            model = _settings(kind, self.seed, {}).fit(self.train)
             judged = self._judged(kind, model)
             error = everything(HOLD_OUT, self.hold_out).fit(model)[1]
         except (SoftneckError, np.linalg.LinAlgError) as error:
@@ -450,10 +427,3 @@ def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:
     if "seed" in settings.__dataclass_fields__:
         values["seed"] = seed
     return settings(**values)
-
-
-def _anew(model: Model, train: Recording, seed: int, progress: Progress = silent) -> Model:
-    """Return the model's kind identified with its usual settings from `train`."""
-    if model.kind == "guarded":
-        return Guarded(of=model.settings["of"], base=model.settings["base"], seed=seed).fit(train, progress=progress)
-    return _settings(model.kind, seed, {}).fit(train)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError, load, silent
-from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose, refit
+from softneck.identification import Choice, Model, Network, OutputError, Play, Rls, SetMembership, choose
 from softneck.identification.models._arrays import members
 from softneck.identification.models._fitting import known_rows, row_hashes
 from softneck.identification.selection import _auto
@@ -17,7 +15,6 @@ from softneck.identification.selection._auto import (
     COLD,
     EXAM,
     HOLD_OUT,
-    REFITTED,
     KindTrial,
     _Race,
     best_others,
@@ -30,7 +27,7 @@ from softneck.identification.uncertainty import _guarded
 from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.signals import Recording, concatenate
 
-from ...data import ROOT, neck_recording, slow_but
+from ...data import ROOT, neck_recording
 
 TRAIN, OTHER = neck_recording(900), neck_recording(500, seed=12)
 
@@ -75,23 +72,6 @@ def test_a_kind_that_fails_is_listed_with_its_reason_and_costs_nothing_else(choi
     assert set(failed) == {"nn"}
     assert "rows are fewer than the network's 951 weights" in failed["nn"].failure
     assert any("Not identified or diverged: nn" in remark for remark in choice.remarks)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "kinds",
-    slow_but([("play",), ("rls", "nlsm")], [("play",)]),
-)
-def test_a_refit_is_the_chosen_kind_on_all_rows_and_keeps_the_scores_of_before(kinds: tuple[str, ...]) -> None:
-    found = choose(TRAIN, OTHER, kinds=kinds, other_excitation=True)
-    last = next(one for one in found.ranking if one.kind == kinds[-1])
-    again = refit(replace(found, chosen=last), [TRAIN, OTHER])
-    assert again.kind == kinds[-1]
-    assert again.training_rows.size == len(TRAIN) + len(OTHER)
-    assert again.findings["refit"] == {"hold_out_fit_before": last.hold_out_fit, "remark": REFITTED}
-    alone = Play().fit([TRAIN, OTHER])
-    if kinds == ("play",):
-        assert all(again.arrays[name].tobytes() == alone.arrays[name].tobytes() for name in alone.arrays)
 
 
 @pytest.mark.slow
@@ -240,8 +220,6 @@ def test_the_guarded_form_of_a_learned_winner_is_taken(race: _Race, monkeypatch:
     assert chosen.scores["largest motions"] == 85.0
     assert set(chosen.scores) == {"largest motions", HOLD_OUT, COLD}
     assert "Its guarded form is taken: 5 models of play that fade to `oe`" in guarded_why(best, chosen)
-    again = refit(Choice((chosen,), chosen, "", ()), [TRAIN, OTHER])
-    assert (asked[1].of, asked[1].base, again.kind) == ("play", "oe", "guarded")
     # A guarded form that costs more than two points on the rows held out is none.
     monkeypatch.setattr(KindTrial, "hold_out_fit", property(lambda one: {"guarded": 90.0, "play": 92.5}[one.kind]))
     assert race.guarded(best, silent) is best
