@@ -178,6 +178,9 @@ def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:
     if unknown:
         meant = did_you_mean(unknown[0], fields)
         raise SettingsError(f"unknown setting `{unknown[0]}`; {meant}this kind has {', '.join(sorted(fields))}.")
+    for field in dataclasses.fields(settings_class):
+        if field.type == "bool" and not isinstance(values.get(field.name, False), bool):
+            raise SettingsError(f"`{field.name}` is true or false; got {values[field.name]!r}.")
     try:
         return settings_class(**values)
     except TypeError as error:

@@ -124,6 +124,7 @@ def test_a_folder_that_cannot_be_written(call: Call, tmp_path: Path, recording: 
         ("na=1.5", "`na` must be a whole number between 1 and 100; got 1.5"),
         ("na=two", "`na` must be a whole number between 1 and 100; got 'two'"),
         ("na=true", "`na` must be a whole number"),
+        ("stable=maybe", "`stable` is true or false; got 'maybe'"),
         ("forgetting=nan", "`forgetting` must be a finite number; got nan"),
         ("delay=-5", "`delay` must be between 0 and 1e+06 [s]; got -5"),
         ("delay=late", "`delay` must be a finite number [s]; got late"),
