@@ -18,10 +18,10 @@ from softneck.design.linear._axis_loop import (
     conditioning_gain,
     delayed_form,
     feedback_response,
+    make_sweep,
 )
 from softneck.design.linear._fopi import FractionalPi
 from softneck.design.linear._pid import PidGains
-from softneck.design.linear._sweep import make_sweep
 from softneck.design.plants._step_and_load import StepAndLoad
 
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, exact, run_bake_off

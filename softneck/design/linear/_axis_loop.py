@@ -3,16 +3,92 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
+from softneck.runtime import load_functions
 
-from ._assembly import AxisController
-from ._margins import LOWEST, Margins, frequencies, nearer_gain
+from ..plants._step_and_load import StepAndLoad, StepAndLoadResult, judge
+from ._assembly import AxisController, ReferenceFilter
+
+if TYPE_CHECKING:
+    import control
+
+# Lowest frequency on which a neck's loop is judged [rad/s]; loops of slower robots are from where their times are.
+LOWEST = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """How far a loop is from instability.
+
+    Attributes:
+        gain: factor on the loop gain until instability; inf where there is none.
+        phase: [rad]; inf where the gain never reaches 1.
+        sensitivity: Ms, the largest `|1/(1 + L)|`.
+        crossover: gain crossover [rad/s]; NaN where there is none.
+        delay: [s] that the loop stands beyond its own.
+    """
+
+    gain: float
+    phase: float
+    sensitivity: float
+    crossover: float
+    delay: float
+
+
+def frequencies(sample_time: float, *, lowest: float = LOWEST) -> Vector:
+    """Return the frequencies [rad/s] on which loops are judged, up to the Nyquist frequency."""
+    # 1 % apart: the peak of |S| of a well-damped loop changes by less than 1e-4 between two of them.
+    highest = math.pi / sample_time
+    return np.geomspace(lowest, highest, math.ceil(math.log(highest / lowest) / 0.01))
+
+
+def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> Margins:
+    """Return the margins of the discrete open loop `loop`, verified to be stable when closed.
+
+    Gain and phase margin are python-control's, from the exact z^-d; Ms is from the frequency response.
+
+    Raises:
+        SettingsError: the closed loop is not stable.
+    """
+    import control
+
+    dt: Any = loop.dt
+    closed: Any = control.feedback(loop, 1)
+    poles = np.asarray(closed.poles())
+    radius = float(np.abs(poles).max(initial=0.0))
+    if radius >= 1.0:
+        raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
+    with warnings.catch_warnings():
+        # It looks at the integrator's own frequency, zero, as well.
+        warnings.filterwarnings("ignore", "(divide by zero|invalid value)", RuntimeWarning)
+        # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
+        warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
+        gain, phase, _, _, crossover, _ = control.stability_margins(loop)
+    response = np.asarray(loop(np.exp(1j * frequencies(dt, lowest=lowest) * dt)))
+    sensitivity = float(np.abs(1.0 / (1.0 + response)).max())
+    angle = math.radians(float(phase))
+    delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
+    return Margins(nearer_gain(float(gain), response[-1]), angle, sensitivity, float(crossover), delay)
+
+
+def nearer_gain(gain: float, last: complex) -> float:
+    """Return the nearer of a gain margin and of that at the Nyquist frequency, which python-control leaves out.
+
+    Args:
+        gain: a factor.
+        last: the open loop at the Nyquist frequency, where it is real.
+    """
+    there = -1.0 / last.real if last.real < 0.0 else math.inf
+    return min(gain, there, key=lambda factor: abs(math.log(max(factor, 1e-300))))
+
 
 # Samples are judged on a coarser grid than margins: 4 % apart, a peak of |S| changes by less than 2e-3 between two.
 _COARSE = 4
@@ -160,3 +236,57 @@ def coarse(plant: AxisPlant) -> Vector:
 def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:
     """Return the indices of the plants around which the loop is not stable."""
     return [i for i, plant in enumerate(plants) if closed_radius(axis, plant, extra_delay) >= 1.0]
+
+
+_RUNTIME = "softneck.design.linear._sweep_runtime"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sweep:
+    """A family of plants made ready for many runs of the bake-off.
+
+    Attributes:
+        plants: (plants, 2, order) numerators and denominators.
+        delays: (plants,) [samples].
+        test: what is asked.
+        nominal: index of the nominal plant.
+    """
+
+    plants: Matrix
+    delays: Vector
+    test: StepAndLoad
+    nominal: int = 0
+
+    def run(self, axis: AxisController, reference: ReferenceFilter | float, L: Matrix) -> StepAndLoadResult:
+        """Return how the axis does; equal to `run_bake_off` with the assembled controller."""
+        test = self.test
+        led = reference if isinstance(reference, ReferenceFilter) else ReferenceFilter(reference)
+        numbers = np.array([
+            test.reference, led.pole(test.sample_time), test.position_limit, test.slew_limit, test.load, test.load_row,
+            led.jump,
+        ])  # fmt: skip
+        angles = np.zeros((self.delays.size, test.rows))
+        functions: Any = load_functions(_RUNTIME)
+        functions.sweep_run(
+            np.ascontiguousarray(axis.A),
+            np.ascontiguousarray(np.hstack([axis.Br, axis.By])),
+            np.ascontiguousarray(axis.C[0]),
+            np.array([axis.Dr, axis.Dy]),
+            np.ascontiguousarray(L[:, 0]),
+            numbers,
+            self.plants,
+            self.delays,
+            angles,
+        )
+        return judge(angles, np.zeros((0, 0)), test, self.nominal)
+
+
+def make_sweep(plants: Sequence[AxisPlant], *, extra_delay: int = 0, test: StepAndLoad | None = None) -> Sweep:
+    """Return `plants`, the nominal one first, ready to be swept with `extra_delay` samples more."""
+    asked = test or StepAndLoad(sample_time=plants[0].sample_time)
+    order = max(plant.order for plant in plants)
+    numbers = np.zeros((len(plants), 2, order))
+    for row, plant in zip(numbers, plants, strict=True):
+        row[0, : plant.order] = plant.numerator
+        row[1, : plant.order] = plant.denominator[1:]
+    return Sweep(numbers, np.array([float(plant.delay + extra_delay) for plant in plants]), asked)

@@ -17,17 +17,22 @@ from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
 from softneck.robot import Robot
 from softneck.robot._search import find_robot
 
-from ..plants._held import USUAL_PERIOD, discrete
 from ..plants._step_and_load import StepAndLoad
-from ..plants._uncertain import UncertainAxis, UncertainPlant, uncertain_plant
+from ..plants._uncertain import USUAL_PERIOD, UncertainAxis, UncertainPlant, discrete, uncertain_plant
 from ._assembly import AxisController, ReferenceFilter, assemble
-from ._axis_loop import axis_margins, conditioning_candidates, sensitivities, unstable_samples
+from ._axis_loop import (
+    Margins,
+    Sweep,
+    axis_margins,
+    conditioning_candidates,
+    make_sweep,
+    sensitivities,
+    unstable_samples,
+)
 from ._controller import LinearController
 from ._loop_settings import LoopSettings, reference_numbers
-from ._margins import Margins
 from ._ports import ControllerLimits
 from ._rise import check_rise, filter_for, leading_filter
-from ._sweep import Sweep, make_sweep
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
 _SLOWEST = 100

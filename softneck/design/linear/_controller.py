@@ -18,7 +18,7 @@ from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.runtime._bundle import sized
 
-from ..plants._held import held_line
+from ..plants._uncertain import held_line
 from ._linear_parts_runtime import LinearArrays
 from ._ports import ControllerLimits, controller_inputs, controller_outputs
 

@@ -13,9 +13,8 @@ from softneck.robot._neck_default import NeckDefault
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._assembly import AxisController, ReferenceFilter, pi_axis
-from ._axis_loop import sensitivities, unstable_samples
+from ._axis_loop import LOWEST, loop_margins, sensitivities, unstable_samples
 from ._axis_settings import AxisDesign, AxisSettings, margins_json
-from ._margins import LOWEST, loop_margins
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 
 TUNINGS = ("nominal", "samples")

@@ -13,9 +13,8 @@ from softneck.core import SettingsError, Vector, require_between
 
 from ..plants._uncertain import UncertainAxis
 from ._assembly import AxisController
-from ._axis_loop import coarse, conditioning_gain
+from ._axis_loop import Sweep, coarse, conditioning_gain
 from ._axis_settings import AxisDesign, AxisSettings
-from ._sweep import Sweep
 
 # While gains are searched the reference is filtered this slowly [s]: only the load is judged.
 _WHILE_SEARCHING = 0.3

@@ -17,7 +17,7 @@ from softneck.estimation import AxisPlant
 
 from ..plants._step_and_load import StepAndLoad
 from ._assembly import AxisController, ReferenceFilter
-from ._sweep import make_sweep
+from ._axis_loop import make_sweep
 
 # A lag of time constant T rises from 10 to 90 % in ln(9) T.
 LAG = math.log(9.0)

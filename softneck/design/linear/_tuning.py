@@ -11,8 +11,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 
-from ._axis_loop import coarse
-from ._margins import LOWEST, frequencies
+from ._axis_loop import LOWEST, coarse, frequencies
 
 if TYPE_CHECKING:
     import control

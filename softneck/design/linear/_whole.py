@@ -13,10 +13,10 @@ from softneck.core import Matrix, SettingsError
 
 from ..plants._coupled_axis import AnyAxes, closed, radius, sensitivity
 from ._assembly import ReferenceFilter, assemble_whole
+from ._axis_loop import LOWEST, frequencies
 from ._axis_settings import AxisSettings, _slowest_filter
 from ._controller import LinearController
 from ._loop_settings import reference_numbers
-from ._margins import LOWEST, frequencies
 from ._rise import rise_time
 
 # Steps are looked at for so many times the slowest time constant, dead time and filter.

@@ -18,7 +18,7 @@ from softneck.runtime import Block, Port, State
 
 from ..linear._controller import assumed_lines, robot_in
 from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
-from ..plants._held import held_line
+from ..plants._uncertain import held_line
 from . import _mpc_state_runtime as rt
 from ._lti import lti
 from ._program import MpcInfo, MpcPart, explain

@@ -20,8 +20,7 @@ from softneck.signals import redefinition_matrix
 from ..linear._ports import LIMITS, ControllerLimits
 from ..plants._coupled import CoupledPlant
 from ..plants._coupled_axis import radius, sensitivity
-from ..plants._held import USUAL_PERIOD, discrete
-from ..plants._uncertain import uncertain_plant
+from ..plants._uncertain import USUAL_PERIOD, discrete, uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
 from ._controller import MpcController
 from ._lti import system

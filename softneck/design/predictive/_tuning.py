@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.estimation import AxisPlant
 
-from ..linear._margins import LOWEST, frequencies
+from ..linear._axis_loop import LOWEST, frequencies
 from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
 from ._arrays import with_filter, with_gains
 from ._lti import system

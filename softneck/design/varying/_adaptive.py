@@ -23,11 +23,11 @@ from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized
 
 from ..linear._assembly import ReferenceFilter, assemble, pi_axis
+from ..linear._axis_loop import LOWEST, frequencies
 from ..linear._axis_settings import slowest
 from ..linear._controller import robot_in
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._loop_settings import LoopSettings
-from ..linear._margins import LOWEST, frequencies
 from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
 from ..linear._rise import filter_for_lag
 from ..plants._uncertain import UncertainPlant, scaled, uncertain_plant
