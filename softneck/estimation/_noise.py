@@ -159,10 +159,8 @@ class Cost:
         self._tables: list[Matrix] = []
         self.outliers = 0
         for run in runs:
-            z = measured_angles(run)
-            spoilt = outliers(z)
-            z[spoilt] = np.nan
-            self.outliers += int(spoilt.sum())
+            z, spoilt = _without_outliers(run)
+            self.outliers += spoilt
             self._tables.append(input_rows(observer, run, z))
         self.rows = sum(self._run(table, observer.noise)[1] for table in self._tables)
 
@@ -177,6 +175,14 @@ class Cost:
         return self._functions.kalman_cost(self._arrays, parameters, state, table, SETTLE)
 
 
+def _without_outliers(run: Recording) -> tuple[Matrix, int]:
+    """Return the measured outputs (time, outputs) with NaN for outliers, and how many there were."""
+    z = measured_angles(run)
+    spoilt = outliers(z)
+    z[spoilt] = np.nan
+    return z, int(spoilt.sum())
+
+
 class WalkCost:
     """The same over a nonlinear model, which runs free: once, and what it misses is judged as a walk."""
 
@@ -186,10 +192,8 @@ class WalkCost:
         self._tables: list[tuple[Matrix, np.ndarray, Vector]] = []
         self.outliers = 0
         for run in runs:
-            z = measured_angles(run)
-            spoilt = outliers(z)
-            z[spoilt] = np.nan
-            self.outliers += int(spoilt.sum())
+            z, spoilt = _without_outliers(run)
+            self.outliers += spoilt
             angles, fastest = observer.free_run(run)
             self._tables.append((z - angles, np.asarray(np.isfinite(z).all(axis=1)), fastest))
         self.rows = sum(int(came[SETTLE:].sum()) for _, came, _ in self._tables)
