@@ -53,7 +53,7 @@ def command(
     """Search kinds and settings for the controller that keeps the requirements on all plants.
 
     Designs are made on the linear MODELs and FAMILYs, the first of which is the nominal plant; loops are closed over
-    plants that step: nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs.
+    simulation models: nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs.
 
     \b
     DIR gets  best.npz               the controller, and observer.npz for it

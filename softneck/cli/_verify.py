@@ -49,7 +49,7 @@ def command(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs, and in loops over plants that step.
+    """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs, and in loops over simulation models.
 
     Those are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are found by
     experiment too. Without any the preset of the requirements is shown, which is a foreign plant and does not decide.

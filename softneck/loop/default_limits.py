@@ -14,7 +14,7 @@ DESIGN_OVERSHOOT_IN_LIMITS_PCT = 4.0
 #: Of one loop, as `demo` and a new project close it: 15 deg, within what the lab's own loop does on the real neck
 #: (overshoot 7.4 to 21.4 %, rise 0.28 to 0.42 s, steady rms 0.19 to 0.34 deg).
 LOOP = {"overshoot_pct": 10.0, "rise_s": 0.8, "settling_s": 1.5, "steady_rms_deg": 0.3}
-#: Of `softneck tune`: loops over plants that step, which are near to the robot. Its rise is `usual_rise`.
+#: Of `softneck tune`: loops over simulation models, which are near to the robot. Its rise is `usual_rise`.
 TUNE = {
     "neck.overshoot_pct": 5.0,
     "neck.steady_rms_deg": 0.15,

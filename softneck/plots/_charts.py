@@ -238,7 +238,7 @@ def _step_limits(
         top = reference[at] + most / 100.0 * (reference[at] - reference[at - 1])
         levels.append(Level(float(shown(top, robot)), f"overshoot at most {most:g} %", RED))
     if (latest := limits.get(f"{name}.settling_s")) is not None:
-        levels.append(Level(float(time[at]) + latest, f"settled after {latest:g} s", RED, vertical=True))
+        levels.append(Level(float(time[at]) + latest, f"settled after {latest:.3g} s", RED, vertical=True))
     return levels
 
 

@@ -84,7 +84,7 @@ def _verdict(recording: Recording, quality: Quality) -> str:
     count = {severity: sum(one.severity == severity for one in quality.findings) for severity in ("warning", "note")}
     runs = len(recording.runs())
     words = {
-        "warning": f"To be mended before a model is identified from it ({count['warning']} warnings below)",
+        "warning": f"Fix this before you identify a model from it ({count['warning']} warnings below)",
         "note": f"Fit to identify a model, with {count['note']} thing(s) to know",
         "ok": "Fit to identify a model; nothing is wrong with it",
     }

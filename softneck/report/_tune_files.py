@@ -37,7 +37,7 @@ def write_tuned(
         found: what came of it.
         folder: where; what an earlier run left there is replaced, and a certificate that no longer holds removed.
         files: role -> path of what was read, for the certificate.
-        steps: name -> file, or the preset's name, of the plants that step.
+        steps: name -> file, or the preset's name, of the simulation models.
     """
     found.controller.save(folder / BEST, force=True)
     if found.observer is not None:
@@ -96,7 +96,7 @@ def _csv(found: Tuned) -> str:
 
 
 def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> None:
-    """Write a loop file with the best: over the first plant that steps, or over the nominal linear one."""
+    """Write a loop file with the best: over the first simulation model, or over the nominal linear one."""
     task = found.task
     robot = task.robot
     if not steps:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 # More lines than this nobody tells apart; the table has all.
 _DRAWN, _SHOWN = 12, 30
 _STEPS = 6
+_SIGNS = {"min": ">=", "max": "<=", "below": "<"}
 _MOST = 3.0
 
 
@@ -83,11 +84,11 @@ def stands_in_the_way(found: Tuned) -> str:
         # Loops of tuning have noise, smaller steps and a circle, which `verify` has not.
         asked = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
         looped = ", ".join(metric for metric in asked if metric.startswith(("neck.", "track.")))
-        return f"What stands in the way is the budget of {found.evaluations}: not judged by all loops are {looped}."
-    text = f"What stands in the way is {found.binding}"
-    if found.nearest is not None:
-        text += f": at {found.nearest:.3g} all the rest would hold"
-    return f"{text}."
+        return f"The budget of {found.evaluations} ended before all loops were simulated: {looped} are not computed."
+    if found.nearest is None:
+        return f"{found.binding} fails, by the largest factor."
+    sign, limit = next((b.bound, b.limit) for b in found.task.asked.bounds if b.metric == found.binding)
+    return f"Only {found.binding} fails: {found.nearest:.3g}, required {_SIGNS[sign]} {limit:.3g}."
 
 
 def _result(found: Tuned, steps: Chart) -> Section:

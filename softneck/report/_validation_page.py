@@ -56,10 +56,10 @@ def _verdict(results: Sequence[Validation]) -> str:
         best = max(rivals, key=lambda r: min(-np.inf if fit is None else fit for fit in _last(r).values()))
         fits = ", ".join(f"{name} {_text(fit, 1)} %" for name, fit in _last(best).items())
         ahead = list(best.fits)[-1]
-        how = "free run" if ahead == INFINITE else f"{ahead} samples ahead"
+        how = "Simulation fit" if ahead == INFINITE else f"Fit {ahead} samples ahead"
         diverged = [Path(r.model).stem for r in rivals if r.diverged is not None]
         said.append(
-            f"On {Path(data).stem} {Path(best.model).stem} fits {how} {fits}"
+            f"{how} of {Path(best.model).stem} on {Path(data).stem}: {fits}"
             + (f" (best of {len(rivals)} models)" if len(rivals) > 1 else "")
             + (f"; diverged: {', '.join(diverged)}" if diverged else "")
         )

@@ -1,4 +1,4 @@
-"""The loops over plants that step: steps of several sizes and directions, noise, delay, and a circle."""
+"""The loops over simulation models: steps of several sizes and directions, noise, delay, and a circle."""
 
 from __future__ import annotations
 

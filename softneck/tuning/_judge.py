@@ -46,7 +46,7 @@ class Ready:
         frequency: on which they are judged [rad/s].
         weights: of the motors in each axis's input; None for a neck.
         uncertain: what linear designs make of the task's plant, made once.
-        own: plants that step.
+        own: simulation models.
         all: the loops.
         kept: designs by kind and settings.
     """
@@ -202,7 +202,7 @@ def loop_metrics(
 def margin_metrics(
     task: Task, ready: Ready, block: Block, order: str, observer: Block | None = None
 ) -> dict[str, float]:
-    """Return the margins by experiment on the plants that step."""
+    """Return the margins by experiment on the simulation models."""
     loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer, robot=task.robot)
     found = crossing_values(crossings(loops, overall=True)) if loops else {}
     return {name: float(values.min()) for name, (values, _) in found.items() if name.startswith("axes.")}

@@ -75,7 +75,7 @@ def read_tune_requirements(
     Args:
         path: a requirements file, also one for `verify`.
         robot: whose controller is asked for; None: a neck's.
-        stepping: whether there are plants that step; else `neck.*` of the defaults is asked of the linear plants.
+        stepping: whether there are simulation models; else `neck.*` of the defaults is asked of the linear plants.
         rise: the default of a neck's [s]; None: that of the paper's neck.
 
     Raises:
@@ -210,7 +210,7 @@ class Task:
     Attributes:
         digest: of all that follows; workers keep what they have made ready by it.
         linear: by name, models and families.
-        own: by name, plants that step.
+        own: by name, simulation models.
         asked: the requirements.
         robot: whose controller is tuned.
         cocontraction: at which the loops are held [rad, else SI]; None: by the controller's own rule.
@@ -240,7 +240,7 @@ class Task:
 
     @property
     def models(self) -> list[Model]:
-        """Nonlinear models among the plants that step."""
+        """Nonlinear models among the simulation models."""
         return [thing for thing in self.own.values() if isinstance(thing, Model)]
 
     @property

@@ -147,7 +147,7 @@ def _small(name: str, value: float) -> float:
 def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
     """Return time (n,) [s], output and reference (n,) of the first output, in its display unit: the heaviest payload.
 
-    Without a plant that steps, on the nominal linear one.
+    Without a simulation model, on the nominal linear one.
     """
     ready = made_ready(task)
     controller = designed(task, ready, item.kind, item.settings)

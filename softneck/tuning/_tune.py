@@ -72,7 +72,7 @@ class Tuned:
         evaluations: judgements that were asked for.
         dropped: kind -> why it was not searched.
         task: what was tuned.
-        own: plants that step.
+        own: simulation models.
     """
 
     best: Candidate
@@ -114,7 +114,7 @@ def tune(
     The same plants, requirements, kinds, budget and seed give the same result, whatever the number of workers.
 
     Args:
-        plants: families and linear models, of which at least one, the first the nominal plant; and plants that step
+        plants: families and linear models, of which at least one, the first the nominal plant; and simulation models
             (nonlinear models, neck parameters, FMUs, functions that return a part), which loops are closed over: one,
             a list, or name -> one, each itself or its file.
         requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`.

@@ -115,10 +115,10 @@ def gather(
         controller: that is judged.
         necks: sources of linear plants.
         asked: the requirements.
-        observer: of loops over plants that step.
+        observer: of loops over simulation models.
         progress: called now and then.
         families: by name, those whose weight over the data is asked.
-        own: the user's plants that step.
+        own: the user's simulation models.
     """
     sources = list(necks)
     seed = int(asked.sampling["seed"])

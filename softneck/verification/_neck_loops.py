@@ -1,4 +1,4 @@
-"""Loops over plants that step: the user's own, or a robot's virtual plant and plausible ones around it."""
+"""Loops over simulation models: the user's own, or a robot's virtual plant and plausible ones around it."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ALONE = (
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class OwnPlant:
-    """A plant that steps.
+    """A simulation model of the robot.
 
     Attributes:
         name: of its file.
@@ -72,7 +72,7 @@ def named_plants(plants: Any, robot: str | Path | Robot | None = None) -> dict[s
     """Return name -> plant of one, several or named plants.
 
     Args:
-        plants: linear models, families, plants that step, or the files of any, FMUs and presets of necks among them.
+        plants: linear models, families, simulation models, or the files of any, FMUs and presets of necks among them.
         robot: whose plants they are; None: what the files say.
 
     Raises:
@@ -154,11 +154,11 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
 
 
 def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Steps) -> dict[str, str]:
-    """Return why nothing is known of the "loop" and of plants that step, "neck"; nothing where all was recorded.
+    """Return why nothing is known of the "loop" and of simulation models, "neck"; nothing where all was recorded.
 
     Args:
         tested: by the names of families, what each says of its recordings.
-        own: plants that step.
+        own: simulation models.
         steps: which show where the loop holds the motors.
     """
     half = steps.motors.shape[2] // 2
@@ -170,7 +170,7 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
         for kg in sorted({value for part in made for value in part["payload_kg"]}):
             if not any(_carries(plant, kg, held) for plant in own):
                 found["neck"] = (
-                    f"not supported by the data: {name} was recorded with {kg:g} kg, and no plant that steps carries "
+                    f"not supported by the data: {name} was recorded with {kg:g} kg, and no simulation model carries "
                     f"that at a co-contraction of {held:.2g} rad; `softneck identify greybox` a recording that does, "
                     "or calibrate a neck to it (`softneck.calibrate` in Python)"
                 )
@@ -409,11 +409,11 @@ def judge_loop(
 def loops_under_test(
     controller: Block, own: Sequence[OwnPlant], asked: Requirements, *, order: str, observer: Block | None, robot: Robot
 ) -> list[LoopUnderTest]:
-    """Return the loops for margins by experiment: each plant that steps, with its lightest and its heaviest payload.
+    """Return the loops for margins by experiment: each simulation model, with its lightest and its heaviest payload.
 
     Args:
         controller, observer: that are judged.
-        own: plants that step.
+        own: simulation models.
         asked: whose payloads count, and how slow and large the robot is.
         order: of the loop.
         robot: whose it is.

@@ -48,7 +48,9 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
     less, kept = dict(require), {}
     for metric, value in reserve.items():
         if not metric.startswith(("neck.", "track.")):
-            raise SettingsError(f"[reserve] is of loops over plants that step, `neck.*` and `track.*`; got `{metric}`.")
+            raise SettingsError(
+                f"[reserve] is of loops over simulation models, `neck.*` and `track.*`; got `{metric}`."
+            )
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
             raise SettingsError(f"the reserve of `{metric}` must be a number from 0 on; got {value!r}.")
         if metric not in require:
@@ -100,7 +102,7 @@ def with_groups(
 ) -> dict[str, Any]:
     """Return a table like a requirements file of one that may be flat: `{"overshoot_pct": 5}`.
 
-    A metric without its group is one of the plants that step if there are any, else of the linear ones, or of the only
+    A metric without its group is one of the simulation models if there are any, else of the linear ones, or of the only
     group that has it; a number is the least that margins may be, and the most that all else may.
     """
     order = ("neck", "step", "track") if stepping else ("step", "track")

@@ -272,9 +272,9 @@ def verify(
 
     Args:
         controller: anything with `block()`, its file, or an object with `step`; with `ss()` linear checks too.
-        plants: linear models, families, plants that step, or the files of any: one, a list, or name -> one.
+        plants: linear models, families, simulation models, or the files of any: one, a list, or name -> one.
         requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`,
-            which is asked of the plants that step if there are any, else of the linear ones.
+            which is asked of the simulation models if there are any, else of the linear ones.
         order: of the loop; the one that the controller was designed for if not given.
         observer: for the loops over the virtual neck; none if not given.
         files: role -> (path, SHA-256) of all that was read for it, for the certificate.
@@ -360,7 +360,7 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
     return Verdict(item, value, item.holds(value), worst)
 
 
-_FOREIGN = "foreign plant: a preset does not decide; give a plant of yours that steps, or ask for it (`[neck] decides`)"
+_FOREIGN = "shown only: a preset does not decide; add a model of your robot, or set `[neck] decides`"
 # What is about the loop's response, which the data may not reach.
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 

@@ -88,7 +88,7 @@ def test_what_does_not_hold_is_said_and_leaves_no_certificate(
     (tmp_path / "wanted.toml").write_text(QUICK % 0.25)
     assert run(call) == 1
     said = capsys.readouterr()
-    assert "What stands in the way is step.rise_s" in said.err
+    assert "step.rise_s fails" in said.err
     assert "requirements: " in said.err
     assert "fails" in said.out
     assert not (folder / "best.certificate.json").exists()
@@ -120,7 +120,7 @@ def test_a_budget_too_small_is_said_and_its_search_goes_on_with_what_it_wrote(
     folder = tmp_path / "out"
     assert run([*looped, "--budget", "1", "--requirements", str(tmp_path / "wanted.toml")]) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "What stands in the way is the budget of 1: not judged by all loops are neck.overshoot_pct, " in said
+    assert "The budget of 1 ended before all loops were simulated: neck.overshoot_pct, " in said
     assert "larger --budget" in said
     assert (folder / "best.npz").exists()
     # `verify`, without noise and circle, would hold.
@@ -147,7 +147,7 @@ def test_no_certificate_where_the_loops_of_tuning_alone_do_not_hold(
     # A circle that closely followed no neck keeps: `verify` does not look at it.
     (tmp_path / "wanted.toml").write_text(QUICK % 1.5 + LOOPED % 0.001)
     assert run([*looped, "--budget", "3", "--requirements", str(tmp_path / "wanted.toml")]) == 1
-    assert "What stands in the way is track.ahead_rms_deg" in capsys.readouterr().err
+    assert "track.ahead_rms_deg fails" in capsys.readouterr().err
     assert not (tmp_path / "out" / "best.certificate.json").exists()
 
 

@@ -72,6 +72,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
             tables=[Table("narrow", ["metric", "value", ""], [["rise_s", "0.62", "holds"], ["b", "2", "fails"]]), wide],
         ),
         Section("More", text=["words"]),
+        Section("The rest", text=["words"]),  # contents are listed for three sections and more
     ]  # fmt: skip
     found = tmp_path_factory.mktemp("pages") / "page.html"
     found.write_text(page("A page of all sorts", sections, verdict="It holds.", holds=True), encoding="utf-8")

@@ -84,7 +84,7 @@ def test_the_verdict_names_the_model_of_the_best_free_run(results: Sequence[Vali
     best = max(results, key=lambda r: min(-np.inf if fit is None else fit for fit in r.fits[INFINITE].values()))
     (said,) = re.findall(r'<p class="verdict ?">(.*?)</p>', html)
     fits = ", ".join(f"{name} {fit:.1f} %" for name, fit in best.fits[INFINITE].items())
-    assert said.startswith(f"On neck {Path(best.model).stem} fits free run {fits} (best of 3 models)")
+    assert said.startswith(f"Simulation fit of {Path(best.model).stem} on neck: {fits} (best of 3 models)")
 
 
 def test_models_of_one_file_name_keep_their_folders_apart(results: Sequence[Validation]) -> None:

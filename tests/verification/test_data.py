@@ -192,7 +192,7 @@ def held_at(common: float) -> Steps:
     ("payload", "at", "loop", "said"),
     [
         ([1.0], [0.0], 0.0, {}),
-        ([0.0], [0.0], 0.0, {"neck": "recorded with 1 kg, and no plant that steps carries that"}),
+        ([0.0], [0.0], 0.0, {"neck": "recorded with 1 kg, and no simulation model carries that"}),
         ([1.0], [0.0], 2.0, {"neck": "at a co-contraction of 2 rad", "loop": "recorded at -0.5 to 0.5 rad"}),
         ([1.0], [2.0], 0.0, {"neck": "at a co-contraction of 0 rad"}),
         (None, [0.0], 2.0, {"loop": "holds its motors at a co-contraction of 2 rad, and with 1 kg"}),
@@ -265,7 +265,7 @@ def test_a_preset_is_a_foreign_plant_that_decides_only_where_it_is_asked() -> No
     asked = {"neck.overshoot_pct": {"max": 0.001}}
     found = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": few}))
     rows = {row["metric"]: row for row in found.contents()["requirements"]}
-    assert (rows["neck.overshoot_pct"]["holds"], "foreign plant" in rows["neck.overshoot_pct"]["note"]) == (None, True)
+    assert (rows["neck.overshoot_pct"]["holds"], "shown only" in rows["neck.overshoot_pct"]["note"]) == (None, True)
     assert rows["neck.overshoot_pct"]["value"] is not None
     assert found.contents()["foreign_plants"] is True
     strict = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": few, "require": asked}))

@@ -181,7 +181,7 @@ def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[s
         )
     if stage == "tune":
         note(_OWN_REQUIREMENTS)
-    note(f"paths are those in {folder}; once that is mended the same command goes on")
+    note(f"paths are those in {folder}; fix this and run the same command again")
     return type(error)(_shortened(f"{stage}: {said}"))
 
 

@@ -337,7 +337,7 @@ def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     assert said.code == 2
     assert said.err.splitlines()[-1].startswith(f"softneck: {stage}: `new` cannot be")
     assert advice in said.err
-    assert "once that is mended the same command goes on" in said.err
+    assert "fix this and run the same command again" in said.err
 
 
 def neck_log(folder: Path) -> None:
