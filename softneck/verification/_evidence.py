@@ -217,7 +217,7 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
             absent[name] = controller.why
     elif observer:
         absent["observer in the linear checks"] = (
-            "margins are of controller and plant alone; the observer is in the loops over the virtual neck"
+            "margins are of controller and plant alone; the observer is in the simulated loops"
         )
     if any(port.name == "payload" for port in controller.block.inputs):
         absent["steps of other payloads"] = UNTOLD

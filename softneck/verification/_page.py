@@ -279,7 +279,7 @@ def _sentence(found: Verification) -> str:
         rest = "".join(f", {number} {words}" for number, words in open_ if number)
         return (
             f"{held} of {count} requirements hold{rest} and none fails, against {plants} and "
-            f"{len(found.evidence.necks)} loops of virtual necks."
+            f"{len(found.evidence.necks)} simulated loops."
         )
     more = f"; {len(failed) - 3} more below" if len(failed) > 3 else ""
     return f"{len(failed)} of {count} requirements fail: {'; '.join(failed[:3])}{more}."

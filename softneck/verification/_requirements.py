@@ -49,7 +49,7 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
     for metric, value in reserve.items():
         if not metric.startswith(("neck.", "track.")):
             raise SettingsError(
-                f"[reserve] is of loops over simulation models, `neck.*` and `track.*`; got `{metric}`."
+                f"[reserve] is for loops over simulation models, `neck.*` and `track.*`; got `{metric}`."
             )
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
             raise SettingsError(f"the reserve of `{metric}` must be a number from 0 on; got {value!r}.")
@@ -398,7 +398,7 @@ def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requir
             raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(names)}.")
     found = []
     for metric, entry in {**defaults, **own}.items():
-        if entry is False:
+        if entry is False or (metric == "neck.slack_s" and metric not in own and robot.directions.kind != "tendons"):
             continue
         if not isinstance(entry, Mapping) or not entry or any(key not in _BOUNDS for key in entry):
             raise SettingsError(

@@ -150,7 +150,7 @@ class Verification(Shown):
         text = f"{count - len(self.failed)} of {count}" if self.failed else f"all {count}"
         text += " requirements hold" + (f", {absent} of them not computed" if absent else "")
         return (
-            f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} loops over the virtual neck, "
+            f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} simulated loops, "
             f"{self.order_words()}; {self.wall_time:.1f} s"
         )
 
