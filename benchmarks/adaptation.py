@@ -47,7 +47,7 @@ def trained(neck: str, kind: str, payload: float = 0.0) -> Model:
     path = OUT / f"{neck}.{kind}.{payload:g}.npz"
     if not path.exists():
         OUT.mkdir(parents=True, exist_ok=True)
-        small = {"nss": {"starts": 2, "iterations": 8}, "nn": {"starts": 1}}.get(kind, {})
+        small = {"nn": {"starts": 1}}.get(kind, {})
         resolve(KINDS[kind].settings)(**small).fit(log(neck, "eq22", payload, 1)).save(path)
     return load(path, role="model")
 

@@ -40,7 +40,7 @@ SHOWN = (*OURS, *NECKS)
 OUT = Path("build/baseline")
 TESTS = ("steps", "sine", "rotation")
 # Kinds of model.
-MODELS = ("rls", "oe", "nlsm", "play", "greybox", "nss", "nn")
+MODELS = ("rls", "oe", "nlsm", "play", "greybox", "nn")
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,8 +41,8 @@ LOGS = {"openloop": 2, "closedloop": 3, "arm": 3, "pneumatic": 2}
 # By cost: cheap ones of all robots first. What is behind the slash is a form, or what it is made of.
 TIERS = (
     ("rls", "oe", "nlsm/paper_eq21", "nlsm/residual", "play"),
-    ("greybox", "nss", "nn"),
-    ("guarded/nn", "guarded/nss"),
+    ("greybox", "nn"),
+    ("guarded/nn",),
 )
 
 

@@ -3,7 +3,7 @@
 `python benchmarks/excite.py [--necks NECK...] [--kinds KIND...] [--seconds S] [--seed N] [--fresh]`
 
 Each neck is recorded for so many seconds of Eq. 22, then again as long: more of Eq. 22, `mixed`, or what four quick
-`nss` ask for after the first. Models of both together run free over steps, sine and rotation, which none of them has
+`nn` ask for after the first. Models of both together run free over steps, sine and rotation, which none of them has
 seen: mean and worst axis [%]. The first alone stands beside. What is computed is kept in `build/excite`.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from benchmarks.baseline import recorded, records_of_tests
-from softneck.identification import INFINITE, Model, NeuralStateSpace, Play, validate
+from softneck.identification import INFINITE, Model, Network, Play, validate
 from softneck.identification.selection._experiment_design import Known, next_experiment
 from softneck.identification.uncertainty._guarded import Guarded, covering, left_out
 from softneck.signals import Excitation, Recording, concatenate, signal
@@ -25,7 +25,7 @@ from tests.foreign_necks.necks import CHOOSING
 
 OUT = Path("build/excite")
 # One start: what is compared are the recordings.
-KINDS = {"play": Play(), "nss": NeuralStateSpace(starts=1)}
+KINDS = {"play": Play(), "nn": Network(starts=1)}
 SECOND = ("none", "eq22", "mixed", "excite")
 
 
@@ -48,7 +48,7 @@ def second(what: str, first: Recording, neck: str, seconds: float, seed: int) ->
 def quickly_known(first: Recording, seed: int) -> Known:
     """Return what four quick models of a recording know, each without another part of it."""
     parts = enumerate(left_out(first, 4))
-    models = [NeuralStateSpace(seed=seed + i, starts=1, iterations=4).fit(a, hold_out=b) for i, (a, b) in parts]
+    models = [Network(seed=seed + i, starts=1, iterations=8, refine=6).fit(a, hold_out=b) for i, (a, b) in parts]
     seen, reach = covering(first.set_points, 200)
     moved = np.sqrt(np.mean(first.set_points.var(axis=0)))
     return Known(

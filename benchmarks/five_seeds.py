@@ -21,7 +21,7 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
 TESTS = ("steps", "sine", "rotation")
-KINDS_SHOWN = ("play", "nss", "nn", "greybox")
+KINDS_SHOWN = ("play", "nn", "greybox")
 
 
 def recordings(data: str, seed: int) -> dict[str, Recording]:

@@ -19,7 +19,6 @@ from softneck.identification import (
     INFINITE,
     GreyBox,
     Network,
-    NeuralStateSpace,
     OutputError,
     Play,
     Rls,
@@ -61,7 +60,7 @@ def necks(seed: int) -> None:
     data, tests = experiments(NeckParameters.paper().sample(np.random.default_rng(seed)))
     kinds: dict[str, Any] = {
         "rls": Rls(), "oe": OutputError(), "nlsm residual": SetMembership(form="residual"),
-        "play": Play(), "nss": NeuralStateSpace(), "greybox": GreyBox(), "nn": Network(),
+        "play": Play(), "greybox": GreyBox(), "nn": Network(),
     }  # fmt: skip
     for name, estimator in kinds.items():
         model = estimator.fit(data)

@@ -116,7 +116,7 @@ def main() -> None:
     """Read the command line, compute what is missing, and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--necks", nargs="+", choices=SHOWN, default=list(SEEN))
-    parser.add_argument("--of", nargs="+", default=["nn", "nss"], help="kinds of the members (nn nss)")
+    parser.add_argument("--of", nargs="+", default=["nn"], help="kinds of the members")
     parser.add_argument("--seeds", type=int, default=2, help="how many (2)")
     parser.add_argument("--kept", action="store_true", help="compute nothing: print what is there")
     parser.add_argument("--fmu", action="store_true", help="compute nothing: print the time of a doStep")

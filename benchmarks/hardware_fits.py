@@ -19,7 +19,7 @@ from softneck.identification import INFINITE, Model, OutputError, SetMembership,
 from softneck.signals import Recording, concatenate, import_log, read_layout
 
 LAYOUTS = Path(__file__).parents[1] / "examples" / "layouts"
-ALL = ("rls", "oe", "oe best", "nlsm", "play", "nss", "nn", "greybox")
+ALL = ("rls", "oe", "oe best", "nlsm", "play", "nn", "greybox")
 _HOLD_OUT = 0.8
 
 

@@ -28,7 +28,7 @@ import softneck
 from softneck.core import KINDS, Vector, load, resolve
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings
-from softneck.identification import INFINITE, GreyBox, Model, Network, NeuralStateSpace, OutputError, Rls, validate
+from softneck.identification import INFINITE, GreyBox, Model, Network, OutputError, Rls, validate
 from softneck.identification.models._arrays import members
 from softneck.identification.models._model import WARM_UP
 from softneck.identification.models._validity import TRUST, grounded, tolerance_of
@@ -229,7 +229,7 @@ def lines_trusted(run: Run, candidates: list[Any]) -> Vector:
 
 def learned_trusted(run: Run, candidates: list[Any]) -> Vector:
     """Return `trusted` of kinds that are learnt from rows alone."""
-    return trusted(run, candidates, ("play", "nn", "nss"))
+    return trusted(run, candidates, ("play", "nn"))
 
 
 def follows(run: Run, candidates: list[Any]) -> Vector:
@@ -245,23 +245,18 @@ _UNKNOWN: dict[str, Any] = {
     "directions": {"kind": "identified"},
 }
 _SHORT = (250, 600)  # rows of records: 5 and 12 s
-# A smaller network with one start of fewer steps for the constants of `nss`, one start for those of `nn`.
-_NSS = NeuralStateSpace(neurons=4, iterations=10)
+# One start of fewer steps for the constants of `nn`.
 _NN = Network(starts=1, iterations=10)
 # Fewer starts and steps stand for those of a whole training.
-SHORT = {"nn": Network(starts=1, iterations=10), "nss": NeuralStateSpace(starts=2)}
+SHORT = {"nn": Network(starts=1, iterations=10)}
 _DEGREES = (0.05, 0.15, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
 QUESTIONS = {
     "rls.forgetting": Question("forgetting", (0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 1.0), Rls(), free_run),
     "rls.nb": Question("nb", (1, 2, 3, 5), Rls(), free_run),
     "oe.nf": Question("nf", (1, 2, 3), OutputError(), free_run),
-    # Networks by `nss`, which trains a little faster than `nn`; minutes a specimen.
-    "guarded.agreement": Question("agreement", (0.05, 0.1, 0.25, 0.5, 1.0), Guarded(of="nss", workers=1), blended),
-    "guarded.unseen": Question("unseen", (0.025, 0.05, 0.1, 0.2, 0.4, 0.8), Guarded(of="nss", workers=1), blended),
+    "guarded.agreement": Question("agreement", (0.05, 0.1, 0.25, 0.5, 1.0), Guarded(of="nn", workers=1), blended),
+    "guarded.unseen": Question("unseen", (0.025, 0.05, 0.1, 0.2, 0.4, 0.8), Guarded(of="nn", workers=1), blended),
     # Constants that only robots other than a neck know.
-    "robot.whole": Question(
-        "value", (0.0, 7.0, 15.0), AnyRobot("networks._nss_problem", "_WHOLE", _NSS, 15.0), free_run_of_any_robot
-    ),
     "robot.rows_each": Question(
         "value", (1, 2, 4, 8, 16), AnyRobot("networks._network", "_ROWS_EACH", _NN, 4), free_run_of_any_robot
     ),

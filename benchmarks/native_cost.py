@@ -25,7 +25,7 @@ import numpy as np
 
 from softneck.core import SettingsError
 from softneck.fmu import build_compiled_fmu
-from softneck.identification import GreyBox, Network, NeuralStateSpace, Play, Rls, SetMembership
+from softneck.identification import GreyBox, Network, Play, Rls, SetMembership
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import Block
 from softneck.signals import signal
@@ -50,7 +50,6 @@ def kinds() -> dict[str, Callable[[], Block]]:
         "nlsm": lambda: SetMembership().fit(training).block(),
         "nlsm residual": lambda: SetMembership(form="residual").fit(training).block(),
         "play": lambda: Play().fit(training).block(),
-        "nss": lambda: NeuralStateSpace(starts=1, iterations=3).fit(training).block(),
         "greybox": lambda: GreyBox(evaluations=3).fit(training).block(),
         "neck paper": neck("paper"),
         "neck lab": neck("lab"),

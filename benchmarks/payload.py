@@ -1,8 +1,8 @@
 """Print what a model of several payloads, and an observer over it, are worth on foreign necks.
 
-`python benchmarks/payload.py [--necks NECK...] [--kind nss]`
+`python benchmarks/payload.py [--necks NECK...] `
 
-`several` is a `greybox` (or `nss` of two starts, in free run alone) of 0, 0.5 and 1 kg, `own` one of the payload that
+`several` is a `greybox` of 0, 0.5 and 1 kg, `own` one of the payload that
 it is judged on, `none` one of 0 kg, each of 100 s of Eq. 22 a payload; judged in free run on the 40 s that follow. The
 observers see a poor sensor (noise of 0.25 deg, 20 % of the samples lost, two blackouts of a second) on three motions at
 0, 0.32, 0.75 and 1 kg: over `none`, over `several`, and over `several` whose payload is told. Nothing is chosen here.
@@ -17,7 +17,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.estimation import KalmanSettings
-from softneck.identification import GreyBox, Model, NeuralStateSpace
+from softneck.identification import GreyBox, Model
 from softneck.signals import Recording, signal
 from tests.foreign_necks.held_out import HELD_OUT
 from tests.foreign_necks.necks import NECKS, ForeignNeck, record
@@ -61,8 +61,9 @@ def error(model: Model, runs: list[Recording]) -> float:
     return float(np.degrees(np.sqrt(np.mean(np.concatenate(missed) ** 2))))
 
 
-def models(neck: str, kind: GreyBox | NeuralStateSpace) -> tuple[Model, Model]:
+def models(neck: str) -> tuple[Model, Model]:
     """Print the free runs; return the models of none and of several payloads."""
+    kind = GreyBox()
     logs = {payload: log(neck, payload) for payload in (*TRAINED, *UNSEEN)}
     none = kind.fit(logs[0.0].rows(0, ROWS))
     several = kind.fit([logs[payload].rows(0, ROWS) for payload in TRAINED])
@@ -79,13 +80,10 @@ def main() -> None:
     """Print the tables of each neck."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--necks", nargs="*", default=["column", "spring", "foam"], choices=NECKS)
-    parser.add_argument("--kind", default="greybox", choices=["greybox", "nss"])
     asked = parser.parse_args()
     for neck in asked.necks:
         print(f"{neck + (' (held out)' if neck in HELD_OUT else ''):34}{'none':>16}{'several':>16}{'own':>16}")
-        none, several = models(neck, GreyBox() if asked.kind == "greybox" else NeuralStateSpace(starts=2))
-        if asked.kind == "nss":
-            continue
+        none, several = models(neck)
         print(f"{'observer, rms error [deg]':34}{'none':>16}{'estimated':>16}{'told':>16}")
         for payload in LOADS:
             runs = [log(neck, payload, motion, 5).rows(0, 2000) for motion in ("rotation", "steps", "eq22")]

@@ -30,7 +30,7 @@ from tests.foreign_necks.necks import CHOOSING
 SHOWN = (*CHOOSING, "paper", "rough")
 OUT = Path("build/predicts")
 # What is judged; `residual` and `ensemble` are made of these, and the baseline has the paper's form of `nlsm`.
-KINDS = ("rls", "oe", "greybox", "play", "nn", "nss")
+KINDS = ("rls", "oe", "greybox", "play", "nn")
 OTHER_FORM = "nlsm"
 
 

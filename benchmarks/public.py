@@ -29,7 +29,6 @@ HOLD_OUT = 0.3
 # A record of fewer rows is short: what its last rows happen to show decides nothing. So many blocks are left out then.
 SHORT, BLOCKS = 5000, 4
 Candidate = tuple[str, dict[str, Any]]
-_NSS = {"widths": (), "order": 3, "neurons": 4, "iterations": 30, "seeds": 5}
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +192,7 @@ def candidates_for(train: Recording) -> tuple[Candidate, ...]:
     Where a record is short a start decides: the median of five (`seeds`) stands for them.
     """
     starts = {"seeds": 5} if len(train) < SHORT else {}
-    return (*(("nss", {**_NSS, "decay": decay}) for decay in (0.1, 1.0)), ("nss", starts), ("nn", {}))
+    return (("nn", starts), ("play", {}), ("nlsm", {"form": "residual"}))
 
 
 def left_out(train: Recording) -> list[tuple[Recording, Recording]]:

@@ -14,7 +14,6 @@ from softneck.identification import (
     GreyBox,
     Model,
     Network,
-    NeuralStateSpace,
     OutputError,
     Play,
     Rls,
@@ -63,7 +62,6 @@ def models() -> dict[str, Model]:
         "nlsm": SetMembership(epsilon=0.01, output_weight=10.0).fit(recording),
         "residual": SetMembership(form="residual").fit(recording),
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
-        "nss": NeuralStateSpace(order=1, neurons=3, starts=1, iterations=4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
         "greybox": GreyBox(evaluations=4, sensor_delay=2).fit(recording),
     }

@@ -58,9 +58,6 @@ KINDS: dict[str, Kind] = {
         Kind("play", "model", "softneck.identification:Play", _MODEL, f"{_IDENT}.structured._play_runtime",
              "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run",
              f"{_IDENT}.structured._play:check_play"),
-        Kind("nss", "model", "softneck.identification:NeuralStateSpace", _MODEL, f"{_IDENT}.networks._nss_runtime",
-             "neural state space over play operators, contracting; trained over its whole free run",
-             f"{_IDENT}.networks._state_space_network:check_nss"),
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
              "equations of a tendon-driven neck, their numbers fitted by the error of its free run",
              f"{_IDENT}.structured._greybox:check_greybox"),
@@ -102,7 +99,7 @@ KINDS: dict[str, Kind] = {
              "linear predictive control: limits, preview and co-contraction in one QP for each sample"),
         Kind("nmpc", "controller", "softneck.design:NmpcSettings", "softneck.design:NmpcController",
              f"{_DESIGN}.predictive._nmpc_runtime",
-             "nonlinear predictive control over nn, play, greybox or nss: one Gauss-Newton step for each sample"),
+             "nonlinear predictive control over nn, play or greybox: one Gauss-Newton step for each sample"),
     )
 }  # fmt: skip
 
@@ -118,6 +115,7 @@ REMOVED: dict[str, str] = {
     "scheduled": "pi",
     "srivc": "oe --set intervals=true",
     "subspace": "rls --set structure=mimo",
+    "nss": "guarded",
     "rls_state": "Recursion in Python",
     "rls_online": "OnlineRls in Python",
     "frf": "softneck.frequency_response in Python",

@@ -11,7 +11,6 @@ from .models._model import load_model as load_model
 from .models._regressors import PAPER_EQ21 as PAPER_EQ21
 from .models._scores import nrmse_fit as nrmse_fit
 from .networks._network import Network as Network
-from .networks._state_space_network import NeuralStateSpace as NeuralStateSpace
 from .selection._auto import Choice as Choice
 from .selection._auto import choose as choose
 from .set_membership._set_membership import SetMembership as SetMembership

@@ -91,7 +91,7 @@ class Calibration(Shown):
             fits = ", ".join(f"{pitch:.1f}/{roll:.1f}" for pitch, roll in self.fits)
             raise CheckFailedError(
                 f"the best neck follows the runs to {fits} % (pitch/roll), less than {LEAST_FIT:g}: not written. Give "
-                "the payloads, more `evaluations`, or verify on a `greybox` or `nss` model instead."
+                "the payloads, more `evaluations`, or verify on a `greybox` model instead."
             )
         with atomic_write(path, force=force) as temporary:
             temporary.write_text(self.toml(), encoding="utf-8")

@@ -27,7 +27,7 @@ _RESIDUALS = (
     "model misses; slow or periodic set-points spread it over many lags, negative ones too. Set-points made by a "
     "controller from the outputs show at negative lags."
 )
-_HEAD = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst", "R2")
+_HEAD = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst")
 # A free run beyond this has diverged [rad], of other outputs than angles beyond so many times what was measured; it is
 # not drawn from there on, for the rest to stay readable.
 _DRAWN, _DRAWN_TIMES = np.pi, 10.0
@@ -77,7 +77,7 @@ def fit_table(results: Sequence[Validation]) -> Table:
         for h in r.fits:
             tables = (r.persistence, r.best_linear, r.fits, r.intervals)
             cells = [_cell(table.get(h, {}), 1) for table in tables]
-            errors = [_cell(r.rmse_deg[h], 2), _cell(r.worst_deg[h], 1), _cell(r.r2[h], 3)]
+            errors = [_cell(r.rmse_deg[h], 2), _cell(r.worst_deg[h], 1)]
             rows.append([_name(r), "free run" if h == INFINITE else h, *cells, *errors])
     return Table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", _HEAD, rows)
 

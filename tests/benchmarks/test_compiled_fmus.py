@@ -27,7 +27,6 @@ from softneck.identification import (
     GreyBox,
     Model,
     Network,
-    NeuralStateSpace,
     Play,
     Rls,
     SetMembership,
@@ -94,15 +93,11 @@ _KINDS = {
     "set membership, 7k x 10": _Kind(make=lambda: _set(7_000), wanted=5.0, outputs=2),
     "set membership, 1M x 10": _Kind(make=lambda: _set(1_000_000), wanted=15.0, outputs=2, python=False),
     # What is fitted hardly matters to a step's time: a few rounds do.
-    "nss": _Kind(make=lambda: NeuralStateSpace(starts=1, iterations=3).fit(_training()).block()),
     "greybox": _Kind(make=lambda: GreyBox(evaluations=3).fit(_training()).block()),
     "guarded (5 nn, greybox)": _Kind(
         make=lambda: _guarded(Network(starts=1, iterations=1, refine=0, prior=0.0).fit(_training())),
         wanted=10.0,
         python=False,
-    ),
-    "guarded (5 nss, greybox)": _Kind(
-        make=lambda: _guarded(NeuralStateSpace(starts=1, iterations=3).fit(_training())), wanted=10.0, python=False
     ),
     # 20 ms at 500 times real time.
     "virtual neck": _Kind(make=lambda: VirtualNeck(NeckParameters.paper()).block(), wanted=40.0),

@@ -56,6 +56,6 @@ def test_a_lead_within_the_spread_of_seeds_wins_nothing(tmp_path: Path, capsys: 
 
 
 def test_forms_of_one_kind_are_no_rivals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    # `guarded/nn` and `guarded/nss` are equal; both lead over `nn`.
-    scores = {"nn": [50.0, 51.0, 52.0], "guarded/nn": [60.0, 61.0, 62.0], "guarded/nss": [60.0, 61.0, 62.0]}
+    # `guarded/nn` and `guarded/play` are equal; both lead over `nn`.
+    scores = {"nn": [50.0, 51.0, 52.0], "guarded/nn": [60.0, 61.0, 62.0], "guarded/play": [60.0, 61.0, 62.0]}
     assert "guarded: best by more than the spread on chain, foam" in printed(scores, tmp_path / "c.jsonl", capsys)

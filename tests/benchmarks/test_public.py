@@ -162,8 +162,8 @@ def test_a_broken_file_is_one_line(
 def test_of_several_seeds_the_median_runs(tmp_path: Path) -> None:
     write("tanks", tmp_path)
     train, tests = OF["tanks"].read(tmp_path)
-    tiny = {"order": 1, "neurons": 1, "widths": (), "starts": 1, "iterations": 1}
-    both = identified("nss", train, {**tiny, "seeds": 2})
+    tiny = {"hidden": (1, 1), "starts": 1, "iterations": 1, "refine": 0}
+    both = identified("nn", train, {**tiny, "seeds": 2})
     (test,) = tests.values()
     free = np.mean([model.simulate(test, warm_up=5)[:, 0] for model in both], axis=0)
     # Of two the median is the mean.

@@ -14,6 +14,7 @@ from scipy.linalg import solve_discrete_are
 from softneck.core import DataError, FileFormatError
 from softneck.design import MpcController, MpcSettings
 from softneck.design.predictive import _mpc_state_runtime as rt
+from softneck.design.predictive._predicted import settings_for
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.loop import BlockPart, Loop, RotationReference, run_loop
 from softneck.loop._reference_parts import AheadReference
@@ -84,7 +85,7 @@ def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureReque
 @pytest.mark.slow
 def test_without_limits_and_blocking_it_is_the_lqr(plain: MpcController) -> None:
     settings = MpcNumbers(bandwidth=8.0, moves=30)
-    problem = settings.problem(bake_off_neck(), 8.0)
+    problem = settings_for(settings, bake_off_neck()).problem(bake_off_neck(), 8.0)
     controller = settings.design(bake_off_neck())
     assert settings.starts == tuple(range(30))
     T, w = problem.T, problem.move_weight

@@ -16,7 +16,7 @@ from softneck.design.predictive._nmpc_prepared import SLACK_WEIGHT, NonlinearPro
 from softneck.design.predictive._nmpc_state_runtime import NmpcArrays, NmpcState
 from softneck.design.predictive._scale import TAUTNESS_LEVER
 from softneck.estimation import LinearNeck
-from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play, Rls
+from softneck.identification import GreyBox, Model, Network, Play, Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.runtime import State, load_functions, load_runtime
 from softneck.signals import Recording, signal
@@ -40,7 +40,6 @@ def models(recording: Recording, network: Model) -> dict[str, Model]:
         "nn": network,
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "greybox": GreyBox(evaluations=3, sensor_delay=2).fit(recording),
-        "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3).fit(recording),
     }
 
 
@@ -129,7 +128,7 @@ def answers(controller: NmpcController, p: NonlinearProblem, a: Asked, z: np.nda
 
 
 # Derivatives by differences and another solver: nothing of what the controller computes with.
-@pytest.mark.parametrize("kind", slow_but(["nn", "play", "nss"], ["nn"], ["nss"]))
+@pytest.mark.parametrize("kind", slow_but(["nn", "play"], ["nn"]))
 @pytest.mark.parametrize("angle_limit", slow_but([None, 0.1], [0.1]))
 def test_each_sample_is_the_quadratic_program_of_differences(
     kind: str, angle_limit: float | None, models: dict[str, Model]
@@ -300,7 +299,7 @@ def test_saved_and_loaded_it_is_the_same(controller: NmpcController, tmp_path: P
 
 
 def test_what_it_cannot_use_is_refused(recording: Recording, controller: NmpcController) -> None:
-    with pytest.raises(SettingsError, match=r"is over nn, play, greybox, nss; got rls"):
+    with pytest.raises(SettingsError, match=r"is over nn, play, greybox; got rls"):
         NmpcSettings().design(Rls().fit(recording))
     with pytest.raises(SettingsError, match="got LinearNeck"):
         NmpcSettings().design(LinearNeck(pitch=None, roll=None))  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.design import NmpcController, NmpcSettings
 from softneck.design.predictive._nmpc import NmpcNumbers
 from softneck.fmu import build_fmu
-from softneck.identification import GreyBox, Model, Network, NeuralStateSpace, Play
+from softneck.identification import GreyBox, Model, Network, Play
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import load_runtime
@@ -135,7 +135,6 @@ def test_what_is_of_necks_is_refused() -> None:
 KINDS: dict[str, Any] = {
     "nn": Network(hidden=(6, 6), iterations=30),
     "play": Play(rate=15.0, widths=(0.2,), degree=1),
-    "nss": NeuralStateSpace(neurons=3, starts=1, iterations=20),
     "greybox": GreyBox(evaluations=20),
 }
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from softneck.drives.master import Phase
 from softneck.drives.master._master import Measurement
+from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.simulated._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_ZERO
 from softneck.drives.supervision._baseline import Baseline
 from softneck.drives.supervision._tilt_charts import TiltModel
@@ -210,6 +211,7 @@ def calm_run(seed: int, payload: float, seconds: float) -> Calm:
 
 
 def tilt_of(bench: Bench) -> np.ndarray:
+    assert isinstance(bench.neck, SimulatedNeck)
     return bench.neck.outputs[:2]
 
 

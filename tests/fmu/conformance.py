@@ -42,7 +42,7 @@ from ._omsimulator import outputs_in_omsimulator
 HERE = Path(__file__).parent
 GOLDEN = HERE.parent / "golden"
 KINDS = (
-    "rls", "rls_mimo", "nlsm", "nlsm_residual", "nn", "nss", "play", "greybox", "guarded", "neck",
+    "rls", "rls_mimo", "nlsm", "nlsm_residual", "nn", "play", "greybox", "guarded", "neck",
     "kalman", "nonlinear", "pi", "fopi", "hinf", "adaptive", "mpc",
 )  # fmt: skip
 BACKENDS = ("python 2.0", "compiled 2.0", "compiled 3.0")

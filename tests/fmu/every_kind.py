@@ -26,7 +26,6 @@ from softneck.identification import (
     GreyBox,
     Model,
     Network,
-    NeuralStateSpace,
     OutputError,
     Play,
     Rls,
@@ -87,15 +86,6 @@ def _residual() -> Block:
 
 def _play() -> Block:
     return Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording()).block()
-
-
-def _nss() -> Block:
-    return NeuralStateSpace(neurons=3, starts=1, iterations=3).fit(recording()).block()
-
-
-def _loaded_nss() -> Block:
-    heavy = recording().with_channels(payload=np.full(len(recording()), 0.5))
-    return NeuralStateSpace(neurons=3, starts=1, iterations=3).fit([recording(), heavy]).block()
 
 
 def _greybox() -> Block:
@@ -205,8 +195,6 @@ KINDS: dict[str, tuple[Callable[[], Block], list[str], list[str], tuple[str, ...
         (*_MODEL, "payload"),
     ),
     "guarded": (_guarded, MOTORS, ["pitch", "roll", "motor_position_1", "validity"], _MODEL),
-    "nss": (_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
-    "nss_loaded": (_loaded_nss, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], (*_MODEL, "payload")),
     "nn": (_nn, MOTORS, ["pitch", "roll", "motor_position_3", "validity"], _MODEL),
     "neck": (
         _neck,

@@ -20,7 +20,6 @@ from softneck.signals import Recording, signal
 ROBOTS = ("arm", "antagonist", "finger", "trunk4")
 # As few numbers, starts and steps as beat a straight line: a minute or two for each robot.
 SETTINGS: dict[str, dict[str, Any]] = {kind: {} for kind in kinds_of("model")} | {
-    "nss": {"neurons": 4, "starts": 1, "iterations": 60},
     "nn": {"hidden": (8, 8), "iterations": 150},
     "greybox": {"evaluations": 40},
 }

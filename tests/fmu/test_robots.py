@@ -25,7 +25,6 @@ from softneck.fmu.describe._description import terminals, with_modelled_drives
 from softneck.identification import (
     GreyBox,
     Model,
-    NeuralStateSpace,
     OutputError,
     Play,
     SetMembership,
@@ -114,7 +113,6 @@ def model(kind: str, chambers: bool) -> Model:
     settings: dict[str, Any] = {
         "oe": OutputError(delay=0.0),
         "play": Play(rate=15.0, widths=(0.2,), degree=1),
-        "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3),
     }
     return settings[kind].fit(recording(chambers))
 
@@ -148,7 +146,7 @@ def test_an_fmu_is_simulated_as_its_model(backend: str, fmi: int, tmp_path: Path
 
 
 @pytest.mark.parametrize(("backend", "fmi"), BACKENDS)
-@pytest.mark.parametrize("kind", ["oe", "play", pytest.param("nss", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", ["oe", "play"])
 def test_pressures_and_lengths_keep_their_names_units_and_ranges(
     kind: str, backend: str, fmi: int, tmp_path: Path
 ) -> None:

@@ -27,7 +27,7 @@ TS = 0.02
 MOTORS = [f"motor_setpoint_{j}" for j in (1, 2, 3)]
 NEXT = ["pitch_next", "roll_next"]
 KINDS = (
-    "rls", "rls_mimo", "oe", "nn", "play", "nss", "greybox", "guarded", "nlsm",
+    "rls", "rls_mimo", "oe", "nn", "play", "greybox", "guarded", "nlsm",
     "nlsm_residual",
 )  # fmt: skip
 # Controllers and observers: their outputs follow the inputs of a sample at once.

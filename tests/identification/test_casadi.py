@@ -14,7 +14,7 @@ from softneck.signals import Recording
 
 from ..data import guarded_of, short_neck
 
-KINDS = ("rls", "mimo", "oe", "oe2", "play", "nss", "nn", "greybox", "guarded")
+KINDS = ("rls", "mimo", "oe", "oe2", "play", "nn", "greybox", "guarded")
 # Sums in another order and another libm's tanh, sine and root: some ulp of numbers of order one. Most kinds are equal
 # to the bit; over 1,000 samples the largest difference of all was 9e-16.
 ROUNDING = 1e-12

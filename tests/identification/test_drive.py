@@ -40,7 +40,7 @@ def test_a_run_shorter_than_the_longest_delay_does_no_harm(rows: int) -> None:
 
 
 # Of the models, all but the grey box, whose drives are part of its own equations.
-DRIVEN = ("rls", "mimo", "oe", "oe2", "nlsm", "residual", "play", "nss", "nn", "guarded")
+DRIVEN = ("rls", "mimo", "oe", "oe2", "nlsm", "residual", "play", "nn", "guarded")
 
 
 @pytest.mark.parametrize("kind", slow_but(DRIVEN, ["rls", "mimo", "nlsm", "nn"]))

@@ -13,7 +13,6 @@ from softneck import identify, load, validate
 from softneck.core import DataError, FileFormatError, Matrix, SettingsError
 from softneck.identification import FamilySettings, choose
 from softneck.identification.models._directions import directions_of
-from softneck.identification.networks._nss_problem import sensor_limits
 from softneck.robot import Robot
 from softneck.signals import Recording
 
@@ -31,7 +30,7 @@ WEIGHTS = np.array([[0.8, -0.6, 0.0, 0.0], [0.0, 0.6, 0.8, 0.0], [0.5, 0.5, 0.5,
 ROBOTS = {name: Robot.preset(name) for name in ("finger", "antagonist", "trunk4")} | {
     "bellows": Robot.from_dict(BELLOWS)
 }
-KINDS_AND_SETTINGS = {
+KINDS_AND_SETTINGS: dict[str, dict[str, Any]] = {
     "rls": {"delay": 0.06},
     "oe": {"delay": 0.06},
 }
@@ -117,7 +116,6 @@ def test_play_takes_any_robot(name: str, tmp_path: Path) -> None:
 # A few weights and steps: enough for a lag.
 NETWORKS: dict[str, dict[str, Any]] = {
     "nn": {"hidden": (3, 3), "iterations": 10, "refine": 12, "starts": 2},
-    "nss": {"order": 1, "neurons": 2, "widths": (), "starts": 1, "iterations": 4},
 }
 
 
@@ -183,25 +181,6 @@ def test_networks_of_the_same_rows_at_another_sample_time_are_the_same(kind: str
     model, other = (identify(kind, one, train=1.0, **{**NETWORKS[kind], "starts": 1}) for one in (fast, slow))
     # The searches take the same steps but for rounding, which training makes grow.
     np.testing.assert_allclose(other.simulate(slow), model.simulate(fast), atol=1e-4)
-
-
-def test_a_map_that_starts_in_motion_finds_its_state_from_what_is_measured() -> None:
-    """As in slow tanks: without the observer the first time constants of a free run would be lost."""
-    fast, slow_rows = recorded(ROBOTS["finger"], noise=1e-5), 400
-    model = identify("nss", fast, train=1.0, **NETWORKS["nss"])
-    tail = fast.rows(slow_rows + 7, len(fast))
-    error = model.simulate(tail, warm_up=5)[5:10, 0] - tail.outputs[5:10, 0]
-    assert np.abs(error).max() < 0.05 * np.ptp(fast.outputs)
-
-
-def test_a_sensor_that_stands_at_its_end_is_seen() -> None:
-    recording = recorded(ROBOTS["finger"])
-    y = recording.outputs[:, 0]
-    top = float(np.quantile(y, 0.9))
-    limits = sensor_limits(recording.with_channels(pitch=np.minimum(y, top)))
-    assert limits.tolist() == [[-np.inf, top]]
-    model = identify("nss", recording.with_channels(pitch=np.minimum(y, top)), train=1.0, **NETWORKS["nss"])
-    assert model.simulate(recording)[30:, 0].max() <= top + 1e-12
 
 
 @pytest.mark.slow

@@ -26,7 +26,6 @@ PLANTS = (
     "nlsm",
     "play",
     "greybox",
-    "nss",
     "nn",
     "guarded",
 )

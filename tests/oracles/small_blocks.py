@@ -68,7 +68,6 @@ def makers(made: dict[str, Any]) -> dict[str, Callable[[], Any]]:
         "nlsm": lambda: ident.SetMembership(epsilon=0.01, output_weight=10.0).fit(fewer),
         "nlsm_residual": lambda: ident.SetMembership(form="residual", epsilon=0.01, output_weight=10.0).fit(fewer),
         "play": lambda: play.fit(few),
-        "nss": lambda: ident.NeuralStateSpace(order=1, neurons=3, starts=1, iterations=4).fit(few),
         "nn": lambda: ident.Network(hidden=(4, 3), iterations=8).fit(few),
         "greybox": lambda: ident.GreyBox(evaluations=4, sensor_delay=2).fit(few),
         "family": lambda: ident.FamilySettings(window=6.0).fit(whole),

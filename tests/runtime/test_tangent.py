@@ -1,6 +1,6 @@
 """Derivatives of a step's text, held against differences of the step itself.
 
-The hand-written derivatives that were here before differed by 7e-17 at most (`nn`, `play`, `nss`, `greybox`).
+The hand-written derivatives that were here before differed by 7e-17 at most (`nn`, `play`, `greybox`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ KINDS = (
     "oe",
     "nn",
     "play",
-    "nss",
     "greybox",
     "guarded",
     "nlsm",
@@ -400,7 +399,7 @@ SN_EXPORT int run(int count, double **data, const int32_t *ranks, const int32_t 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
-@pytest.mark.parametrize("name", ["nn", "greybox", "play", "nss", "oe"])
+@pytest.mark.parametrize("name", ["nn", "greybox", "play", "oe"])
 def test_in_c_it_is_the_same(name: str, tmp_path: Path) -> None:
     block, unit = block_of(name), Unit()
     c_name = unit.tangent(block.runtime, ranks_of(block.runtime))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError
-from softneck.identification import Network, NeuralStateSpace, OutputError, Play
+from softneck.identification import Network, OutputError, Play
 from softneck.signals import Recording, redefinition_matrix, signal
 from softneck.signals.quality._excitation import explained, independent_motions, poor_excitation, stands_still
 
@@ -101,7 +101,7 @@ def test_a_motion_that_hardly_shows_where_it_is_fitted_does_not_hide_that_output
     assert poor_excitation(recording) == ()
 
 
-@pytest.mark.parametrize("settings", [Play(), Network(), NeuralStateSpace()], ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("settings", [Play(), Network()], ids=lambda s: type(s).__name__)
 def test_kinds_that_learn_each_motor_refuse_motors_that_move_as_one(settings: Play) -> None:
     with pytest.raises(DataError, match=r"move along 1 direction\(s\) for 2 outputs.*or take `oe`"):
         settings.fit(one_axis(GOOD))

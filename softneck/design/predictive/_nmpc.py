@@ -49,7 +49,7 @@ from ._tuning import move_weight, require_given, require_solvable, samples_ahead
 _STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
-NONLINEAR_KINDS = ("nn", "play", "greybox", "nss")
+NONLINEAR_KINDS = ("nn", "play", "greybox")
 # Of another robot, stretched by its slowest pole: the horizon behind the dead time, and the window [s], as a neck's 20
 # and 8 samples.
 _HORIZON, _WINDOW = 0.32, 0.16
@@ -64,7 +64,7 @@ _GONE = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NmpcSettings(Shown):
-    """Nonlinear predictive control of all axes over `nn`, `play`, `greybox` or `nss`, in sequential loops.
+    """Nonlinear predictive control of all axes over `nn`, `play` or `greybox`, in sequential loops.
 
     One Gauss-Newton iteration for each sample, from the shifted plan of the sample before (real-time iteration, Diehl
     et al. 2005). The defaults are the neck's; of another robot times are stretched by its slowest pole. Limits of the

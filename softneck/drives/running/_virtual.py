@@ -17,7 +17,6 @@ from ..bus._link import VirtualLink
 from ..master import Frame, Master
 from ..master._gate import Reading
 from ..simulated import SimulatedNeck, SimulatedSettings
-from ..simulated._drives import SimulatedDrives
 from ..simulated._springs import SimulatedSprings, SpringSettings
 
 # A run is over at the latest this long after its loop, whatever happens [s].
@@ -75,7 +74,7 @@ def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
     return SimulatedSprings(springs, _settings(file, **how))
 
 
-def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -> SimulatedDrives:
+def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -> SimulatedNeck | SimulatedSprings:
     """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
 
     Args:

@@ -14,7 +14,7 @@ rows, and `strength` its weight beside the mean of the window's.
 Which numbers of each kind of model an adaptation moves, and what it moves with them.
 
 Of a network those are the weights to and from its states: a change of the neck is a change of its gains, rests and
-rates, while what was learnt of its shape stays. `nss` keeps its contraction, whatever these are.
+rates, while what was learnt of its shape stays.
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ _MOVED = {
     "oe": ("a", "b", "A", "B", "offset"),
     "play": ("weights",),
     "nn": ("w3", "b3"),
-    "nss": ("B", "h", "C", "c"),
     "greybox": ("neck",),
 }
 #: Kinds that can adapt.

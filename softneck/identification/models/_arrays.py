@@ -21,13 +21,8 @@ from ._ports import MOST_PAYLOAD
 
 COMPOSED = ("guarded",)
 _LEAST_MEMBERS = 2  # a base and one other
-# Of `nss` where the state is corrected by what is measured.
-OBSERVED_NSS = "softneck.identification.networks._nss_observed_runtime"
 # Where the recordings had several payloads.
-LOADED = {
-    "greybox": "softneck.identification.structured._loaded_greybox_runtime",
-    "nss": "softneck.identification.networks._loaded_nss_runtime",
-}
+LOADED = {"greybox": "softneck.identification.structured._loaded_greybox_runtime"}
 
 
 # What says where a model knows the robot: older files, models made by hand and members of others have none.
@@ -124,8 +119,6 @@ def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
         return LOADED[kind]
     if "A" not in arrays:
         return runtime
-    if kind == "nss":
-        return OBSERVED_NSS if "gain" in arrays else runtime
     return AFFINE if "offset" in arrays else STATE_SPACE
 
 

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 WARM_UP = 25
 _MOTORS = ("simulated", "measured")
 # Kinds that can be far off beyond their training and have a guarded form.
-_GUARDED = ("nn", "nss")
+_GUARDED = ("nn",)
 # Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
 _SEARCHING = ("nlsm",)
 

@@ -55,7 +55,7 @@ class Trust:
 _EQUATIONS, _LEARNED = Trust(0.7, 1.0, 0.002), Trust(2.0, 0.0, 0.02)
 TRUST = {
     **dict.fromkeys(("rls", "oe", "greybox"), _EQUATIONS),
-    **dict.fromkeys(("play", "nlsm", "nn", "nss"), _LEARNED),
+    **dict.fromkeys(("play", "nlsm", "nn"), _LEARNED),
     "guarded": Trust(1.0, 0.0, 0.02, 1.0),
 }
 

@@ -163,14 +163,14 @@ def remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str
 
 
 # From what can be read to what cannot: of kinds that hold as many numbers the first is taken.
-_SIMPLE_FIRST = ("rls", "oe", "greybox", "play", "nlsm", "nn", "nss")
+_SIMPLE_FIRST = ("rls", "oe", "greybox", "play", "nlsm", "nn")
 # Settings other than the default: that form of set membership which can run free.
 _SETTINGS: dict[str, dict[str, Any]] = {"nlsm": {"form": "residual"}}
 # Cheaper settings of the same method, by which kinds are compared: fewer starts and steps.
 _SCREENED: dict[str, dict[str, Any]] = {
     "greybox": {"evaluations": 15, "sensor_delay": 2},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
-    "nlsm": {"output_weight": 5.0}, "nss": {"starts": 4, "iterations": 4},
+    "nlsm": {"output_weight": 5.0},
 }  # fmt: skip
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0

@@ -35,7 +35,6 @@ from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
 from ..models._validity import grounded
 from ..networks._network import Network
-from ..networks._state_space_network import NeuralStateSpace
 from ..set_membership._set_membership import SetMembership
 from ..structured._play import Play
 
@@ -184,9 +183,9 @@ def base_or_reason(kind: str, recording: Recording) -> Base | str:
         return f"{kind}: {error}"
 
 
-OF = ("nn", "nss", "play", "nlsm")
+OF = ("nn", "play", "nlsm")
 # Those that take long enough for processes of their own to be worth starting.
-_LONG = ("nn", "nss")
+_LONG = ("nn",)
 # Weight decays of `nn`, one after the other over the members, as over the starts of one network.
 _DECAYS = (0.03, 0.1, 0.01)
 # Motor positions that stand for all that were seen.
@@ -202,7 +201,7 @@ class Guarded:
     their outputs are blended by weights of inverse variance that move at a limited rate.
 
     Attributes:
-        of: kind of the members: "nn", "nss", "play" or "nlsm" (in its form `residual`, which can run free).
+        of: kind of the members: "nn", "play" or "nlsm" (in its form `residual`, which can run free).
         members: how many.
         base: kind to fall back to; None takes `greybox` or `oe`, whichever misses less on blocks left out.
         agreement: weight of the squared spread of the members beside the base's squared error.
@@ -210,7 +209,7 @@ class Guarded:
             the motors.
         fade: time in which the weight can go from members to base [s].
         seed: of the first member; the next have the next seeds.
-        workers: processes to train `nn` and `nss` in; None takes all cores, 1 none. It changes no result.
+        workers: processes to train `nn` in; None takes all cores, 1 none. It changes no result.
     """
 
     of: str = "nn"
@@ -300,8 +299,6 @@ def _member(kind: str, seed: int, rest: Recording, part: Recording) -> Model:
         # No prior: where nothing was recorded they are to part.
         settings = Network(seed=seed, starts=1, iterations=20, decay=_DECAYS[seed % len(_DECAYS)], prior=0.0)
         return settings.fit(rest, hold_out=part)
-    if kind == "nss":
-        return NeuralStateSpace(seed=seed, starts=1).fit(rest, hold_out=part)
     return (Play() if kind == "play" else SetMembership(form="residual")).fit(rest)
 
 

@@ -101,7 +101,7 @@ def test_a_jog_replays(tmp_path: Path) -> None:
     with RunLogger(path, wait=True) as log:
         jog(2, Session(file=FILE, link=virtual(), log=log), tendon_angles=PSI, amplitude=0.4)
     logged = read_run_log(path)
-    assert logged.facts["jog"] == {"motor": 2, "amplitude": 0.4}
+    assert logged.facts["jog"] == {"motor": 2, "amplitude": 0.4, "lowest": -0.4, "motors": 3}
     replay(logged, jog_pilot(2, 0.4)).require()
     assert replay(logged, jog_pilot(1, 0.4)).difference is not None
 

@@ -13,7 +13,6 @@ from softneck.identification import (
     GreyBox,
     Model,
     Network,
-    NeuralStateSpace,
     OutputError,
     Play,
     Rls,
@@ -34,7 +33,6 @@ SETTINGS = {
     "play": Play(rate=6.0, widths=(0.3,), degree=2),
     "greybox": GreyBox(sensor_delay=2, evaluations=10),
     "nn": Network(hidden=(6, 6), starts=1, iterations=6, refine=3),
-    "nss": NeuralStateSpace(neurons=3, starts=1, iterations=3),
 }
 
 
@@ -236,7 +234,7 @@ def test_an_adapted_model_knows_its_rows_and_doubts_itself_no_less(old: Trained,
 
 
 def test_a_kind_that_cannot_adapt_says_so(empty: Recording, window: Recording) -> None:
-    with pytest.raises(SettingsError, match="kind `rls` cannot adapt; oe, play, nn, nss, greybox can"):
+    with pytest.raises(SettingsError, match="kind `rls` cannot adapt; oe, play, nn, greybox can"):
         Rls().fit(empty).adapted(window)
 
 

@@ -102,7 +102,7 @@ def test_nothing_to_try_and_nothing_that_works_are_errors() -> None:
 
 
 def test_the_best_of_the_other_sort_ran_free() -> None:
-    fits = {"rls": 80.0, "oe": 85.0, "play": 70.0, "nn": 75.0, "nss": float("-inf")}
+    fits = {"rls": 80.0, "oe": 85.0, "play": 70.0, "nn": 75.0, "nlsm": float("-inf")}
     linear = load(ROOT / "tests" / "golden" / "oe.npz")
     trials = {
         kind: KindTrial(kind, 0.0, left_out={"hold-out": fit}, model=linear if kind in ("rls", "oe") else None)
