@@ -10,6 +10,7 @@ seen: mean and worst axis [%]. The first alone stands beside. What is computed i
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -47,8 +48,9 @@ def second(what: str, first: Recording, neck: str, seconds: float, seed: int) ->
 
 def quickly_known(first: Recording, seed: int) -> Known:
     """Return what four quick models of a recording know, each without another part of it."""
+    quick = partial(Network, starts=1, iterations=8, refine=6, prior=0.0)
     parts = enumerate(left_out(first, 4))
-    models = [Network(seed=seed + i, starts=1, iterations=8, refine=6).fit(a, hold_out=b) for i, (a, b) in parts]
+    models = [quick(seed=seed + i).fit(a, hold_out=b) for i, (a, b) in parts]
     seen, reach = covering(first.set_points, 200)
     moved = np.sqrt(np.mean(first.set_points.var(axis=0)))
     return Known(

@@ -212,7 +212,7 @@ def trusted(run: Run, candidates: list[Any], kinds: tuple[str, ...]) -> Vector:
     tests = [run(signal(name), number) for number, name in enumerate(TESTS, start=2)]
     found = np.zeros(len(candidates))
     for kind in kinds:
-        model = fitted(SHORT.get(kind) or resolve(KINDS[kind].settings)(), run, train)
+        model = fitted(_NN if kind == "nn" else resolve(KINDS[kind].settings)(), run, train)
         for place, trust in enumerate(candidates):
             told = grounded(model, train, trust=trust)
             for test in tests:
@@ -245,22 +245,21 @@ _UNKNOWN: dict[str, Any] = {
     "directions": {"kind": "identified"},
 }
 _SHORT = (250, 600)  # rows of records: 5 and 12 s
-# One start of fewer steps for the constants of `nn`.
-_NN = Network(starts=1, iterations=10)
 # Fewer starts and steps stand for those of a whole training.
-SHORT = {"nn": Network(starts=1, iterations=10)}
+_NN = Network(starts=1, iterations=10)
 _DEGREES = (0.05, 0.15, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0)
 QUESTIONS = {
     "rls.forgetting": Question("forgetting", (0.99, 0.995, 0.998, 0.999, 0.9995, 0.9998, 1.0), Rls(), free_run),
     "rls.nb": Question("nb", (1, 2, 3, 5), Rls(), free_run),
     "oe.nf": Question("nf", (1, 2, 3), OutputError(), free_run),
-    "guarded.agreement": Question("agreement", (0.05, 0.1, 0.25, 0.5, 1.0), Guarded(of="nn", workers=1), blended),
-    "guarded.unseen": Question("unseen", (0.025, 0.05, 0.1, 0.2, 0.4, 0.8), Guarded(of="nn", workers=1), blended),
+    # Minutes a specimen.
+    "guarded.agreement": Question("agreement", (0.05, 0.1, 0.25, 0.5, 1.0), Guarded(workers=1), blended),
+    "guarded.unseen": Question("unseen", (0.025, 0.05, 0.1, 0.2, 0.4, 0.8), Guarded(workers=1), blended),
     # Constants that only robots other than a neck know.
     "robot.rows_each": Question(
         "value", (1, 2, 4, 8, 16), AnyRobot("networks._network", "_ROWS_EACH", _NN, 4), free_run_of_any_robot
     ),
-    "nn.prior": Question("prior", (0.0, 0.03, 0.1, 0.3), SHORT["nn"], free_run),
+    "nn.prior": Question("prior", (0.0, 0.03, 0.1, 0.3), _NN, free_run),
     "validity.lines": Question("growth", (0.0, 0.3, 1.0, 2.0, 4.0), TRUST["oe"], lines_trusted),
     "validity.lines.ratio": Question("ratio", (0.5, 0.7, 1.0, 1.5, 2.0), TRUST["oe"], lines_trusted),
     "validity.learned": Question(

@@ -1,6 +1,6 @@
 """Print what a model of several payloads, and an observer over it, are worth on foreign necks.
 
-`python benchmarks/payload.py [--necks NECK...] `
+`python benchmarks/payload.py [--necks NECK...]`
 
 `several` is a `greybox` of 0, 0.5 and 1 kg, `own` one of the payload that
 it is judged on, `none` one of 0 kg, each of 100 s of Eq. 22 a payload; judged in free run on the 40 s that follow. The
@@ -63,13 +63,12 @@ def error(model: Model, runs: list[Recording]) -> float:
 
 def models(neck: str) -> tuple[Model, Model]:
     """Print the free runs; return the models of none and of several payloads."""
-    kind = GreyBox()
     logs = {payload: log(neck, payload) for payload in (*TRAINED, *UNSEEN)}
-    none = kind.fit(logs[0.0].rows(0, ROWS))
-    several = kind.fit([logs[payload].rows(0, ROWS) for payload in TRAINED])
+    none = GreyBox().fit(logs[0.0].rows(0, ROWS))
+    several = GreyBox().fit([logs[payload].rows(0, ROWS) for payload in TRAINED])
     for payload in sorted(logs):
         run = logs[payload].rows(ROWS, 7000)
-        own = kind.fit(logs[payload].rows(0, ROWS))
+        own = GreyBox().fit(logs[payload].rows(0, ROWS))
         cells = ["/".join(f"{value:.1f}" for value in fit(model, run)) for model in (none, several, own)]
         mark = "unseen" if payload in UNSEEN else ""
         print(f"{neck:18}{payload:5.2f} kg {mark:7}" + "".join(f"{cell:>16}" for cell in cells), flush=True)

@@ -115,7 +115,7 @@ REMOVED: dict[str, str] = {
     "scheduled": "pi",
     "srivc": "oe --set intervals=true",
     "subspace": "rls --set structure=mimo",
-    "nss": "guarded",
+    "nss": "guarded --set of=nn` or `greybox",
     "rls_state": "Recursion in Python",
     "rls_online": "OnlineRls in Python",
     "frf": "softneck.frequency_response in Python",

@@ -17,12 +17,11 @@ from softneck.runtime._bundle import declared, sized
 from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import AFFINE, STATE_SPACE
-from ._ports import MOST_PAYLOAD
 
 COMPOSED = ("guarded",)
 _LEAST_MEMBERS = 2  # a base and one other
-# Where the recordings had several payloads.
-LOADED = {"greybox": "softneck.identification.structured._loaded_greybox_runtime"}
+# Of `greybox` where the recordings had several payloads.
+LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
 
 
 # What says where a model knows the robot: older files, models made by hand and members of others have none.
@@ -115,8 +114,8 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
 def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the module of the runtime: some kinds have several forms, which their arrays tell apart."""
     runtime = KINDS[kind].runtime
-    if kind in LOADED and "payload" in arrays:
-        return LOADED[kind]
+    if kind == "greybox" and "payload" in arrays:
+        return LOADED_GREYBOX
     if "A" not in arrays:
         return runtime
     return AFFINE if "offset" in arrays else STATE_SPACE
@@ -151,12 +150,6 @@ _LONGEST_HISTORY = 60_000
 def memory_array(seconds: float, sample_time: float) -> Vector:
     """Return the array `memory` of a model's file: samples in so many seconds, as far as a file goes."""
     return np.array([float(min(np.ceil(seconds / sample_time), _LONGEST_HISTORY))])
-
-
-def check_payloads(least: float, most: float) -> None:
-    """Raise FileFormatError unless a neck bears the payloads [kg] of a model's recordings."""
-    if not 0.0 <= least <= most <= MOST_PAYLOAD:
-        raise FileFormatError(f"its payloads from {least:g} to {most:g} kg are not between 0 and {MOST_PAYLOAD:g}.")
 
 
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:

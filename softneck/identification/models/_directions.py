@@ -72,17 +72,6 @@ class Directions:
         size = (recording.set_points @ T.T).std(axis=0)
         return _NECK_SIZE * T / np.where(size > 0.0, size, _NECK_SIZE)[:, None]
 
-    @property
-    def independent(self) -> int:
-        """How many outputs move by themselves: so many redefined inputs are directions."""
-        return len(_independent(self.weights))
-
-    def shares(self, T: Matrix) -> Matrix:
-        """Return the weights (outputs, motors) of the redefined inputs `T` (motors, motors) in each direction."""
-        if np.array_equal(T[: len(self.weights)], self.weights):
-            return np.eye(len(self.weights), len(T))
-        return np.linalg.solve(T.T, self.weights.T).T
-
     def findings(self) -> dict[str, object]:
         """Return what a model's findings say of it; nothing of a neck, which needs no finding."""
         return {

@@ -47,8 +47,6 @@ if TYPE_CHECKING:
 #: A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
 _MOTORS = ("simulated", "measured")
-# Kinds that can be far off beyond their training and have a guarded form.
-_GUARDED = ("nn",)
 # Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
 _SEARCHING = ("nlsm",)
 
@@ -315,10 +313,9 @@ class Model(Shown):
         lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
         if not self.arrays.get("ground", np.zeros(0)).size:
             lines.append("no validity in this file: identify it again")
-        if self.kind in _GUARDED:
+        if self.kind == "nn":
             lines.append(
-                f"a guarded form exists (`softneck identify guarded --set of={self.kind}`): it falls back where this "
-                "kind alone can be far off"
+                "a guarded form exists (`softneck identify guarded`): it falls back where this one can be far off"
             )
         lines.append(f"trained on {self.training_rows.size} rows")
         lines += _held_out_lines(self.findings.get("hold_out", {}), self.robot.outputs.names)

@@ -1,5 +1,5 @@
-"""Neural networks: the paper's NLARX network (section 6.2) and neural state spaces.
+"""The paper's NLARX network (section 6.2).
 
 Training by Levenberg-Marquardt with exact derivatives.
-May import `identification.models` and `.linear`, from which a state space starts.
+May import `identification.models` and `.linear`, whose output-error model is the prior.
 """

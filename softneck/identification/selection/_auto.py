@@ -171,7 +171,7 @@ _SCREENED: dict[str, dict[str, Any]] = {
     "greybox": {"evaluations": 15, "sensor_delay": 2},
     "nn": {"starts": 1, "iterations": 8, "refine": 6},
     "nlsm": {"output_weight": 5.0},
-}  # fmt: skip
+}
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _SIGMAS = 8.0
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.

@@ -20,12 +20,12 @@ from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
-from ..models._arrays import check_payloads, memory_array, within
+from ..models._arrays import memory_array, within
 from ..models._directions import Directions, directions_of
 from ..models._drive import drive_start, fit_echo, fit_loaded_drive
 from ..models._fitting import payload_of, row_hashes, training_recording
 from ..models._model import Model
-from ..models._ports import trained_set_points
+from ..models._ports import MOST_PAYLOAD, trained_set_points
 from ..models._state_space import history_array
 from ..models._validity import grounded
 from ._loaded_greybox_runtime import loaded_neck
@@ -416,7 +416,9 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
 
 
 def _check_payload(load: Matrix) -> None:
-    check_payloads(*load[:2])
+    least, most = load[:2]
+    if not 0.0 <= least <= most <= MOST_PAYLOAD:
+        raise FileFormatError(f"its payloads from {least:g} to {most:g} kg are not between 0 and {MOST_PAYLOAD:g}.")
     for number, value in zip(LOADS, load[2:], strict=True):
         if not number.low <= value <= number.high:
             raise FileFormatError(f"its {number.name} of {value:g} {number.unit} is out of range.")

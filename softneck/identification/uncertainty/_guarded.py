@@ -184,8 +184,6 @@ def base_or_reason(kind: str, recording: Recording) -> Base | str:
 
 
 OF = ("nn", "play", "nlsm")
-# Those that take long enough for processes of their own to be worth starting.
-_LONG = ("nn",)
 # Weight decays of `nn`, one after the other over the members, as over the starts of one network.
 _DECAYS = (0.03, 0.1, 0.01)
 # Motor positions that stand for all that were seen.
@@ -250,7 +248,8 @@ class Guarded:
         for number, (rest, part) in enumerate(left_out(recording, self.members)):
             jobs.append(Job(f"member {number + 1}", _member, (self.of, self.seed + number, rest, part)))
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = 1 if self.of not in _LONG else min(self.workers or cores, len(jobs))
+        # The others are trained sooner than processes start.
+        workers = min(self.workers or cores, len(jobs)) if self.of == "nn" else 1
         found = done(jobs, workers, progress)
         model = self.around(_least_missing(found[:wanted]), found[wanted:], recording)
         progress(1.0, "done")
