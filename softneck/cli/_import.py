@@ -33,7 +33,7 @@ def settle(guess: Guess, log: Path, proposal: Path) -> Guess:
     """Return the guess with all doubts answered, the least sure first, and the sample time of a log without a clock.
 
     Raises:
-        DataError: columns were said to be wrong; the line says where to mend them.
+        DataError: columns were said to be wrong; the line says where to fix them.
     """
     for doubt in guess.doubts:
         if doubt.choices:

@@ -200,7 +200,7 @@ def _log(file: Path, html: Path | None, error: DataError | FileFormatError | Non
 
 
 def _is_titled(guess: Guess) -> bool:
-    """Whether a table has the form and the titles of a recording: a fault in it is for its user to mend."""
+    """Whether a table has the form and the titles of a recording: a fault in it is for its user to fix."""
     from softneck.signals import Layout
 
     titled = [line for line in guess.lines if "titled as in a recording" in line]

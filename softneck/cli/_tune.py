@@ -139,11 +139,11 @@ def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:
         blind: whether the kind has no linear form that could be held against the data.
     """
     if blind:
-        return "No setting mends it: name kinds with a linear form in --kinds, such as pi or lqg"
+        return "No setting fixes it: name kinds with a linear form in --kinds, such as pi or lqg"
     if binding is None:
         return "Go on with a larger --budget"
     if unheard:
-        return "Record what is said above, no setting mends it"
+        return "Record what is said above, no setting fixes it"
     if binding.startswith(_MARGINS):
         return (
             "It stands for what the models do not know: allow a slower rise, give a family of more recordings, or go "

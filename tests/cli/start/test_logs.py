@@ -118,7 +118,7 @@ def test_a_log_without_motors_ends_in_a_line_that_says_what_to_record(call: Call
         "softneck: import: log.csv: not found: motor_setpoint_1..3: no column is of a motor; record their "
         "set-points, positions or velocities too."
     )
-    assert "the same command goes on" in said.err
+    assert "run the same command again" in said.err
     assert said.out == ""
 
 

@@ -207,7 +207,7 @@ def test_a_robots_file_that_lacks_something_is_to_be_mended_and_no_log_to_be_rec
         assert said.code == 2
         assert all(f"{table}.{key}" in last for table, key in (("motors", "setpoint_min"), ("sensor", "rate_hz")))
         assert "Record" not in said.err
-        assert "the same command goes on" in said.err
+        assert "run the same command again" in said.err
         assert len(last) <= 160
 
 

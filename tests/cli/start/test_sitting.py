@@ -350,7 +350,7 @@ def neck_log(folder: Path) -> None:
 @pytest.mark.usefixtures("heard")
 @pytest.mark.slow
 def test_ctrl_c_of_a_user_in_steps_at_work(tmp_path: Path) -> None:
-    """Once in the import, in the look at the quality and in the identification: each time the same command goes on."""
+    """In the import, the quality and the identification: each time the same command continues."""
     neck_log(tmp_path)
     words = ["start", "log.csv", "-o", "p", "--yes"]
     script = f"import sys; from softneck.cli._main import run; sys.exit(run({words}))"
