@@ -158,17 +158,17 @@ _BOUNDS = ("min", "max", "below")
 # Number -> least, largest, unit.
 _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
     "uncertainty": {
-        "gain_pct": (0.0, 95.0, "%"), "pole_pct": (0.0, 95.0, "%"), "delay_ms": (0.0, 1000.0, "ms"),
+        "gain_pct": (0.0, 95.0, "%"), "pole_pct": (0.0, 95.0, "%"), "delay_ms": (0.0, 1e9, "ms"),
         "rolloff_db_per_decade": (-1.0, 200.0, "dB"),
     },
     "sampling": {"plants": (1, 100_000, ""), "search_generations": (0, 10_000, ""), "seed": (0, 2**31 - 2, "")},
     "step": {
-        "size_deg": (0.01, 45.0, "deg"), "duration_s": (0.2, 600.0, "s"), "noise_deg": (0.0, 10.0, "deg"),
+        "size_deg": (0.01, 45.0, "deg"), "duration_s": (1e-3, 1e6, "s"), "noise_deg": (0.0, 10.0, "deg"),
         "load_rad": (-6.0, 6.0, "rad"),
     },
     "neck": {
         "necks": (0, 1000, ""), "spread_pct": (0.0, 50.0, "%"), "size_deg": (0.01, 45.0, "deg"),
-        "duration_s": (0.5, 600.0, "s"), "taut_up_to_kg": (0.0, 5.0, "kg"),
+        "duration_s": (1e-3, 1e6, "s"), "taut_up_to_kg": (0.0, 5.0, "kg"),
     },
 }  # fmt: skip
 _WHOLE = ("plants", "search_generations", "seed", "necks")

@@ -22,6 +22,7 @@ from softneck.tuning import tune
 from softneck.tuning._beforehand import refuse_impossible
 from softneck.tuning._cases import loop_of
 from softneck.tuning._judge import made_ready
+from softneck.tuning._requirements import loosened, make_tune_requirements
 from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
 from softneck.verification import read_requirements
@@ -67,6 +68,18 @@ def test_noise_and_delay_of_the_noisy_loops_are_the_robots_own() -> None:
     assert asked.track["noise_deg"] == asked.certificate.step["noise_deg"]
     assert asked.table["track"] == asked.track
     assert stated.track == {**asked.track, "delay_ms": 7.0}
+
+
+def test_a_loosened_settling_time_of_a_slow_robot_is_a_file_that_is_read_again() -> None:
+    slow = replace(plant(BELLOWS), sample_time=2.0)
+    asked = task_of({"model": slow}, {}, 0).asked
+    limit = 1.5 * (asked.limit("neck.settling_s") or 0.0)
+    assert limit > 5.0  # the neck's duration of a step
+    wider = loosened(asked, {"neck.settling_s": limit})
+    table = {key: value for key, value in wider.table.items() if key != "version"}
+    again = make_tune_requirements(table, robot=slow.robot)
+    assert again.limit("neck.settling_s") == pytest.approx(limit, rel=1e-6)  # a file has 9 digits
+    assert again.certificate.neck["duration_s"] == asked.certificate.neck["duration_s"]
 
 
 def test_the_recordings_cocontraction_is_told_to_controllers_in_the_unit_of_the_motors() -> None:

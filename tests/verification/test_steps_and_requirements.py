@@ -112,11 +112,11 @@ def test_a_bound_holds_at_its_limit_except_below() -> None:
     ("table", "key", "low", "high"),
     [
         ("uncertainty", "gain_pct", 0.0, 95.0), ("uncertainty", "pole_pct", 0.0, 95.0),
-        ("uncertainty", "delay_ms", 0.0, 1000.0), ("sampling", "plants", 1, 100_000),
+        ("uncertainty", "delay_ms", 0.0, 1e9), ("sampling", "plants", 1, 100_000),
         ("sampling", "search_generations", 0, 10_000), ("sampling", "seed", 0, 2**31 - 2),
-        ("step", "size_deg", 0.01, 45.0), ("step", "duration_s", 0.2, 600.0), ("step", "noise_deg", 0.0, 10.0),
+        ("step", "size_deg", 0.01, 45.0), ("step", "duration_s", 1e-3, 1e6), ("step", "noise_deg", 0.0, 10.0),
         ("step", "load_rad", -6.0, 6.0), ("neck", "necks", 0, 1000), ("neck", "spread_pct", 0.0, 50.0),
-        ("neck", "size_deg", 0.01, 45.0), ("neck", "duration_s", 0.5, 600.0),
+        ("neck", "size_deg", 0.01, 45.0), ("neck", "duration_s", 1e-3, 1e6),
     ],
 )  # fmt: skip
 def test_numbers_of_the_tables_have_their_ranges(table: str, key: str, low: float, high: float) -> None:
