@@ -8,6 +8,7 @@ import json
 import os
 import pty
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -91,6 +92,9 @@ def test_in_a_real_terminal(tmp_path: Path, answer: bytes | None, code: int, lef
                 asked = True
                 if answer is None:
                     child.send_signal(signal.SIGINT)
+                    # One that comes before the command reads is noted, and the read waits: a person presses it again.
+                    while not select.select([ours], [], [], 1.0)[0]:
+                        child.send_signal(signal.SIGINT)
                 else:
                     os.write(ours, answer)
     os.close(ours)

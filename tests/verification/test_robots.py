@@ -125,7 +125,7 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays(tmp_path: P
     verdicts = {item.requirement.metric: item for item in found.verdicts}
     assert verdicts["step.load_rms_mm"].value is not None
     assert verdicts["step.settling_s"].holds, "bellows cannot be stepped from 0 bar, but around 1.5 bar"
-    assert "necks = 0" in verdicts["neck.slack_s"].note
+    assert "necks = 0" in verdicts["neck.settling_s"].note
     assert set(found.contents()["settings"]["step"]) == {"size_mm", "duration_s", "noise_mm", "load_bar"}
     # The files of the worst plants are steps around 50 mm and 1.5 bar, and show the numbers of the verdicts.
     controller.save(tmp_path / "pi.npz")
