@@ -26,6 +26,8 @@ class Motors:
         setpoint_max: (motors,) highest set-points.
         rate_limit: (motors,) largest changes of the set-points [`unit`/s].
         sign: (motors,) -1 where the hardware counts against softneck, whose motors pull where they are positive.
+        nominal: (motors,) a typical set-point, as in FMI, by which motors are scaled; by their range where not given.
+        rest: (motors,) set-points at rest; learned from data where not given.
     """
 
     names: tuple[str, ...]
@@ -34,16 +36,19 @@ class Motors:
     setpoint_max: tuple[float, ...] | None = None
     rate_limit: tuple[float, ...] | None = None
     sign: tuple[float, ...] = ()
+    nominal: tuple[float, ...] | None = None
+    rest: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         _check_names("motors", self.names, MOST_MOTORS)
         _unit("motors.unit", self.unit)
         if not self.sign:
             object.__setattr__(self, "sign", (1.0,) * len(self.names))
-        _one_each("motors", self.names, self.setpoint_min, self.setpoint_max, self.rate_limit, self.sign)
+        _one_each("motors", self.names, self.setpoint_min, self.setpoint_max, self.rate_limit, self.sign,
+                  self.nominal, self.rest)  # fmt: skip
+        _positive("motors.nominal", self.nominal, self.unit)
         check_range("motors", "setpoint_min", "setpoint_max", self.setpoint_min, self.setpoint_max)
-        if self.rate_limit is not None and min(self.rate_limit) <= 0.0:
-            raise SettingsError(f"`motors.rate_limit` must be positive [{self.unit}/s]; got {min(self.rate_limit):g}.")
+        _positive("motors.rate_limit", self.rate_limit, f"{self.unit}/s")
         if not set(self.sign) <= {1.0, -1.0}:
             raise SettingsError(f"`motors.sign` must be 1 or -1; got {_first_not(self.sign, (1.0, -1.0)):g}.")
 
@@ -58,6 +63,8 @@ class Outputs:
         display_unit: in which files, reports and plots show them, such as "deg".
         min: (outputs,) lowest values.
         max: (outputs,) highest values.
+        nominal: (outputs,) a typical value, as in FMI, by which outputs are scaled; by their range where not given.
+        rest: (outputs,) values at rest; learned from data where not given.
     """
 
     names: tuple[str, ...]
@@ -65,6 +72,8 @@ class Outputs:
     display_unit: str = ""
     min: tuple[float, ...] | None = None
     max: tuple[float, ...] | None = None
+    nominal: tuple[float, ...] | None = None
+    rest: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         _check_names("outputs", self.names, MOST_OUTPUTS)
@@ -76,7 +85,8 @@ class Outputs:
             object.__setattr__(self, "display_unit", self.unit)
         if _unit("outputs.display_unit", self.display_unit) != quantity:
             raise SettingsError(f"`outputs.display_unit` cannot be {self.display_unit} where `unit` is {self.unit}.")
-        _one_each("outputs", self.names, self.min, self.max)
+        _one_each("outputs", self.names, self.min, self.max, self.nominal, self.rest)
+        _positive("outputs.nominal", self.nominal, self.unit)
         check_range("outputs", "min", "max", self.min, self.max)
 
 
@@ -114,6 +124,11 @@ def _one_each(table: str, names: Sequence[str], *values: Sequence[float] | None)
             raise SettingsError(
                 f"`{table}` gives {len(value)} values for its {len(names)} names; give one for all or one for each."
             )
+
+
+def _positive(key: str, values: Sequence[float] | None, unit: str) -> None:
+    if values is not None and min(values) <= 0.0:
+        raise SettingsError(f"`{key}` must be positive [{unit}]; got {min(values):g}.")
 
 
 def _first_not(values: Sequence[float], allowed: Sequence[float]) -> float:

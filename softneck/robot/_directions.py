@@ -21,11 +21,13 @@ class Directions:
         kind: "tendons" (from where they stand around the axis), "matrix" (as given), "identified" (learned from data).
         angles_deg: (motors,) where the tendons stand [deg]; 0 bends the first output, 90 the second.
         matrix: (outputs, motors) weights.
+        names: of the redefined inputs, one for each output and one for co-contraction; `{output}_input` if not given.
     """
 
     kind: str
     angles_deg: tuple[float, ...] = ()
     matrix: tuple[tuple[float, ...], ...] = ()
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         require_one_of("directions.kind", self.kind, KINDS)
@@ -51,6 +53,13 @@ class Directions:
 
     def check(self, motors: int, outputs: int) -> None:
         """Raise SettingsError unless the directions are those of so many motors, and span so many outputs."""
+        self._check_weights(motors, outputs)
+        if self.names and len(self.names) != outputs + 1:
+            raise SettingsError(
+                f"`directions.names` must name {outputs} redefined input(s) and co-contraction; got {len(self.names)}."
+            )
+
+    def _check_weights(self, motors: int, outputs: int) -> None:
         if self.kind == "identified":
             return
         if self.kind == "tendons":

@@ -22,11 +22,12 @@ PRESETS = ("neck", "arm", "antagonist", "finger", "trunk4")
 #: Table -> its keys and what they hold; "" is the top of the file. A number of "each" stands for all channels, or one
 # for each of them.
 KEYS: dict[str, dict[str, str]] = {
-    "": {"name": "text", "extends": "text", "sample_time_s": "number"},
+    "": {"name": "text", "extends": "text", "sample_time_s": "number", "time_constant_s": "number"},
     "motors": {"names": "texts", "unit": "text", "setpoint_min": "each", "setpoint_max": "each", "rate_limit": "each",
-               "sign": "each"},
-    "outputs": {"names": "texts", "unit": "text", "display_unit": "text", "min": "each", "max": "each"},
-    "directions": {"kind": "text", "angles_deg": "numbers", "matrix": "rows"},
+               "sign": "each", "nominal": "each", "rest": "each"},
+    "outputs": {"names": "texts", "unit": "text", "display_unit": "text", "min": "each", "max": "each",
+                "nominal": "each", "rest": "each"},
+    "directions": {"kind": "text", "angles_deg": "numbers", "matrix": "rows", "names": "texts"},
     "winch": {"radius_m": "number"},
     "sensor": {"noise_std": "number", "delay_s": "number", "rate_hz": "number"},
     "plant": {"neck": "text"},
@@ -35,6 +36,7 @@ KEYS: dict[str, dict[str, str]] = {
 #: Attribute of `Robot` -> its key in the file.
 KEY_OF = {
     "sample_time_s": "sample_time_s",
+    "time_constant_s": "time_constant_s",
     "winch_radius_m": "winch.radius_m",
     "noise_std": "sensor.noise_std",
     "delay_s": "sensor.delay_s",
@@ -52,9 +54,17 @@ _SAID = {
 }
 # What is in a unit goes with it: table -> the keys, also of other tables, that a new `unit` there makes void.
 _IN_UNIT = {
-    "motors": (("motors", "setpoint_min"), ("motors", "setpoint_max"), ("motors", "rate_limit")),
-    "outputs": (("outputs", "display_unit"), ("outputs", "min"), ("outputs", "max"), ("sensor", "noise_std")),
+    "motors": tuple(("motors", key) for key in ("setpoint_min", "setpoint_max", "rate_limit", "nominal", "rest")),
+    "outputs": (
+        *(("outputs", key) for key in ("display_unit", "min", "max", "nominal", "rest")),
+        ("sensor", "noise_std"),
+    ),
 }
+
+
+# What tells how large and how fast a robot moves goes with its directions: another robot's own is not the preset's.
+_OF_DIRECTIONS = (("", "time_constant_s"), *((table, key) for table in ("motors", "outputs")
+                                             for key in ("nominal", "rest")))  # fmt: skip
 
 
 def read_table(path: Path) -> dict[str, Any]:
@@ -179,6 +189,9 @@ def _extended(table: Mapping[str, Any]) -> dict[str, Any]:
         if new.get("unit", base[name]["unit"]) != base[name]["unit"]:
             for where, key in others:
                 base.get(where, {}).pop(key, None)
+    if "directions" in table:
+        for where, key in _OF_DIRECTIONS:
+            (base[where] if where else base).pop(key, None)
     found = {key: value for key, value in {**base, **table}.items() if key != "extends"}
     for name in KEYS:
         # Directions go together: angles of the one and a matrix of the other would be none.

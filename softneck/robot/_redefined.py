@@ -44,6 +44,10 @@ def redefinition_of(weights: Matrix, names: tuple[str, ...]) -> tuple[Matrix, Ma
         back = shared / (shared @ shared)
     else:
         shared, back = np.zeros(motors), np.zeros(motors)
+    if motors == outputs + 1 and np.abs(shared - 1.0).max() < _SHARED:
+        # As the paper writes them, Eq. 9 to 11: exact means, and an inverse without the rounding of a decomposition.
+        T = np.vstack([weights, np.full(motors, 1.0 / motors)])
+        return T, np.linalg.inv(T)
     inverse = np.column_stack([np.linalg.pinv(weights), shared])
     # What rounding leaves of a motor that takes no part.
     inverse[np.abs(inverse) < 1e-14 * np.abs(inverse).max(axis=0, initial=0.0)] = 0.0

@@ -5,19 +5,20 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_positive
+from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.core._shown import Shown
 
 from . import _file
 from ._channels import Motors, Outputs
 from ._directions import Directions
+from ._redefined import redefinition_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -30,6 +31,7 @@ class Robot(Shown):
         outputs: the 1 to 4 measured outputs.
         directions: which motors move which outputs.
         sample_time_s: [s].
+        time_constant_s: [s] in which outputs follow motors, by which seconds are scaled; learned from data where None.
         winch_radius_m: [m], of tendons on winches.
         noise_std: standard deviation of the sensor's noise, in the unit of the outputs.
         delay_s: of the sensor [s].
@@ -54,6 +56,7 @@ class Robot(Shown):
     outputs: Outputs
     directions: Directions
     sample_time_s: float | None = None
+    time_constant_s: float | None = None
     winch_radius_m: float | None = None
     noise_std: float | None = None
     delay_s: float | None = None
@@ -66,12 +69,29 @@ class Robot(Shown):
         if not self.name.strip() or not self.name.isprintable():
             raise SettingsError(f"`name` must be one line of text; got {self.name!r}.")
         self.directions.check(len(self.motors.names), len(self.outputs.names))
-        for key, unit in (("sample_time_s", "s"), ("winch_radius_m", "m"), ("rate_hz", "1/s")):
+        for key, unit in (
+            ("sample_time_s", "s"),
+            ("time_constant_s", "s"),
+            ("winch_radius_m", "m"),
+            ("rate_hz", "1/s"),
+        ):
             if (value := getattr(self, key)) is not None:
                 require_positive(key, value, unit)
         for key in ("noise_std", "delay_s"):
             if (value := getattr(self, key)) is not None and not 0.0 <= value < np.inf:
                 raise SettingsError(f"`sensor.{key}` must not be negative; got {value:g}.")
+        self._complete()
+
+    def _complete(self) -> None:
+        """Take what a file leaves out from the preset `neck` where channels and directions are that preset's."""
+        if self.time_constant_s is None and self.is_neck:
+            neck = Robot.preset("neck")
+            object.__setattr__(self, "time_constant_s", neck.time_constant_s)
+            object.__setattr__(self, "directions", neck.directions)
+            for name in ("motors", "outputs"):
+                part, own = getattr(self, name), getattr(neck, name)
+                given = {key: getattr(own, key) for key in ("nominal", "rest") if getattr(part, key) is None}
+                object.__setattr__(self, name, replace(part, **given))
 
     @classmethod
     def preset(cls, name: str = "neck") -> Robot:
@@ -140,6 +160,35 @@ class Robot(Shown):
         weights = self.directions.weights()
         return None if weights is None else weights[: len(self.outputs.names)]
 
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """The redefined inputs, one for each output: of the neck theta_i and phi_i (Eq. 9, 10)."""
+        return self.directions.names[:-1] or tuple(f"{name}_input" for name in self.outputs.names)
+
+    @property
+    def cocontraction_name(self) -> str:
+        """What moves no output: of the neck delta_i (Eq. 11)."""
+        return self.directions.names[-1] if self.directions.names else "cocontraction"
+
+    @property
+    def tendon_angles(self) -> Vector | None:
+        """(motors,) where the tendons stand [rad]; None for a robot without tendons at known angles."""
+        return np.radians(self.directions.angles_deg) if self.directions.kind == "tendons" else None
+
+    def redefinition(self, weights: Matrix | None = None) -> tuple[Matrix, Matrix]:
+        """Return T (outputs + 1, motors) to redefined inputs and co-contraction, and its inverse (motors, outputs + 1).
+
+        Args:
+            weights: (outputs, motors) where the robot does not give its own.
+
+        Raises:
+            SettingsError: directions that are to be identified, or that do not span the outputs.
+        """
+        own = self.weights() if weights is None else weights
+        if own is None:
+            raise SettingsError(f"the directions of {self.label()} are to be identified; a model of it knows them.")
+        return redefinition_of(own, self.outputs.names)
+
     def in_header(self) -> dict[str, Any]:
         """Return what the header of a model's file says of its robot: nothing where it is the neck as we know it."""
         table = self.as_dict()
@@ -174,7 +223,8 @@ class Robot(Shown):
 def _hash(robot: Robot) -> str:
     table = robot.as_dict()
     outputs = {key: table["outputs"][key] for key in ("names", "unit", "display_unit")}
-    told = [len(robot.motors.names), robot.motors.unit, outputs, table["directions"]]
+    directions = {key: value for key, value in table["directions"].items() if key != "names"}
+    told = [len(robot.motors.names), robot.motors.unit, outputs, directions]
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
 
 
