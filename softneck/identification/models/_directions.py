@@ -55,9 +55,14 @@ class Directions:
     learned: bool
 
     @property
+    def time_constant(self) -> float:
+        """Of the robot as a whole, the geometric mean of its outputs' [s]."""
+        return float(np.exp(np.mean(np.log(self.seconds))))
+
+    @property
     def stretch(self) -> float:
         """By how much the robot is slower than a neck."""
-        return float(np.exp(np.mean(np.log(self.seconds)))) / NECK_SECONDS
+        return self.time_constant / NECK_SECONDS
 
     def inputs(self, recording: Recording) -> Matrix:
         """Return T (motors, motors) of all redefined inputs: the directions first, then what moves none of them.
