@@ -44,6 +44,8 @@ KEY_OF = {
     "neck": "plant.neck",
     "drives": "drives.file",
 }
+#: What is learned from data where a robot does not give it, or is 1.
+OPTIONAL = ("time_constant_s", "nominal", "rest", "sign")
 _SAID = {
     "text": "a text",
     "texts": "a list of texts",

@@ -265,7 +265,7 @@ def _summary(robot: Robot) -> str:
     ]
     values = {key: getattr(robot, name) for name, key in _file.KEY_OF.items()}
     given = [f"{key} = {value}" for key, value in values.items() if value is not None]
-    absent = [key for key, value in values.items() if value is None]
+    absent = [key for key, value in values.items() if value is None and key not in _file.OPTIONAL]
     lines += [f"given: {', '.join(given)}"] if given else []
     lines += [f"not given: {', '.join(absent)}"] if absent else []
     return "\n".join(lines)

@@ -15,7 +15,7 @@ import tomli_w
 from softneck.core import OutputFileError, SettingsError, atomic_write, to_si
 from softneck.core._budget import settings_text
 from softneck.robot import Robot
-from softneck.robot._file import KEYS
+from softneck.robot._file import KEYS, OPTIONAL
 from softneck.signals.recording._recording import Recording
 
 from ..shared._console import note
@@ -62,7 +62,7 @@ _METRIC = re.compile(r"`([\w.]+)`.* cannot be: ")
 def lacking(robot: Robot) -> list[str]:
     """Return what a robot's file does not say and controller and observer ask for: of motors and sensor all."""
     told = robot.as_dict()
-    asked = [(table, key) for table in ("motors", "sensor") for key in KEYS[table] if key != "sign"]  # 1 where not said
+    asked = [(table, key) for table in ("motors", "sensor") for key in KEYS[table] if key not in OPTIONAL]
     return [f"{table}.{key}" for table, key in asked if key not in told.get(table, {})]
 
 
