@@ -233,9 +233,9 @@ def _rows(name: str, rows: int, seed: int) -> tuple[Matrix, Matrix]:
     v = (U - 0.5 * (low + high)) @ W.T
     late = np.vstack([np.repeat(v[:1], plant.delay, axis=0), v])[:rows]
     a = np.exp(-1.0 / plant.time_constant)
-    linear = lfilter([0.0, 1.0 - a], [1.0, -a], late, axis=0)
+    linear = np.asarray(lfilter([0.0, 1.0 - a], [1.0, -a], late, axis=0))
     reach = np.abs(linear).max(axis=0)
-    Y = plant.gain * linear / (1.0 + 0.2 * (linear / reach) ** 2)
+    Y = np.asarray(plant.gain * linear / (1.0 + 0.2 * (linear / reach) ** 2))
     return U, Y + 0.01 * Y.std(axis=0) * rng.standard_normal(Y.shape)
 
 
