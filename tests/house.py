@@ -21,10 +21,10 @@ ODD = ("what", "told", "seen", "asked", "know", "knows", "say", "says", "stand",
        "lies", "nothing", "nobody", "whoever", "of ours", "of yours")  # fmt: skip
 _ODD = re.compile(rf"\b({'|'.join(ODD)})\b", re.IGNORECASE)
 # Participles that do not end in "ed".
-_IRREGULAR = set(
-    "held made seen told kept known said shown given taken drawn grown begun done gone bound built left met risen sent "
-    "spent stood written worn torn lost meant sought bent swept driven broken chosen frozen hidden spoken thought won "
-    "heard led fed laid paid".split()
+_IRREGULAR = re.compile(
+    r"held|made|seen|told|kept|known|said|shown|given|taken|drawn|grown|begun|done|gone|bound|built|left|met|risen|sent|"
+    r"spent|stood|written|worn|torn|lost|meant|sought|bent|swept|driven|broken|chosen|frozen|hidden|spoken|thought|won|"
+    r"heard|led|fed|laid|paid"
 )
 # Words that end in "ed" and are none.
 _NOUNS = {"speed", "seed", "feed", "need", "bed", "red", "shed", "embed", "exceed", "proceed"}
@@ -78,7 +78,7 @@ def participles(path: Path, tree: ast.AST) -> Iterator[str]:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             name = node.name.strip("_")
             ends = name.endswith("ed") and name not in _NOUNS
-            if "_" not in name and (ends or name in _IRREGULAR) and not _is_property(node):
+            if "_" not in name and (ends or _IRREGULAR.fullmatch(name)) and not _is_property(node):
                 yield f"{path}:{node.lineno}: {node.name}"
 
 
