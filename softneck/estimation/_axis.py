@@ -229,8 +229,10 @@ def robot_of(source: Any) -> Robot:
 
 def directions_of(source: Any) -> Matrix:
     """Return the weights (outputs, motors) of the motors in each axis: a family has its own, a model its findings'."""
-    own = getattr(source, "directions", None)
-    return weights_of(source) if own is None else np.asarray(own)
+    own, given = getattr(source, "directions", None), robot_of(source).weights()
+    if own is not None:
+        return np.asarray(own)
+    return weights_of(source) if given is None else given
 
 
 def _stretch(model: HasTransferFunctions, numerator: Vector, denominator: Vector, sample_time: float) -> float:

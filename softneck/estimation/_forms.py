@@ -10,6 +10,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 
 from ._axis import AxisPlant
 from ._kalman_parts_runtime import KalmanArrays
@@ -25,27 +26,18 @@ NOISES: dict[str, tuple[tuple[str, str], ...]] = {
 STATES = {"model": "model and disturbance", "gyro": "angle and gyro bias"}
 
 
+#: Scaled standard deviations: of the first output when nothing is known, as outputs reach some 40 deg (paper, section
+#: 5), and of what a rate may be when nothing tells it, as they move by up to 0.8 deg in 20 ms.
+START, RATE = math.radians(40.0), math.radians(40.0)
+# Of a gyro that was not zeroed, up to some deg/s (MPU-9250 data sheet: 5); of redefined inputs that may be held.
+_BIAS, _HELD_INPUT = math.radians(5.0), 2.0
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reach:
-    """How far and how fast a robot's outputs go, in SI; the defaults are the neck's.
+    """How far a robot's outputs go when nothing is known [SI]; for `varying` and `verification` until they scale."""
 
-    Attributes:
-        start: standard deviation of the first output when nothing is known; the neck reaches some 40 deg (paper,
-            section 5).
-        held: of an output that set-points hold which may stand anywhere; None: what 2 rad do, a third of the neck's
-            range.
-        rate: what the rate may be when nothing tells it [1/s]; the neck moves by up to 0.8 deg in 20 ms.
-        bias: of a gyro that was not zeroed [1/s]; up to some deg/s (MPU-9250 data sheet: 5).
-    """
-
-    start: float = math.radians(40.0)
-    held: float | None = None
-    rate: float = math.radians(40.0)
-    bias: float = math.radians(5.0)
-
-
-_NECK = Reach()
-_START_INPUT = 2.0
+    start: float = START
 
 
 def noise_units(form: str, robot: Robot) -> tuple[tuple[str, str], ...]:
@@ -89,34 +81,41 @@ class FilterMatrices:
         return (*items, sources, constants)
 
 
-def model_form(plants: Sequence[AxisPlant], reach: Reach = _NECK) -> FilterMatrices:
-    """Return model states and an output disturbance that walks, on each axis."""
+def model_form(plants: Sequence[AxisPlant], scaling: Scaling, input_units: Vector) -> FilterMatrices:
+    """Return model states and an output disturbance that walks, on each axis.
+
+    Args:
+        plants: of each output.
+        scaling: of the robot.
+        input_units: (outputs,) of the redefined inputs.
+    """
     from scipy.linalg import solve_discrete_lyapunov
 
     axes: list[tuple[Matrix, ...]] = []
-    for plant in plants:
+    for plant, input_unit, output_unit in zip(plants, input_units.tolist(), scaling.output_unit.tolist(), strict=True):
         A, b, c = plant.observable_form()
         F = _diagonal(A, np.eye(1))
         QM, QW = np.zeros_like(F), np.zeros_like(F)
         QM[0, 0] = QW[-1, -1] = 1.0
-        # The model's spread under a white input, scaled to what set-points of _START_INPUT held for long do.
+        # The model's spread under a white input, scaled to what an input does that is held for long.
         spread = np.asarray(solve_discrete_lyapunov(A, np.outer(b, b)))
-        held = _START_INPUT * plant.static_gain if reach.held is None else reach.held
-        spread *= held**2 / spread[0, 0]
-        P0 = _diagonal(0.5 * (spread + spread.T), reach.start**2 * np.eye(1))
+        spread *= (_HELD_INPUT * input_unit * plant.static_gain) ** 2 / spread[0, 0]
+        P0 = _diagonal(0.5 * (spread + spread.T), (START * output_unit) ** 2 * np.eye(1))
         axes.append((F, np.append(b, 0.0)[:, None], np.append(c, 1.0)[None, :], QM, QW, P0, P0))
     return _all(axes)
 
 
-def gyro_form(sample_time: float, outputs: int = 2, reach: Reach = _NECK) -> FilterMatrices:
+def gyro_form(sample_time: float, scaling: Scaling) -> FilterMatrices:
     """Return angle and gyro bias: the angle rises by what the gyro says minus its bias (Lefferts 1982)."""
-    T = sample_time
-    F = np.array([[1.0, -T], [0.0, 1.0]])
-    P0 = np.diag([reach.start**2, reach.bias**2])
-    # A measurement taken in by force moves the angle; the bias is none the worse for it.
-    forced = np.diag([reach.start**2, 0.0])
-    axis = (F, np.array([[T], [0.0]]), np.array([[1.0, 0.0]]), np.diag([T * T, 0.0]), np.diag([0.0, 1.0]), P0, forced)
-    return _all([axis] * outputs)
+    T, axes = sample_time, []
+    for unit in scaling.output_unit.tolist():
+        F = np.array([[1.0, -T], [0.0, 1.0]])
+        P0 = np.diag([(START * unit) ** 2, (_BIAS * unit / scaling.second) ** 2])
+        # A measurement taken in by force moves the angle; the bias is none the worse for it.
+        forced = np.diag([(START * unit) ** 2, 0.0])
+        Q = np.diag([T * T, 0.0]), np.diag([0.0, 1.0])
+        axes.append((F, np.array([[T], [0.0]]), np.array([[1.0, 0.0]]), *Q, P0, forced))
+    return _all(axes)
 
 
 def _all(axes: Sequence[tuple[Matrix, ...]]) -> FilterMatrices:

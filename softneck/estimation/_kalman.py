@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 _RUNTIME = "softneck.estimation._kalman_runtime"
 _NECK = Robot.preset("neck")
+# Of a level that is as small as others' lowest.
+_LEAST = 1e-3
 # Where the sensor's delay comes from, as the summary says it.
 _SOURCES = {"given": "as given", "sensor": "of the sensor", "robot": "of the robot's file; set-points and angles alone "
             "tell only the sum of drive and sensor delay", "gyro": "behind the gyro's rates",
@@ -121,7 +123,6 @@ class KalmanObserver(Shown):
         """Return the filter as a block of role "observer"."""
         inputs, outputs = observer_ports(self.form, self.robot)
         levels = list(zip(noise_units(self.form, self.robot), self.noise, strict=True))
-        least, most = (1e-9, 1e3) if self.robot.is_neck else (0.0, None)
         return Block(
             kind="kalman",
             role="observer",
@@ -131,8 +132,8 @@ class KalmanObserver(Shown):
             inputs=inputs,
             outputs=outputs,
             parameters=tuple(
-                Port(name=name, unit=unit, start=value, minimum=least, maximum=most if unit != "rad" else math.pi,
-                     description="standard deviation")
+                Port(name=name, unit=unit, start=value, minimum=min(1e-9, _LEAST * value),
+                     maximum={"rad": math.pi, "rad/s": 1e3}.get(unit), description="standard deviation")
                 for (name, unit), value in levels
             ),
         )  # fmt: skip
@@ -261,20 +262,21 @@ def delay_source(header: Mapping[str, Any]) -> str:
 
 def observer_ports(form: str, robot: Robot = _NECK) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
     """Return the inputs and outputs of a filter of one form."""
-    names, unit, motor = robot.outputs.names, to_si(robot.outputs.unit)[1], to_si(robot.motors.unit)[1]
-    most = 6.0 if robot.is_neck else None
-    # What people see of a neck's angles is usual.
-    shown, told = ("", "") if robot.is_neck else (robot.outputs.display_unit, robot.motors.unit)
+    names, unit, shown = robot.outputs.names, to_si(robot.outputs.unit)[1], robot.outputs.display_unit
+    factor, motor = to_si(robot.motors.unit)
+    # In SI the usual unit is shown.
+    told = "" if robot.motors.unit == motor else robot.motors.unit
+    ends = [[None] * len(robot.set_points) if given is None else [factor * value for value in given]
+            for given in (robot.motors.setpoint_min, robot.motors.setpoint_max)]  # fmt: skip
     u = tuple(
-        Port(name=name, unit=motor, minimum=None if most is None else -most, maximum=most, display_unit=told)
-        for name in robot.set_points
+        Port(name=name, unit=motor, minimum=low, maximum=high, display_unit=told)
+        for name, low, high in zip(robot.set_points, *ends, strict=True)
     )
     y = tuple(
         Port(name=f"{a}_measured", unit=unit, description=f"measured {a}", missing=True, display_unit=shown)
         for a in names
     )
-    what = "angles" if robot.is_neck else "outputs"
-    valid = Port(name="measurement_valid", description=f"whether the {what} were measured", start=1.0, boolean=True)
+    valid = Port(name="measurement_valid", description="whether the outputs were measured", start=1.0, boolean=True)
     rates = tuple(
         Port(name=f"{a}_rate_measured", unit=f"{unit}/s", description=f"{a} rate of the gyro", missing=True)
         for a in names

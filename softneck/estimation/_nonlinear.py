@@ -16,11 +16,11 @@ from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
 from softneck.core._shown import Shown
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
-from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._linear_systems import KINDS as LINEAR
 from softneck.identification.models._model import nested, nested_model
 from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
+from softneck.robot._scaling import TIME_CONSTANT
 from softneck.runtime import Block, Port, State
 from softneck.signals import Recording
 
@@ -32,19 +32,18 @@ from ._nonlinear_parts_runtime import NonlinearArrays
 from ._nonlinear_runtime import NonlinearState
 from ._offline import Estimates, check_recording, measured_angles
 from ._payload_runtime import PayloadArrays, PayloadState
+from ._scaling import slowest_seconds
 
 _RUNTIME = "softneck.estimation._nonlinear_runtime"
 # Over a model that takes the payload as a parameter.
 _PAYLOAD_RUNTIME = "softneck.estimation._payload_runtime"
 FORM = "nonlinear"
-# Samples of a neck until its model stands, and what 20 ms leave of the fastest motion: half of it after 0.27 s, as long
-# as a neck is on its way. Of another robot both are stretched by its time constant.
-_SETTLE, _KEEP, _NECK_SAMPLE = 300, 0.95, 0.02
+# In scaled seconds: until a model stands, and what `_PERIOD` leaves of the fastest motion: half of it after 0.27, as
+# long as outputs are on their way.
+_SETTLED, _KEEP, _PERIOD = 6.0, 0.95, 0.02
 # A number that files and C know, beyond any set-point.
 _UNLIMITED = 1e12
-
-
-# How far the payload walks in a second, of a robot's time, as a part of the range that the model knows.
+# How far the payload walks in a scaled second, as a part of the range that the model knows.
 _PAYLOAD_WALK = 0.1
 _PAYLOAD = Port(name="payload", unit="kg", description="estimated, within what the model's recordings had")
 _MEANINGS = ("standard deviation", "standard deviation", "of the model's fastest motion of late")
@@ -149,13 +148,18 @@ class NonlinearObserver(Shown):
         )
 
     def _own_arrays(self, plant: Block) -> tuple[Matrix, ...]:
-        stretch = max(self.model.findings.get("time_constants_s", [NECK_SECONDS])) / NECK_SECONDS
-        setup = model_setup(self.robot, plant, self.sample_time, stretch, self.start, self.slew)
+        robot, motors, period = self.robot, len(self.robot.motors.names), self.sample_time
+        scaled = period / (slowest_seconds(self.model) / TIME_CONSTANT)
+        setup = np.array([
+            motors, len(robot.outputs.names), len(plant.outputs),
+            max(1, round(_SETTLED / scaled)), self.start, _KEEP ** (scaled / _PERIOD),
+            *(period * most for most in self.slew or (_UNLIMITED,) * motors),
+        ])  # fmt: skip
         arrays = (setup, self.constants, plant.initial_state(use_measurement=0.0).parameters)
         if self.payloads is None:
             return arrays
         least, most = self.payloads
-        walk = _PAYLOAD_WALK * (most - least) * math.sqrt(self.sample_time / stretch)
+        walk = _PAYLOAD_WALK * (most - least) * math.sqrt(scaled)
         return (*arrays, np.array([least, most, walk]))
 
     def initial_state(self, **parameters: float) -> State:
@@ -297,19 +301,6 @@ def _slew(header: Mapping[str, Any]) -> tuple[float, ...] | None:
     """Return how fast set-points move the model; of files of earlier versions as fast as they come."""
     found = header.get("slew")
     return None if found is None else tuple(float(value) for value in found)
-
-
-def model_setup(
-    robot: Robot, plant: Block, sample_time: float, stretch: float, start: float, slew: Sequence[float] | None = None
-) -> Vector:
-    """Return the array `setup` of a runtime over a model (see `NonlinearArrays`)."""
-    samples = _NECK_SAMPLE * stretch / sample_time  # for one of the neck's
-    motors = len(robot.motors.names)
-    return np.array([
-        motors, len(robot.outputs.names), len(plant.outputs),
-        max(1, round(_SETTLE * samples)), start, _KEEP ** (1.0 / samples),
-        *(sample_time * most for most in slew or (_UNLIMITED,) * motors),
-    ])  # fmt: skip
 
 
 def is_nonlinear(model: Any) -> bool:

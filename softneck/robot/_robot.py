@@ -88,6 +88,7 @@ class Robot(Shown):
             neck = Robot.preset("neck")
             object.__setattr__(self, "time_constant_s", neck.time_constant_s)
             object.__setattr__(self, "directions", neck.directions)
+            object.__setattr__(self, "noise_std", neck.noise_std if self.noise_std is None else self.noise_std)
             for name in ("motors", "outputs"):
                 part, own = getattr(self, name), getattr(neck, name)
                 given = {key: getattr(own, key) for key in ("nominal", "rest") if getattr(part, key) is None}

@@ -7,6 +7,7 @@ neck itself are the identity. Nothing else in softneck multiplies by a unit or b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +20,8 @@ from ._robot import Robot
 
 #: Half the range of scaled set-points and of scaled outputs, and their time constant: section 3.1, 5 and Eq. 31.
 MOTOR_RANGE, OUTPUT_RANGE, TIME_CONSTANT = 6.0, 0.8, 0.2
+# Of theta_i = P_1 - P_2 / 2 - P_3 / 2 (Eq. 9): the norm of its weights.
+_INPUT_WEIGHT = math.sqrt(1.5)
 # Scaled data are rounded to this, so that iterative fits see the same numbers whatever the unit of the file was.
 _RESOLUTION = 2.0**-40
 
@@ -86,6 +89,16 @@ class Scaling:
     def unscale_outputs(self, values: Matrix) -> Matrix:
         """Return scaled outputs (..., outputs) in SI."""
         return np.asarray(self.output_rest + self.output_unit * values)
+
+    def input_units(self, weights: Matrix) -> Vector:
+        """Return the units (outputs,) of redefined inputs in SI: in these each direction pulls as theta_i does.
+
+        Args:
+            weights: (outputs, motors) of the motors in each output's direction.
+        """
+        pull = np.linalg.norm(weights, axis=1) / _INPUT_WEIGHT
+        # Rounded by their ratio, so that a norm's own rounding leaves the neck's at one.
+        return self.motor_unit * np.exp2(rounded(np.log2(pull)))
 
     def scale_seconds(self, seconds: float) -> float:
         """Return a time [s] in scaled seconds."""

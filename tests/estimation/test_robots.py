@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -145,24 +146,37 @@ def test_a_loop_with_an_observer_closes_over_dropouts(tmp_path: Path) -> None:
 def test_levels_are_given_in_the_unit_of_the_outputs() -> None:
     observer = KalmanSettings(measurement_noise_std=0.2).design(model_of(3))
     assert observer.noise[0] == pytest.approx(2e-4)
-    # The other levels are stretched with the outputs: ten times the gain, ten times the motion.
-    few, many = (KalmanSettings().design(plant(SENSED, gain=gain)).noise for gain in (1e-8, 1e-7))
+    # The other levels go with the range of the outputs, and with that of the motors where the file gives none.
+    wide = replace(SENSED, outputs=replace(SENSED.outputs, min=(10.0,) * 3, max=(90.0,) * 3))
+    few, many = (KalmanSettings().design(plant(robot, gain=1e-7)).noise for robot in (SENSED, wide))
+    assert many[1] == pytest.approx(4.0 * few[1])
+    open_ended = replace(SENSED, outputs=replace(SENSED.outputs, min=None, max=None))
+    few, many = (KalmanSettings().design(plant(open_ended, gain=gain)).noise for gain in (1e-8, 1e-7))
     assert many[1] == pytest.approx(10.0 * few[1])
 
 
-@pytest.mark.parametrize("key", ["noise_std", "delay_s", "rate_hz"])
-def test_what_the_robot_does_not_say_of_its_sensor_is_asked_for(key: str) -> None:
+def silent_on(key: str) -> Robot:
     sensor = {name: value for name, value in SENSED.as_dict()["sensor"].items() if name != key}
-    silent = Robot.from_dict({**SENSED.as_dict(), "sensor": sensor})
+    return Robot.from_dict({**SENSED.as_dict(), "sensor": sensor})
+
+
+def test_a_sensor_whose_rate_nobody_gives_measures_in_each_sample() -> None:
+    given, silent = (KalmanSettings().design(plant(robot, gain=1e-7)) for robot in (SENSED, silent_on("rate_hz")))
+    np.testing.assert_array_equal(given.constants, silent.constants)
+
+
+@pytest.mark.parametrize(("key", "form"), [("noise_std", "model"), ("delay_s", "nonlinear")])
+def test_what_the_robot_does_not_say_of_its_sensor_is_asked_for(key: str, form: str) -> None:
+    silent = silent_on(key)
     line = rf"robot `bellows` \(\w{{8}}\) gives no `sensor.{key}`, which an observer needs; add it"
     with pytest.raises(SettingsError, match=line):
-        KalmanSettings().design(plant(silent, gain=1e-7))
+        KalmanSettings(form=form).design(plant(silent, gain=1e-7))
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"form": "gyro"}, "says nothing of its rates' noise; give `sensor`"),
+        ({"form": "gyro"}, "a gyro measures angles, robot `bellows`"),
         ({"sensor": "mpu9250"}, "`sensor` mpu9250 measures angles, robot `bellows`"),
     ],
 )
