@@ -63,7 +63,7 @@ _AS_WELL = 0.95
 # As few loops as say the same: the certificate's steps and the truth's have the same directions.
 FEW = {
     "sampling": {"plants": 100, "search_generations": 5},
-    "neck": {"necks": 0, "orientations_deg": [0.0, 45.0], "payloads_kg": list(PAYLOADS)},
+    "sim": {"necks": 0, "orientations_deg": [0.0, 45.0], "payloads_kg": list(PAYLOADS)},
 }
 # The truth is bisected to half a percent and found in windows of 4 s: nobody promises more closely.
 ROUNDING = 1.02
@@ -130,9 +130,9 @@ TRUTHS = {
        for name in ("axes.disk_margin", "mimo.disk_margin")},
     _GAIN: Truth(_GAIN, lambda limit: limit),
     "axes.delay_margin_ms": Truth("axes.delay_margin_ms", lambda limit: limit),
-    **{f"{group}.{name}": Truth(f"neck.{name}", lambda limit: limit, least=False)
+    **{f"{group}.{name}": Truth(f"sim.{name}", lambda limit: limit, least=False)
        for group, names in (("step", ("overshoot_pct", "settling_s")),
-                            ("neck", ("overshoot_pct", "settling_s", "steady_rms_deg"))) for name in names},
+                            ("sim", ("overshoot_pct", "settling_s", "steady_rms_deg"))) for name in names},
 }  # fmt: skip
 # Margins, whose certified value stands beside the true one.
 MARGINS = (_GAIN, "axes.delay_margin_ms")
@@ -250,7 +250,7 @@ def truth(neck: str, controller: Block) -> dict[str, float]:
     )  # fmt: skip
     runs = run_necks(controller, make_requirements(FEW), order="sequential", observer=None, seed=0,
                      progress=softneck.core.silent, own=[own])  # fmt: skip
-    steps = {f"neck.{name}": max(run.metrics[name] for run in runs)
+    steps = {f"sim.{name}": max(run.metrics[name] for run in runs)
              for name in ("overshoot_pct", "settling_s", "steady_rms_deg")}  # fmt: skip
     return {**{name: float(found[name][0].min()) for name in MARGINS}, **steps}
 

@@ -32,7 +32,7 @@ from tests.foreign_necks.necks import CHOOSING
 
 OUT = Path("build/tune_reserve")
 KINDS = ("pi", "pid", "lqg", "hinf")
-METRICS = {"overshoot": "neck.overshoot_pct", "rise": "neck.rise_s", "steady": "neck.steady_rms_deg",
+METRICS = {"overshoot": "sim.overshoot_pct", "rise": "sim.rise_s", "steady": "sim.steady_rms_deg",
            "circle": "track.circle_rms_deg", "ahead": "track.ahead_rms_deg"}  # fmt: skip
 # What is further beyond a limit no search returns.
 _BEYOND = 1.5

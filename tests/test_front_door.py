@@ -145,11 +145,11 @@ NECK = Robot.preset("neck")
 
 def test_flat_requirements_are_of_the_plants_that_step_or_else_of_the_linear_ones() -> None:
     flat = {"overshoot_pct": 5, "disk_margin": 0.6}
-    for stepping, group in ((True, "neck"), (False, "step")):
+    for stepping, group in ((True, "sim"), (False, "step")):
         asked = with_groups(flat, NECK, stepping=stepping)
         assert asked == {"require": {f"{group}.overshoot_pct": {"max": 5}, "axes.disk_margin": {"min": 0.6}}}
     # A whole table and whole names stay what they are.
-    table = {"require": {"step.rise_s": {"max": 0.5}}, "neck": {"necks": 0}}
+    table = {"require": {"step.rise_s": {"max": 0.5}}, "sim": {"necks": 0}}
     assert with_groups(table, NECK, stepping=False) == table
     assert with_groups({"step.rise_s": 0.5}, NECK, stepping=True) == {"require": {"step.rise_s": {"max": 0.5}}}
 

@@ -62,7 +62,13 @@ class Certificate(Shown):
 def required_rows(contents: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the requirements or limits in a certificate's JSON values; one without any certifies nothing."""
     rows = contents.get("requirements", contents.get("limits"))
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    return [{**row, "metric": sim_name(row["metric"])} if "metric" in row else row for row in found]
+
+
+def sim_name(name: Any) -> Any:
+    """Return the name of a metric or table: what is `sim.*` of any robot was `neck.*` up to softneck 0.2."""
+    return re.sub(r"^neck(?=\.|$)", "sim", name) if isinstance(name, str) else name
 
 
 def certificate_contents(

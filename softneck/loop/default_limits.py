@@ -16,8 +16,8 @@ DESIGN_OVERSHOOT_IN_LIMITS_PCT = 4.0
 LOOP = {"overshoot_pct": 10.0, "rise_s": 0.8, "settling_s": 1.5, "steady_rms_deg": 0.3}
 #: Of `softneck tune`: loops over simulation models, which are near to the robot. Its rise is `usual_rise`.
 TUNE = {
-    "neck.overshoot_pct": 5.0,
-    "neck.steady_rms_deg": 0.15,
+    "sim.overshoot_pct": 5.0,
+    "sim.steady_rms_deg": 0.15,
     "track.circle_rms_deg": 3.0,  # distance to a reference that is not known beforehand
     "track.ahead_rms_deg": 1.5,  # to one that is given as much earlier as is best for all plants
 }
@@ -26,10 +26,10 @@ VERIFY = {
     "step.overshoot_pct": 15.0,
     "step.settling_s": 2.0,
     "step.load_rms_deg": 2.0,
-    "neck.overshoot_pct": 15.0,
-    "neck.settling_s": 2.5,
-    "neck.steady_rms_deg": 0.5,
-    "neck.slack_s": 0.1,  # a tendon that hangs; a moment as a step turns it is no harm
+    "sim.overshoot_pct": 15.0,
+    "sim.settling_s": 2.5,
+    "sim.steady_rms_deg": 0.5,
+    "sim.slack_s": 0.1,  # a tendon that hangs; a moment as a step turns it is no harm
 }
 
 

@@ -111,7 +111,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     name, path = next(iter(steps.items()))
     taut = task.cocontraction is not None
     at = _LOOP_TAUT if taut else _LOOP_AT
-    neck = task.asked.certificate.neck
+    neck = task.asked.certificate.sim
     first, unit = robot.outputs.names[0], robot.outputs.display_unit
     stepped = f"{first}_{unit}" if robot.is_neck else first
     table: dict[str, Any] = {
@@ -126,7 +126,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     if taut and "least_cocontraction" not in found.best.settings:
         table["reference"]["cocontraction"] = task.said_cocontraction
     asked = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
-             if b.metric.startswith("neck.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
+             if b.metric.startswith("sim.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
     known = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_")
     table["limits"] = {f"{first}.{key}": limit for key, limit in asked.items() if key.startswith(known)}
     words = "" if found.observed else (

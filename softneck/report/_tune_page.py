@@ -47,7 +47,7 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
     for verdict in found.verification.verdicts:
         item, value, holds = verdict.requirement, verdict.value, verdict.holds
         seen = found.best.metrics.get(item.metric)
-        if value is not None and seen is not None and item.metric.startswith("neck.") and seen > value:
+        if value is not None and seen is not None and item.metric.startswith("sim.") and seen > value:
             # Of the loops that only tuning looks at: noise, another dead time.
             value, holds = seen, bool(holds) and item.holds(seen)
         said = "-" if holds is None else "holds" if holds else "fails"
@@ -83,7 +83,7 @@ def stands_in_the_way(found: Tuned) -> str:
     if found.binding is None:
         # Loops of tuning have noise, smaller steps and a circle, which `verify` has not.
         asked = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
-        looped = ", ".join(metric for metric in asked if metric.startswith(("neck.", "track.")))
+        looped = ", ".join(metric for metric in asked if metric.startswith(("sim.", "track.")))
         return f"The budget of {found.evaluations} ended before all loops were simulated: {looped} are not computed."
     if found.nearest is None:
         return f"{found.binding} fails, by the largest factor."

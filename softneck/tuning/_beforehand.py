@@ -19,7 +19,7 @@ from softneck.loop.default_limits import usual_rise
 from ._requirements import TuneRequirements
 
 # What has settled has risen before.
-_RISES = ("neck.rise_s", "step.rise_s", "neck.settling_s", "step.settling_s")
+_RISES = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
 
 
 def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
@@ -58,7 +58,7 @@ def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
     uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
     limits, size = (
         LoopSettings().limits(uncertain.robot),
-        asked.certificate.si(float(asked.certificate.neck["size_deg"])),
+        asked.certificate.si(float(asked.certificate.sim["size_deg"])),
     )
     found = []
     for name in uncertain.names:
@@ -68,13 +68,13 @@ def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
         least = least_rise(axis.nominal, test, size)
         found.append(usual_rise(least, latest) if math.isfinite(least) else math.inf)
     # Who asks for an earlier settling asks for a rise before it.
-    return min(max(found), asked.wanted("neck.settling_s") or math.inf) if max(found) < math.inf else None
+    return min(max(found), asked.wanted("sim.settling_s") or math.inf) if max(found) < math.inf else None
 
 
 def _refuse_order(asked: TuneRequirements) -> None:
     """Refuse a step that may rise later than it has to have settled; of defaults of `verify` nobody asked both."""
     said = {item.metric for item in asked.bounds if item.asked}
-    for group in ("neck", "step"):
+    for group in ("sim", "step"):
         names = f"{group}.settling_s", f"{group}.rise_s"
         settling, rise = (asked.wanted(name) for name in names)
         if settling is not None and rise is not None and settling < rise and said.issuperset(names):
@@ -89,7 +89,7 @@ def _refuse_quiet(asked: TuneRequirements) -> None:
 
     Of another robot the defaults are stretched to it and the noise is not: only what somebody asked counts.
     """
-    metric, noise = f"neck.{asked.certificate.name_of('steady_rms_deg')}", asked.track["noise_deg"]
+    metric, noise = f"sim.{asked.certificate.name_of('steady_rms_deg')}", asked.track["noise_deg"]
     limit = min((b.limit for b in asked.bounds if b.metric == metric and b.bound != "min" and b.asked), default=noise)
     if limit < noise:
         raise SettingsError(
@@ -107,7 +107,7 @@ def _refuse_rise(
         limit = asked.wanted(metric)
         if limit is None:
             continue
-        table = asked.certificate.neck if metric.startswith("neck") else asked.certificate.step
+        table = asked.certificate.sim if metric.startswith("sim.") else asked.certificate.step
         least = least_rise(plant, test, asked.certificate.si(float(table["size_deg"])))
         if math.isinf(least):
             raise SettingsError(

@@ -49,7 +49,7 @@ class Case:
 
 def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tuple[Case, ...]:
     """Return all loops."""
-    table, small = asked.certificate.neck, asked.track["small_part"]
+    table, small = asked.certificate.sim, asked.track["small_part"]
     payloads = sorted({float(kg) for kg in table["payloads_kg"]})
     angles = [math.radians(a) for a in table["orientations_deg"]] if len(robot.outputs.names) > 1 else [0.0]
     found = []
@@ -75,7 +75,7 @@ def run_case(
     values, result = judge_loop(loop, compiled=True, angle="measured")
     asked = task.asked.certificate
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
-    found = {f"neck.{asked.name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
+    found = {f"sim.{asked.name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
     if case.noise and case.part < 1.0:
         found["track.variation_rad_s"] = math.inf if result is None else variation(result)
     if case.part < 1.0:
@@ -93,9 +93,9 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, o
     together = 0.0 if pulls else common
     if together:
         at = max(at, 3.0)
-    size = case.part * asked.si(float(asked.neck["size_deg"]))
+    size = case.part * asked.si(float(asked.sim["size_deg"]))
     ends = tuple(size * share for share in direction(case.orientation, robot))
-    duration = at + float(asked.neck["duration_s"])
+    duration = at + float(asked.sim["duration_s"])
     faults = []
     if case.noise and track["noise_deg"] > 0.0:
         faults.append(SensorFault(kind="noise", std=asked.si(track["noise_deg"]), seed=_seed(case, task)))

@@ -131,7 +131,7 @@ def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, s
     asked = task.asked
     told = {
         "asked": [(b.metric, b.bound, b.limit, b.asked) for b in asked.bounds], "track": dict(asked.track),
-        "tables": [dict(getattr(asked.certificate, name)) for name in ("uncertainty", "sampling", "step", "neck")],
+        "tables": [dict(getattr(asked.certificate, name)) for name in ("uncertainty", "sampling", "step", "sim")],
         "kinds": list(kinds), "seed": task.seed, "robot": task.robot.hash, "plants": [*task.linear, *task.own],
         "observer": _observer(task, kinds),
         "files": None if files is None else [digest for _, digest in files.values()],

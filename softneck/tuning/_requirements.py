@@ -17,7 +17,7 @@ from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import TRACK_METRICS, VERSION, Requirement, kept_back, with_groups
 
-_RISE = "neck.rise_s"
+_RISE = "sim.rise_s"
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Least, largest and unit of the numbers of [track].
 _TRACK = {
@@ -75,7 +75,7 @@ def read_tune_requirements(
     Args:
         path: a requirements file, also one for `verify`.
         robot: whose controller is asked for; None: a neck's.
-        stepping: whether there are simulation models; else `neck.*` of the defaults is asked of the linear plants.
+        stepping: whether there are simulation models; else `sim.*` of the defaults is asked of the linear plants.
         rise: the default of a neck's [s]; None: that of the paper's neck.
 
     Raises:
@@ -156,8 +156,8 @@ def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequir
     """Return them with other largest values of some metrics on the plants; what is kept back of them stays."""
     require = {metric: {"max": round(limit + asked.reserve.get(metric, 0.0), 9)} for metric, limit in limits.items()}
     table = {**asked.table, "require": {**asked.table.get("require", {}), **require}}
-    if "neck.settling_s" in limits:  # a file states seconds of the robot: so must the duration it is compared with
-        table["neck"] = {"duration_s": asked.certificate.neck["duration_s"], **table.get("neck", {})}
+    if "sim.settling_s" in limits:  # a file states seconds of the robot: so must the duration it is compared with
+        table["sim"] = {"duration_s": asked.certificate.sim["duration_s"], **table.get("sim", {})}
     bounds = tuple(replace(b, limit=limits[b.metric]) if b.metric in limits else b for b in asked.bounds)
     own = {key: value for key, value in table.items() if key != "version"}
     certificate = replace(
@@ -169,10 +169,10 @@ def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequir
 
 def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:
     require = {f"step.{name.partition('.')[2]}": limit for name, limit in defaults["require"].items()
-               if name.startswith("neck.")}  # fmt: skip
+               if name.startswith("sim.")}  # fmt: skip
     tracked = {name: limit for name, limit in defaults["require"].items() if name.startswith("track.")}
     # Presets are foreign plants, which decide nothing and take half a minute.
-    return {**defaults, "reserve": {}, "neck": {**defaults["neck"], "necks": 0}, "require": {**require, **tracked}}
+    return {**defaults, "reserve": {}, "sim": {**defaults["sim"], "necks": 0}, "require": {**require, **tracked}}
 
 
 def _numbers(given: Any, defaults: Mapping[str, float]) -> dict[str, float]:

@@ -26,8 +26,8 @@ from ._search import Candidate, ratio
 
 # What is traded, the first of each that was found; of the least ones the reciprocal counts.
 _OBJECTIVES = (
-    ("neck.rise_s", "step.rise_s"), ("neck.overshoot_pct", "step.overshoot_pct"), ("step.load_rms_",),
-    ("neck.steady_rms_", "step.steady_rms_"), ("track.circle_rms_deg",), ("track.variation_rad_s",),
+    ("sim.rise_s", "step.rise_s"), ("sim.overshoot_pct", "step.overshoot_pct"), ("step.load_rms_",),
+    ("sim.steady_rms_", "step.steady_rms_"), ("track.circle_rms_deg",), ("track.variation_rad_s",),
     ("axes.sensitivity",), ("axes.gain_margin",),
 )  # fmt: skip
 # Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
@@ -35,7 +35,7 @@ _OBJECTIVES = (
 _NEAR = 2.0
 # Of these a default is a wish about speed and precision: what the best reaches is told instead. Margins of stability,
 # slack tendons and what a load may do are never loosened.
-_LOOSENED = ("neck.rise_s", "neck.settling_s", "neck.overshoot_pct", "neck.steady_rms_", "step.rise_s",
+_LOOSENED = ("sim.rise_s", "sim.settling_s", "sim.overshoot_pct", "sim.steady_rms_", "step.rise_s",
              "step.settling_s", "step.overshoot_pct", "step.steady_rms_", "track.")  # fmt: skip
 _ROOM = 1.05
 
@@ -106,7 +106,7 @@ class Loosened:
     limit: float
 
     def in_words(self, metric: str) -> str:
-        """Return it as a clause for people: `neck.rise_s: 0.44, by default 0.40 is required`."""
+        """Return it as a clause for people: `sim.rise_s: 0.44, by default 0.40 is required`."""
         return f"{metric}: {self.reached:.3g}, by default {self.default:.3g} is required (certified: {self.limit:g})"
 
 
@@ -117,7 +117,7 @@ def nearest(item: Candidate, failed: Sequence[Verdict], asked: TuneRequirements)
     missed by more than a factor of two.
     """
     broken = {verdict.requirement: verdict.value for verdict in failed}
-    looped = [bound for bound in asked.bounds if bound.metric.startswith(("neck.", "track."))]
+    looped = [bound for bound in asked.bounds if bound.metric.startswith(("sim.", "track."))]
     for bound in looped:  # in loops with noise, which `verify` does not close
         seen = item.metrics.get(bound.metric)
         if seen is not None and not bound.holds(seen):
@@ -161,7 +161,7 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
         found = run_steps(ready.plants.take(0), block, test, workers=1, robot=task.robot, weights=ready.weights)
         half = found.time.size // 2
         return found.time[:half], found.angles[0, 0, :half] / per, np.full(half, step / per)
-    case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.neck["payloads_kg"]))))
+    case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.sim["payloads_kg"]))))
     result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, watched(task, item.kind)), compiled=True)
     reference = result[f"{name}_reference"]
     first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))
@@ -181,7 +181,7 @@ def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirem
             worst |= _worst(worst, judge_loop(loop)[0])
     except SoftneckError:
         return False
-    named = {f"neck.{task.asked.certificate.name_of(name)}": value for name, value in worst.items()}
+    named = {f"sim.{task.asked.certificate.name_of(name)}": value for name, value in worst.items()}
     return bool(named) and all(ratio(b, named[b.metric]) <= 1.0 for b in bounds if b.metric in named)
 
 

@@ -352,7 +352,7 @@ def given_out(
 
 def in_words(item: Candidate, cost: float) -> str:
     """Return a candidate in a few words."""
-    names = {"neck.rise_s": "rise {:.2f} s", "step.rise_s": "rise {:.2f} s", "neck.overshoot_pct": "overshoot {:.1f} %",
+    names = {"sim.rise_s": "rise {:.2f} s", "step.rise_s": "rise {:.2f} s", "sim.overshoot_pct": "overshoot {:.1f} %",
              "step.overshoot_pct": "overshoot {:.1f} %", "axes.gain_margin": "gain margin {:.2g}"}  # fmt: skip
     told: dict[str, str] = {}
     for name, text in names.items():

@@ -232,7 +232,7 @@ def _held(linear: Mapping[str, Any]) -> float | None:
 
 def _aimed(task: Task) -> float:
     """Return the longest rise that is allowed [s], or what is usual for the plant."""
-    limits = [task.asked.limit(metric) for metric in ("neck.rise_s", "step.rise_s")]
+    limits = [task.asked.limit(metric) for metric in ("sim.rise_s", "step.rise_s")]
     known = [limit for limit in limits if limit is not None]
     if known:
         return min(known)
@@ -255,7 +255,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     bounds = task.asked.bounds
     names = objectives(compared)
     # Loops of tuning have noise, and plants that are later than they say: `verify` has neither.
-    looped = [b for b in bounds if b.metric.startswith(("neck.", "track."))]
+    looped = [b for b in bounds if b.metric.startswith(("sim.", "track."))]
     holds = verification.holds
     if looped and task.own:
         holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)

@@ -155,7 +155,7 @@ def gather(
     evidence = Evidence(
         plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
     )
-    evidence.not_computed.update({"neck": why} if why and not own else payloads_left_out(own, asked))
+    evidence.not_computed.update({"sim": why} if why and not own else payloads_left_out(own, asked))
     _tell(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence
@@ -174,9 +174,9 @@ def _linear(
 
 def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
     """Return whether the necks in the loops are presets that nobody asked to decide; a neck file is the user's own."""
-    if not asked.robot.is_neck and "preset" not in asked.own.get("neck", {}):
+    if not asked.robot.is_neck and "preset" not in asked.own.get("sim", {}):
         return False  # its own file says what stands for it
-    return not (own or asked.neck["decides"] or str(asked.neck["preset"]).endswith(".toml"))
+    return not (own or asked.sim["decides"] or str(asked.sim["preset"]).endswith(".toml"))
 
 
 def _tell_data(evidence: Evidence) -> None:
@@ -235,19 +235,19 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
     describe = _neck_describer(evidence, controller, asked)
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
-        metrics[f"neck.{asked.name_of(name)}"] = Values(values, describe)
-    if np.isnan(metrics["neck.slack_s"].values).any():
-        del metrics["neck.slack_s"]
-        absent["neck.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
+        metrics[f"sim.{asked.name_of(name)}"] = Values(values, describe)
+    if np.isnan(metrics["sim.slack_s"].values).any():
+        del metrics["sim.slack_s"]
+        absent["sim.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
         return
     # What a heavier payload leaves of the pretension is no matter of the controller's.
-    light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.neck["taut_up_to_kg"]]
+    light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.sim["taut_up_to_kg"]]
     if light:
-        values = metrics["neck.slack_s"].values[light]
-        metrics["neck.slack_s"] = Values(values, lambda row: describe(light[row]))
+        values = metrics["sim.slack_s"].values[light]
+        metrics["sim.slack_s"] = Values(values, lambda row: describe(light[row]))
     else:
-        del metrics["neck.slack_s"]
-        absent["neck.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
+        del metrics["sim.slack_s"]
+        absent["sim.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
 
 
 def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
@@ -331,14 +331,14 @@ def _step_describer(evidence: Evidence, name: str) -> Describe:
 def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
         run, at = evidence.necks[row], step_at(controller.block)
-        size = float(asked.neck["size_deg"])
+        size = float(asked.sim["size_deg"])
         parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {
             "kind": "own" if run.parameters is None else "neck", "name": run.name, "parameters": parameters,
             "payload_kg": run.payload,
             **{f"{name}_{shown_unit(controller.robot)[0]}": size * share for name, share in
                zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},
-            "seed": run.seed, "at_s": at, "duration_s": at + float(asked.neck["duration_s"]),
+            "seed": run.seed, "at_s": at, "duration_s": at + float(asked.sim["duration_s"]),
             "sample_time_s": controller.block.sample_time, "order": controller.order,
         }  # fmt: skip
 

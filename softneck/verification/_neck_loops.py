@@ -154,7 +154,7 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
 
 
 def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Steps) -> dict[str, str]:
-    """Return why nothing is known of the "loop" and of simulation models, "neck"; nothing where all was recorded.
+    """Return why nothing is known of the "loop" and of simulation models, "sim"; nothing where all was recorded.
 
     Args:
         tested: by the names of families, what each says of its recordings.
@@ -169,7 +169,7 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
         made = item.get("conditions", [])
         for kg in sorted({value for part in made for value in part["payload_kg"]}):
             if not any(_carries(plant, kg, held) for plant in own):
-                found["neck"] = (
+                found["sim"] = (
                     f"not supported by the data: {name} was recorded with {kg:g} kg, and no simulation model carries "
                     f"that at a co-contraction of {held:.2g} rad; `softneck identify greybox` a recording that does, "
                     "or calibrate a neck to it (`softneck.calibrate` in Python)"
@@ -186,7 +186,7 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
 
 def payloads_left_out(own: Sequence[OwnPlant], asked: Requirements) -> dict[str, str]:
     """Return which of the payloads asked for no loop of a plant carried, as it knows none; nothing where all did."""
-    wanted = [kg for kg in asked.neck["payloads_kg"] if kg > 0.0]
+    wanted = [kg for kg in asked.sim["payloads_kg"] if kg > 0.0]
     left = {plant.name: [f"{kg:g}" for kg in wanted if kg not in plant.payloads(wanted)] for plant in own}
     said = [
         f"no loop of {name} carries {', '.join(heavy)} kg, which it does not know"
@@ -244,12 +244,12 @@ class NeckRun:
 
 def no_virtual_plant(robot: Robot, asked: Requirements) -> str:
     """Return why there are no loops over a virtual plant; "" where there are."""
-    if not asked.neck["necks"]:
+    if not asked.sim["necks"]:
         return "no loops over the virtual neck were asked for (necks = 0)"
     try:
         virtual_plant(robot, asked)
     except SettingsError as error:
-        if robot.is_neck or "preset" in asked.own.get("neck", {}):
+        if robot.is_neck or "preset" in asked.own.get("sim", {}):
             raise
         return f"no virtual plant stands for `{robot.name}`: {error}"
     return ""
@@ -258,16 +258,16 @@ def no_virtual_plant(robot: Robot, asked: Requirements) -> str:
 def virtual_plant(robot: Robot, asked: Requirements) -> tuple[str, VirtualNeck]:
     """Return the virtual plant that is asked for, of another robot its own where nobody says otherwise, by its name."""
     if robot.is_neck:
-        return str(asked.neck["preset"]), VirtualNeck(NeckParameters.preset(str(asked.neck["preset"])))
-    given = asked.own.get("neck", {}).get("preset")
+        return str(asked.sim["preset"]), VirtualNeck(NeckParameters.preset(str(asked.sim["preset"])))
+    given = asked.own.get("sim", {}).get("preset")
     plant = VirtualNeck.of(robot, None if given is None else NeckParameters.preset(str(given)))
     return str(robot.neck if given is None else given), plant
 
 
 def neck_file_of(robot: Robot, asked: Requirements) -> Path:
     """Return what names the physics of the loops: a preset or a neck file."""
-    if robot.is_neck or "preset" in asked.own.get("neck", {}):
-        return Path(str(asked.neck["preset"]))
+    if robot.is_neck or "preset" in asked.own.get("sim", {}):
+        return Path(str(asked.sim["preset"]))
     return (robot.folder or Path()) / str(robot.neck)
 
 
@@ -293,12 +293,12 @@ def run_necks(
     progress: Progress,
     own: Sequence[OwnPlant] = (),
 ) -> list[NeckRun]:
-    """Return all runs that the table [neck] of the requirements asks for, over the user's own plants if there are any.
+    """Return all runs that the table [sim] of the requirements asks for, over the user's own plants if there are any.
 
     Raises:
         SettingsError: controller and observer that do not fit the neck.
     """
-    table, robot = asked.neck, asked.robot
+    table, robot = asked.sim, asked.robot
     plants = own or _virtual(asked, seed)
     # One output bends in one plane: other orientations are the same step, or none.
     angles = table["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
@@ -317,8 +317,8 @@ def run_necks(
 
 
 def _virtual(asked: Requirements, seed: int) -> list[OwnPlant]:
-    """Return the virtual plant that the table [neck] asks for and plausible ones around it."""
-    table = asked.neck
+    """Return the virtual plant that the table [sim] asks for and plausible ones around it."""
+    table = asked.sim
     base, plant = virtual_plant(asked.robot, asked)
     rng = np.random.default_rng(seed)
     spread = table["spread_pct"] / 100.0
@@ -351,7 +351,7 @@ def _loop(
     observer: Block | None,
     seed: int,
 ) -> Loop:
-    size, robot, at = asked.si(float(asked.neck["size_deg"])), asked.robot, step_at(controller)
+    size, robot, at = asked.si(float(asked.sim["size_deg"])), asked.robot, step_at(controller)
     ends = tuple(size * share for share in direction(orientation, robot))
     reference = (
         StepReference(pitch=ends[0], roll=ends[1], at=at) if robot.is_neck
@@ -362,7 +362,7 @@ def _loop(
         controller=BlockPart(controller),
         observer=None if observer is None else BlockPart(observer),
         reference=reference,
-        duration=at + float(asked.neck["duration_s"]),
+        duration=at + float(asked.sim["duration_s"]),
         order=order,
         robot=robot,
         **plant.carrying(payload),
@@ -420,7 +420,7 @@ def loops_under_test(
     """
     names = robot.outputs.names
     axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
-    known = [(plant, plant.payloads(asked.neck["payloads_kg"])) for plant in own]
+    known = [(plant, plant.payloads(asked.sim["payloads_kg"])) for plant in own]
     return [
         LoopUnderTest(
             name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller,

@@ -255,7 +255,7 @@ def verification_page(found: Verification, controller: str, certificate: str = "
     sections.append(Section("Steps", tables=[_spread(found, "step")], method=text))
     if evidence.necks:
         charts = [neck_chart(evidence, robot)] if any(run.result is not None for run in evidence.necks) else []
-        sections.append(Section("Virtual neck", tables=[_spread(found, "neck"), _runs(found)], charts=charts))
+        sections.append(Section("Virtual neck", tables=[_spread(found, "sim"), _runs(found)], charts=charts))
     sections.append(_plants(found))
     words = "holds" if found.holds else "does not hold"
     return page(

@@ -11,6 +11,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
 from softneck.core._budget import settings_text
+from softneck.core._certificate import sim_name
 from softneck.core._errors import did_you_mean
 from softneck.core._shown import Shown
 from softneck.loop import default_limits
@@ -47,9 +48,9 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
         raise SettingsError("`require` must be a table: [require].")
     less, kept = dict(require), {}
     for metric, value in reserve.items():
-        if not metric.startswith(("neck.", "track.")):
+        if not metric.startswith(("sim.", "track.")):
             raise SettingsError(
-                f"[reserve] is for loops over simulation models, `neck.*` and `track.*`; got `{metric}`."
+                f"[reserve] is for loops over simulation models, `sim.*` and `track.*`; got `{metric}`."
             )
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
             raise SettingsError(f"the reserve of `{metric}` must be a number from 0 on; got {value!r}.")
@@ -74,13 +75,13 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
 _AXIS_METRICS = (*LARGE, *SMALL)
-_NECK_METRICS = (
+_SIM_METRICS = (
     "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
     "slack_s",
 )  # fmt: skip
 _NECK = Robot.preset("neck")
 # Of requirements files, `tune`'s included.
-_TABLES = ("version", "uncertainty", "sampling", "step", "neck", "require", "track", "reserve")
+_TABLES = ("version", "uncertainty", "sampling", "step", "sim", "require", "track", "reserve")
 
 
 def metric_names(robot: Robot) -> tuple[str, ...]:
@@ -93,7 +94,7 @@ def metric_names(robot: Robot) -> tuple[str, ...]:
         "mimo.disk_margin",
         "robust.mu",
         *(f"step.{shown.of(name)}" for name in METRICS),
-        *(f"neck.{shown.of(name)}" for name in _NECK_METRICS),
+        *(f"sim.{shown.of(name)}" for name in _SIM_METRICS),
     )
 
 
@@ -105,7 +106,8 @@ def with_groups(
     A metric without its group is one of the simulation models if there are any, else of the linear ones, or of the only
     group that has it; a number is the least that margins may be, and the most that all else may.
     """
-    order = ("neck", "step", "track") if stepping else ("step", "track")
+    table = with_sim(table, robot)
+    order = ("sim", "step", "track") if stepping else ("step", "track")
     known = (*metric_names(robot), *more)
     nested: dict[str, Any] = {key: value for key, value in table.items() if key in _TABLES}
     for key, value in table.items():
@@ -125,6 +127,17 @@ def with_groups(
             raise SettingsError("`require` must be a table: [require].")
         nested["require"] = {**require, metric: entry}
     return nested
+
+
+def with_sim(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
+    """Return a requirements table by the names of today: files up to softneck 0.2 say `neck` for `sim`."""
+    if "neck" in robot.outputs.names:
+        return dict(table)
+    found = {sim_name(key): value for key, value in table.items()}
+    for name in ("require", "reserve"):
+        if isinstance(inside := found.get(name), Mapping):
+            found[name] = {sim_name(key): value for key, value in inside.items()}
+    return found
 
 
 def metric_ends(robot: Robot) -> Callable[[str], str]:
@@ -166,7 +179,7 @@ _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
         "size_deg": (0.01, 45.0, "deg"), "duration_s": (1e-3, 1e6, "s"), "noise_deg": (0.0, 10.0, "deg"),
         "load_rad": (-6.0, 6.0, "rad"),
     },
-    "neck": {
+    "sim": {
         "necks": (0, 1000, ""), "spread_pct": (0.0, 50.0, "%"), "size_deg": (0.01, 45.0, "deg"),
         "duration_s": (1e-3, 1e6, "s"), "taut_up_to_kg": (0.0, 5.0, "kg"),
     },
@@ -193,7 +206,7 @@ class Requirement:
     def stretched(self, time: float, size: float, robot: Robot) -> Requirement:
         """Return it with its limit for another robot's time and size."""
         group, _, name = self.metric.partition(".")
-        sized = group in ("step", "neck") and name.endswith("_" + shown_unit(robot)[0])
+        sized = group in ("step", "sim") and name.endswith("_" + shown_unit(robot)[0])
         return replace(self, limit=self.limit * (size if sized else time if name.endswith(("_s", "_ms")) else 1.0))
 
     def holds(self, value: float) -> bool:
@@ -209,7 +222,7 @@ class Requirements(Shown):
 
     Attributes:
         bounds: in the order of the file.
-        uncertainty, sampling, step, neck: the tables of the file; keys that end in `_deg` or `_rad` hold what they hold
+        uncertainty, sampling, step, sim: the tables of the file; keys that end in `_deg` or `_rad` hold what they hold
             of a neck, or numbers in the units of another robot's outputs and motors.
         robot: whose controller is judged.
         own: what the user's file says.
@@ -220,7 +233,7 @@ class Requirements(Shown):
     uncertainty: Mapping[str, Any]
     sampling: Mapping[str, Any]
     step: Mapping[str, Any]
-    neck: Mapping[str, Any]
+    sim: Mapping[str, Any]
     robot: Robot = _NECK
     own: Mapping[str, Any] = field(default_factory=dict)
     scale: tuple[float, float] = (1.0, 1.0)
@@ -262,7 +275,7 @@ class Requirements(Shown):
             free = {key: value for key, value in defaults.items() if known.key(key) not in said[name]}
             return {**getattr(self, name), **free}
 
-        step, neck, size_deg = self.step, self.neck, size * self.step["size_deg"]
+        step, sim, size_deg = self.step, self.sim, size * self.step["size_deg"]
         quiet = size * step["noise_deg"] if noise is None else noise
         return replace(
             self,
@@ -271,7 +284,7 @@ class Requirements(Shown):
             step=with_free(
                 "step", size_deg=size_deg, duration_s=time * step["duration_s"], noise_deg=quiet, load_rad=load
             ),
-            neck=with_free("neck", size_deg=size * neck["size_deg"], duration_s=time * neck["duration_s"]),
+            sim=with_free("sim", size_deg=size * sim["size_deg"], duration_s=time * sim["duration_s"]),
             scale=(time, size),
         )
 
@@ -329,7 +342,8 @@ def _read(source: Path) -> dict[str, Any]:
 
 
 def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Robot) -> Requirements:
-    said, own = own, for_verify(own)
+    said = with_sim(own, robot)
+    own = for_verify(said)
     known = ("version", *_NUMBERS, "require")
     for key in own:
         if key not in known:
@@ -346,7 +360,7 @@ def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Ro
 
 def _shown(metric: str, shown: _Names) -> str:
     group, _, name = metric.partition(".")
-    return f"{group}.{shown.of(name)}" if group in ("step", "neck") else metric
+    return f"{group}.{shown.of(name)}" if group in ("step", "sim") else metric
 
 
 def _table(name: str, defaults: Mapping[str, Any], own: Any, shown: _Names) -> dict[str, Any]:
@@ -398,7 +412,7 @@ def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requir
             raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(names)}.")
     found = []
     for metric, entry in {**defaults, **own}.items():
-        if entry is False or (metric == "neck.slack_s" and metric not in own and robot.directions.kind != "tendons"):
+        if entry is False or (metric == "sim.slack_s" and metric not in own and robot.directions.kind != "tendons"):
             continue
         if not isinstance(entry, Mapping) or not entry or any(key not in _BOUNDS for key in entry):
             raise SettingsError(
@@ -433,7 +447,7 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
     for metric in low:
         if low[metric] > high.get(metric, math.inf):
             raise SettingsError(f"`{metric}` cannot be at least {low[metric]:g} and at most {high[metric]:g}.")
-    for group in ("step", "neck"):
+    for group in ("step", "sim"):
         rise, settling = low.get(f"{group}.rise_s", 0.0), high.get(f"{group}.settling_s", math.inf)
         if rise > settling:
             raise SettingsError(f"`{group}` cannot rise in {rise:g} s or more and settle within {settling:g} s.")

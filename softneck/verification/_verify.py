@@ -187,7 +187,7 @@ class Verification(Shown):
             "foreign_plants": evidence.foreign,
             **validity(evidence, self.tested),
             "settings": {
-                name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "neck")
+                name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")
             },
             **self._robot(),
         }  # fmt: skip
@@ -290,7 +290,7 @@ def verify(
         >>> from softneck.signals import signal
         >>> neck = softneck.VirtualNeck(NeckParameters.paper())
         >>> model = softneck.identify("rls", softneck.record(signal("eq22", duration=20.0), neck, seed=1))
-        >>> asked = {"sampling": {"plants": 20, "search_generations": 0}, "neck": {"necks": 1}, "overshoot_pct": 20}
+        >>> asked = {"sampling": {"plants": 20, "search_generations": 0}, "sim": {"necks": 1}, "overshoot_pct": 20}
         >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
         True
     """
@@ -355,12 +355,12 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
     why = unsupported(item, evidence, elsewhere)
     if why:
         return Verdict(item, value, False, worst, why)
-    if item.metric.startswith("neck.") and evidence.foreign and not item.asked:
+    if item.metric.startswith("sim.") and evidence.foreign and not item.asked:
         return Verdict(item, value, None, worst, _FOREIGN)
     return Verdict(item, value, item.holds(value), worst)
 
 
-_FOREIGN = "shown only: a preset does not decide; add a model of your robot, or set `[neck] decides`"
+_FOREIGN = "shown only: a preset does not decide; add a model of your robot, or set `[sim] decides`"
 # What is about the loop's response, which the data may not reach.
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 
@@ -369,8 +369,8 @@ def unsupported(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, s
     """Return why the data do not support a requirement; else ""."""
     group, _, name = item.metric.partition(".")
     axes = evidence.plants.axes
-    if group == "neck":
-        return "" if evidence.foreign else elsewhere.get("neck", "")
+    if group == "sim":
+        return "" if evidence.foreign else elsewhere.get("sim", "")
     if group not in (*_LINEAR_GROUPS, "step", *axes):
         return ""
     parts = [part for part in evidence.tested if group not in axes or part.axis == group]

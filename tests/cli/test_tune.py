@@ -96,12 +96,12 @@ def test_what_does_not_hold_is_said_and_leaves_no_certificate(
 
 
 LOOPED = """
-"neck.overshoot_pct" = { max = 60.0 }
-"neck.rise_s" = { max = 2.5 }
-"neck.settling_s" = { max = 4.0 }
-"neck.steady_rms_deg" = { max = 4.0 }
-"neck.slack_s" = false
-"neck.limit_violation_s" = false
+"sim.overshoot_pct" = { max = 60.0 }
+"sim.rise_s" = { max = 2.5 }
+"sim.settling_s" = { max = 4.0 }
+"sim.steady_rms_deg" = { max = 4.0 }
+"sim.slack_s" = false
+"sim.limit_violation_s" = false
 "track.circle_rms_deg" = { max = 30.0 }
 "track.ahead_rms_deg" = { max = %s }
 """
@@ -120,7 +120,7 @@ def test_a_budget_too_small_is_said_and_its_search_goes_on_with_what_it_wrote(
     folder = tmp_path / "out"
     assert run([*looped, "--budget", "1", "--requirements", str(tmp_path / "wanted.toml")]) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert "The budget of 1 ended before all loops were simulated: neck.overshoot_pct, " in said
+    assert "The budget of 1 ended before all loops were simulated: sim.overshoot_pct, " in said
     assert "larger --budget" in said
     assert (folder / "best.npz").exists()
     # `verify`, without noise and circle, would hold.
@@ -136,7 +136,7 @@ def test_a_budget_too_small_is_said_and_its_search_goes_on_with_what_it_wrote(
     assert run([*check, "-o", str(tmp_path / "c.json")]) == 0
     told = capsys.readouterr()
     limits = {row["metric"]: row["limit"] for row in json.loads(told.out)["requirements"]}
-    assert limits["neck.overshoot_pct"] == 60.0 - 1.6  # less the reserve of the defaults, once
+    assert limits["sim.overshoot_pct"] == 60.0 - 1.6  # less the reserve of the defaults, once
     assert "track.circle_rms_deg, track.ahead_rms_deg not looked at" in told.err
 
 
@@ -152,7 +152,7 @@ def test_no_certificate_where_the_loops_of_tuning_alone_do_not_hold(
 
 
 def test_nobody_is_told_to_loosen_a_margin() -> None:
-    assert "Loosen it" in way_on("neck.rise_s", unheard=False)
+    assert "Loosen it" in way_on("sim.rise_s", unheard=False)
     for margin in ("axes.gain_margin", "mimo.disk_margin", "robust.mu", "stability.radius"):
         assert "slower rise" in way_on(margin, unheard=False)
         assert "oosen" not in way_on(margin, unheard=False)
@@ -184,4 +184,4 @@ def test_bad_input_is_said_before_anything_is_searched(
 
 def test_the_default_requirements_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["tune", "--print-requirements"]) == 0
-    assert '"neck.rise_s" = { max = 0.49 }' in capsys.readouterr().out
+    assert '"sim.rise_s" = { max = 0.49 }' in capsys.readouterr().out

@@ -72,7 +72,7 @@ def step(arrays, parameters, state, inputs, outputs):
 LOOP: dict[str, Any] = {
     "duration_s": 2.0, "plant": "paper", "reference": {"kind": "step", "pitch_deg": 10.0, "at_s": 0.5},
 }  # fmt: skip
-QUICK = {"sampling": {"plants": 10, "search_generations": 0}, "neck": {"necks": 1, "payloads_kg": [0.0]}}
+QUICK = {"sampling": {"plants": 10, "search_generations": 0}, "sim": {"necks": 1, "payloads_kg": [0.0]}}
 
 
 @pytest.fixture

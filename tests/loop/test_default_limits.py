@@ -15,7 +15,7 @@ from softneck.tuning._requirements import default_text as of_tune
 from softneck.verification._requirements import default_text as of_verify
 
 ROOT = Path(softneck.__file__).parent
-# A number that is said to be how far a step may overshoot: `overshoot_pct = 10`, `"neck.overshoot_pct": 5.0`,
+# A number that is said to be how far a step may overshoot: `overshoot_pct = 10`, `"sim.overshoot_pct": 5.0`,
 # `"step.overshoot_pct" = { max = 15.0 }`, `overshoot_pct: float = 2.0`.
 NUMBER = re.compile(r'overshoot_pct"?(?:: float)? ?[=:] ?(?:\{ max = )?\d')
 

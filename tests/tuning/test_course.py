@@ -19,7 +19,7 @@ from softneck.verification._requirements import Requirement
 
 BOUNDS = (
     Requirement("axes.sensitivity", "max", 2.5, False), Requirement("axes.gain_margin", "min", 2.0, False),
-    Requirement("neck.rise_s", "max", 0.4, True), Requirement("neck.overshoot_pct", "max", 5.0, True),
+    Requirement("sim.rise_s", "max", 0.4, True), Requirement("sim.overshoot_pct", "max", 5.0, True),
 )  # fmt: skip
 # Of a kind: what its Ms is certified as, in parts of what is asked of the design.
 CERTIFIED = {"pi": 1.6, "hinf": 1.2}
@@ -33,7 +33,7 @@ def judged(_: Any, kind: str, settings: Mapping[str, Any], level: str) -> Judgem
         return Judgement({"axes.sensitivity": certified, "axes.gain_margin": certified / (certified - 1.0)})
     if level == "margins":
         return Judgement({"axes.gain_margin": 2.2 - 0.1 * certified})
-    return Judgement({"neck.rise_s": rise + 0.45 / Ms**2, "neck.overshoot_pct": 1.0 / rise})
+    return Judgement({"sim.rise_s": rise + 0.45 / Ms**2, "sim.overshoot_pct": 1.0 / rise})
 
 
 def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) -> Search:
@@ -84,7 +84,7 @@ def test_a_search_ends_nearer_to_what_is_wanted_than_it_begins(monkeypatch: pyte
     costs = []
     for budget in (13, 40, 90, 200):
         found = searched(monkeypatch, budget)
-        looped = [item for item in found.candidates.values() if "neck.rise_s" in item.metrics]
+        looped = [item for item in found.candidates.values() if "sim.rise_s" in item.metrics]
         # Without what experiments said of the few that had them.
         costs.append(min(item.cost(BOUNDS[:1] + BOUNDS[2:], tested=True) for item in looped))
     assert costs == sorted(costs, reverse=True), "a larger budget ended farther off"

@@ -31,14 +31,14 @@ def candidate(**metrics: float) -> Candidate:
 
 
 def test_a_slower_rise_than_the_default_is_told_and_certified_with_some_room() -> None:
-    found = nearest(candidate(), [failed("neck.rise_s", 0.6)], ASKED)
-    assert list(found) == ["neck.rise_s"]
-    assert (found["neck.rise_s"].default, found["neck.rise_s"].reached) == (NECK_RISE_S, 0.6)
-    assert 0.6 < found["neck.rise_s"].limit <= 0.6 * 1.05 + 0.01  # the room, up to the next hundredth
-    asked = loosened(ASKED, {"neck.rise_s": found["neck.rise_s"].limit})
-    assert asked.limit("neck.rise_s") == found["neck.rise_s"].limit
-    assert [b for b in asked.bounds if b.metric != "neck.rise_s"] == [
-        b for b in ASKED.bounds if b.metric != "neck.rise_s"
+    found = nearest(candidate(), [failed("sim.rise_s", 0.6)], ASKED)
+    assert list(found) == ["sim.rise_s"]
+    assert (found["sim.rise_s"].default, found["sim.rise_s"].reached) == (NECK_RISE_S, 0.6)
+    assert 0.6 < found["sim.rise_s"].limit <= 0.6 * 1.05 + 0.01  # the room, up to the next hundredth
+    asked = loosened(ASKED, {"sim.rise_s": found["sim.rise_s"].limit})
+    assert asked.limit("sim.rise_s") == found["sim.rise_s"].limit
+    assert [b for b in asked.bounds if b.metric != "sim.rise_s"] == [
+        b for b in ASKED.bounds if b.metric != "sim.rise_s"
     ]
     # A file of it asks for the same.
     again = make_tune_requirements({key: value for key, value in asked.table.items() if key != "version"})
@@ -46,23 +46,23 @@ def test_a_slower_rise_than_the_default_is_told_and_certified_with_some_room() -
 
 
 def test_the_worse_of_the_loops_with_noise_and_of_verify_counts() -> None:
-    found = nearest(candidate(neck__rise_s=0.7), [failed("neck.rise_s", 0.6)], ASKED)
-    assert found["neck.rise_s"].reached == 0.7
+    found = nearest(candidate(sim__rise_s=0.7), [failed("sim.rise_s", 0.6)], ASKED)
+    assert found["sim.rise_s"].reached == 0.7
     assert list(nearest(candidate(track__circle_rms_deg=3.5), [], ASKED)) == ["track.circle_rms_deg"]
 
 
 @pytest.mark.parametrize(
     ("metric", "value"),
-    [("axes.gain_margin", 1.9), ("robust.mu", 1.01), ("stability.radius", 1.0), ("neck.rise_s", 1.0),
-     ("neck.rise_s", float("inf")), ("neck.rise_s", None), ("step.load_rms_deg", 2.1)],
+    [("axes.gain_margin", 1.9), ("robust.mu", 1.01), ("stability.radius", 1.0), ("sim.rise_s", 1.0),
+     ("sim.rise_s", float("inf")), ("sim.rise_s", None), ("step.load_rms_deg", 2.1)],
 )  # fmt: skip
 def test_margins_loads_and_what_is_far_off_are_never_loosened(metric: str, value: float | None) -> None:
     assert nearest(candidate(), [failed(metric, value)], ASKED) == {}
     # Nor is anything beside them.
-    assert nearest(candidate(), [failed("neck.settling_s", 2.6), failed(metric, value)], ASKED) == {}
+    assert nearest(candidate(), [failed("sim.settling_s", 2.6), failed(metric, value)], ASKED) == {}
 
 
 def test_what_somebody_asks_for_stands() -> None:
-    asked = make_tune_requirements({"require": {"neck.rise_s": {"max": 0.4}}})
-    assert nearest(candidate(), [failed("neck.rise_s", 0.44, asked)], asked) == {}
-    assert nearest(candidate(), [failed("neck.rise_s", 0.6)], replace(ASKED, stated=frozenset())) != {}
+    asked = make_tune_requirements({"require": {"sim.rise_s": {"max": 0.4}}})
+    assert nearest(candidate(), [failed("sim.rise_s", 0.44, asked)], asked) == {}
+    assert nearest(candidate(), [failed("sim.rise_s", 0.6)], replace(ASKED, stated=frozenset())) != {}

@@ -37,24 +37,24 @@ def test_the_defaults_are_those_of_verify_with_what_tuning_adds() -> None:
     mine = {(b.metric, b.bound): b.limit for b in asked.bounds}
     assert set(theirs) <= set(mine)
     changed = {key for key in theirs if theirs[key] != mine[key]}
-    assert changed == {("neck.overshoot_pct", "max"), ("neck.steady_rms_deg", "max")}
-    assert (asked.wanted("neck.rise_s"), asked.wanted("track.circle_rms_deg")) == (NECK_RISE_S, 3.0)
+    assert changed == {("sim.overshoot_pct", "max"), ("sim.steady_rms_deg", "max")}
+    assert (asked.wanted("sim.rise_s"), asked.wanted("track.circle_rms_deg")) == (NECK_RISE_S, 3.0)
 
 
 def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
-    table = {"require": {"neck.rise_s": {"max": 0.5}}, "reserve": {"neck.rise_s": 0.1, "track.circle_rms_deg": 0.0}}
+    table = {"require": {"sim.rise_s": {"max": 0.5}}, "reserve": {"sim.rise_s": 0.1, "track.circle_rms_deg": 0.0}}
     asked = make_tune_requirements(table)
-    assert (asked.limit("neck.rise_s"), asked.wanted("neck.rise_s")) == (0.4, 0.5)
+    assert (asked.limit("sim.rise_s"), asked.wanted("sim.rise_s")) == (0.4, 0.5)
     assert asked.limit("track.circle_rms_deg") == asked.wanted("track.circle_rms_deg") == 3.0
-    assert {"neck.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
+    assert {"sim.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
     # What verify is asked is what the plants must keep.
     assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
 
 
 def test_nothing_is_kept_back_of_what_is_not_asked() -> None:
-    asked = make_tune_requirements({"require": {"neck.rise_s": False}, "reserve": {"neck.rise_s": 0.1}})
-    assert "neck.rise_s" not in asked.reserve
-    assert asked.limit("neck.rise_s") is None
+    asked = make_tune_requirements({"require": {"sim.rise_s": False}, "reserve": {"sim.rise_s": 0.1}})
+    assert "sim.rise_s" not in asked.reserve
+    assert asked.limit("sim.rise_s") is None
     # Linear plants have no loops of which anything was found to be beyond.
     assert not make_tune_requirements({}, stepping=False).reserve
 
@@ -62,23 +62,23 @@ def test_nothing_is_kept_back_of_what_is_not_asked() -> None:
 @pytest.mark.parametrize("stepping", [True, False])
 def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path, stepping: bool) -> None:
     table = {
-        "require": {"neck.rise_s": {"max": 0.5}, "track.ahead_rms_deg": False, "axes.gain_margin": {"min": 2.1}},
-        "reserve": {"neck.rise_s": 0.07}, "track": {"noise_deg": 0.1}, "step": {"duration_s": 5.0},
+        "require": {"sim.rise_s": {"max": 0.5}, "track.ahead_rms_deg": False, "axes.gain_margin": {"min": 2.1}},
+        "reserve": {"sim.rise_s": 0.07}, "track": {"noise_deg": 0.1}, "step": {"duration_s": 5.0},
     }  # fmt: skip
     asked = make_tune_requirements(table, stepping=stepping)
     path = tmp_path / "requirements.toml"
     path.write_text(tomli_w.dumps(_told(asked.table)))
     # Limits are as they were asked, the reserve is beside them.
     written = tomllib.loads(path.read_text())
-    assert written["require"]["neck.rise_s"] == {"max": 0.5}
-    assert written["reserve"]["neck.rise_s"] == 0.07
+    assert written["require"]["sim.rise_s"] == {"max": 0.5}
+    assert written["reserve"]["sim.rise_s"] == 0.07
     again = read_tune_requirements(path, stepping=stepping)
     assert (again.bounds, again.track, again.reserve) == (asked.bounds, asked.track, asked.reserve)
     assert again.lines() == asked.lines()
     theirs = read_requirements(path)
     assert theirs.bounds == asked.certificate.bounds
     assert theirs.of_robot(Robot.preset("antagonist")).own == theirs.own
-    for name in ("uncertainty", "sampling", "step", "neck"):
+    for name in ("uncertainty", "sampling", "step", "sim"):
         assert getattr(theirs, name) == getattr(asked.certificate, name) == getattr(again.certificate, name)
     assert asked.limit("track.ahead_rms_deg") is None
 
@@ -86,7 +86,7 @@ def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path,
 def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
     asked = make_tune_requirements({}, stepping=False)
     assert asked.limit("step.rise_s") == NECK_RISE_S
-    assert asked.limit("neck.rise_s") is None
+    assert asked.limit("sim.rise_s") is None
 
 
 @pytest.mark.parametrize(
@@ -99,14 +99,14 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must say"),
         ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "must be a positive number"),
         ({"reserve": {"axes.gain_margin": 0.1}}, "is for loops over simulation models"),
-        ({"reserve": {"neck.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
-        ({"reserve": {"neck.rise_s": 0.49}}, "<= 0.49 leaves nothing beside its reserve of 0.49"),
-        ({"require": {"neck.overshoot_pct": {"max": 0.0}}}, "<= 0 leaves nothing beside its reserve of 1.6"),
-        ({"reserve": {"neck.ris_s": 0.1}}, r"of which \[require\] asks nothing"),
+        ({"reserve": {"sim.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
+        ({"reserve": {"sim.rise_s": 0.49}}, "<= 0.49 leaves nothing beside its reserve of 0.49"),
+        ({"require": {"sim.overshoot_pct": {"max": 0.0}}}, "<= 0 leaves nothing beside its reserve of 1.6"),
+        ({"reserve": {"sim.ris_s": 0.1}}, r"of which \[require\] asks nothing"),
         ({"reserve": 1.0}, "must be a table"),
         ({"require": 1.0}, "must be a table"),
-        ({"require": {"neck.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most"),
-        ({"require": {"neck.rise_s": {"min": 3.0}, "neck.settling_s": {"max": 2.0}}}, "cannot"),
+        ({"require": {"sim.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most"),
+        ({"require": {"sim.rise_s": {"min": 3.0}, "sim.settling_s": {"max": 2.0}}}, "cannot"),
     ],
 )
 def test_bad_requirements_are_refused_in_a_line(table: dict, match: str) -> None:
@@ -116,9 +116,9 @@ def test_bad_requirements_are_refused_in_a_line(table: dict, match: str) -> None
 
 def test_a_file_says_what_differs(tmp_path: Path) -> None:
     path = tmp_path / "wanted.toml"
-    path.write_text('version = 1\n[track]\ncircle_deg = 10.0\n[require]\n"neck.rise_s" = { max = 0.6 }\n')
+    path.write_text('version = 1\n[track]\ncircle_deg = 10.0\n[require]\n"sim.rise_s" = { max = 0.6 }\n')
     asked = read_tune_requirements(path)
-    assert (asked.wanted("neck.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
+    assert (asked.wanted("sim.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
     path.write_text("version = 2\n")
     with pytest.raises(FileFormatError, match="version = 1"):
         read_tune_requirements(path)
@@ -141,7 +141,7 @@ def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
     low, high = (np.interp(level, rows, np.arange(400) * TS) for level in (0.1, 0.9))
     least = float(high - low)
     for factor in (0.95, 1.05):
-        table = {"require": {"neck.rise_s": {"max": least * factor}, "track.circle_rms_deg": False}}
+        table = {"require": {"sim.rise_s": {"max": least * factor}, "track.circle_rms_deg": False}}
         asked = make_tune_requirements(table)
         if factor > 1.0:
             refuse_impossible(asked, neck())
@@ -150,7 +150,7 @@ def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
                 refuse_impossible(asked, neck())
     with pytest.raises(SettingsError, match="range does not reach"):
         refuse_impossible(
-            make_tune_requirements({"neck": {"size_deg": 45.0}}), LinearNeck(neck().pitch / 2, neck().roll)
+            make_tune_requirements({"sim": {"size_deg": 45.0}}), LinearNeck(neck().pitch / 2, neck().roll)
         )
 
 
@@ -192,7 +192,7 @@ def test_a_circle_is_refused_exactly_where_slew_and_range_leave_too_little_of_it
             refuse_impossible(asked, plant)
 
 
-@pytest.mark.parametrize("group", ["neck", "step"])
+@pytest.mark.parametrize("group", ["sim", "step"])
 @pytest.mark.parametrize(("rise", "settling", "refused"), [(0.5, 0.3, True), (0.3, 0.3, False), (0.5, 0.6, False)])
 def test_what_may_rise_later_than_it_settles_is_refused(
     group: str, rise: float, settling: float, refused: bool
@@ -206,12 +206,12 @@ def test_what_may_rise_later_than_it_settles_is_refused(
 
 
 def test_a_slow_rise_beside_a_settling_that_nobody_asked_is_no_contradiction() -> None:
-    refuse_impossible(make_tune_requirements({"require": {"neck.rise_s": {"max": 3.0}}}), neck())
+    refuse_impossible(make_tune_requirements({"require": {"sim.rise_s": {"max": 3.0}}}), neck())
 
 
 @pytest.mark.parametrize(("limit", "noise", "refused"), [(0.05, 0.06, True), (0.05, 0.04, False), (0.0, 0.05, True)])
 def test_a_steady_state_quieter_than_the_sensor_is_refused(limit: float, noise: float, refused: bool) -> None:
-    table = {"require": {"neck.steady_rms_deg": {"max": limit}}, "track": {"noise_deg": noise}}
+    table = {"require": {"sim.steady_rms_deg": {"max": limit}}, "track": {"noise_deg": noise}}
     if refused:
         with pytest.raises(SettingsError, match="noise of the sensor alone"):
             refuse_impossible(make_tune_requirements(table), neck())
@@ -220,7 +220,7 @@ def test_a_steady_state_quieter_than_the_sensor_is_refused(limit: float, noise: 
 
 
 def test_what_settles_before_it_can_rise_and_an_Ms_of_one_are_refused() -> None:
-    for metric, limit, match in (("neck.settling_s", 0.05, "slew and range"), ("axes.sensitivity", 1.0, "no feedback")):
+    for metric, limit, match in (("sim.settling_s", 0.05, "slew and range"), ("axes.sensitivity", 1.0, "no feedback")):
         asked = make_tune_requirements({"require": {metric: {"max": limit}}})
         with pytest.raises(SettingsError, match=match):
             refuse_impossible(asked, neck())

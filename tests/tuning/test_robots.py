@@ -31,7 +31,7 @@ from softneck.verification._verify import scaled, sources_of
 from tests.design.test_robots import BELLOWS, plant
 
 QUICK: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "step": {"duration_s": 2.0},
-                         "neck": {"duration_s": 2.5}, "track": {"noise_deg": 0.0}}  # fmt: skip
+                         "sim": {"duration_s": 2.5}, "track": {"noise_deg": 0.0}}  # fmt: skip
 
 
 def tuned(plants: dict[str, Any]) -> Tuned:
@@ -47,15 +47,15 @@ def test_a_robots_own_plant_steps_as_the_linear_one_that_it_is(name: str) -> Non
     metrics = found.best.metrics
     assert found.best.level == "margins"
     # The worst of a box around the model is never quicker than the model itself; a sample more is what rounds.
-    assert 0.0 < metrics["neck.rise_s"] <= metrics["step.rise_s"] + 0.02
-    assert metrics["neck.overshoot_pct"] <= metrics["step.overshoot_pct"] + 0.5
+    assert 0.0 < metrics["sim.rise_s"] <= metrics["step.rise_s"] + 0.02
+    assert metrics["sim.overshoot_pct"] <= metrics["step.overshoot_pct"] + 0.5
     assert not [metric for metric in metrics if metric.startswith("track.circle")], "a circle is a neck's"
 
 
 def test_a_default_that_is_quieter_than_the_noise_of_a_neck_refuses_no_other_robot() -> None:
     model = plant(Robot.preset("antagonist"))
     asked = task_of({"model": model}, {"track": {"noise_deg": 5.0}}, 0).asked
-    assert 0.0 < (asked.limit("neck.steady_rms_deg") or 0.0) < 5.0
+    assert 0.0 < (asked.limit("sim.steady_rms_deg") or 0.0) < 5.0
     refuse_impossible(asked, model)
 
 
@@ -73,13 +73,13 @@ def test_noise_and_delay_of_the_noisy_loops_are_the_robots_own() -> None:
 def test_a_loosened_settling_time_of_a_slow_robot_is_a_file_that_is_read_again() -> None:
     slow = replace(plant(BELLOWS), sample_time=2.0)
     asked = task_of({"model": slow}, {}, 0).asked
-    limit = 1.5 * (asked.limit("neck.settling_s") or 0.0)
+    limit = 1.5 * (asked.limit("sim.settling_s") or 0.0)
     assert limit > 5.0  # the neck's duration of a step
-    wider = loosened(asked, {"neck.settling_s": limit})
+    wider = loosened(asked, {"sim.settling_s": limit})
     table = {key: value for key, value in wider.table.items() if key != "version"}
     again = make_tune_requirements(table, robot=slow.robot)
-    assert again.limit("neck.settling_s") == pytest.approx(limit, rel=1e-6)  # a file has 9 digits
-    assert again.certificate.neck["duration_s"] == asked.certificate.neck["duration_s"]
+    assert again.limit("sim.settling_s") == pytest.approx(limit, rel=1e-6)  # a file has 9 digits
+    assert again.certificate.sim["duration_s"] == asked.certificate.sim["duration_s"]
 
 
 def test_the_recordings_cocontraction_is_told_to_controllers_in_the_unit_of_the_motors() -> None:

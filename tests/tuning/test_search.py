@@ -199,7 +199,7 @@ def candidate(**metrics: float) -> Candidate:
     return Candidate("pi", {}, np.zeros(1), "all", named)
 
 
-BOUNDS = (Requirement("neck.rise_s", "max", 0.4, True), Requirement("neck.overshoot_pct", "max", 5.0, True),
+BOUNDS = (Requirement("sim.rise_s", "max", 0.4, True), Requirement("sim.overshoot_pct", "max", 5.0, True),
           Requirement("axes.gain_margin", "min", 2.0, True))  # fmt: skip
 
 
@@ -216,16 +216,16 @@ def test_the_front_is_what_no_other_beats() -> None:
 
 
 def test_what_binds_is_what_alone_must_give_way_least() -> None:
-    fast = candidate(neck__rise_s=0.3, neck__overshoot_pct=7.0, axes__gain_margin=2.5)
-    slow = candidate(neck__rise_s=0.52, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
-    loud = candidate(neck__rise_s=0.3, neck__overshoot_pct=6.0, axes__gain_margin=1.0)
-    assert binding([fast, slow, loud], BOUNDS, tested=False) == ("neck.rise_s", pytest.approx(0.52))
-    slower = candidate(neck__rise_s=0.55, neck__overshoot_pct=5.0, axes__gain_margin=2.5)
+    fast = candidate(sim__rise_s=0.3, sim__overshoot_pct=7.0, axes__gain_margin=2.5)
+    slow = candidate(sim__rise_s=0.52, sim__overshoot_pct=5.0, axes__gain_margin=2.5)
+    loud = candidate(sim__rise_s=0.3, sim__overshoot_pct=6.0, axes__gain_margin=1.0)
+    assert binding([fast, slow, loud], BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
+    slower = candidate(sim__rise_s=0.55, sim__overshoot_pct=5.0, axes__gain_margin=2.5)
     for listed in ([slow, slower, loud], [slower, slow, loud]):
-        assert binding(listed, BOUNDS, tested=False) == ("neck.rise_s", pytest.approx(0.52))
-    assert binding([fast, loud], BOUNDS, tested=False) == ("neck.overshoot_pct", pytest.approx(7.0))
+        assert binding(listed, BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
+    assert binding([fast, loud], BOUNDS, tested=False) == ("sim.overshoot_pct", pytest.approx(7.0))
     assert binding([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
-    good = candidate(neck__rise_s=0.3, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
+    good = candidate(sim__rise_s=0.3, sim__overshoot_pct=5.0, axes__gain_margin=2.0)
     assert binding([good, slow], BOUNDS, tested=False) == (None, None)
 
 
@@ -233,26 +233,26 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
 def test_what_was_not_computed_does_not_bind(tested: bool) -> None:
     """`adaptive` has no linear form: beside recordings its Ms counts as broken, and nobody knows it."""
     bounds = (Requirement("axes.sensitivity", "max", 2.5, True), *BOUNDS[:2])
-    blind = candidate(neck__rise_s=0.5, neck__overshoot_pct=3.0)
+    blind = candidate(sim__rise_s=0.5, sim__overshoot_pct=3.0)
     del blind.metrics["axes.sensitivity"]
     assert blind.cost(bounds, tested=tested) > 1.0
-    assert binding([blind], bounds, tested=tested) == ("neck.rise_s", None)
-    blind.metrics["neck.rise_s"] = 0.3
+    assert binding([blind], bounds, tested=tested) == ("sim.rise_s", None)
+    blind.metrics["sim.rise_s"] = 0.3
     assert blind.cost(bounds, tested=tested) > 1.0
     assert binding([blind], bounds, tested=tested) == (None, None)
 
 
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
-    one = candidate(neck__rise_s=0.5, neck__overshoot_pct=4.0, axes__gain_margin=2.1)
-    each = candidate(neck__rise_s=0.46, neck__overshoot_pct=5.75, axes__gain_margin=2.1)
-    good = candidate(neck__rise_s=0.4, neck__overshoot_pct=5.0, axes__gain_margin=2.0)
+    one = candidate(sim__rise_s=0.5, sim__overshoot_pct=4.0, axes__gain_margin=2.1)
+    each = candidate(sim__rise_s=0.46, sim__overshoot_pct=5.75, axes__gain_margin=2.1)
+    good = candidate(sim__rise_s=0.4, sim__overshoot_pct=5.0, axes__gain_margin=2.0)
     costs = [item.cost(BOUNDS, tested=False) for item in (good, one, each)]
     assert costs[0] <= 1.0 < costs[1] < costs[2]
     # A quarter beyond, of which 4 at most count; and what breaks ties, 0.02 at most.
     assert 1.0 + 0.25 / (1.0 + 0.25 / 4.0) < costs[1] < 1.02 + 0.25 / (1.0 + 0.25 / 4.0)
 
 
-KNOWN = ("axes.sensitivity", "axes.gain_margin", "mimo.disk_margin", "neck.rise_s", "neck.overshoot_pct")
+KNOWN = ("axes.sensitivity", "axes.gain_margin", "mimo.disk_margin", "sim.rise_s", "sim.overshoot_pct")
 JUDGED = tuple(Requirement(name, "min" if "margin" in name else "max", limit, False)
                for name, limit in zip(KNOWN, (2.5, 2.0, 0.4, 0.4, 5.0), strict=True))  # fmt: skip
 ANY = st.one_of(st.floats(0.01, 100.0), st.sampled_from([0.0, math.inf]))
@@ -287,7 +287,7 @@ def test_what_was_judged_at_fewer_metrics_never_wins_for_that(values: Any, teste
 def test_what_is_not_certified_is_as_bad_in_whatever_way_that_is_told() -> None:
     # On `chain` the loops of an `mpc`, whose margins nobody certifies, came before those of a `pi` that crosses where
     # nobody recorded: one counted twice its limits, the other a thousand times.
-    mpc = Candidate("mpc", {}, np.zeros(1), "all", {"neck.rise_s": 1.16, "neck.overshoot_pct": 8.6})
+    mpc = Candidate("mpc", {}, np.zeros(1), "all", {"sim.rise_s": 1.16, "sim.overshoot_pct": 8.6})
     pi = of((math.inf, 0.0, 0.0, 0.34, 1.5))
     assert pi.cost(JUDGED, tested=True) < mpc.cost(JUDGED, tested=True)
     assert not mpc.holds(JUDGED, tested=True)

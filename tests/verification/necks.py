@@ -19,7 +19,7 @@ TS = 0.02
 PAPER = np.array([math.radians(27.69) / 5.293, 5.293, 0.08])  # Eq. 31
 QUICK = {
     "sampling": {"plants": 40, "search_generations": 3},
-    "neck": {"necks": 1, "payloads_kg": [0.0], "orientations_deg": [0.0], "duration_s": 2.5, "decides": True},
+    "sim": {"necks": 1, "payloads_kg": [0.0], "orientations_deg": [0.0], "duration_s": 2.5, "decides": True},
 }
 
 

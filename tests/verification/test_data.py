@@ -42,7 +42,7 @@ from .necks import PAPER, QUICK, TS, family, linear_neck, pi
 
 MODEL = Continuous(a=np.array([PAPER[1]]), b=np.array([PAPER[0] * PAPER[1]]), delay=float(PAPER[2]))
 LAW = LinearLaw.of(pi().ss())
-QUIET = {**QUICK, "neck": {"necks": 0}}
+QUIET = {**QUICK, "sim": {"necks": 0}}
 
 
 def measured(*, weight: float = 0.3, low: float = 0.3, high: float = 25.0) -> AxisMeasured:
@@ -192,9 +192,9 @@ def held_at(common: float) -> Steps:
     ("payload", "at", "loop", "said"),
     [
         ([1.0], [0.0], 0.0, {}),
-        ([0.0], [0.0], 0.0, {"neck": "recorded with 1 kg, and no simulation model carries that"}),
-        ([1.0], [0.0], 2.0, {"neck": "at a co-contraction of 2 rad", "loop": "recorded at -0.5 to 0.5 rad"}),
-        ([1.0], [2.0], 0.0, {"neck": "at a co-contraction of 0 rad"}),
+        ([0.0], [0.0], 0.0, {"sim": "recorded with 1 kg, and no simulation model carries that"}),
+        ([1.0], [0.0], 2.0, {"sim": "at a co-contraction of 2 rad", "loop": "recorded at -0.5 to 0.5 rad"}),
+        ([1.0], [2.0], 0.0, {"sim": "at a co-contraction of 0 rad"}),
         (None, [0.0], 2.0, {"loop": "holds its motors at a co-contraction of 2 rad, and with 1 kg"}),
     ],
     ids=["recorded", "other payload", "tauter than all recordings", "tauter plant", "takes any payload"],
@@ -215,12 +215,12 @@ def test_what_nobody_recorded_is_not_supported(
 
 @pytest.mark.slow
 def test_of_what_was_not_recorded_no_requirement_holds(supported: Verification) -> None:
-    evidence, why = supported.evidence, {"neck": "no such payload", "loop": "slack there"}
+    evidence, why = supported.evidence, {"sim": "no such payload", "loop": "slack there"}
     for item in make_requirements(QUIET).bounds:
-        group = "neck" if item.metric.startswith("neck.") else "loop"
+        group = "sim" if item.metric.startswith("sim.") else "loop"
         assert unsupported(item, replace(evidence, foreign=False), why) == why[group], item.metric
         # A preset is nobody's recorded plant, and decides nothing.
-        assert unsupported(item, evidence, {"neck": why["neck"]}) == "", item.metric
+        assert unsupported(item, evidence, {"sim": why["sim"]}) == "", item.metric
 
 
 @pytest.mark.slow
@@ -245,7 +245,7 @@ def test_margins_by_experiment_stand_beside_the_linear_ones_and_the_smaller_is_c
     monkeypatch.setattr("softneck.verification._evidence.crossings", lambda loops, **_: told if loops else [])
     things: dict[str, Any] = {"m": linear_neck(), "own": NeckParameters.paper()}
     few = {"payloads_kg": [0.0], "orientations_deg": [0.0], "duration_s": 2.5}
-    found = verify(pi(), things, make_requirements({**QUICK, "neck": few}))
+    found = verify(pi(), things, make_requirements({**QUICK, "sim": few}))
     rows = {row["metric"]: row for row in found.contents()["requirements"]}
     assert (rows["axes.gain_margin"]["value"], rows["axes.gain_margin"]["holds"]) == (1.3, False)
     assert rows["axes.gain_margin"]["worst"]["kind"] == "experiment"
@@ -256,20 +256,20 @@ def test_margins_by_experiment_stand_beside_the_linear_ones_and_the_smaller_is_c
     assert both["linear"]["gain_ratio"] > 1.3
     # On the user's own plant neck.* decides, and one run is enough: one payload, one orientation.
     assert [run.name for run in found.evidence.necks] == ["own, 0 kg, 0 deg"]
-    assert rows["neck.overshoot_pct"]["holds"] is not None
+    assert rows["sim.overshoot_pct"]["holds"] is not None
 
 
 @pytest.mark.slow
 def test_a_preset_is_a_foreign_plant_that_decides_only_where_it_is_asked() -> None:
-    few = {**QUICK["neck"], "decides": False}
-    asked = {"neck.overshoot_pct": {"max": 0.001}}
-    found = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": few}))
+    few = {**QUICK["sim"], "decides": False}
+    asked = {"sim.overshoot_pct": {"max": 0.001}}
+    found = verify(pi(), linear_neck(), make_requirements({**QUICK, "sim": few}))
     rows = {row["metric"]: row for row in found.contents()["requirements"]}
-    assert (rows["neck.overshoot_pct"]["holds"], "shown only" in rows["neck.overshoot_pct"]["note"]) == (None, True)
-    assert rows["neck.overshoot_pct"]["value"] is not None
+    assert (rows["sim.overshoot_pct"]["holds"], "shown only" in rows["sim.overshoot_pct"]["note"]) == (None, True)
+    assert rows["sim.overshoot_pct"]["value"] is not None
     assert found.contents()["foreign_plants"] is True
-    strict = verify(pi(), linear_neck(), make_requirements({**QUICK, "neck": few, "require": asked}))
-    assert "neck.overshoot_pct" in [v.requirement.metric for v in strict.failed]
+    strict = verify(pi(), linear_neck(), make_requirements({**QUICK, "sim": few, "require": asked}))
+    assert "sim.overshoot_pct" in [v.requirement.metric for v in strict.failed]
 
 
 def test_what_steps_is_told_from_what_is_linear() -> None:

@@ -41,7 +41,7 @@ def test_a_plant_s_path_is_designed_on_and_verified_as_the_plant(tmp_path: Path)
     one, several = (softneck.design_controller("pi", given) for given in (plant, [str(plant), held]))
     assert one.summary() == softneck.design_controller("pi", held).summary()
     assert several.summary() == softneck.design_controller("pi", [held, held]).summary()
-    few = make_requirements({key: QUICK[key] for key in ("sampling", "neck")})
+    few = make_requirements({key: QUICK[key] for key in ("sampling", "sim")})
     rows = [
         [(v.requirement.metric, v.value) for v in softneck.verify(c, plants, few).verdicts]
         for c, plants in ((controller, str(plant)), (softneck.load(controller), held), (controller, {"plant": plant}))

@@ -39,9 +39,9 @@ def test_a_plant_carries_the_payloads_that_it_knows_and_the_others_are_said(
 ) -> None:
     plant = plant_with(payload, seen)
     assert plant.payloads([0.0, 0.5, 1.0]) == carried
-    told = payloads_left_out([plant], make_requirements({**QUICK, "neck": {"payloads_kg": [0.0, 0.5, 1.0]}}))
+    told = payloads_left_out([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0, 0.5, 1.0]}}))
     assert [f"no loop of own carries {left} kg" in why for why in told.values()] == [True] * bool(left)
-    assert not payloads_left_out([plant], make_requirements({**QUICK, "neck": {"payloads_kg": [0.0]}}))
+    assert not payloads_left_out([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0]}}))
 
 
 def test_loops_over_a_model_of_several_payloads_carry_each() -> None:
@@ -51,9 +51,7 @@ def test_loops_over_a_model_of_several_payloads_carry_each() -> None:
         plain, arrays={**plain.arrays, "payload": np.array([0.0, 1.0, -3.0, -0.2])},
         findings={**plain.findings, "conditions": {"payload_kg": [0.0, 1.0]}},
     )  # fmt: skip
-    few = make_requirements(
-        {**QUICK, "neck": {"payloads_kg": [0.0, 1.0], "orientations_deg": [0.0], "duration_s": 2.5}}
-    )
+    few = make_requirements({**QUICK, "sim": {"payloads_kg": [0.0, 1.0], "orientations_deg": [0.0], "duration_s": 2.5}})
 
     def angles(model: Any) -> list[np.ndarray]:
         own = [own_plant(model, "m")]

@@ -27,7 +27,7 @@ from softneck.verification._verify import sources_of
 from tests.data import slow_but
 from tests.design.test_robots import BELLOWS, LEARNED, SLOW, plant
 
-FEW: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "neck": {"necks": 0}}
+FEW: dict[str, Any] = {"sampling": {"plants": 12, "search_generations": 0}, "sim": {"necks": 0}}
 NONE = {"gain": 0.0, "pole": 0.0, "delay": 0.0}
 
 
@@ -89,7 +89,7 @@ def test_a_verified_robot_holds_on_its_own_virtual_plant_and_says_who_it_is(tmp_
     model = plant(robot)
     controller = design_controller("pi", model)
     controller.save(tmp_path / "pi.npz")
-    table = {**FEW, "neck": {"necks": 1, "payloads_kg": [0.0]}}
+    table = {**FEW, "sim": {"necks": 1, "payloads_kg": [0.0]}}
     found = verify(controller, model, make_requirements(table, robot=robot))
     assert found.holds, found.failed
     assert [run.name for run in found.evidence.necks] == ["paper, 0 kg, 0 deg"]
@@ -97,7 +97,7 @@ def test_a_verified_robot_holds_on_its_own_virtual_plant_and_says_who_it_is(tmp_
     assert contents["robot"] == {"name": "antagonist", "hash": robot.hash}
     values = {row["metric"]: row["value"] for row in contents["requirements"]}
     files = found.write_worst(tmp_path, controller=tmp_path / "pi.npz")
-    for number, metric in ((9, "step.overshoot_pct"), (12, "neck.overshoot_pct")):
+    for number, metric in ((9, "step.overshoot_pct"), (12, "sim.overshoot_pct")):
         assert found.verdicts[number].requirement.metric == metric
         result = simulate(files[number])
         # The same loop again; noise of the step test is drawn for all plants alike, that of a loop by its seed.
@@ -125,7 +125,7 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays(tmp_path: P
     verdicts = {item.requirement.metric: item for item in found.verdicts}
     assert verdicts["step.load_rms_mm"].value is not None
     assert verdicts["step.settling_s"].holds, "bellows cannot be stepped from 0 bar, but around 1.5 bar"
-    assert "necks = 0" in verdicts["neck.settling_s"].note
+    assert "necks = 0" in verdicts["sim.settling_s"].note
     assert set(found.contents()["settings"]["step"]) == {"size_mm", "duration_s", "noise_mm", "load_bar"}
     # The files of the worst plants are steps around 50 mm and 1.5 bar, and show the numbers of the verdicts.
     controller.save(tmp_path / "pi.npz")
@@ -164,10 +164,10 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(SettingsError, match="unknown key `size_deg` of \\[step\\]; it takes size_mm"):
         make_requirements({"step": {"size_deg": 3.0}}, robot=BELLOWS)
     asked = {item.metric for item in read_requirements(robot=BELLOWS).bounds}
-    assert asked >= {"step.load_rms_mm", "neck.steady_rms_mm"}
+    assert asked >= {"step.load_rms_mm", "sim.steady_rms_mm"}
     # Only tendons hang slack.
-    assert "neck.slack_s" not in asked
-    assert "neck.slack_s" in {item.metric for item in read_requirements(robot=Robot.preset("trunk4")).bounds}
+    assert "sim.slack_s" not in asked
+    assert "sim.slack_s" in {item.metric for item in read_requirements(robot=Robot.preset("trunk4")).bounds}
 
 
 @pytest.mark.slow
@@ -227,7 +227,7 @@ def test_a_plant_of_ones_own_has_to_be_of_the_robot() -> None:
 def test_a_robots_own_nonlinear_model_has_margins_by_experiment() -> None:
     robot = Robot.preset("antagonist")
     model = plant(robot)
-    asked = make_requirements({**FEW, "neck": {"necks": 1, "payloads_kg": [0.0]}}, robot=robot)
+    asked = make_requirements({**FEW, "sim": {"necks": 1, "payloads_kg": [0.0]}}, robot=robot)
     found = verify(design_controller("pi", model), {"m": model, "physics": VirtualNeck.of(robot)}, asked)
     assert any(item.metric == "axes.gain_margin" for item in asked.bounds)
     assert "margins by experiment" not in found.evidence.not_computed

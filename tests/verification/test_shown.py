@@ -30,7 +30,7 @@ def things(neck: Recording, models: dict[str, Model]) -> dict[str, Any]:
         "reference": {"kind": "step", "pitch_deg": 5.0}, "limits": {"pitch.rms_error_deg": 0.01},
     }  # fmt: skip
     done = softneck.simulate(table)
-    few = {key: QUICK[key] for key in ("sampling", "neck")}
+    few = {key: QUICK[key] for key in ("sampling", "sim")}
     found = softneck.verify(pi(), {HOSTILE: linear_neck()}, make_requirements(few))
     study = make_study(table, vary={"reference.pitch_deg": {"uniform": [1.0, 3.0]}}, runs=8)
     rls = models["rls"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from itertools import product
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, SettingsError
+from softneck.core._certificate import required_rows
 from softneck.loop import LoopResult, metrics
 from softneck.verification import make_requirements
 from softneck.verification._linear import LinearLaw, classical, judged
@@ -115,13 +117,13 @@ def test_a_bound_holds_at_its_limit_except_below() -> None:
         ("uncertainty", "delay_ms", 0.0, 1e9), ("sampling", "plants", 1, 100_000),
         ("sampling", "search_generations", 0, 10_000), ("sampling", "seed", 0, 2**31 - 2),
         ("step", "size_deg", 0.01, 45.0), ("step", "duration_s", 1e-3, 1e6), ("step", "noise_deg", 0.0, 10.0),
-        ("step", "load_rad", -6.0, 6.0), ("neck", "necks", 0, 1000), ("neck", "spread_pct", 0.0, 50.0),
-        ("neck", "size_deg", 0.01, 45.0), ("neck", "duration_s", 1e-3, 1e6),
+        ("step", "load_rad", -6.0, 6.0), ("sim", "necks", 0, 1000), ("sim", "spread_pct", 0.0, 50.0),
+        ("sim", "size_deg", 0.01, 45.0), ("sim", "duration_s", 1e-3, 1e6),
     ],
 )  # fmt: skip
 def test_numbers_of_the_tables_have_their_ranges(table: str, key: str, low: float, high: float) -> None:
     # A short run is no test of settling, which is refused by itself.
-    free = {"step.settling_s": False, "neck.settling_s": False} if key == "duration_s" else {}
+    free = {"step.settling_s": False, "sim.settling_s": False} if key == "duration_s" else {}
     for value in (low, high):
         assert getattr(make_requirements({table: {key: value}, "require": free}), table)[key] == value
     step = 1 if isinstance(low, int) else 1e-6
@@ -132,10 +134,10 @@ def test_numbers_of_the_tables_have_their_ranges(table: str, key: str, low: floa
 
 @pytest.mark.parametrize(("key", "most"), [("payloads_kg", 5.0), ("orientations_deg", 360.0)])
 def test_lists_of_numbers_have_theirs(key: str, most: float) -> None:
-    assert make_requirements({"neck": {key: [0.0, most]}}).neck[key] == [0.0, most]
+    assert make_requirements({"sim": {key: [0.0, most]}}).sim[key] == [0.0, most]
     for wrong in ([most + 1e-6], [-1e-6], [], 1.0, [True]):
         with pytest.raises(SettingsError):
-            make_requirements({"neck": {key: wrong}})
+            make_requirements({"sim": {key: wrong}})
 
 
 @pytest.mark.parametrize(
@@ -269,3 +271,12 @@ def test_a_controller_is_coupled_where_one_angle_moves_the_others_input() -> Non
     z = np.exp(1j * w * TS)
     np.testing.assert_allclose(law.feedback(w)[:, 0, 0], -(z - 0.9) / (z - 0.5), rtol=1e-12)
     assert np.abs(law.forward(w)).max() == 0.0
+
+
+def test_files_of_before_say_neck_for_what_is_sim_now() -> None:
+    asked = {"{0}": {"necks": 2}, "require": {"{0}.rise_s": {"max": 0.7}}}
+    old, new = (make_requirements(json.loads(json.dumps(asked).replace("{0}", name))) for name in ("neck", "sim"))
+    assert old.bounds == new.bounds
+    assert old.sim == new.sim
+    rows = required_rows({"requirements": [{"metric": "neck.slack_s", "holds": True}]})
+    assert [row["metric"] for row in rows] == ["sim.slack_s"]

@@ -30,7 +30,7 @@ def neck() -> LinearNeck:
 PAPER = VirtualNeck(NeckParameters.paper())
 ASKED = {
     "sampling": {"plants": 20, "search_generations": 0},
-    "neck": {"necks": 1, "payloads_kg": [0.0, 1.0], "orientations_deg": [45.0], "duration_s": 2.5},
+    "sim": {"necks": 1, "payloads_kg": [0.0, 1.0], "orientations_deg": [45.0], "duration_s": 2.5},
 }
 
 

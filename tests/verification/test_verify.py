@@ -36,7 +36,7 @@ QUICK_TOML = """version = 1
 [sampling]
 plants = 40
 search_generations = 3
-[neck]
+[sim]
 necks = 1
 payloads_kg = [0.0]
 orientations_deg = [0.0]
@@ -75,17 +75,17 @@ def test_a_good_controller_holds(held: Verification) -> None:
 def test_taut_tendons_are_asked_for_up_to_the_payload_that_leaves_a_pretension() -> None:
     """Of the runs over the virtual neck those with light payloads count; without any the metric is not computed."""
     few = {"sampling": {"plants": 1, "search_generations": 0}, "step": {"duration_s": 0.4}}
-    few["require"] = {"step.settling_s": False, "neck.settling_s": False}
+    few["require"] = {"step.settling_s": False, "sim.settling_s": False}
     asked = {"payloads_kg": [0.0, 1.0], "taut_up_to_kg": 0.5, "duration_s": 1.0}
-    found = verify(pi(), linear_neck(), make_requirements({**few, "neck": {**QUICK["neck"], **asked}}))
+    found = verify(pi(), linear_neck(), make_requirements({**few, "sim": {**QUICK["sim"], **asked}}))
     slack = [run.metrics["slack_s"] for run in found.evidence.necks]
     # The paper's neck under 1 kg: 3.3 N of pretension less 3 N, and the step takes the rest.
     assert slack[0] == 0.0 < slack[1]
-    row = next(row for row in found.contents()["requirements"] if row["metric"] == "neck.slack_s")
+    row = next(row for row in found.contents()["requirements"] if row["metric"] == "sim.slack_s")
     assert (row["value"], row["holds"], row["worst"]["payload_kg"]) == (0.0, True, 0.0)
-    heavy = {**QUICK["neck"], **asked, "payloads_kg": [1.0]}
-    found = verify(pi(), linear_neck(), make_requirements({**few, "neck": heavy}))
-    row = next(row for row in found.contents()["requirements"] if row["metric"] == "neck.slack_s")
+    heavy = {**QUICK["sim"], **asked, "payloads_kg": [1.0]}
+    found = verify(pi(), linear_neck(), make_requirements({**few, "sim": heavy}))
+    row = next(row for row in found.contents()["requirements"] if row["metric"] == "sim.slack_s")
     assert (row["holds"], row["note"]) == (None, "not computed: all of `payloads_kg` are above `taut_up_to_kg`")
 
 
@@ -207,9 +207,9 @@ def test_the_worst_plant_of_the_certificate_runs_and_gives_its_value(files: dict
     call = ["verify", str(files["controller"]), str(files["family"]), "--requirements", str(files["asked"]), "--json"]
     assert run([*call, "-o", str(certificate)]) == 0
     rows = {row["metric"]: row for row in json.loads(capsys.readouterr().out)["requirements"]}
-    neck = simulate(load_loop(rows["neck.overshoot_pct"]["loop"]))
+    neck = simulate(load_loop(rows["sim.overshoot_pct"]["loop"]))
     # The same loop, run again: to the bit.
-    assert neck.metrics["pitch"]["overshoot_pct"] == pytest.approx(rows["neck.overshoot_pct"]["value"], rel=1e-12)
+    assert neck.metrics["pitch"]["overshoot_pct"] == pytest.approx(rows["sim.overshoot_pct"]["value"], rel=1e-12)
     worst = rows["step.overshoot_pct"]
     step = simulate(load_loop(worst["loop"]))
     axis = worst["worst"]["axis"]
@@ -263,14 +263,14 @@ def test_bad_input_is_told_in_words(files: dict[str, Path]) -> None:
         ('version = 1\n[require]\n"axes.sensitivity" = { min = 1.0 }', "always holds"),
         ('version = 1\n[require]\n"stability.radius" = { below = 1.5 }', "allows unstable loops"),
         ("version = 1\n[step]\nduration_s = 1.0", "shorter than the settling time"),
-        ("version = 1\n[neck]\nduration_s = 2.0", r"`\[neck\] duration_s` = 2 is shorter than the settling time"),
-        ('version = 1\n[neck]\ndecides = "yes"', "must be true or false"),
+        ("version = 1\n[sim]\nduration_s = 2.0", r"`\[sim\] duration_s` = 2 is shorter than the settling time"),
+        ('version = 1\n[sim]\ndecides = "yes"', "must be true or false"),
         ("", "must say `version = 1`"),
         ("version = 2", "it says 2"),
         ("version = 1\n[what]", "unknown table `what`"),
         ("version = 1\n[step]\nsize = 3", "unknown key `size` of"),
         ("version = 1\n[step]\nsize_deg = 300.0", "between 0.01 and 45"),
-        ("version = 1\n[neck]\npayloads_kg = []", "must be a list of numbers"),
+        ("version = 1\n[sim]\npayloads_kg = []", "must be a list of numbers"),
         ('version = 1\n[require]\n"axes.speed" = { max = 1.0 }', "unknown metric"),
         ('version = 1\n[require]\n"axes.sensitivity" = { most = 1.0 }', "must say"),
         ('version = 1\n[require]\n"axes.sensitivity" = { max = nan }', "must be a finite number"),

@@ -43,7 +43,7 @@ def test_the_worst_row_is_the_one_that_is_farthest_from_holding(
 
 @pytest.mark.slow
 def test_no_plant_of_a_verification_is_worse_than_the_one_that_it_names() -> None:
-    found = verify(pi(), family(spread=0.3), make_requirements({**QUICK, "neck": {"necks": 0}}))
+    found = verify(pi(), family(spread=0.3), make_requirements({**QUICK, "sim": {"necks": 0}}))
     computed = [verdict for verdict in found.verdicts if verdict.value is not None]
     assert len(computed) > 8
     for verdict in computed:
@@ -62,7 +62,7 @@ def test_no_plant_of_a_verification_is_worse_than_the_one_that_it_names() -> Non
             own = table[f"{verdict.worst['axis']}.{name}"][row]
             assert own == pytest.approx(verdict.value, rel=1e-9)  # rounding of sums over other batches
     # A worse plant makes the value worse, never better: all margins shrink as the box grows.
-    narrow = verify(pi(), family(spread=0.05), make_requirements({**QUICK, "neck": {"necks": 0}}))
+    narrow = verify(pi(), family(spread=0.05), make_requirements({**QUICK, "sim": {"necks": 0}}))
     for wide, tight in zip(found.verdicts, narrow.verdicts, strict=True):
         if wide.value is None or not wide.requirement.metric.startswith(("axes.", "stability.", "robust.mu")):
             continue

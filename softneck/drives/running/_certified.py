@@ -23,7 +23,7 @@ ARMING = {
     "axes.delay_margin_ms": "delay margin",
     "step.overshoot_pct": "overshoot of a step",
     "step.load_rms_deg": "error under a load",
-    "neck.slack_s": "tendons stay taut",
+    "sim.slack_s": "tendons stay taut",
 }
 # Two machines round differently, which a stable loop keeps at 1e-9 rad and less; a drive cannot tell 1e-4 rad apart:
 # its encoder has 1.3e-4 rad of the winch to a count.
