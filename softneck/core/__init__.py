@@ -1,7 +1,7 @@
 """Errors, checks, array types, units, archives, certificates and the table of kinds.
 
-For every subpackage.
-Imports nothing of ours.
+Used by every subpackage.
+Imports no other subpackage.
 """
 
 import lazy_loader

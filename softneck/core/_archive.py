@@ -1,4 +1,4 @@
-"""Our one binary file form: a numpy `.npz` with a JSON header, never a pickle."""
+"""The binary file format of softneck: a numpy `.npz` with a JSON header, never a pickle."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ._errors import FileFormatError
 from ._files import as_path, atomic_write, require_file
 
 FORMAT_VERSION = 1
-_HEADER = "header"
-# What arrays may hold: numbers. Others are not ours, and complex ones would lose a part without a word.
-_NUMBERS = "fiub"
+_HEADER_KEY = "header"
+# Allowed `dtype.kind` of arrays: real numbers. Reading a complex array as float would drop its imaginary part.
+_NUMBER_KINDS = "fiub"
 
 
 def write_archive(
@@ -29,7 +29,7 @@ def write_archive(
         OutputFileError: the file exists (and not `force`) or cannot be written.
     """
     text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header})
-    contents = {_HEADER: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
+    contents = {_HEADER_KEY: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
     with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **contents)
 
@@ -50,16 +50,16 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
         open_zip(source).close()
         with np.load(source, allow_pickle=False) as archive:
             contents = {name: archive[name] for name in archive.files}
-        written = contents.pop(_HEADER)
+        written = contents.pop(_HEADER_KEY)
         if written.nbytes > MOST_JSON:
             raise ValueError(f"its header has {written.nbytes} bytes")
         header = json.loads(written.tobytes().decode())
         for name, array in contents.items():
-            if not isinstance(array, np.ndarray) or array.dtype.kind not in _NUMBERS:
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in _NUMBER_KINDS:
                 raise ValueError(f"its member `{name}` is not an array of numbers")
     except FileFormatError:
         raise
-    except Exception as error:  # zipfile, its decompressors, numpy and json raise whatever damaged bytes lead to
+    except Exception as error:  # damaged bytes raise all kinds of errors in zipfile, its decompressors, numpy and json
         raise FileFormatError(f"{source}: is not a softneck file or is damaged ({_short(error)}).") from error
     _check_header(source, header)
     return header, contents

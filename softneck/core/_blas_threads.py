@@ -12,7 +12,7 @@ _Result = TypeVar("_Result")
 
 
 class _Limit:
-    """BLAS's number of threads, which is one for the whole process: fits may run in several threads of Python."""
+    """The number of BLAS threads. It holds for the whole process, and fits may run in several Python threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -20,8 +20,8 @@ class _Limit:
         self._limits: Any = None
 
     def __enter__(self) -> None:
-        """Limit BLAS to one thread, where no other call has done so."""
-        # Only libraries that are loaded can be limited: NumPy and SciPy bring one each.
+        """Limit BLAS to one thread, unless another call has already done so."""
+        # Only libraries that are loaded can be with_one_thread: NumPy and SciPy bring one each.
         import numpy  # noqa: F401
         import scipy.linalg  # noqa: F401
         from threadpoolctl import threadpool_limits
@@ -33,7 +33,7 @@ class _Limit:
             self._running += 1
 
     def __exit__(self, *_: object) -> None:
-        """Restore the number of threads when the last call ends; the first to end would restore it for all."""
+        """Restore the number of threads when the last call ends; restoring it earlier would restore it for all."""
         with self._lock:
             self._running -= 1
             if not self._running:
@@ -43,7 +43,7 @@ class _Limit:
 
 
 def _release_control() -> None:
-    """Let whichever thread comes next set the number: from 3.8 on, threadpoolctl ignores all but the first silently."""
+    """Let the next thread set the number: from 3.8 on, threadpoolctl silently ignores all threads but the first."""
     from threadpoolctl import OpenBLASController
 
     clear = getattr(OpenBLASController, "clear_controlling_thread", None)
@@ -57,13 +57,13 @@ _LIMIT = _Limit()
 def one_blas_thread(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Run `function` with one BLAS thread.
 
-    Products of our matrices end before a second thread has woken up. Where the processors are busy, each
-    product waits for it, many times as long as it takes by itself (issue 48 has numbers).
+    Products of matrices as small as ours finish before a second thread has started. On a busy machine each product
+    waits for that thread, many times as long as the product itself takes (issue 48 has numbers).
     """
 
     @wraps(function)
-    def limited(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+    def with_one_thread(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         with _LIMIT:
             return function(*args, **kwargs)
 
-    return limited
+    return with_one_thread

@@ -1,8 +1,8 @@
-"""Certificates: JSON files that say what held, on which files, and whether those are still the same.
+"""Certificates: JSON files with verified requirements and the SHA-256 of every file that they were verified on.
 
-A certificate is bound to the content of each file that it was made from, by SHA-256, and to itself: `seal` is the
-SHA-256 of all else that stands in it. The seal is a checksum and no signature: it guards against accidents and edits by
-hand, not against forgers, for whoever can write the file can seal it again.
+A certificate is bound to the content of each of these files, by SHA-256, and to its own: `seal` is the SHA-256 of the
+rest of the file. The seal is a checksum and not a signature: it guards against accidents and edits by hand, not against
+forgery, as anyone who can write the file can also compute a new seal.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ _FOLDER = Path("build") / "certificates"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class Certificate(Shown):
-    """What a certificate says: whether all held, and for which files.
+    """A certificate as read from its file.
 
     Attributes:
         path: of the file.
         kind: "verify" or "simulate".
-        holds: whether something was required, and all of it held.
+        holds: whether at least one requirement was checked and all of them hold.
         files: role -> (path, SHA-256) of every file that was read for it.
-        contents: all of the JSON.
+        contents: the whole JSON.
     """
 
     path: Path
@@ -53,21 +53,21 @@ class Certificate(Shown):
         """The requirements or limits, each with "metric", "limit", "value" and "holds"."""
         return required_rows(self.contents)
 
-    def failed(self) -> list[str]:
-        """Return the names of the requirements or limits that did not hold; one that is None was not computed."""
+    def failed_metrics(self) -> list[str]:
+        """Return the requirements or limits that do not hold; those that were not computed (None) are left out."""
         judged = (row for row in self.rows if row.get("holds", False) is not None)
         return [str(row.get("metric")) for row in judged if not row.get("holds")]
 
 
 def required_rows(contents: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the requirements or limits in a certificate's JSON values; one without any certifies nothing."""
+    """Return the requirements or limits in a certificate's JSON values."""
     rows = contents.get("requirements", contents.get("limits"))
     found = [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [{**row, "metric": sim_name(row["metric"])} if "metric" in row else row for row in found]
 
 
 def sim_name(name: Any) -> Any:
-    """Return the name of a metric or table: what is `sim.*` of any robot was `neck.*` up to softneck 0.2."""
+    """Return the current name of a metric or table: up to softneck 0.2 `sim.*` was called `neck.*`."""
     return re.sub(r"^neck(?=\.|$)", "sim", name) if isinstance(name, str) else name
 
 
@@ -78,9 +78,9 @@ def certificate_contents(
 
     Args:
         kind: "verify" or "simulate".
-        holds: whether all that was required held.
+        holds: whether all requirements hold.
         files: role -> (path, SHA-256) of every file that was read.
-        more: what else it says, JSON values only (no NaN, no infinity).
+        more: further entries, JSON values only (no NaN, no infinity).
     """
     contents = {
         "certificate": kind,
@@ -94,7 +94,7 @@ def certificate_contents(
 
 
 def write_certificate(path: str | Path, contents: Mapping[str, Any], *, force: bool = False) -> None:
-    """Write what `certificate_contents` returned, in one piece.
+    """Write the values of `certificate_contents` to a file, whole or not at all.
 
     Raises:
         OutputFileError: the file exists (and not `force`) or cannot be written.
@@ -104,10 +104,10 @@ def write_certificate(path: str | Path, contents: Mapping[str, Any], *, force: b
 
 
 def read_certificate(path: str | Path) -> Certificate:
-    """Return the certificate in a file, whether or not what it asks for held.
+    """Return the certificate in a file, whether or not its requirements hold.
 
     Raises:
-        FileFormatError: no such file, no certificate, of another version, or edited since it was written.
+        FileFormatError: no such file, not a certificate, of another version, or edited since it was written.
     """
     source = Path(path)
     try:
@@ -135,16 +135,16 @@ def read_certificate(path: str | Path) -> Certificate:
 
 
 def check_certificate(path: str | Path, files: Iterable[str | Path], *, kind: str = "verify") -> Certificate:
-    """Return the certificate if it holds and was made from exactly these files, by content and wherever they lie.
+    """Return the certificate if it holds and covers exactly these files, compared by content and not by path.
 
     Args:
         path: of the certificate.
-        files: that must be covered, such as the controller and the observer that are about to be used.
-        kind: "verify" or "simulate": which command must have written it.
+        files: that must be covered, such as the controller and the observer to be used.
+        kind: "verify" or "simulate": the command that must have written it.
 
     Raises:
-        FileFormatError: no certificate, damaged, or edited.
-        CheckFailedError: something required does not hold, or a file was changed since or is not covered.
+        FileFormatError: not a certificate, damaged, or edited.
+        CheckFailedError: a requirement does not hold, or a file has changed since or is not covered.
     """
     found = read_certificate(path)
     if found.kind != kind:
@@ -152,10 +152,12 @@ def check_certificate(path: str | Path, files: Iterable[str | Path], *, kind: st
             f"{found.path}: is a certificate of `softneck {found.kind}`; one of `softneck {kind}` is needed."
         )
     if not found.rows:
-        raise CheckFailedError(f"{found.path}: requires nothing, so it shows nothing; state limits and make it again.")
+        raise CheckFailedError(
+            f"{found.path}: has no requirements, so it certifies nothing; set limits and run the command again."
+        )
     if not found.holds:
-        listed = ", ".join(found.failed()) or "something required"
-        raise CheckFailedError(f"{found.path}: says that {listed} did not hold; mend the design and verify again.")
+        listed = ", ".join(found.failed_metrics()) or "a requirement"
+        raise CheckFailedError(f"{found.path}: {listed} did not hold; fix the design and verify again.")
     digests = {digest for _, digest in found.files.values()}
     for item in map(Path, files):
         if not item.is_file():
@@ -168,7 +170,7 @@ def check_certificate(path: str | Path, files: Iterable[str | Path], *, kind: st
 
 
 def certificate_path(controller: str | Path) -> Path:
-    """Return where the certificate of a controller file is looked for: beside it, else where `verify` writes it.
+    """Return the path of a controller file's certificate: beside the file, else where `verify` writes it.
 
     Beside `pi.npz` that is `pi.certificate.json`; without `-o`, `softneck verify` writes
     `build/certificates/pi.certificate.json`. The file need not exist.

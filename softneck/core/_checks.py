@@ -1,4 +1,4 @@
-"""Checks at the public edge: the argument, the rule with its unit, what came."""
+"""Argument checks of public functions: errors name the argument, the rule with its unit, and the value given."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ Vector = NDArray[np.floating[Any]]
 Matrix = NDArray[np.floating[Any]]
 
 
-#: Called with the fraction done, 0 to 1, and a word on what is being done.
+#: Called with the fraction done, 0 to 1, and a word for the current step.
 Progress = Callable[[float, str], None]
 
 
 def silent(done: float, what: str) -> None:
-    """Report nothing."""
+    """Ignore progress; the callback for calls without a progress bar."""
     del done, what
 
 
@@ -60,9 +60,9 @@ def require_one_of(name: str, value: object, allowed: tuple[str, ...]) -> None:
 
 
 def finite_matrix(name: str, value: object, columns: int, *, missing: bool = False) -> Matrix:
-    """Return `value` as a float matrix (time, `columns`); raise DataError if it is none, or not finite.
+    """Return `value` as a float matrix (time, `columns`); raise DataError if it has another shape or is not finite.
 
-    A vector is one column. With `missing` an entry may be NaN.
+    A vector counts as one column. With `missing` an entry may be NaN.
     """
     array = _numbers(name, value)
     array = array[:, None] if array.ndim == 1 and columns == 1 else array

@@ -1,4 +1,4 @@
-"""The errors users meet: one clear line each, one exit code each; and which extra installs what is missing."""
+"""The errors that users meet, each with one line and an exit code, and the extras that install missing packages."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Iterable
 from importlib import metadata
 from importlib.util import find_spec
 
-# A message quotes what stands in files. Control characters there would end its line, or write to the terminal what they
-# like; where we say several things, a line each, it is by the newline alone.
+# A message quotes text from files. Control characters in it could end the line or control the terminal, so they become
+# `?`. The newline stays: it separates the lines of our own messages.
 _CONTROLS = dict.fromkeys([*range(10), *range(11, 32), *range(127, 160), 0x2028, 0x2029], "?")
 
 
 class SoftneckError(Exception):
-    """Base of all errors a user can mend; the command line prints it on one line and exits with 2."""
+    """Base of all errors that a user can fix; the command line prints it on one line and exits with 2."""
 
     exit_code = 2
 
@@ -28,19 +28,19 @@ class SettingsError(SoftneckError, ValueError):
 
 
 class DataError(SoftneckError, ValueError):
-    """A recording or an array is not what the operation needs."""
+    """A recording or an array does not fit the operation."""
 
 
 class FileFormatError(SoftneckError, ValueError):
-    """A file is not what it should be: another kind, another version, damaged."""
+    """A file is of another kind or version, or is damaged."""
 
 
 class OutputFileError(SoftneckError, OSError):
-    """A file cannot be written where it was asked for."""
+    """A file cannot be written to the given path."""
 
 
 class CheckFailedError(SoftneckError):
-    """A check that the user asked for did not hold; exit code 1."""
+    """A requested check does not hold; exit code 1."""
 
     exit_code = 1
 
@@ -51,7 +51,7 @@ def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     return f"did you mean `{prefix}{near[0]}`? " if near else ""
 
 
-# Package as it is imported -> (extra of `pip install`, what needs it). No path of the README needs one but the drives'.
+# Package as it is imported -> (extra of `pip install`, its purpose). README uses the extra `drives` only.
 EXTRAS = {
     "pyarrow": ("files", "Parquet files"),
     "h5py": ("files", "MATLAB files of version 7.3"),
@@ -67,7 +67,7 @@ EXTRAS = {
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """Return one line on which extra to install; None where the missing module is in none of them."""
+    """Return one line that names the extra to install; None if no extra has the missing module."""
     found = EXTRAS.get((error.name or "").partition(".")[0])
     if found is None:
         return None
@@ -76,16 +76,16 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
 
 
 def _requirements(extra: str) -> str:
-    """Return the packages of an extra for a shell: softneck itself is on no index that pip asks."""
+    """Return the packages of an extra, quoted for a shell: softneck itself is on no package index."""
     try:
         lines = metadata.requires("softneck") or []
     except metadata.PackageNotFoundError:  # run from its folder alone
         return f"'.[{extra}]'"
-    asked = (line.replace('"', "'").partition(";") for line in lines)
-    return shlex.join(name.strip() for name, _, condition in asked if condition.strip() == f"extra == '{extra}'")
+    lists = (line.replace('"', "'").partition(";") for line in lines)
+    return shlex.join(name.strip() for name, _, condition in lists if condition.strip() == f"extra == '{extra}'")
 
 
 def require_package(package: str) -> None:
-    """Raise `SettingsError` with that line unless `package`, of one of the extras, is installed."""
+    """Raise SettingsError that names the extra to install unless `package` is installed."""
     if find_spec(package) is None:
         raise SettingsError(f"{missing_extra(ModuleNotFoundError(name=package))}.")

@@ -1,4 +1,4 @@
-"""Whole files or none: everything is written to a temporary name, brought to the disk and renamed."""
+"""Atomic writing of files: to a temporary file, flushed to the disk, then renamed; and checks of paths."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pathlib import Path
 
 from ._errors import FileFormatError, OutputFileError, SettingsError
 
-# Beside every target: `.NAME-softneck-RANDOM.SUFFIX`; readers and listings of `*.SUFFIX` pass over hidden files.
-_MARK = "-softneck-"
+# Temporary files are called `.NAME-softneck-RANDOM.SUFFIX`: hidden, so that listings of `*.SUFFIX` skip them.
+_NAME_MARK = "-softneck-"
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     """Yield a temporary path beside `path`; on success it becomes `path`, on failure it vanishes.
 
-    The file and its folder are on the disk when this returns, so that a power cut leaves the old file or the new one. A
-    symbolic link is followed: what it points to is replaced, and the link stays. What killed processes left in the
-    folder is removed.
+    The file and its folder are on the disk when this returns, so that a power cut leaves either the old file or the new
+    one. A symbolic link is followed: its target is replaced, and the link stays. Temporary files that killed processes
+    left in the folder are removed.
 
     Raises:
         OutputFileError: `path` exists and `force` is false, or its folder cannot be written, or the disk is full.
@@ -31,10 +31,10 @@ def atomic_write(path: str | Path, *, force: bool = False) -> Iterator[Path]:
     named = Path(path)
     refuse_existing(named, force=force)
     try:
-        target = _followed(named)
+        target = _resolve_link(named)
         target.parent.mkdir(parents=True, exist_ok=True)
         _sweep(target.parent)
-        temporary, held = _begun(target)
+        temporary, descriptor = _create_temporary(target)
     except OSError as error:
         raise OutputFileError(f"{named}: cannot be written: {error.strerror}. Choose another folder.") from error
     try:
@@ -43,46 +43,46 @@ def atomic_write(path: str | Path, *, force: bool = False) -> Iterator[Path]:
         temporary.replace(target)
         _to_disk(target.parent)
     except OSError as error:
-        if isinstance(error, OutputFileError):  # of a writer in a writer, which knows the temporary file alone
+        if isinstance(error, OutputFileError):  # of a nested writer, which only has the name of the temporary file
             raise OutputFileError(str(error).replace(str(temporary), str(named))) from error
         reason = error.strerror or str(error)
         raise OutputFileError(f"{named}: cannot be written: {reason}. Nothing was left behind.") from error
     finally:
         temporary.unlink(missing_ok=True)
-        os.close(held)
+        os.close(descriptor)
 
 
-def _followed(path: Path) -> Path:
-    """Return what a symbolic link points to, there or not yet; raise OSError where links lead in a circle."""
+def _resolve_link(path: Path) -> Path:
+    """Return the target of a symbolic link, whether or not it exists; raise OSError if links form a circle."""
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     if target.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
     return target
 
 
-def _begun(target: Path) -> tuple[Path, int]:
-    """Return a new temporary file and the descriptor that holds its lock; the umask decides who may read it."""
+def _create_temporary(target: Path) -> tuple[Path, int]:
+    """Create a temporary file; return its path and the descriptor that holds its lock. Its mode follows the umask."""
     while True:
-        path = target.with_name(f".{target.stem[:40]}{_MARK}{secrets.token_hex(4)}{target.suffix}")
-        held = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
-        fcntl.flock(held, fcntl.LOCK_EX)
-        # Between the two lines another process may have taken it for one that was left.
+        path = target.with_name(f".{target.stem[:40]}{_NAME_MARK}{secrets.token_hex(4)}{target.suffix}")
+        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        # Between these two lines another process may have removed it as an abandoned file.
         if path.exists():
-            return path, held
-        os.close(held)
+            return path, descriptor
+        os.close(descriptor)
 
 
 def _sweep(folder: Path) -> None:
-    """Remove the temporary files of processes that ended: nobody holds their locks."""
+    """Remove the temporary files of processes that ended: those whose lock is free."""
     for entry in os.scandir(folder):
-        if entry.name.startswith(".") and _MARK in entry.name and entry.is_file(follow_symlinks=False):
+        if entry.name.startswith(".") and _NAME_MARK in entry.name and entry.is_file(follow_symlinks=False):
             with contextlib.suppress(OSError):
-                held = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
+                descriptor = os.open(entry.path, os.O_RDONLY | os.O_NOFOLLOW)
                 try:
-                    fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    os.unlink(entry.path)  # noqa: PTH108  (what scandir gives)
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    os.unlink(entry.path)  # noqa: PTH108  (scandir gives a text)
                 finally:
-                    os.close(held)
+                    os.close(descriptor)
 
 
 def _to_disk(path: Path) -> None:
@@ -104,14 +104,14 @@ def refuse_existing(path: str | Path, *, force: bool) -> None:
 
 
 def as_path(thing: object) -> Path:
-    """Return a path; raise SettingsError for what names no file."""
+    """Return `thing` as a path; raise SettingsError if it is neither a text nor a path."""
     if not isinstance(thing, str | Path):
         raise SettingsError(f"the name of a file is needed; got a {type(thing).__name__}.")
     return Path(thing)
 
 
 def require_file(path: str | Path) -> None:
-    """Raise FileFormatError where there is no file, and say so of a folder."""
+    """Raise FileFormatError if `path` does not exist or is a folder."""
     if not Path(path).is_file():
         what = "is a folder; name a file in it" if Path(path).is_dir() else "no such file"
         raise FileFormatError(f"{path}: {what}.")

@@ -1,4 +1,4 @@
-"""The table of kinds: a constant, resolved on demand, read by the command line, FMU builder and validation."""
+"""The table of kinds of models, observers and controllers, with the dotted paths of their classes and runtimes."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from ._errors import FileFormatError, SettingsError, did_you_mean
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One kind of thing that can be saved and stepped.
+    """One kind of model, family, observer or controller.
 
     Attributes:
-        name: what users type and what a file's header says.
+        name: as users type it and as it is in a file's header.
         role: "model", "observer", "controller" or "family".
-        settings: dotted path of the settings class whose `fit` or `design` makes it, or of the function.
-        result: dotted path of the class that a file becomes, by its `from_archive`.
-        runtime: dotted name of the runtime module (see `core.bundle`); "" for what no loop steps.
+        settings: dotted path of the settings class with the `fit` or `design` that makes it, or of a function.
+        result: dotted path of the class whose `from_archive` reads the file.
+        runtime: dotted name of the runtime module (see `softneck.runtime`); "" for kinds that are not simulated.
         summary: one line for `--help` and the docs.
-        check: dotted path of what checks the numbers in a model's arrays; names and shapes its runtime declares.
+        check: dotted path of the function that checks the values of a model's arrays; the runtime declares their names
+            and shapes.
     """
 
     name: str
@@ -39,7 +40,7 @@ class Kind:
 
 _IDENT, _DESIGN = "softneck.identification", "softneck.design"
 _MODEL = f"{_IDENT}:Model"
-#: The table of kinds: the name that users type -> what makes it, what it becomes, what steps it.
+#: The table of kinds by name.
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (

@@ -1,4 +1,4 @@
-"""A bar on stderr for what takes more than two seconds in Python; commands have their own."""
+"""A progress bar on stderr for Python calls that take more than two seconds; commands draw their own."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from typing import Any
 
 from ._checks import Progress, silent
 
-# Nobody waits for what ends sooner [s].
-_PATIENCE = 2.0
-_OFF = "SOFTNECK_PROGRESS"
+# Time after which the bar appears [s].
+_DELAY_S = 2.0
+_SWITCH_VARIABLE = "SOFTNECK_PROGRESS"
 
 
 @contextmanager
 def shown_progress(what: str, given: Progress | None) -> Iterator[Progress]:
-    """Yield the callback that was `given`, or one that draws a bar once two seconds have passed.
+    """Yield the callback that was `given`, or one that draws a bar after two seconds.
 
-    Nothing is drawn where stderr is no terminal or the variable SOFTNECK_PROGRESS is 0; `softneck.core.silent` given
+    No bar is drawn where stderr is no terminal or the variable SOFTNECK_PROGRESS is 0; `softneck.core.silent` given
     as callback turns one bar off.
     """
-    if given is not None or not sys.stderr.isatty() or os.environ.get(_OFF) == "0":
+    if given is not None or not sys.stderr.isatty() or os.environ.get(_SWITCH_VARIABLE) == "0":
         yield given or silent
         return
     bars: list[Any] = []
     since = time.monotonic()
 
     def tell(done: float, word: str) -> None:
-        if not bars and time.monotonic() - since > _PATIENCE:
+        if not bars and time.monotonic() - since > _DELAY_S:
             bars.append(_bar())
             bars[0].add_task(what, total=1.0)
         if bars:

@@ -1,4 +1,4 @@
-"""How an object shows itself: three lines."""
+"""Short `repr` of softneck's objects, three lines at most."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 
+# Lines of a `repr` and characters of each.
 _LINES, _COLUMNS = 3, 120
-# Of one value among others in a line.
+# Characters of one value, and entries of one list.
 _VALUE, _ITEMS = 40, 4
-# What pages and terminals cannot hold.
-_ODD = re.compile(r"[^\x20-\x7e\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+# Characters that pages and terminals cannot show.
+_NOT_PRINTABLE = re.compile(r"[^\x20-\x7e\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 class Shown:
-    """Gives a dataclass made with `repr=False` a short `repr`."""
+    """Mixin that gives a dataclass made with `repr=False` a short `repr`."""
 
     __slots__ = ()
 
@@ -54,11 +55,11 @@ def _short(value: Any) -> str:
 
 
 def _plain(text: Any) -> str:
-    return _ODD.sub("\ufffd", " ".join(str(text).split()))
+    return _NOT_PRINTABLE.sub("\ufffd", " ".join(str(text).split()))
 
 
 def percent(value: float | None) -> str:
-    """Return a fit for a table cell; `-` where there is none: it diverged, or nothing was measured or moved."""
+    """Return a fit [%] as a table cell; `-` if it diverged or the output was not measured or is constant."""
     if value is not None and value < -1000.0:
         return "<-1000"
     return "-" if value is None else f"{value:.1f}"

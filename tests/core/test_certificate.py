@@ -36,7 +36,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     assert found.kind == "verify"
     assert found.holds
     assert found.files == {"controller": (str(controller), file_hash(controller))}
-    assert check_certificate(path, [controller]).failed() == []
+    assert check_certificate(path, [controller]).failed_metrics() == []
 
 
 def test_a_file_counts_by_its_content_wherever_it_lies(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 def later(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let two seconds have passed."""
-    monkeypatch.setattr("softneck.core._progress._PATIENCE", -1.0)
+    monkeypatch.setattr("softneck.core._progress._DELAY_S", -1.0)
 
 
 def test_what_takes_long_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

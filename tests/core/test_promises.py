@@ -166,7 +166,7 @@ def test_the_rows_that_failed_are_named_in_their_order(tmp_path: Path) -> None:
         del changed["requirements"]
         path = tmp_path / f"{key}.json"
         path.write_text(sealed({**changed, key: rows}), encoding="utf-8")
-        assert read_certificate(path).failed() == ["b", "c"]
+        assert read_certificate(path).failed_metrics() == ["b", "c"]
 
 
 def test_a_certificate_lies_beside_its_controller_or_where_verify_writes(tmp_path: Path, controller: Path) -> None:

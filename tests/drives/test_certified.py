@@ -45,7 +45,7 @@ def test_both_certificates_let_a_run_begin(project: Project) -> None:
 def test_an_empty_certificate_arms_nothing(project: Project, tmp_path: Path) -> None:
     empty = edited(project.certificate, tmp_path / "empty.json", limits=[])
     assert not read_certificate(empty).holds
-    with pytest.raises(CheckFailedError, match=r"empty\.json: requires nothing, so it shows nothing"):
+    with pytest.raises(CheckFailedError, match=r"empty\.json: has no requirements, so it certifies nothing"):
         require_certified(load_loop(project.loop), project.controller, [empty])
 
 

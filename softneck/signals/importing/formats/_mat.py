@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, FileFormatError, SoftneckError
-from softneck.core._budget import room
+from softneck.core._budget import largest_unpacked
 from softneck.core._errors import require_package
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def read_mat5(data: bytes) -> Iterator[tuple[str, np.ndarray]]:
     """
     if not is_mat5(data):
         raise ValueError("neither version 5 nor 7.3; save it with -v7")
-    left = room(len(data))
+    left = largest_unpacked(len(data))
     file = _Elements(memoryview(data), "<" if data[126:128] == b"IM" else ">", _HEADER)
     while file.place + 8 <= len(data):
         kind, content = file.next()
@@ -155,7 +155,7 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
         if hdf5:
             require_package("h5py")
         arrays = _hdf5(source) if hdf5 else read_mat5(source.read_bytes())
-        found = _by_name(arrays, room(8 * source.stat().st_size))
+        found = _by_name(arrays, largest_unpacked(8 * source.stat().st_size))
     except SoftneckError:
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
@@ -219,7 +219,7 @@ def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[st
     elif isinstance(item, h5py.Dataset) and _is_numbers(item):
         if item.external or item.is_virtual:
             raise DataError(f"variable `{name}` lies in another file; softneck reads what is in this one.")
-        if item.size is not None and 8 * item.size > room(8 * item.file.id.get_filesize()):
+        if item.size is not None and 8 * item.size > largest_unpacked(8 * item.file.id.get_filesize()):
             raise DataError(f"variable `{name}` declares {item.size} numbers; that is not a log.")
         # MATLAB stores columns first: the file's shape is the transpose.
         yield name, np.asarray(item[()], dtype=np.float64).T
