@@ -167,10 +167,9 @@ def _turned(observer: AnyObserver, run: Recording) -> Matrix | None:
 
 def _pulled(observer: AnyObserver, run: Recording) -> Matrix | None:
     """Return what the motors' positions add up to in each axis (time, outputs)."""
-    names = [f"motor_position_{j + 1}" for j in range(len(run.robot.motors.names))]
-    if observer.form not in ("model", "nonlinear") or not set(names) <= set(run.channels):
+    if observer.form not in ("model", "nonlinear") or not run.has_motor_positions:
         return None
-    return np.column_stack([run.channels[name] for name in names]) @ observer.directions.T
+    return run.motor_positions @ observer.directions.T
 
 
 def _lag(pairs: Sequence[tuple[Matrix, Matrix]], period: float) -> float | None:

@@ -92,14 +92,14 @@ def _played(model: Model, source: str | Path) -> Recording:
     block = model.block()
     names = [port.name for port in block.inputs]
     inputs = block.checked_inputs(np.tile([port.start for port in block.inputs], (len(played.time) - 1, 1)))
-    for j in (1, 2, 3):
-        inputs[:, names.index(f"motor_setpoint_{j}")] = played.set_points[:-1, j - 1]
+    motors = model.robot.set_points
+    inputs[:, [names.index(name) for name in motors]] = played.set_points[:-1]
     start = block.initial_state()
     outputs = [port.name for port in block.outputs]
     rows = [outputs.index(axis) for axis in ("pitch", "roll")]
     Y = np.vstack([start.outputs[rows], block.run(start, inputs)[1][:, rows]])
-    channels = {f"motor_setpoint_{j}": played.set_points[:, j - 1] for j in (1, 2, 3)}
-    return Recording(played.time, played.sample_time, {**channels, "pitch": Y[:, 0], "roll": Y[:, 1]})
+    channels = dict(zip((*motors, "pitch", "roll"), (*played.set_points.T, *Y.T), strict=True))
+    return Recording(played.time, played.sample_time, channels, robot=model.robot)
 
 
 # A hold-out of a second or less says nothing.

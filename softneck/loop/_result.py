@@ -43,7 +43,7 @@ class LoopResult(Shown):
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,); raise DataError with the known names if there is none."""
         try:
-            return self.signals[name]
+            return self.signals[self.robot.own(name)]
         except KeyError:
             raise DataError(f"the result has no signal `{name}`; it has {', '.join(self.signals)}.") from None
 

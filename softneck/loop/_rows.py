@@ -13,6 +13,7 @@ from typing import TypeGuard
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
+from softneck.robot._channels import is_set_point
 from softneck.runtime import load_runtime
 from softneck.runtime._compile import load_linked
 
@@ -100,7 +101,7 @@ def _feeders(name: str, parts: Mapping[str, Part], tap: Tap) -> dict[str, str]:
     """Return the part -> variable that must be known before `name` steps."""
     feeders = {}
     for owner, port in zip(tap.owners, tap.ports, strict=True):
-        held = parts[name].role == "observer" and port.name.startswith("motor_setpoint_")
+        held = parts[name].role == "observer" and is_set_point(port.name)
         if owner in parts and not late(parts[owner]) and not held:
             feeders.setdefault(owner, port.name)
     return feeders

@@ -230,7 +230,7 @@ def _check_plant(plant: Part, constants: Mapping[str, float], robot: Robot) -> N
         if name not in names:
             raise SettingsError(f"the plant has no input `{name}`; its inputs are {', '.join(names)}.")
     for name in constants:
-        if name.startswith("motor_setpoint_"):
+        if name in robot.set_points:
             raise SettingsError(f"the plant's input `{name}` has two writers: the controller and a constant.")
 
 
@@ -258,7 +258,7 @@ class _Finder:
             return self.links[self.name, port.name]
         if port.name in self.constants:
             return float(self.constants[port.name])
-        if self.name == "plant" and not port.name.startswith("motor_setpoint_"):
+        if self.name == "plant" and port.name not in self.robot.set_points:
             return math.nan if port.missing else port.start
         for candidate in _candidates(self.name, port.name, self.parts, self.robot):
             if candidate in self.slots:
@@ -287,7 +287,7 @@ class _Finder:
 def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot) -> Iterator[tuple[str, str]]:
     if sources := _sources(wanted, robot):
         yield from sources
-    elif wanted.startswith("motor_setpoint_"):
+    elif wanted in robot.set_points:
         yield ("controller", wanted)
     elif name == "controller" and wanted in measured_names(robot):
         # With an observer its estimate or nothing: a silent fall-back would hide a wrong observer.

@@ -62,7 +62,10 @@ def _outputs(robot: Robot) -> tuple[Port, ...]:
         ),
         *(Port(name=f"{name}_rate_measured", unit="rad/s", description=f"{name} rate of the gyro") for name in outputs),
         Port(name="measurement_valid", description="false while the inclinometer drops out", boolean=True, start=1.0),
-        *(Port(name=f"motor_position_{i}", unit="rad", description=f"encoder of winch {i}") for i in motors),
+        *(
+            Port(name=name, unit="rad", description=f"encoder of winch {i}")
+            for i, name in enumerate(robot.motor_positions, start=1)
+        ),
         *(Port(name=f"tension_{i}", unit="N", description=f"tension of tendon {i} at its winch") for i in motors),
         Port(name="compression", unit="m", description="axial compression of the link"),
     )
@@ -200,7 +203,7 @@ def _as_shown(ports: tuple[Port, ...], robot: Robot) -> tuple[Port, ...]:
 
     def shown(port: Port) -> str:
         if port.unit == "rad":
-            return motors if port.name.startswith("motor_") else outputs
+            return motors if port.name in (*robot.set_points, *robot.motor_positions) else outputs
         return f"{outputs}/s" if port.unit == "rad/s" else ""
 
     return tuple(replace(port, display_unit=shown(port)) for port in ports)

@@ -137,6 +137,6 @@ def _check_set_points(P: Matrix, excitation: Excitation, neck: VirtualNeck) -> N
         low, high = ranges[motor]
         within = f"within +-{high:g} rad" if low == -high else f"from {low:g} to {high:g} rad"
         raise DataError(
-            f"`motor_setpoint_{motor + 1}` of {excitation.name} is {P[row, motor]:g} rad at t = "
+            f"`{neck.robot.set_points[motor]}` of {excitation.name} is {P[row, motor]:g} rad at t = "
             f"{excitation.time[row]:g} s; it must be finite and {within}."
         )

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 # More points than this hide each other, and fill the page.
 _POINTS = 3_000
-_GROUPS = (("set-points", "motor_setpoint_"), ("positions", "motor_position_"), ("velocities", "motor_velocity_"))
 
 
 def import_page(
@@ -128,9 +127,13 @@ def _span(values: Vector, unit: str) -> str:
 def _charts(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> list[Chart]:
     """Return a chart for each group of channels, the raw columns beside it."""
     sources = _sources(layout)
-    groups = {title: [name for name in layout.channels if name.startswith(start)] for title, start in _GROUPS}
+    robot = layout.robot
+    channels = {
+        "set-points": robot.set_points, "positions": robot.motor_positions, "velocities": robot.motor_velocities,
+    }  # fmt: skip
+    groups = {title: [name for name in layout.channels if name in names] for title, names in channels.items()}
     taken = {name for names in groups.values() for name in names}
-    for output in layout.robot.outputs.names:
+    for output in robot.outputs.names:
         groups[output] = [name for name in layout.channels if name.startswith(output) and name not in taken]
     charts = []
     for title, names in groups.items():

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from softneck.core import SettingsError, to_si
 
 MOST_MOTORS, MOST_OUTPUTS = 8, 4
+_NUMBERED = re.compile(r"motor_(?P<what>setpoint|position|velocity|position_measured)_(?P<motor>[1-8])")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 # What recordings call other things: an output of that name, or one that ends so, could not be told from them.
 _TAKEN = re.compile(r"(time|run|motor_.*|payload|compression|push_.*|base_tilt_.*|innovation|healthy|enabled|"
@@ -20,7 +21,7 @@ class Motors:
     """The 1 to 8 motors, tendons or chambers that a robot is moved by; limits in `unit`, None where not given.
 
     Attributes:
-        names: for people; channels are numbered, `motor_setpoint_1` and so on, in this order.
+        names: `pressure` has the channels `pressure_setpoint`, `pressure_position`, ..; `motor_1` `motor_setpoint_1`.
         unit: of set-points and positions in the robot's files, such as "rad" or "bar".
         setpoint_min: (motors,) lowest set-points.
         setpoint_max: (motors,) highest set-points.
@@ -88,6 +89,44 @@ class Outputs:
         _one_each("outputs", self.names, self.min, self.max, self.nominal, self.rest)
         _positive("outputs.nominal", self.nominal, self.unit)
         check_range("outputs", "min", "max", self.min, self.max)
+
+
+def motor_channels(motors: Sequence[str], outputs: Sequence[str], what: str) -> tuple[str, ...]:
+    """Return the channels of `what` ("setpoint", "position", "velocity", "position_measured") of each motor.
+
+    `pressure` has `pressure_setpoint`; `motor_1`, or one whose channel would be another's, has `motor_setpoint_1`.
+    """
+    stems, found = [name.removesuffix("_setpoint") for name in motors], []
+    for j, (name, stem) in enumerate(zip(motors, stems, strict=True), start=1):
+        other = stems.count(stem) > 1 or f"{stem}_{what.removesuffix('_measured')}" in outputs
+        numbered = name == f"motor_{j}" or other
+        found.append(_with_number(what, j) if numbered else f"{stem}_{what}")
+    return tuple(found)
+
+
+def _with_number(what: str, motor: int) -> str:
+    return f"motor_{what}_{motor}"
+
+
+def numbered(channel: str) -> tuple[str, int] | None:
+    """Return what of which motor, from 0, `motor_setpoint_1` and the like are; None for other channels."""
+    match = _NUMBERED.fullmatch(channel)
+    return None if match is None else (match["what"], int(match["motor"]) - 1)
+
+
+def is_set_point(channel: str) -> bool:
+    """Return whether a variable is called like the set-point of a motor, of any robot."""
+    return channel.startswith("motor_setpoint_") or channel.endswith("_setpoint")
+
+
+def motor_positions_among(names: Collection[str]) -> tuple[str, ...]:
+    """Return what the positions of the motors are called whose set-points are among `names`, of any robot."""
+    found = []
+    for j, name in enumerate(filter(is_set_point, dict.fromkeys(names)), start=1):
+        with_number = _with_number("position", j)
+        own = not name.startswith("motor_setpoint_") and with_number not in names
+        found.append(f"{name.removesuffix('_setpoint')}_position" if own else with_number)
+    return tuple(found)
 
 
 def check_range(

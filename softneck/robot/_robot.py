@@ -16,7 +16,7 @@ from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.core._shown import Shown
 
 from . import _file
-from ._channels import Motors, Outputs
+from ._channels import Motors, Outputs, motor_channels, numbered
 from ._directions import Directions
 from ._redefined import redefinition_of
 
@@ -136,12 +136,30 @@ class Robot(Shown):
     @property
     def set_points(self) -> tuple[str, ...]:
         """The channels of the motors' set-points."""
-        return tuple(f"motor_setpoint_{j + 1}" for j in range(len(self.motors.names)))
+        return self._motor_channels("setpoint")
 
     @property
     def motor_positions(self) -> tuple[str, ...]:
         """The channels of the motors' measured positions."""
-        return tuple(f"motor_position_{j + 1}" for j in range(len(self.motors.names)))
+        return self._motor_channels("position")
+
+    @property
+    def motor_velocities(self) -> tuple[str, ...]:
+        """The channels of the motors' measured speeds."""
+        return self._motor_channels("velocity")
+
+    @property
+    def measured_positions(self) -> tuple[str, ...]:
+        """What a model's inputs for the motors' measured positions are called."""
+        return self._motor_channels("position_measured")
+
+    def own(self, channel: str) -> str:
+        """Return what the robot calls a channel: `motor_setpoint_1` stands for the first motor's, whatever its name."""
+        what, motor = numbered(channel) or ("", 0)
+        return self._motor_channels(what)[motor] if what and motor < len(self.motors.names) else channel
+
+    def _motor_channels(self, what: str) -> tuple[str, ...]:
+        return motor_channels(self.motors.names, self.outputs.names, what)
 
     @property
     def hash(self) -> str:

@@ -80,7 +80,7 @@ def check_ports(block: Block, robot: Robot) -> None:
     if missing:
         raise SettingsError(
             f"the controller {block.kind} has no channel `{missing[0]}`; softneck verifies controllers from "
-            f"{', '.join(names)} and their references to motor_setpoint_1..{len(robot.set_points)}."
+            f"{', '.join(names)} and their references to {', '.join(robot.set_points)}."
         )
 
 

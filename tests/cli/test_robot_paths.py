@@ -112,7 +112,7 @@ def test_fmus_and_pages_of_a_tank(call: Call, log: Path, tmp_path: Path) -> None
     assert call("fmu", "m.npz", "-o", "M.fmu", "--data", "rec.csv").code == 0
     assert call("info", "rec.csv", "--html", "q.html").code == 0
     assert call("validate", "m.npz", "--data", "rec.csv", "--html", "v.html").code == 0
-    assert "motor_setpoint_2" in (tmp_path / "q.html").read_text(encoding="utf-8")
+    assert "valve_2_setpoint" in (tmp_path / "q.html").read_text(encoding="utf-8")
     assert "errors in mm, level" in (tmp_path / "v.html").read_text(encoding="utf-8")
 
 
@@ -198,7 +198,7 @@ def test_named_columns_are_a_layout_and_a_robot(call: Call, tmp_path: Path) -> N
     table = np.genfromtxt("log.csv", delimiter=",", skip_header=1)
     # Files of ours keep all digits; the robot's own unit is Pa inside.
     np.testing.assert_allclose(recording.set_points, 1e3 * table[:, 1:3], rtol=1e-12)
-    np.testing.assert_allclose(recording.channels["motor_position_2"], 1e3 * table[:, 4], rtol=1e-12)
+    np.testing.assert_allclose(recording.motor_positions[:, 1], 1e3 * table[:, 4], rtol=1e-12)
     np.testing.assert_allclose(np.degrees(recording.outputs[:, 0]), table[:, 5], rtol=1e-9, atol=1e-9)
     # The layout and the robot that were written do the same again; and so does the robot alone.
     again = ("import", "log.csv", "--layout", "rec.layout.toml", "--robot", "rec.robot.toml", "-o", "again.csv")

@@ -154,12 +154,12 @@ def test_pressures_and_lengths_keep_their_names_units_and_ranges(
     path = built(block, tmp_path / "Chambers.fmu", backend, fmi)
     found = variables(path)
     assert list(found)[:10] == [
-        "motor_setpoint_1", "motor_setpoint_2", "x_measured", "y_measured", "z_measured",
-        "motor_position_measured_1", "motor_position_measured_2", "x", "y", "z",
+        "left_setpoint", "right_setpoint", "x_measured", "y_measured", "z_measured",
+        "left_position_measured", "right_position_measured", "x", "y", "z",
     ]  # fmt: skip
     assert [found[name].causality for name in ("x_start", "z_start", "use_measurement")] == ["parameter"] * 3
-    pressure = found["motor_setpoint_1"]
-    assert float(pressure.max) == rec.channels["motor_setpoint_1"].max()
+    pressure = found["left_setpoint"]
+    assert float(pressure.max) == rec.channels["left_setpoint"].max()
     units = {unit.name: unit for unit in fmpy.read_model_description(str(path)).unitDefinitions}
     (bar,), (mm,) = units["Pa"].displayUnits, units["m"].displayUnits
     assert (bar.name, bar.factor, mm.name, mm.factor) == ("bar", 1e-5, "mm", 1e3)

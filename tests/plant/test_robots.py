@@ -27,7 +27,7 @@ def robot(count: int, seen: int, /, *, turn: float = 0.0, **tables: Any) -> Robo
         {
             **table,
             "name": f"robot {count}",
-            "motors": {**table["motors"], "names": [f"m{j}" for j in range(count)]},
+            "motors": {**table["motors"], "names": [f"motor_{j + 1}" for j in range(count)]},
             "outputs": {**table["outputs"], "names": ["bend", "sway"][:seen]},
             "directions": {"kind": "tendons", "angles_deg": angles},
             **tables,
@@ -234,7 +234,7 @@ def test_set_points_beyond_the_robot_s_range_are_refused() -> None:
     pulls = VirtualNeck.of(robot(2, 1, motors={"names": ["a", "b"], "unit": "rad", "setpoint_min": 0.0,
                                                "setpoint_max": 3.0}))  # fmt: skip
     P = np.array([[0.0, 0.0], [1.0, -0.1]])
-    with pytest.raises(DataError, match=r"`motor_setpoint_2` of mine is -0.1 rad .* from 0 to 3 rad"):
+    with pytest.raises(DataError, match=r"`b_setpoint` of mine is -0.1 rad .* from 0 to 3 rad"):
         record(Excitation("mine", np.array([0.0, 0.02]), P), pulls)
     with pytest.raises(DataError, match=r"shape \(time, 2\)"):
         record(Excitation("mine", np.array([0.0, 0.02]), np.zeros((2, 3))), pulls)

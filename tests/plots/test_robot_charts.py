@@ -52,7 +52,7 @@ def test_a_recording_has_all_motors_and_outputs_in_the_robot_s_units(recording: 
 def test_the_page_on_quality_is_of_any_robot(recording: Recording) -> None:
     found = assess_quality(recording, bandwidth=4.0)
     page = quality_page(recording, found, "mine")
-    assert ">motor_setpoint_5<" in page
+    assert f">{recording.robot.set_points[4]}<" in page
     assert page.count('<li class="ok">') == sum(finding.severity == "ok" for finding in found.findings)
 
 

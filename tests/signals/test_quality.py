@@ -178,7 +178,8 @@ def test_another_robot_is_judged_by_its_channels() -> None:
         "outputs": {"names": ["x", "y"], "unit": "m", "display_unit": "mm"},
         "directions": {"kind": "identified"},
     })  # fmt: skip
-    names = {"pitch": "x", "roll": "y"} | {n: n for n in (*neck.robot.set_points, *neck.robot.motor_positions)}
+    theirs, mine = ((*r.outputs.names, *r.set_points, *r.motor_positions) for r in (neck.robot, robot))
+    names = dict(zip(theirs, mine, strict=True))
     channels = {mine: neck.channels[name] for name, mine in names.items()}
     other = Recording(neck.time, neck.sample_time, channels, robot=robot)
     of_neck, found = assess_quality(neck), assess_quality(other, bandwidth=4.0)

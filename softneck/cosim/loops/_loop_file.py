@@ -101,7 +101,7 @@ def load_ssp(path: str | Path) -> LoopSetup | System:
     inputs, parameters = _constants(parts, entries)
     return System(
         parts=parts,
-        connections=links(read.table["connections"]),
+        connections=links(read.table["connections"], Robot.preset("neck")),
         constants=inputs,
         parameters=parameters,
         duration=number("duration_s", read.table["duration_s"]),
@@ -212,6 +212,7 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     robot = opener.robot(table.get("robot"), None if source.is_dir() else source)
     _check_fmus(parts, robot)
     parts["plant"] = opener.plant_of(robot, parts["plant"])
+    parts = {name: opener.called(name, part, robot) for name, part in parts.items()}
     reference = opener.reference(table["reference"], parts["controller"].sample_time, robot)
     if isinstance(reference, FmuPart | IsolatedPart):
         parts["reference"], described["reference"] = reference, table["reference"]
@@ -232,7 +233,7 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
         others={name: parts[name] for name in others},
         faults=_faults(table.get("fault", []), robot),
         robot=robot,
-        connections=links(table.get("connections", {})),
+        connections=links(table.get("connections", {}), robot),
     )
     _check_sample_time(loop, table.get("sample_time_s"))
     limits = numbers("[limits]", table.get("limits", {}))

@@ -9,6 +9,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from softneck.loop._wiring import Link
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
 from softneck.robot import Robot, find_robot
-from softneck.runtime import Block
+from softneck.runtime import Block, Port
 from softneck.signals import read_recording
 from softneck.signals.recording._recording import require_same_robot
 
@@ -72,10 +73,15 @@ def texts(where: str, table: Any) -> dict[str, str]:
     return dict(table)
 
 
-def links(table: Any) -> dict[str, str | Link]:
+def links(table: Any, robot: Robot) -> dict[str, str | Link]:
     """Return [connections]: each a name, or {from = name, factor, offset}, which stands for any conversion of units."""
     if not isinstance(table, dict):
         raise SettingsError(f"[connections] must be a table; got {table!r}.")
+
+    def own(end: str) -> str:
+        part, dot, name = end.partition(".")
+        return f"{part}{dot}{robot.own(name)}"
+
     made: dict[str, str | Link] = {}
     for target, origin in table.items():
         where = f'[connections] "{target}"'
@@ -84,9 +90,9 @@ def links(table: Any) -> dict[str, str | Link]:
             name, factor, offset = origin.get("from"), origin.get("factor", 1.0), origin.get("offset", 0.0)
             if not isinstance(name, str):
                 raise SettingsError(f"{where} needs `from`, the name of an output; got {name!r}.")
-            made[target] = Link(name, number(f"{where} factor", factor), number(f"{where} offset", offset))
+            made[own(target)] = Link(own(name), number(f"{where} factor", factor), number(f"{where} offset", offset))
         elif isinstance(origin, str):
-            made[target] = origin
+            made[own(target)] = own(origin)
         else:
             raise SettingsError(f"{where} must be a name or a table with `from`; got {origin!r}.")
     return made
@@ -234,6 +240,23 @@ class PartOpener:
             return made
         return BlockPart(VirtualNeck.of(robot, self._physics).block(sample_time=self._step))
 
+    def called(self, name: str, part: Part, robot: Robot) -> Part:
+        """Return a part whose motors' ports have `robot`'s names, no numbers, and no names of its own robot."""
+        names = {port.name: robot.own(port.name) for port in (*part.inputs, *part.outputs)}
+        if name in self.robots:
+            whose = self.robots[name]
+            for what in ("set_points", "motor_positions", "measured_positions"):
+                names |= dict(zip(getattr(whose, what), getattr(robot, what), strict=True))
+        names = {other: own for other, own in names.items() if other != own}
+        if names and type(part) is BlockPart:
+            block = part.block
+            ports = {"inputs": _with_names(block.inputs, names), "outputs": _with_names(block.outputs, names)}
+            return BlockPart(replace(block, **ports))
+        if isinstance(part, FmuPart | IsolatedPart):
+            return part.called(names) if names else part
+        made: Any = _CalledPart(part, names) if names else part
+        return made
+
     def _says(self, name: str, thing: Any) -> None:
         """Remember whose a part is, if it says so."""
         if isinstance(robot := getattr(thing, "robot", None), Robot):
@@ -270,6 +293,23 @@ class PartOpener:
             raise FileFormatError(f"[{role}]: there is no file {path}.")
         self.files[role] = (str(path), self._open(("hash", path), lambda: file_hash(path)))
         return path
+
+
+class _CalledPart:
+    """A part of one's own whose ports have other names."""
+
+    def __init__(self, part: Part, names: Mapping[str, str]) -> None:
+        """Take what they are called -> what they shall be."""
+        self._part, self.sample_time, self.role = part, part.sample_time, part.role
+        self.inputs, self.outputs = (_with_names(ports, names) for ports in (part.inputs, part.outputs))
+
+    def __getattr__(self, name: str) -> Any:
+        """Leave all else to the part itself."""
+        return getattr(self._part, name)
+
+
+def _with_names(ports: tuple[Port, ...], names: Mapping[str, str]) -> tuple[Port, ...]:
+    return tuple(replace(port, name=names.get(port.name, port.name)) for port in ports)
 
 
 def _part_of(name: str, made: Any, said: str = " is") -> Part:

@@ -97,6 +97,11 @@ class FmuPart:
         self._folder: Path | None = None
         self._broken = False
 
+    def called(self, names: Mapping[str, str]) -> FmuPart:
+        """Return the same part with other names for its variables: what they are called here -> what there."""
+        settings = {"role": self.role, "sample_time": self.sample_time}
+        return FmuPart(self.path, **settings, **renamed(self, names))  # pyright: ignore[reportArgumentType]
+
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Instantiate and initialise the FMU at `time` [s]; return its outputs (n_out,) there.
 
@@ -221,6 +226,15 @@ class FmuPart:
     def _reason(self) -> str:
         lines = [text for status, text in self.messages if status >= ERROR and not text.startswith(_NO_REASON)]
         return lines[-1] if lines else ""
+
+
+def renamed(part: Any, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return the arguments `names` and `units` of an FMU's part for variables with other names."""
+    native = {**{name: name for name in names}, **part.native_names}
+    return {
+        "names": {theirs: names.get(ours, ours) for ours, theirs in native.items()},
+        "units": {names.get(ours, ours): unit for ours, unit in part.units.items()},
+    }
 
 
 def _check_platform(description: Description, folder: Path) -> None:

@@ -30,7 +30,7 @@ from softneck.core import (
     require_positive,
 )
 
-from ._fmu_part import FmuError, FmuPart
+from ._fmu_part import FmuError, FmuPart, renamed
 
 _ERRORS: dict[str, type[SoftneckError]] = {
     kind.__name__: kind for kind in (FmuError, DataError, FileFormatError, OutputFileError, SettingsError)
@@ -69,6 +69,11 @@ class IsolatedPart:
             "names": dict(names or {}), "units": dict(units or {}),
         }  # fmt: skip
         self._child: _Child | None = None
+
+    def called(self, names: Mapping[str, str]) -> IsolatedPart:
+        """Return the same part with other names for its variables, as of `FmuPart`."""
+        settings: Any = {"role": self.role, "sample_time": self.sample_time, "timeout": self.timeout}
+        return IsolatedPart(self.path, **settings, **renamed(self, names))
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Begin a run as `FmuPart.start` does; a FmuError also says that the FMU crashed or hung."""

@@ -13,6 +13,7 @@ from typing import Any
 from softneck.core import FileFormatError, SettingsError
 from softneck.fmu import unpack, unpacked
 from softneck.loop._loop import USE_MOTOR_POSITIONS
+from softneck.robot._channels import is_set_point
 
 from ..parts._variables import Description, number_of, read_description
 from ._flat import Flat, Line, Ports, flatten
@@ -140,7 +141,7 @@ class _Writer:
     def _moved(self, plant: tuple[str, ...]) -> bool:
         """Return whether somebody feeds all set-points of a plant, which says its angles."""
         description = self.descriptions[self.flat.components[plant].source]
-        moved = [port.name for port in description.ports("input") if port.name.startswith("motor_setpoint_")]
+        moved = [port.name for port in description.ports("input") if is_set_point(port.name)]
         return bool(moved) and all((plant, name) in self.flat.links for name in moved)
 
     def _values(self, path: tuple[str, ...], component: Component, *, closed: bool) -> dict[str, float]:

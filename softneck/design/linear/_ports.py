@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -50,7 +50,7 @@ def limit_ports(starts: tuple[float, float, float, float, float], robot: Robot =
 def controller_outputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     """Return the outputs: the motors' set-points."""
     ranges = motor_ranges(robot, None)
-    return tuple(_motor(robot, name, "set-point of motor", ranges) for name in robot.set_points)
+    return _motors(robot, robot.set_points, "set-point of motor", ranges)
 
 
 def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
@@ -71,7 +71,7 @@ def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     )  # fmt: skip
     whose = "the neck" if neck else robot.name
     angles = tuple(Port(name=name, unit=unit, description=f"{name} of {whose}") for name in robot.outputs.names)
-    motors = tuple(_motor(robot, name, "measured position of motor", ranges) for name in robot.motor_positions)
+    motors = _motors(robot, robot.motor_positions, "measured position of motor", ranges)
     flags = (
         Port(name="healthy", description="the angles can be trusted", start=1.0, boolean=True),
         Port(name="enabled", description="may move the motors", start=1.0, boolean=True),
@@ -79,11 +79,13 @@ def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     return (*references, cocontraction, *angles, *motors, *flags)
 
 
-def _motor(robot: Robot, name: str, what: str, ranges: tuple[Vector, Vector] | None) -> Port:
-    j = int(name[-1]) - 1
-    low, high = (None, None) if ranges is None else (float(ranges[0][j]), float(ranges[1][j]))
-    return Port(
-        name=name, unit=to_si(robot.motors.unit)[1], description=f"{what} {name[-1]}", minimum=low, maximum=high
+def _motors(robot: Robot, names: Sequence[str], what: str, ranges: tuple[Vector, Vector] | None) -> tuple[Port, ...]:
+    ends = (
+        [(None, None)] * len(names) if ranges is None else [(float(a), float(b)) for a, b in zip(*ranges, strict=True)]
+    )
+    return tuple(
+        Port(name=name, unit=to_si(robot.motors.unit)[1], description=f"{what} {j}", minimum=low, maximum=high)
+        for j, (name, (low, high)) in enumerate(zip(names, ends, strict=True), start=1)
     )
 
 

@@ -145,7 +145,7 @@ def jog(
     if run.recording is None or run.rows < len(path):
         return found
     seen, noise = _response(np.column_stack([run.recording.channels[name] for name in outputs]), stands)
-    position = run.recording.channels[f"motor_position_{motor}"]
+    position = run.recording.motor_positions[:, motor - 1]
     turned = float(position[stands[1]].mean() - position[stands[3]].mean())
     verdict, advice = judge(seen, noise, expected, ways, motor) if ways else ("not judged", "")
     if verdict == "no movement" and turned < 0.5 * (amplitude - lowest):

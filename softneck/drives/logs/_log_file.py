@@ -88,10 +88,15 @@ class LoggedRun:
 
     def signals(self) -> LoopResult:
         """Return the rows as the result of the run had them."""
-        names = list(dict.fromkeys(name for row in self.rows for name in row))
-        signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in self.rows]) for name in names}
+        rows = self._owned_rows()
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in rows]) for name in names}
         step = self.sample_time
         return LoopResult(np.arange(len(self.rows)) * step, signals, signal_units(names), step, self.robot)
+
+    def _owned_rows(self) -> list[dict[str, float]]:
+        robot = self.robot
+        return [{robot.own(name): value for name, value in row.items()} for row in self.rows]
 
     @property
     def robot(self) -> Robot:
@@ -132,7 +137,7 @@ class LoggedRun:
         # A row of an experiment is logged when its set-points were sent to their end.
         late = self.settings().sample_cycles - 1
         columns = experiment_channels(
-            experiment_table(self.rows, robot),
+            experiment_table(self._owned_rows(), robot),
             *motion_at(times, positions, [cycle - late for cycle in self.row_cycles]),
             robot,
         )

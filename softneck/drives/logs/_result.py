@@ -16,7 +16,6 @@ from softneck.signals import Recording
 from softneck.signals.recording._channels import NECK, known_channels
 
 from ..master import Event
-from ._rows import speed_channels
 
 # 10 us a bin, up to 200 ms; what is longer falls into the last.
 _BIN = 1e-5
@@ -105,7 +104,7 @@ def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Re
         if not np.isfinite(channels.get(rate, np.nan)).any():
             channels.pop(rate, None)
     if np.isfinite(speeds).any():
-        channels |= speed_channels(speeds)
+        channels |= dict(zip(robot.motor_velocities, speeds.T.copy(), strict=True))
     return Recording(signals.time, signals.sample_time, channels, robot=robot)
 
 

@@ -62,11 +62,6 @@ def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[
     return here, speed
 
 
-def speed_channels(speeds: Matrix) -> dict[str, Vector]:
-    """Return speeds (rows, motors) as channels of a recording."""
-    return {f"motor_velocity_{j + 1}": speeds[:, j].copy() for j in range(speeds.shape[1])}
-
-
 def truths(robot: Robot) -> tuple[str, ...]:
     """Return what simulated drives know of a robot beyond what is measured: tensions, and a neck's compression."""
     return (*(f"tension_{j}" for j in range(1, len(robot.motors.names) + 1)), "compression")
@@ -83,12 +78,13 @@ def experiment_channels(
 ) -> dict[str, Vector]:  # fmt: skip
     """Return the channels of an experiment: rows of a `SignalLog`, positions and speeds at their times."""
     columns = dict(zip(columns_of(robot), table.T.copy(), strict=True))
-    moved = dict(zip(robot.motor_positions, positions.T.copy(), strict=True)) | speed_channels(speeds)
-    maybe = {"compression", *(f"{name}_rate" for name in robot.outputs.names)}
+    moved = dict(zip(robot.motor_positions, positions.T.copy(), strict=True))
+    moved |= dict(zip(robot.motor_velocities, speeds.T.copy(), strict=True))
+    maybe = {"compression", *(f"{name}_rate" for name in robot.outputs.names), *robot.motor_velocities}
     return {
         name: values
         for name, values in ({**columns, **moved}).items()
-        if (name not in maybe and not name.startswith("motor_velocity_")) or np.isfinite(values).any()
+        if name not in maybe or np.isfinite(values).any()
     }
 
 

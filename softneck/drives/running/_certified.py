@@ -162,9 +162,10 @@ def require_same_again(loop: Loop, certificate: Certificate) -> float:
     if not isinstance(trace, dict) or not trace.get("row"):
         raise CheckFailedError(f"{certificate.path}: is of an earlier softneck and keeps no rows; simulate it again.")
     again = _run_for(loop, _REPLAY_TIME)
-    for name, expected in trace.items():
-        if name == "row":
+    for said, expected in trace.items():
+        if said == "row":
             continue
+        name = loop.robot.own(said)
         values = again.angle(name) if name in loop.robot.outputs.names else again[name]
         for row, value in zip(trace["row"], expected, strict=True):
             if value is not None and row < len(values) and not abs(values[row] - value) <= SAME:

@@ -14,6 +14,7 @@ from softneck.cosim.loops._simulate import reach_beyond
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
 from softneck.robot import Robot
+from softneck.robot._channels import is_set_point
 from softneck.signals.recording._channels import NECK
 from softneck.signals.recording._recording import require_same_robot
 
@@ -121,7 +122,7 @@ def run_simulated(
     loop = deployed.loop
     pilot = LoopPilot(loop, file.moves)
     virtual = simulated_plant(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
-    disturbances = {name: value for name, value in loop.plant_inputs.items() if not name.startswith("motor_")}
+    disturbances = {name: value for name, value in loop.plant_inputs.items() if not is_set_point(name)}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)
     more = () if hook is None else (lambda _now, _in, _out, _tilt, _master: hook(link),)

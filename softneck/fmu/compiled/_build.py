@@ -18,7 +18,7 @@ from softneck.runtime._tangent import with_tangent
 from softneck.runtime._tangent_activity import TangentError
 
 from ..describe._describe import Buildable, FmuInfo, block_and_info, documentation_page
-from ..describe._description import Identity, described_block, model_description, terminals_file
+from ..describe._description import Identity, described_block, model_description, motor_positions, terminals_file
 from ..python._build import check_block, generation_date, license_text, model_name
 from ..python._zip import write_zip
 from ._compilers import PLATFORMS
@@ -99,7 +99,9 @@ def next_outputs(block: Block) -> tuple[Port, ...]:
         with_tangent(bundle(block.runtime, loops=False))
     except TangentError as error:
         raise SettingsError(f"{block.kind} has no sensitivities: {error}") from None
-    own = takewhile(lambda port: not (port.boolean or port.integer or port.missing or _is_aside(port)), block.outputs)
+    # Those tell of the block itself, not of the robot or what it is asked to do.
+    aside = (*motor_positions(block), "innovation")
+    own = takewhile(lambda p: not (p.boolean or p.integer or p.missing or p.name in aside), block.outputs)
     what = "at the next sample, if the inputs are held"
     found = tuple(
         replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {what}") for port in own
@@ -107,11 +109,6 @@ def next_outputs(block: Block) -> tuple[Port, ...]:
     if not found:
         raise SettingsError(f"{block.kind} ({block.role}) has no sensitivities: none of its outputs is a number.")
     return found
-
-
-def _is_aside(port: Port) -> bool:
-    """Return whether an output tells of the block itself, not of the robot or what it is asked to do."""
-    return port.name.startswith("motor_position_") or port.name == "innovation"
 
 
 def _check_kinds(modules: set[str], sources: Sources) -> None:

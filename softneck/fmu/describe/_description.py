@@ -7,6 +7,7 @@ terminals have the same names in plants, observers, controllers and references, 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -18,6 +19,7 @@ from softneck.core import SettingsError, to_si
 from softneck.core._units import SI_BASES
 from softneck.loop._loop import USE_MOTOR_POSITIONS
 from softneck.plant import NeckParameters
+from softneck.robot._channels import is_set_point, motor_positions_among
 from softneck.runtime import Block, Port
 
 from ._describe import FmuInfo
@@ -32,8 +34,8 @@ def with_modelled_drives(block: Block) -> Block:
 
     No file of a controller knows its drives: they are those of the paper's neck.
     """
-    motors = len([port for port in block.outputs if port.name.startswith("motor_setpoint_")])
-    inputs, positions = [port.name for port in block.inputs], [f"motor_position_{j + 1}" for j in range(motors)]
+    inputs, positions = [port.name for port in block.inputs], list(motor_positions(block))
+    motors = len(positions)
     first = inputs.index(positions[0]) if positions and positions[0] in inputs else len(inputs)
     if block.role != "controller" or inputs[first : first + motors] != positions or motors != len(block.outputs):
         return block
@@ -48,15 +50,21 @@ def with_modelled_drives(block: Block) -> Block:
         block,
         runtime=f"{_RUNTIME}({block.runtime}:{len(block.arrays)})",
         arrays=(np.array(drive[:2] if (first, motors) == _NECK else drive), *block.arrays),
-        parameters=(*block.parameters, _parameter(motors)),
+        parameters=(*block.parameters, _parameter(positions)),
     )
 
 
-def _parameter(motors: int) -> Port:
+def motor_positions(block: Block) -> tuple[str, ...]:
+    """Return what the positions of the motors are called that a block moves, or that move it."""
+    return motor_positions_among([port.name for port in (*block.inputs, *block.outputs)])
+
+
+def _parameter(positions: Sequence[str]) -> Port:
+    numbered = positions[0] == "motor_position_1"
+    told = f"motor_position_1..{len(positions)}" if numbered else ", ".join(positions)
     return Port(
         name=USE_MOTOR_POSITIONS,
-        description=f"true: the motors are where motor_position_1..{motors} say; false: a model of the drives inside "
-        "says it",
+        description=f"true: the motors are where {told} say; false: a model of the drives inside says it",
         boolean=True,
         minimum=0.0,
         maximum=1.0,
@@ -302,15 +310,16 @@ def terminals(block: Block) -> dict[str, list[str]]:
     """Return terminal -> names of its inputs and outputs, without empty terminals."""
     ports = (*block.inputs, *block.outputs)
     outputs = {port.name.removesuffix(end) for port in ports for end in _TOLD if port.name.endswith(end)}
-    found = {title: [port.name for port in ports if _terminal_of(port, outputs) == title] for title in _TERMINALS}
+    motors = motor_positions(block)
+    found = {title: [p.name for p in ports if _terminal_of(p, outputs, motors) == title] for title in _TERMINALS}
     return {title: members for title, members in found.items() if members}
 
 
-def _terminal_of(port: Port, outputs: set[str]) -> str:
+def _terminal_of(port: Port, outputs: set[str], positions: Collection[str]) -> str:
     name = port.name
     if "_measured" in name or name == "measurement_valid":
         return "measurement"
-    if name.startswith(("motor_setpoint_", "motor_position_")):
+    if is_set_point(name) or name in positions:
         return "motors"
     if name.endswith("_reference") or name == "enabled":
         return "reference"

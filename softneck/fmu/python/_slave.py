@@ -288,7 +288,7 @@ class SoftneckSlave(Fmi2Slave):
         self.warned.add(port["name"])
         # A set-point just outside of what was trained is in rad all the same.
         far = abs(value) > 2.0 * max(-port["low"], port["high"])
-        asked = port["name"].endswith("_reference") or (port["name"].startswith("motor_setpoint_") and far)
+        asked = port["name"].endswith("_reference") or ("_setpoint" in port["name"] and far)
         hint = " Is it in degrees?" if asked and port["unit"] == "rad" else ""
         span = f"{port['low']:g} to {port['high']:g} {port['unit']}"
         self.tell(_FMU_WARNING, f"{self.facts['name']}: {port['name']} = {value:g} is outside {span}.{hint}")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole, to_si
 from softneck.core._checks import finite_vector
 from softneck.robot import Robot
+from softneck.robot._channels import is_set_point
 from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, State
 from softneck.runtime._compile import load_tangent
@@ -263,7 +264,7 @@ def _checked(model: Any, output: str, input: str | None, angle_unit: str) -> tup
         name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
         require_one_of("input", name, _REDEFINED + _MOTORS)
     else:
-        name = redefined_input(robot, output) if input is None else input
+        name = redefined_input(robot, output) if input is None else robot.own(input)
         require_one_of("input", name, (redefined_input(robot, output), *robot.set_points))
     angle = to_si(robot.outputs.unit)[1] == "rad"
     return name, 180.0 / np.pi if angle_unit == "deg" and angle else 1.0
@@ -297,7 +298,7 @@ class Jacobian(NamedTuple):
 
 def _motor_count(block: Block) -> int:
     """Return the number of motors: their set-points stand first among a plant's inputs."""
-    return sum(port.name.startswith("motor_setpoint_") for port in block.inputs)
+    return sum(is_set_point(port.name) for port in block.inputs)
 
 
 def jacobian(model: Any, state: State, inputs: ArrayLike) -> Jacobian:

@@ -109,23 +109,20 @@ def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] 
 
 def inputs(findings: Mapping[str, Any], robot: Robot) -> tuple[Port, ...]:
     """Return the inputs; the set-points range over what the model was trained on."""
-    motors = range(1, len(robot.motors.names) + 1)
-    low, high = _range(findings, len(motors))
+    low, high = _range(findings, len(robot.motors.names))
     pulls = "; positive: the winch pulls" if robot.is_neck else f" ({robot.motors.unit} in the robot's files)"
     return (
         *(
-            replace(_motor(robot, f"motor_setpoint_{j}", f"Set-point of motor {j}{pulls}"), minimum=float(a),
-                    maximum=float(b))
-            for j, a, b in zip(motors, low, high, strict=True)
+            replace(_motor(robot, name, f"Set-point of motor {j}{pulls}"), minimum=float(a), maximum=float(b))
+            for j, (name, a, b) in enumerate(zip(robot.set_points, low, high, strict=True), start=1)
         ),
         *(
             _output(robot, f"{name}_measured", f"Measured {name}; for use_measurement", missing=True)
             for name in robot.outputs.names
         ),
         *(
-            _motor(robot, f"motor_position_measured_{j}", f"Measured position of motor {j}; for use_measurement",
-                   missing=True)
-            for j in motors
+            _motor(robot, name, f"Measured position of motor {j}; for use_measurement", missing=True)
+            for j, name in enumerate(robot.measured_positions, start=1)
         ),
     )  # fmt: skip
 
@@ -150,8 +147,8 @@ def outputs(kind: str, robot: Robot) -> tuple[Port, ...]:
     return (
         *(_output(robot, name, _platform(robot, name)) for name in names),
         *(
-            _motor(robot, f"motor_position_{j}", f"Position of motor {j} by the drive model")
-            for j in range(1, len(robot.motors.names) + 1)
+            _motor(robot, name, f"Position of motor {j} by the drive model")
+            for j, name in enumerate(robot.motor_positions, start=1)
         ),
         *(bounds if kind in BOUNDED else ()),
         Port(

@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, to_si
 
-from ..recording._channels import is_held, may_miss
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, is_held, may_miss
 from ..recording._files import numbers
 from ..recording._resampling import Samples, gaps
 from ._layout import Layout, Source
@@ -59,8 +59,8 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
         run: (time,) numbers of the runs.
     """
     periods = []
-    for j in (1, 2, 3):
-        x, v = channels.get(f"motor_position_{j}"), channels.get(f"motor_velocity_{j}")
+    for position, speed in zip(MOTOR_POSITIONS, MOTOR_VELOCITIES, strict=True):
+        x, v = channels.get(position), channels.get(speed)
         if x is not None and v is not None:
             period, correlation = velocity_period(x, v, run)
             if correlation > _AGREE:

@@ -186,7 +186,9 @@ def _layout(table: dict[str, Any], robot: Robot) -> Layout:
     if file.get("unit_row") is True and file.get("header") is False:
         raise SettingsError("[file] unit_row is the line below the names; a file without `header` has none.")
     return Layout(
-        channels={name: _channel_source(name, entry, robot) for name, entry in table.get("channels", {}).items()},
+        channels={
+            robot.own(name): _channel_source(name, entry, robot) for name, entry in table.get("channels", {}).items()
+        },
         inclination=_source(tilt["inclination"], "rad", "[tilt] inclination") if tilt else None,
         orientation=_source(tilt["orientation"], "rad", "[tilt] orientation") if tilt else None,
         quaternion=_quaternion(quaternion) if quaternion else None,
@@ -233,7 +235,7 @@ def _quaternion(entry: dict[str, Any]) -> Quaternion:
 
 
 def _channel_source(name: str, entry: Any, robot: Robot) -> Source:
-    known = known_channels(robot)
+    name, known = robot.own(name), known_channels(robot)
     if name not in known or name == "time":
         raise SettingsError(f"[channels.{name}]: not a channel of a recording; known: {', '.join(known)}.")
     return _source(entry, si_unit(name, robot), f"[channels.{name}]")

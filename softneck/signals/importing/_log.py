@@ -130,8 +130,7 @@ def _refuse_range(layout: Layout, channels: Mapping[str, Vector]) -> tuple[str, 
     """Return a warning where set-points go further than the motors' range."""
     motors, robot = layout.robot.motors, layout.robot
     warnings: list[str] = []
-    for name in (*robot.set_points, *robot.motor_positions):
-        j = int(name.rpartition("_")[2]) - 1
+    for j, name in (*enumerate(robot.set_points), *enumerate(robot.motor_positions)):
         bounds = [abs(limit[j]) for limit in (motors.setpoint_min, motors.setpoint_max) if limit is not None]
         reached = np.abs(channels.get(name, np.zeros(1)))
         limit = max(bounds, default=np.inf) * to_si(motors.unit)[0]

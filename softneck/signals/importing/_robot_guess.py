@@ -13,7 +13,6 @@ from softneck.core import DataError, SettingsError, SoftneckError, to_si
 from softneck.core._errors import did_you_mean
 from softneck.robot import Robot
 
-from ..recording._channels import own_names
 from ._column_titles import read_title
 from ._layout import Column, Layout, Source, Term
 from ._table_format import SniffResult, sniff
@@ -195,10 +194,9 @@ def layout_for(path: str | Path, robot: Robot) -> Layout:
             raise DataError(f"{path}: no column is titled `{names[-1]}`; it has {', '.join(rest)}. Write a layout.")
         return title
 
-    own = own_names(robot)
     motors = [
-        title_of(channel, own.get(channel, channel), name)
-        for channel, name in zip(robot.set_points, robot.motors.names, strict=True)
+        title_of(f"motor_setpoint_{j}", channel, name)
+        for j, (channel, name) in enumerate(zip(robot.set_points, robot.motors.names, strict=True), start=1)
     ]
     outputs = [title_of(name) for name in robot.outputs.names]
     return _layout(table, robot, motors, outputs, (time, run))

@@ -37,7 +37,9 @@ _MAD_TO_STD = 1.4826
 # Fourth differences of white noise: variance 1 + 16 + 36 + 16 + 1.
 _FOURTH = 70.0
 # These say what was asked for; a held or a repeated value is no fault of a sensor.
-_COMMANDS = re.compile(r"motor_setpoint_|.*_reference$|payload|push_|base_tilt_|healthy|enabled|measurement_valid")
+_COMMANDS = re.compile(
+    r"motor_setpoint_|.*_(setpoint|reference)$|payload|push_|base_tilt_|healthy|enabled|measurement_valid"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,9 +213,12 @@ def _flats(equal: np.ndarray) -> np.ndarray:
 
 def _inputs(recording: Recording, name: str) -> np.ndarray:
     """Return what drives a channel, (time, 1 or more): its motor, its output's direction, else all of them."""
-    if motor := re.fullmatch(r"(motor_\w+|tension)_(\d)", name):
-        return recording.set_points[:, [int(motor[2]) - 1]]
-    weights, outputs = recording.robot.weights(), recording.robot.outputs.names
+    robot = recording.robot
+    motors = range(1, len(robot.motors.names) + 1)
+    for names in (robot.motor_positions, robot.motor_velocities, [f"tension_{j}" for j in motors]):
+        if name in names:
+            return recording.set_points[:, [names.index(name)]]
+    weights, outputs = robot.weights(), robot.outputs.names
     of = next((i for i, output in enumerate(outputs) if name.startswith(output)), None)
     return recording.set_points if weights is None or of is None else recording.set_points @ weights[[of]].T
 

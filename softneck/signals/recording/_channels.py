@@ -14,7 +14,7 @@ MOTORS = (1, 2, 3)
 #: Names of the three channels with the motors' set-points of a neck.
 SET_POINTS = NECK.set_points
 MOTOR_POSITIONS = NECK.motor_positions
-MOTOR_VELOCITIES = tuple(f"motor_velocity_{j}" for j in MOTORS)
+MOTOR_VELOCITIES = NECK.motor_velocities
 # [rad] The motors stay within 6 rad: two turns are another unit, and in degrees hardly a move.
 MOTOR_TURNS = 4.0 * math.pi
 OUTPUTS = NECK.outputs.names
@@ -36,21 +36,20 @@ _OF_ALL = {
     "measurement_valid": "1",
 }
 # Channels that are set, not measured: they hold their value until the next one.
-_HELD = re.compile(r"(motor_setpoint_\d|.*_reference|healthy|enabled|measurement_valid|payload)$")
+_HELD = re.compile(r"(motor_setpoint_\d|.*_setpoint|.*_reference|healthy|enabled|measurement_valid|payload)$")
 _COLUMN = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
 @cache
 def _table(robot: Robot) -> dict[str, str]:
     """Return channel -> unit in files of all channels that a recording of `robot` may have."""
-    motors = range(1, len(robot.motors.names) + 1)
     unit, shown = robot.motors.unit, robot.outputs.display_unit
     return {
         "time": "s",
         **dict.fromkeys(robot.set_points, unit),
         **dict.fromkeys(robot.motor_positions, unit),
-        **{f"motor_velocity_{j}": f"{unit}/s" for j in motors},
-        **{f"tension_{j}": "N" for j in motors},
+        **dict.fromkeys(robot.motor_velocities, f"{unit}/s"),
+        **{f"tension_{j}": "N" for j in range(1, len(robot.motors.names) + 1)},
         **{f"{output}{what}": shown for output in robot.outputs.names for what in _OF_OUTPUT},
         **{f"{output}{what}": f"{shown}/s" for output in robot.outputs.names for what in _OF_RATE},
         "cocontraction_reference": unit,
@@ -73,25 +72,14 @@ def si_unit(channel: str, robot: Robot = NECK) -> str:
     return to_si(_table(robot)[channel])[1]
 
 
-@cache
-def own_names(robot: Robot) -> dict[str, str]:
-    """Return channel -> name in files of the motors' channels, such as `pressure_setpoint`; none for `motor_1`."""
-    names = {}
-    for j, name in enumerate(robot.motors.names, start=1):
-        if name != f"motor_{j}":
-            stem = name.removesuffix("_setpoint")
-            names |= {f"motor_{what}_{j}": f"{stem}_{what}" for what in ("setpoint", "position", "velocity")}
-    return {channel: name for channel, name in names.items() if name not in _table(robot)}
-
-
 def column_name(channel: str, robot: Robot = NECK) -> str:
-    """Return the column title of `channel`, such as `pitch [deg]`; motors have their own names."""
-    return f"{own_names(robot).get(channel, channel)} [{_table(robot)[channel]}]"
+    """Return the column title of `channel`, such as `pitch [deg]`."""
+    return f"{channel} [{_table(robot)[channel]}]"
 
 
 def may_miss(channel: str, robot: Robot = NECK) -> bool:
     """Return whether a sample of `channel` may be missing: an empty cell is one that the sensor missed."""
-    measured = (*robot.outputs.names, "motor_position", "motor_velocity", "compression", "tension")
+    measured = (*robot.outputs.names, *robot.motor_positions, *robot.motor_velocities, "compression", "tension")
     return channel.startswith(measured) and not channel.endswith("_reference")
 
 
@@ -108,8 +96,7 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
         name = title.strip()
         hint = f"write `{column_name(name, robot)}`" if name in table else "use `softneck import` with a layout"
         raise DataError(f"column `{name}` names no unit; {hint}.")
-    name, unit = match["name"], match["unit"].strip()
-    name = {own: channel for channel, own in own_names(robot).items()}.get(name, name)
+    name, unit = robot.own(match["name"]), match["unit"].strip()
     if name not in table:
         whose = "" if robot.is_neck else f" of robot {robot.label()}"
         raise DataError(

@@ -114,7 +114,9 @@ class Recording(Shown):
         require_positive("sample_time", self.sample_time, "s")
         time = np.ascontiguousarray(self.time, dtype=np.float64)
         run = np.zeros(time.size, dtype=np.int64) if self.run.size == 0 else self.run.astype(np.int64)
-        channels = {name: np.ascontiguousarray(c, dtype=np.float64) for name, c in self.channels.items()}
+        channels = {
+            self.robot.own(name): np.ascontiguousarray(c, dtype=np.float64) for name, c in self.channels.items()
+        }
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "run", run)
         object.__setattr__(self, "channels", channels)
@@ -250,7 +252,7 @@ class Recording(Shown):
 
     def with_channels(self, **channels: Vector) -> Recording:
         """Return the same recording with channels added or replaced."""
-        return replace(self, channels={**self.channels, **channels})
+        return replace(self, channels={**self.channels, **{self.robot.own(name): c for name, c in channels.items()}})
 
     def _check_channels(self) -> None:
         required, known = (*self.robot.set_points, *self.robot.outputs.names), known_channels(self.robot)

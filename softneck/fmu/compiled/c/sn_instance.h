@@ -355,7 +355,7 @@ static void sn_warn_outside(sn_instance *s, uint32_t i, double value)
     /* A set-point just outside of what was trained is in rad all the same. */
     int beyond = fabs(value) > 2.0 * (port->high > -port->low ? port->high : -port->low);
     int asked = (n > 10 && strcmp(port->name + n - 10, "_reference") == 0) ||
-                (strncmp(port->name, "motor_setpoint_", 15) == 0 && beyond);
+                (strstr(port->name, "_setpoint") != NULL && beyond);
     int angle = asked && strcmp(port->unit, "rad") == 0;
     if (s->warned[i])
         return;
