@@ -7,12 +7,12 @@ from softneck.runtime._layout import array
 
 
 class ArxArrays(NarxArrays):
-    """Both axes of Eq. 23."""
+    """Eq. 23 of each output."""
 
-    redefinition = array("3, 3", "T of Eq. 9-11: motors to redefined inputs")
-    a = array("2, na", "of the outputs, newest first")
-    b = array("2, nb", "of the redefined inputs, newest first")
-    delay = array("2", "dead time of each axis [samples]")
+    redefinition = array("c, motors", "T of Eq. 9-11: motors to redefined inputs, one for each output first")
+    a = array("outputs, na", "of the outputs, newest first")
+    b = array("outputs, nb", "of the redefined inputs, newest first")
+    delay = array("outputs", "dead time of each axis [samples]")
 
 
 def arx_output(

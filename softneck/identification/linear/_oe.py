@@ -27,14 +27,22 @@ from softneck.core import (
     silent,
 )
 from softneck.core._blas_threads import one_blas_thread
-from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
+from softneck.signals import Recording
 
-from ..models._directions import Directions, directions_of
+from ..models._door import Door
 from ..models._drive import fit_drive
-from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
+from ..models._fitting import delay_samples, free_run_fit, training_recording
 from ..models._model import Model
 from ..models._state_space import axes_system, lss_arrays
-from ._regression import about, arx_rows, operating_point, require_excitation, with_offset
+from ._regression import (
+    MAX_DELAY,
+    arx_rows,
+    axis_arrays,
+    functions_found,
+    linear_in_si,
+    require_excitation,
+    with_offset,
+)
 from ._srivc_fit import SrivcFitOptions, deviations
 
 # A time constant beyond a third of the longest run is no more than a drift that each run's start makes up for.
@@ -42,7 +50,7 @@ _RUNS_PER_TIME_CONSTANT = 3.0
 _ITERATIONS = 50
 # A step that changes the sum of squares by less than this part changes no digit that noise leaves.
 _TOLERANCE = 1e-10
-# Time constants [s] from which the search starts, beside that of least squares: a neck has 0.2 s.
+# Time constants from which the search starts, beside that of least squares: the robot's, and those around it.
 _TIME_CONSTANTS = (0.05, 0.2, 0.8)
 
 # -log of the rounding of a double.
@@ -253,16 +261,16 @@ _CAUTION = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputError:
-    """Transfer functions from theta_i to pitch and phi_i to roll by output error (Ljung 1999, sec. 4.2 and 10.2).
+    """Transfer functions from redefined inputs (of a neck theta_i, phi_i) by output error (Ljung 1999, 4.2 and 10.2).
 
-    Of another robot each output follows its direction, given or learned from the data.
+    Each output follows its direction, given or learned from the data.
     Unbiased under output noise, where `rls` is not. It has no noise model: a prediction some samples ahead is the
     free run started again from the measured outputs.
 
     Attributes:
         nf, nb: poles, and coefficients of the numerator.
         delay: dead time [s]; None takes the one of the least cost.
-        max_delay: end of that search [s], of another robot by its time constant over the neck's 0.2 s.
+        max_delay: end of that search [s]; None: one and a half time constants of the robot (of a neck 0.3 s).
         source: what drives the model: "set_points", or "positions" of the motors, which in free run the drive model
             makes from the set-points.
         intervals: find 95 % intervals of K, pole, dead time and static gain as well, in the findings (one pole only).
@@ -271,7 +279,7 @@ class OutputError:
     nf: int = 1
     nb: int = 1
     delay: float | None = None
-    max_delay: float = 0.3
+    max_delay: float | None = None
     source: str = "set_points"
     intervals: bool = False
 
@@ -280,7 +288,8 @@ class OutputError:
         require_whole("nb", self.nb, 1, 100)
         if self.delay is not None:
             require_between("delay", self.delay, 0.0, 1e6, "s")
-        require_positive("max_delay", self.max_delay, "s")
+        if self.max_delay is not None:
+            require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
         if self.intervals and (self.nf, self.nb) != (1, 1):
             raise SettingsError("`intervals` are those of one pole; set `nf` and `nb` to 1 with it.")
@@ -292,45 +301,57 @@ class OutputError:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        recording = training_recording(recordings)
-        point = operating_point(recording)
-        directions, inputs = axis_runs(about(recording, point), self.source)
-        found, delays, curves, beside = [], [], {}, {}
-        for axis, name in enumerate(directions.names):
+        door = Door.of(training_recording(recordings))
+        settings = replace(self, delay=door.seconds(self.delay), max_delay=door.seconds(self.max_delay, MAX_DELAY))
+        names, Ts, inputs = door.directions.names, door.data.sample_time, _axis_runs(door, self.source)
+        found: list[OutputErrorFit] = []
+        delays, curves, beside = [], {}, {}
+        for axis, name in enumerate(names):
             progress(axis / len(inputs), name)
-            fit, d, curves[name], beside[name] = self._fit_axis(recording.sample_time, inputs[axis], name, directions)
+            fit, d, curves[name], beside[name] = settings._fit_axis(Ts, inputs[axis], name)
             found.append(fit)
-            delays.append(float(d))
-        arrays, functions = axis_arrays(
-            recording, directions, [fit.f for fit in found], [fit.b for fit in found], delays, self.source
-        )
-        arrays = with_offset("oe", arrays, recording, point)
+            delays.append(d)
+        arrays, functions = self._arrays(door, found, delays)
         said = {}
         if self.intervals:
-            each = [
-                self._intervals(recording.sample_time, *one, directions.stretch)
-                for one in zip(inputs, found, delays, strict=True)
-            ]
-            said = {"intervals": dict(zip(directions.names, each, strict=True)), "caution": _CAUTION}
+            each = [settings._intervals(Ts, *one) for one in zip(inputs, found, delays, strict=True)]
+            said = {"intervals": dict(zip(names, each, strict=True)), "caution": _CAUTION}
+        findings = {
+            **functions,
+            "delay_criterion": "output_error",
+            "delay_curve": curves,
+            "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
+            "least_squares_beside": beside,
+            **_warnings(names, inputs, found),
+            **said,
+        }
         progress(1.0, "done")
-        return fitted_model(
-            "oe",
-            self,
-            recording,
-            arrays=arrays,
-            findings={
-                **functions,
-                "delay_criterion": "output_error",
-                "delay_curve": curves,
-                "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
-                "least_squares_beside": beside,
-                **_warnings(directions.names, inputs, found),
-                **said,
-            },
-        )
+        return door.model("oe", self, linear_in_si, arrays=arrays, findings=_in_si(findings, door, self.nf))
+
+    def _arrays(
+        self, door: Door, found: list[OutputErrorFit], delays: list[int]
+    ) -> tuple[dict[str, Matrix], dict[str, Any]]:
+        """Return the arrays that the runtime reads, and what findings must say beside them.
+
+        A model of one pole starts from its last measured output; one of more poles has a Kalman observer, as the last
+        outputs determine a slow state beside a fast one only through their noise. So has one with an offset.
+        """
+        drive = fit_drive(door.data)
+        a, b = [fit.f for fit in found], [fit.b for fit in found]
+        source = int(self.source == "positions")
+        if self.nf == 1 and not door.has_offset:
+            arrays = axis_arrays(door, drive, np.array(a), np.array(b), delays)
+            return {**arrays, "source": np.array([float(source)])}, {}
+        common = min(delays)
+        late = [np.concatenate([np.zeros(d - common), part]) for d, part in zip(delays, b, strict=True)]
+        system = axes_system(a, late, door.directions.weights)
+        arrays = lss_arrays(system, delay=common, drive=drive.array, source=source)
+        if door.has_offset:
+            arrays = with_offset("oe", arrays, door.data)
+        return arrays, functions_found(door, a, b, delays)
 
     def _fit_axis(
-        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str, directions: Directions
+        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str
     ) -> tuple[OutputErrorFit, int, list[list[float]], dict[str, Any]]:
         """Return the best fit, its dead time, the cost curve (delay [s], fit [%], one-step rms), and plain ARX."""
         columns = [(y[:, None], u[:, None]) for u, y in runs]
@@ -338,14 +359,12 @@ class OutputError:
         best: tuple[OutputErrorFit, int] | None = None
         curve: list[list[float]] = []
         last: list[Vector] = []
-        # In the time of a neck: what starts from time constants starts from the robot's.
-        necks = sample_time / directions.stretch
-        for d in delay_samples(self.delay, self.max_delay * directions.stretch, sample_time, columns):
+        for d in delay_samples(self.delay, self.max_delay or MAX_DELAY, sample_time, columns):
             Phi, Y = arx_rows(columns, self.nf, self.nb, d)
             require_excitation(name, Phi)
             arx = np.linalg.lstsq(Phi, Y[:, 0])[0]
             # The optimum of one dead time is a good start for the next; all others only where there is none yet.
-            starts = [*last, arx[: self.nf]] if last else default_starts(self.nf, necks, arx[: self.nf])
+            starts = [*last, arx[: self.nf]] if last else default_starts(self.nf, sample_time, arx[: self.nf])
             fit = fit_output_error(runs, self.nf, self.nb, d, starts)
             if fit is None:
                 continue
@@ -358,20 +377,19 @@ class OutputError:
         if best is None:
             raise DataError(f"no dead time gives a stable model of {name}; record with more excitation.")
         d = best[1]
-        again = fit_output_error(runs, self.nf, self.nb, d, [best[0].f, *default_starts(self.nf, necks, None)])
+        again = fit_output_error(runs, self.nf, self.nb, d, [best[0].f, *default_starts(self.nf, sample_time, None)])
         fit = again if again is not None and again.cost < best[0].cost else best[0]
         return fit, d, curve, _beside(columns, self.nf, self.nb, d, sample_time)
 
     def _intervals(
-        self, sample_time: float, runs: list[tuple[Vector, Vector]], fit: OutputErrorFit, delay: float, stretch: float
+        self, sample_time: float, runs: list[tuple[Vector, Vector]], fit: OutputErrorFit, delay: int
     ) -> dict[str, list[float]]:
-        """Return name -> [low, high] in SI, by the continuous-time model that ends nearest to the one found."""
+        """Return name -> [low, high], by the continuous-time model that ends nearest to the one found."""
         if not -1.0 < fit.f[0] < 0.0:
             return {}
         search = SrivcFitOptions(
-            sample_time=sample_time, max_delay=self.max_delay * stretch, free_delay=self.delay is None
+            sample_time=sample_time, max_delay=self.max_delay or MAX_DELAY, free_delay=self.delay is None
         )
-        search = replace(search, fastest=search.fastest / stretch)
         pole, late = -float(np.log(-fit.f[0])) / sample_time, delay * sample_time
         # The cost has a kink at each sample of dead time: from the middle of those on both sides as well.
         starts = (
@@ -382,76 +400,50 @@ class OutputError:
             return {}
         best = min(tried, key=lambda near: near.cost)
         K, p, L = float(best.model.b[0]), float(best.model.a[0]), best.model.delay
-        gain, a, late, b = _NORMAL * deviations(search, runs, best, stretch)[0]
+        gain, a, late, b = _NORMAL * deviations(search, runs, best, 1.0)[0]
         found = {"K": [K - b, K + b], "pole": [p - a, p + a], "static_gain": [K / p - gain, K / p + gain]}
         return found if self.delay is not None else {**found, "delay_s": [max(L - late, 0.0), L + late]}
 
 
-def axis_runs(recording: Recording, source: str) -> tuple[Directions, list[list[tuple[Vector, Vector]]]]:
-    """Return the directions, and (input, output) of each run for each output, from set-points or logged positions.
+def _axis_runs(door: Door, source: str) -> list[list[tuple[Vector, Vector]]]:
+    """Return (input, output) of each run for each output, from set-points or logged positions.
 
     Raises:
-        DataError: positions are asked for and were not logged, or only in part; or an output follows no motor.
+        DataError: positions are asked for and were not logged, or only in part.
     """
-    if source == "positions" and not recording.has_motor_positions:
+    if source == "positions" and not door.data.has_motor_positions:
         raise DataError("no motor positions were logged; use `source=set_points`.")
-    parts = recording.runs()
-    motors = [run.motor_positions if source == "positions" else run.set_points for run in parts]
-    if not all(np.isfinite(part).all() for part in motors):
-        raise DataError("some motor positions were missed; fill them or use `source=set_points`.")
-    directions = directions_of(recording, motors)
-    runs: list[list[tuple[Vector, Vector]]] = [[] for _ in directions.names]
-    for run, part in zip(parts, motors, strict=True):
-        U = redefine(part) if recording.robot.is_neck else part @ directions.weights.T
+    runs: list[list[tuple[Vector, Vector]]] = [[] for _ in door.directions.names]
+    for run in door.data.runs():
+        motors = run.motor_positions if source == "positions" else run.set_points
+        if not np.isfinite(motors).all():
+            raise DataError("some motor positions were missed; fill them or use `source=set_points`.")
+        U = motors @ door.directions.redefinition.T
         for axis, pairs in enumerate(runs):
             y = run.outputs[:, axis]
             if np.isfinite(y).any():
                 pairs.append((np.ascontiguousarray(U[:, axis]), y))
-    return directions, runs
+    return runs
 
 
-def axis_arrays(
-    recording: Recording, directions: Directions, a: list[Vector], b: list[Vector], delays: list[float], source: str
-) -> tuple[dict[str, Matrix], dict[str, Any]]:
-    """Return the arrays that the runtime reads, and what `findings` must say beside them.
-
-    A model of one pole starts from its last measured output; one of more poles has a Kalman observer, as the last
-    outputs determine a slow state beside a fast one only through their noise. So has a model of another robot.
-    """
-    drive = fit_drive(recording)
-    neck = recording.robot.is_neck
-    if max(part.size for part in a) > 1 or not neck:
-        common = int(min(delays))
-        late = [np.concatenate([np.zeros(int(d) - common), part]) for d, part in zip(delays, b, strict=True)]
-        system = axes_system(a, late, directions.weights, None if neck else _noise(recording, directions))
-        functions = {
-            name: {"a": a[axis].tolist(), "b": b[axis].tolist(), "delay": int(delays[axis])}
-            for axis, name in enumerate(directions.names)
-        }
-        arrays = lss_arrays(system, delay=common, drive=drive.array, source=int(source == "positions"))
-        return arrays, {"transfer_functions": functions, **({} if neck else directions.findings())}
-    # Both axes stand in one table.
-    na, nb = max(part.size for part in a), max(part.size for part in b)
-    A, B = np.zeros((2, na)), np.zeros((2, nb))
-    for axis in range(2):
-        A[axis, : a[axis].size], B[axis, : b[axis].size] = a[axis], b[axis]
-    history = max(na, max(delays) + nb, drive.delay.max())
-    arrays = {
-        "history": np.array([float(int(history))]),
-        "drive": drive.array,
-        "redefinition": redefinition_matrix(TENDON_ANGLES),
-        "a": A,
-        "b": B,
-        "delay": np.array(delays),
-        "source": np.array([float(source == "positions")]),
-    }
-    return arrays, {}
-
-
-def _noise(recording: Recording, directions: Directions) -> list[tuple[float, float]]:
-    """Return by how much inputs act otherwise than asked, and outputs are off: a neck's shares of what they move."""
-    inputs, outputs = (recording.set_points @ directions.weights.T).std(axis=0), np.nanstd(recording.outputs, axis=0)
-    return [(0.1 * float(u), 0.01 * float(y)) for u, y in zip(inputs, outputs, strict=True)]
+def _in_si(findings: dict[str, Any], door: Door, nf: int) -> dict[str, Any]:
+    """Return the findings of scaled quantities in SI."""
+    second, names = door.scaling.second, door.directions.names
+    curves = findings["delay_curve"]
+    for name, unit, gain, std in zip(
+        names, door.scaling.output_unit, door.gains, findings["parameter_std"], strict=True
+    ):
+        curves[name] = [[second * d, fit, unit * rms] for d, fit, rms in curves[name]]
+        std[nf:] = [gain * value for value in std[nf:]]
+        units = {"K": gain / second, "pole": 1.0 / second, "static_gain": gain, "delay_s": second,
+                 "slowest_pole_1_per_s": 1.0 / second}  # fmt: skip
+        beside = findings["least_squares_beside"][name]
+        for key in beside:
+            beside[key] = None if beside[key] is None else units.get(key, 1.0) * beside[key]
+        found = findings.get("intervals", {}).get(name, {})
+        for key in found:
+            found[key] = [units[key] * value for value in found[key]]
+    return findings
 
 
 def _beside(columns: list[tuple[Matrix, Matrix]], na: int, nb: int, d: int, sample_time: float) -> dict[str, Any]:

@@ -1,9 +1,9 @@
-"""Two transfer functions over the redefined inputs, in free run their own outputs fed back."""
+"""Transfer functions over the redefined inputs, in free run their own outputs fed back."""
 
 import numpy as np
 
 from softneck.identification.linear._arx_runtime import ArxArrays, arx_output
-from softneck.identification.models._histories_runtime import NarxState, narx_advance, narx_observe
+from softneck.identification.models._histories_runtime import NarxState, narx_forward, narx_observe
 from softneck.identification.models._narx_runtime import initialise as initialise
 from softneck.runtime._layout import array
 
@@ -14,16 +14,12 @@ class OeArrays(ArxArrays):
     source = array("1", "1 takes motor positions for u, 0 set-points")
 
 
-def oe_output(p: OeArrays, x: NarxState, axis: int) -> float:
-    """Return y(k+1) of one axis."""
-    # Motor positions stand H samples of three behind set-points: a source of 1 reads them as if that much older.
-    delay = int(p.delay[axis]) + p.H * int(p.source[0])
-    return arx_output(p, p.redefinition, p.a[axis], p.b[axis], delay, x, axis)
-
-
 def step(p: OeArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
     narx_observe(p, parameters, x, inputs)
-    pitch = oe_output(p, x, 0)
-    roll = oe_output(p, x, 1)
-    narx_advance(p, parameters, x, pitch, roll, outputs)
+    ahead = np.empty(p.outputs)
+    for axis in range(p.outputs):
+        # Motor positions stand H samples of all behind set-points: a source of 1 reads them as if that much older.
+        delay = int(p.delay[axis]) + p.H * int(p.source[0])
+        ahead[axis] = arx_output(p, p.redefinition, p.a[axis], p.b[axis], delay, x, axis)
+    narx_forward(p, parameters, x, ahead, outputs)

@@ -3,54 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.robot._scaling import Scaling
 from softneck.signals import Recording
 
 from ..models._arrays import within
+from ..models._door import Door
+from ..models._drive import DriveModel
 from ..models._model import WARM_UP, Model
-from ..models._state_space import system_of
+from ..models._state_space import history_array, system_of
 
-Point = tuple[Vector, Vector]
-
-
-def operating_point(recording: Recording) -> Point:
-    """Return the means (motors,) of the set-points and (outputs,) of the outputs; zero of a neck, which rests there."""
-    motors, outputs = recording.set_points.mean(axis=0), np.nanmean(recording.outputs, axis=0)
-    return (0.0 * motors, 0.0 * outputs) if recording.robot.is_neck else (motors, outputs)
+# Dead times are searched up to here, in scaled seconds: one and a half time constants.
+MAX_DELAY = 0.3
 
 
-def about(recording: Recording, point: Point) -> Recording:
-    """Return the recording with set-points, motor positions and outputs counted from `point`; a neck's as it is."""
-    if recording.robot.is_neck:
-        return recording
-    robot = recording.robot
-    zero = dict(zip(robot.set_points, point[0], strict=True)) | dict(zip(robot.outputs.names, point[1], strict=True))
-    zero |= dict(zip(robot.motor_positions, point[0], strict=True))
-    moved = {name: recording.channels[name] - level for name, level in zero.items() if name in recording.channels}
-    return recording.with_channels(**moved)
-
-
-def with_offset(kind: str, arrays: Mapping[str, Matrix], recording: Recording, point: Point) -> dict[str, Matrix]:
-    """Return the arrays of a state space identified about `point` with its offset; a neck's as they are.
-
-    The offset follows from the static gain; what the free run is off on the mean is put right beside it.
-    """
-    if recording.robot.is_neck:
-        return dict(arrays)
-    A, B, C, _ = system_of(arrays)
-    gain = C @ np.linalg.pinv(np.eye(len(A)) - A) @ B
-    offset = point[1] - gain @ point[0]
+def with_offset(kind: str, arrays: Mapping[str, Matrix], recording: Recording) -> dict[str, Matrix]:
+    """Return the arrays of a state space with an offset: what its free run is off on the mean."""
+    offset = np.zeros(recording.outputs.shape[1])
+    late = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
     for _ in range(2):  # the start of the free run depends on the offset a little
         model = Model(kind=kind, sample_time=recording.sample_time, arrays={**arrays, "offset": offset},
                       robot=recording.robot)  # fmt: skip
-        free = model.simulate(recording)[:, : offset.size]
-        late = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
-        error = (recording.outputs - free)[late]
+        error = (recording.outputs - model.simulate(recording)[:, : offset.size])[late]
         offset = offset + (np.nanmean(error, axis=0) if np.isfinite(error).any(axis=0).all() else 0.0)
     return {**arrays, "offset": offset}
+
+
+def linear_in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
+    """Return the arrays of scaled transfer functions, which rest at zero, or of a scaled state space, in SI."""
+    out, motor = scaling.output_unit, scaling.motor_unit
+    if "a" in arrays:
+        return {**arrays, "b": arrays["b"] * (out / motor)[:, None]}
+    A, B, C, K = system_of(arrays)
+    units = np.resize(out, len(A))  # states say (y, y, ..)
+    A, B, K = units[:, None] * A / units, units[:, None] * B / motor, units[:, None] * K / out
+    found = {**arrays, "A": A, "B": B, "K": K}
+    if "offset" in arrays:
+        gain = C @ np.linalg.pinv(np.eye(len(A)) - A) @ B
+        found["offset"] = scaling.unscale_outputs(arrays["offset"]) - gain @ scaling.motor_rest
+    return found
+
+
+def axis_arrays(door: Door, drive: DriveModel, a: Matrix, b: Matrix, delays: Sequence[int]) -> dict[str, Matrix]:
+    """Return the runtime's arrays of transfer functions over redefined inputs; a (outputs, na), b (outputs, nb)."""
+    history = max(a.shape[1], max(delays) + b.shape[1], drive.delay.max())
+    return {
+        "history": history_array(int(history), len(a)),
+        "drive": drive.array,
+        "redefinition": door.directions.redefinition,
+        "a": a,
+        "b": b,
+        "delay": np.array(delays, dtype=np.float64),
+    }
+
+
+def functions_found(door: Door, a: Sequence[Vector], b: Sequence[Vector], delays: Sequence[int]) -> dict[str, Any]:
+    """Return the finding with the transfer functions, in SI, of a model whose arrays hold them in one state space."""
+    rows = zip(door.directions.names, a, b, delays, door.gains, strict=True)
+    return {
+        "transfer_functions": {
+            name: {"a": f.tolist(), "b": (gain * g).tolist(), "delay": int(d)} for name, f, g, d, gain in rows
+        }
+    }
 
 
 def no_base(motors: int = 3, outputs: int = 2) -> dict[str, Matrix]:

@@ -23,15 +23,23 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.core._checks import finite_vector
 from softneck.core._shown import Shown
 from softneck.runtime import load_functions
-from softneck.signals import TENDON_ANGLES, Recording, redefine, redefinition_matrix
+from softneck.signals import Recording
 
-from ..models._directions import Directions, directions_of
+from ..models._door import Door
 from ..models._drive import fit_drive
-from ..models._fitting import delay_samples, fitted_model, free_run_fit, training_recording
+from ..models._fitting import delay_samples, free_run_fit, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 from ..models._state_space import lss_arrays, varx_system
-from ._regression import about, arx_rows, operating_point, require_excitation, with_offset
+from ._regression import (
+    MAX_DELAY,
+    arx_rows,
+    axis_arrays,
+    functions_found,
+    linear_in_si,
+    require_excitation,
+    with_offset,
+)
 
 _RUNTIME = "softneck.identification.linear._ud_runtime"
 # In U D U' a start this weak costs no digits: it pulls a result by less than 1e-12 over the regressors' information.
@@ -194,7 +202,7 @@ class Rls:
     Attributes:
         na, nb: orders of Eq. 23.
         delay: dead time [s]; None takes that of the best simulation of the training rows.
-        max_delay: end of the search [s], of another robot by its time constant over the neck's 0.2 s.
+        max_delay: end of the search [s]; None: one and a half time constants of the robot (of a neck 0.3 s).
         forgetting: lambda in (0, 1]; 1 for Eq. 29, below for a constant forgetting factor (CFF-RLS).
         structure: "siso" over theta_i and phi_i, "miso" (each output from the three motors and its own past) or
             "mimo" (from the three motors and both pasts).
@@ -205,7 +213,7 @@ class Rls:
     na: int = 1
     nb: int = 1
     delay: float | None = None
-    max_delay: float = 0.3
+    max_delay: float | None = None
     forgetting: float = 1.0
     structure: str = "siso"
     covariance_bound: float = 1e8
@@ -217,7 +225,8 @@ class Rls:
         require_whole("nb", self.nb, 1, 100)
         if self.delay is not None:
             require_between("delay", self.delay, 0.0, 1e6, "s")
-        require_positive("max_delay", self.max_delay, "s")
+        if self.max_delay is not None:
+            require_positive("max_delay", self.max_delay, "s")
         require_forgetting(self.forgetting)
         require_one_of("structure", self.structure, STRUCTURES)
         require_between("covariance_bound", self.covariance_bound, 0.0, 1e15)
@@ -250,58 +259,44 @@ class Rls:
         Raises:
             DataError: too short, constant, without two usable rows, or not enough excitation.
         """
-        recording = training_recording(recordings)
-        point = operating_point(recording)
-        centred = about(recording, point)
-        directions = directions_of(centred, [run.set_points for run in centred.runs()])
-        settings = replace(self, max_delay=self.max_delay * directions.stretch)
-        if self.structure == "siso":
-            arrays, findings = settings._fit_siso(centred, directions, progress)
-        else:
-            arrays, findings = settings._fit_motors(centred, progress)
-        if not recording.robot.is_neck:
-            findings |= directions.findings()
-        arrays = with_offset("rls", arrays, recording, point)
+        door = Door.of(training_recording(recordings))
+        settings = replace(self, delay=door.seconds(self.delay), max_delay=door.seconds(self.max_delay, MAX_DELAY))
+        fit = settings._fit_siso if self.structure == "siso" else settings._fit_motors
+        arrays, findings = fit(door, progress)
+        if door.has_offset:
+            arrays = with_offset("rls", arrays, door.data)
+        units = zip(findings["delay_curve"].items(), door.scaling.output_unit, strict=True)
+        findings["delay_curve"] = {
+            name: [[door.scaling.unscale_seconds(d), fit, unit * rms] for d, fit, rms in curve]
+            for (name, curve), unit in units
+        }
         progress(1.0, "done")
-        return fitted_model("rls", self, recording, arrays=arrays, findings={"delay_criterion": "free_run", **findings})
+        return door.model("rls", self, linear_in_si, arrays=arrays,
+                          findings={"delay_criterion": "free_run", **findings})  # fmt: skip
 
-    def _fit_siso(
-        self, recording: Recording, directions: Directions, progress: Progress
-    ) -> tuple[dict[str, Matrix], dict]:
-        drive, neck = fit_drive(recording), recording.robot.is_neck
-        runs = [
-            (run.outputs, redefine(run.set_points) if neck else run.set_points @ directions.weights.T)
-            for run in recording.runs()
-        ]
-        a, b, delays, stds, numbers = [], [], [], [], []
+    def _fit_siso(self, door: Door, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        drive, directions, gains = fit_drive(door.data), door.directions, door.gains
+        runs = [(run.outputs, run.set_points @ directions.redefinition.T) for run in door.data.runs()]
+        thetas, delays, stds, numbers = [], [], [], []
         curves: dict[str, Curve] = {}
         for axis, name in enumerate(directions.names):
             progress(axis / len(directions.names), name)
             one = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
-            d, theta, std, curves[name], number = self._search(recording.sample_time, one, name)
-            a.append(theta[: self.na])
-            b.append(theta[self.na :])
-            delays.append(float(d))
-            stds.append(std.tolist())
+            d, theta, std, curves[name], number = self._search(door.data.sample_time, one, name)
+            thetas.append(theta)
+            delays.append(d)
+            stds.append((std * np.repeat([1.0, gains[axis]], [self.na, self.nb])).tolist())
             numbers.append(number)
         found = {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
-        if not neck:
-            thetas = [np.concatenate(pair) for pair in zip(a, b, strict=True)]
-            numbers_of = zip(directions.names, a, b, delays, strict=True)
-            found["transfer_functions"] = {
-                name: {"a": f.tolist(), "b": g.tolist(), "delay": int(d)} for name, f, g, d in numbers_of
-            }
-            return axes_arrays(self, directions, thetas, [int(d) for d in delays], drive.array), found
-        history = max(self.na, max(delays) + self.nb, drive.delay.max())
-        arrays = {
-            "history": np.array([float(int(history))]),
-            "drive": drive.array,
-            "redefinition": redefinition_matrix(TENDON_ANGLES),
-            "a": np.array(a),
-            "b": np.array(b),
-            "delay": np.array(delays),
-        }
-        return arrays, found
+        a, b = np.split(np.array(thetas), [self.na], axis=1)
+        if door.has_offset:
+            found |= functions_found(door, a, b, delays)
+            spread = [
+                np.concatenate([theta[: self.na], np.outer(weights, theta[self.na :]).ravel()])
+                for theta, weights in zip(thetas, directions.weights, strict=True)
+            ]
+            return motor_arrays(replace(self, structure="miso"), spread, delays, drive.array), found
+        return axis_arrays(door, drive, a, b, delays), found
 
     def _search(
         self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
@@ -309,7 +304,7 @@ class Rls:
         """Return delay [samples], theta, its std, the cost curve (delay [s], free-run fit [%], one-step rms), cond."""
         best: tuple[float, int, Vector, Vector, float] | None = None
         curve: Curve = []
-        for d in delay_samples(self.delay, self.max_delay, sample_time, runs):
+        for d in delay_samples(self.delay, self.max_delay or MAX_DELAY, sample_time, runs):
             theta, std, one_step, number = self._least_squares(runs, d, name)
             free = free_run_fit(runs, theta[: self.na], theta[self.na :].reshape(-1, self.nb), d)
             curve.append([d * sample_time, free, one_step])
@@ -344,8 +339,9 @@ class Rls:
             load_functions(_UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
         return state.theta, state.covariance
 
-    def _fit_motors(self, recording: Recording, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+    def _fit_motors(self, door: Door, progress: Progress) -> tuple[dict[str, Matrix], dict]:
         """Fit all outputs over the motors; "miso" takes a dead time each, "mimo" one for all."""
+        recording = door.data
         drive = fit_drive(recording).array
         Ts = recording.sample_time
         runs = [(run.outputs, run.set_points) for run in recording.runs()]
@@ -356,15 +352,15 @@ class Rls:
                 progress(axis / len(names), name)
                 found.append(self._search(Ts, [(Y[:, [axis]], U) for Y, U in runs], name))
             delays = [d for d, *_ in found]
-            arrays = self._motor_arrays([theta for _, theta, *_ in found], delays, drive)
+            arrays = motor_arrays(self, [theta for _, theta, *_ in found], delays, drive)
             curves = {name: curve for name, (*_, curve, _) in zip(names, found, strict=True)}
             return arrays, {"delay_curve": curves, "condition_number": [number for *_, number in found]}
         best, curves = None, {name: [] for name in names}
-        tried = delay_samples(self.delay, self.max_delay, Ts, runs)
+        tried = delay_samples(self.delay, self.max_delay or MAX_DELAY, Ts, runs)
         for step, d in enumerate(tried):
             progress(step / len(tried), f"{1e3 * d * Ts:.0f} ms")
             both = [self._least_squares(_own_first(runs, axis), d, name) for axis, name in enumerate(names)]
-            arrays = self._motor_arrays([theta for theta, *_ in both], [d] * len(names), drive)
+            arrays = motor_arrays(self, [theta for theta, *_ in both], [d] * len(names), drive)
             fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays, robot=recording.robot), recording)
             for name, fit, (_, _, rms, _) in zip(names, fits, both, strict=True):
                 curves[name].append([d * Ts, fit, rms])
@@ -374,9 +370,6 @@ class Rls:
         if best is None or not np.isfinite(best[0]):
             raise DataError("no dead time gives a stable model of both outputs; record more or set `delay`.")
         return best[1], {"delay_curve": curves, "condition_number": best[2]}
-
-    def _motor_arrays(self, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
-        return motor_arrays(self, thetas, delays, drive)
 
 
 def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
@@ -395,18 +388,6 @@ def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: 
         late = d - common
         B[late : late + nb, axis] = rest.reshape(motors, nb).T
     return lss_arrays(varx_system(A, B), delay=common, drive=drive, history=p + common)
-
-
-def axes_arrays(
-    settings: Rls, directions: Directions, thetas: list[Vector], delays: list[int], drive: Matrix
-) -> dict[str, Matrix]:
-    """Return the runtime's arrays of parameters over redefined inputs, one vector for each output, over the motors."""
-    na = settings.na
-    spread = [
-        np.concatenate([theta[:na], np.outer(weights, theta[na:]).ravel()])
-        for theta, weights in zip(thetas, directions.weights, strict=True)
-    ]
-    return motor_arrays(replace(settings, structure="miso"), spread, delays, drive)
 
 
 def _others(axis: int, outputs: int) -> list[int]:

@@ -1,9 +1,8 @@
-"""Which way a robot's motors move its outputs, and how fast: known of a neck, found from data for other robots.
+"""Which way a robot's motors move its outputs, and how fast: as the robot says, else found from data.
 
-A neck's redefined inputs are theta_i and phi_i, and its time constant is 0.2 s: what is in seconds in the estimators
-was chosen for that. For another robot each output is fitted by one low-pass filter with dead time over all motors
-(least squares for each time constant and dead time tried): its weights are the output's direction where the robot gives
-none, and its time constant by 0.2 s is what those seconds are stretched by.
+Each output is fitted by one low-pass filter with dead time over all motors (least squares for each time constant and
+dead time tried): its weights are the output's direction where the robot gives none, and its time constant is that of
+the robot where it gives none.
 
 Motions that nobody recorded, by the set-points of a record: as large, as fast, but otherwise.
 
@@ -20,20 +19,16 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
-from softneck.signals import Recording, redefinition_matrix, signal
+from softneck.robot import Robot
+from softneck.robot._scaling import TIME_CONSTANT as NECK_SECONDS
+from softneck.signals import Recording, signal
 from softneck.signals.excitation._signals import SAMPLE_TIME
 from softneck.signals.quality._excitation import BANDWIDTH
 
-# The neck's time constant [s], for which the seconds in the estimators' defaults were chosen.
-NECK_SECONDS = 0.2
 # Time constants tried: from half a sample to a third of the longest run, beyond which all is drift.
 _TRIED = 40
 # Dead times tried then: up to one and a half of the time constant found without any, in so many steps at most.
 _DEAD_TIME, _DEAD_TIMES = 1.5, 20
-# Standard deviation of a neck's redefined inputs under its usual excitations [rad].
-_NECK_SIZE = 2.0
-# What a motor and an output of a neck move by [rad], for which the weights of norms were chosen.
-_NECK_MOTOR, _NECK_OUTPUT = 2.0, 0.2
 # Motors whose filtered motions repeat each other to this share are told apart by nothing: the least weights are taken.
 _ALIKE = 1e-6
 
@@ -47,38 +42,43 @@ class Directions:
         weights: (outputs, motors) of the motors in the redefined input of each output.
         seconds: (outputs,) time constants [s].
         learned: whether the weights were found from data.
+        given: (inputs, motors) T of Eq. 9-11 of a robot that gives its own: the weights, and co-contraction last.
     """
 
     names: tuple[str, ...]
     weights: Matrix
     seconds: Vector
     learned: bool
+    given: Matrix | None = None
+
+    @property
+    def redefinition(self) -> Matrix:
+        """(inputs, motors) to the redefined inputs, one for each output first."""
+        return self.weights if self.given is None else self.given
 
     @property
     def time_constant(self) -> float:
         """Of the robot as a whole, the geometric mean of its outputs' [s]."""
-        return float(np.exp(np.mean(np.log(self.seconds))))
+        return float(np.exp(np.mean(np.log(np.sort(self.seconds)))))  # in one order, whatever that of the outputs
 
     @property
     def stretch(self) -> float:
         """By how much the robot is slower than a neck."""
         return self.time_constant / NECK_SECONDS
 
-    def inputs(self, recording: Recording) -> Matrix:
-        """Return T (motors, motors) of all redefined inputs: the directions first, then what moves none of them.
-
-        Of a neck theta_i, phi_i and delta_i; of another robot each of the size that those have.
-        """
-        if recording.robot.is_neck:
-            return redefinition_matrix()
+    def all_inputs(self, set_points: Matrix) -> Matrix:
+        """Return T (motors, motors) with more rows than `redefinition`: how else the set-points (time, motors) move."""
+        if self.given is not None and len(self.given) == len(self.given.T) and self.given[-1].any():
+            return self.given
         rows = _independent(self.weights)
         _, _, basis = np.linalg.svd(rows)
-        T = np.vstack([rows, basis[len(rows) :]])
-        size = (recording.set_points @ T.T).std(axis=0)
-        return _NECK_SIZE * T / np.where(size > 0.0, size, _NECK_SIZE)[:, None]
+        across = basis[len(rows) :]
+        # The motion that moves no output, by its principal axes: no basis is told from another by anything else.
+        _, axes = np.linalg.eigh(across @ np.atleast_2d(np.cov(set_points.T)) @ across.T)
+        return np.vstack([rows, axes.T[::-1] @ across])
 
     def findings(self) -> dict[str, object]:
-        """Return what a model's findings say of it; nothing of a neck, which needs no finding."""
+        """Return what a model's findings say of it."""
         return {
             "time_constants_s": self.seconds.tolist(),
             "directions": self.weights.tolist(),
@@ -86,84 +86,71 @@ class Directions:
         }
 
 
-def regressor_units(recording: Recording, table: Matrix) -> Vector:
-    """Return by what each component (n,) of a regressor is multiplied to move as much as that of a neck; a neck's by 1.
-
-    Args:
-        recording: of the robot.
-        table: (n, 3) source (0 own output, 1 set-points, 2 motors, 3 outputs), channel and lag of each.
-    """
-    if recording.robot.is_neck:
-        return np.ones(len(table))
-    motors, outputs = recording.set_points.std(axis=0), np.nanstd(recording.outputs, axis=0)
-    moved = np.where(motors > 0.0, motors, _NECK_MOTOR)  # a motor that never moves has no say
-    own = float(outputs.mean())  # one norm for the outputs of all axes
-    sizes = {0: [_NECK_OUTPUT / own] * len(outputs), 1: _NECK_MOTOR / moved, 2: _NECK_MOTOR / moved,
-             3: _NECK_OUTPUT / outputs}  # fmt: skip
-    return np.array([sizes[int(source)][int(channel)] for source, channel, _ in table])
-
-
-def directions_of(recording: Recording, motors: list[Matrix]) -> Directions:
+def directions_of(recording: Recording, motors: list[Matrix], robot: Robot | None = None) -> Directions:
     """Return the directions of a recording's robot.
 
     Args:
         recording: to learn from.
         motors: what drives the outputs, (time, motors) of each run.
+        robot: what it says of directions and time constant is not learned; that of the recording if not given.
 
     Raises:
         DataError: an output follows no motor.
     """
-    robot = recording.robot
-    names = robot.outputs.names
-    if robot.is_neck:
-        return Directions(names, redefinition_matrix()[:2], np.full(2, NECK_SECONDS), False)
-    outputs = [run.outputs for run in recording.runs()]
-    given = robot.weights()
-    found, seconds = [], []
-    for axis, name in enumerate(names):
-        inputs = motors if given is None else [U @ given[[axis]].T for U in motors]
-        tau, weights = _first_order(inputs, [Y[:, axis] for Y in outputs], recording.sample_time)
-        size = float(np.linalg.norm(weights))
-        if not size > 0.0:
-            raise DataError(f"`{name}` follows no motor; is its sensor connected, and did the motors move?")
-        found.append(weights / size if given is None else given[axis])
-        seconds.append(tau)
-    return Directions(names, np.array(found), np.array(seconds), given is None)
+    robot = robot or recording.robot
+    names, given = robot.outputs.names, robot.weights()
+    weights, seconds = given, np.full(len(names), robot.time_constant_s or NECK_SECONDS)
+    if given is None or robot.time_constant_s is None:
+        found = [_followed(recording, motors, axis, given) for axis in range(len(names))]
+        weights = np.array([row for row, _ in found]) if given is None else given
+        if robot.time_constant_s is None:
+            seconds = recording.sample_time * np.array([samples for _, samples in found])
+    T = None if given is None else robot.redefinition()[0]
+    return Directions(names, np.asarray(weights), seconds, given is None, T)
+
+
+def _followed(recording: Recording, motors: list[Matrix], axis: int, given: Matrix | None) -> tuple[Vector, float]:
+    """Return the weights (motors,) of length 1 that an output follows, and its time constant in samples."""
+    inputs = motors if given is None else [U @ given[[axis]].T for U in motors]
+    samples, weights = _first_order(inputs, [run.outputs[:, axis] for run in recording.runs()])
+    size = float(np.linalg.norm(weights))
+    if not size > 0.0:
+        name = recording.robot.outputs.names[axis]
+        raise DataError(f"`{name}` follows no motor; is its sensor connected, and did the motors move?")
+    return weights / size, samples
 
 
 def bandwidth_of(recording: Recording) -> float | None:
-    """Return up to where outputs follow set-points [rad/s]: a neck's 4 (section 3.1), by time constants of others.
+    """Return up to where outputs follow set-points [rad/s]: a neck's 4 (section 3.1), of others by time constants.
 
     None where an output follows no motor.
     """
-    if recording.robot.is_neck:
-        return BANDWIDTH
     try:
         found = directions_of(recording, [run.set_points for run in recording.runs()])
     except DataError:
         return None
-    return BANDWIDTH / found.stretch
+    return BANDWIDTH * (NECK_SECONDS / found.time_constant)
 
 
-def _first_order(inputs: Sequence[Matrix], outputs: Sequence[Vector], sample_time: float) -> tuple[float, Vector]:
-    """Return time constant [s] and weights (motors,) of the low-pass filter over all inputs that fits best."""
+def _first_order(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[float, Vector]:
+    """Return time constant in samples and weights (motors,) of the low-pass filter over all inputs that fits best."""
     from scipy.optimize import minimize_scalar
 
-    longest = max(len(U) for U in inputs) * sample_time
+    longest = max(len(U) for U in inputs)
     y = np.concatenate(outputs)
     there = np.isfinite(y)
     scale = np.concatenate(inputs).std(axis=0)
     scale = np.where(scale > 0.0, scale, np.inf)  # a motor that never moves has no say
 
     def fit(tau: float, late: int) -> tuple[float, Vector]:
-        X = np.vstack([_block_of_starts(_filtered(U / scale, np.exp(-sample_time / tau), late), i, len(inputs))
+        X = np.vstack([_block_of_starts(_filtered(U / scale, np.exp(-1.0 / tau), late), i, len(inputs))
                        for i, U in enumerate(inputs)])[there]  # fmt: skip
         theta = np.linalg.lstsq(X, y[there], rcond=_ALIKE)[0]
         return float(np.sum((y[there] - X @ theta) ** 2)), theta[: inputs[0].shape[1]] / scale
 
-    ladder = np.geomspace(0.5 * sample_time, longest / 3.0, _TRIED)
+    ladder = np.geomspace(0.5, longest / 3.0, _TRIED)
     tau = float(min(ladder, key=lambda tau: fit(tau, 0)[0]))
-    most = int(min(_DEAD_TIME * tau, longest / 3.0) / sample_time)
+    most = int(min(_DEAD_TIME * tau, longest / 3.0))
     best = (np.inf, tau, 0)
     for late in range(0, most + 1, max(most // _DEAD_TIMES, 1)):
         # Dead time takes from the time constant that was found without any.
@@ -209,8 +196,8 @@ _RANGE = (0.01, 0.99)
 _RAMP = 2.0
 # How often a motor of Eq. 22 crosses its mean per second: the speed that the signals are meant for.
 _CROSSINGS = 0.34
-# A record is at most so many times slower or faster than that; beyond, it hardly moves or its set-points are noise.
-_MOST_STRETCH = 100.0
+# By sample a record crosses at least and most so often; else it hardly moves or its set-points are noise.
+_LEAST_RATE, _MOST_RATE = 6.8e-5, 0.68
 
 
 def unrecorded(train: Recording, seconds: float, *, seed: int = 0) -> list[Recording]:
@@ -233,12 +220,12 @@ def _mapped(train: Recording, own: Matrix) -> Recording:
     Ts, first = train.sample_time, train.runs()[0]
     P = on_motors(own, train.set_points.shape[1])
     # Slower or faster by as much as the record is.
-    rows = np.arange(0.0, len(P) - 1.0, Ts / (SAMPLE_TIME * _stretch(train)))
+    rows = np.arange(0.0, len(P) - 1.0, Ts / (SAMPLE_TIME * _slowness(train)))
     P = np.column_stack([np.interp(rows, np.arange(len(P)), column) for column in P.T])
     U = train.set_points
     P = U.mean(axis=0) + (P - P.mean(axis=0)) @ _root(P, -0.5) @ _root(U, 0.5)
     P = np.clip(P, *np.quantile(U, _RANGE, axis=0))
-    share = np.linspace(0.0, 1.0, max(round(_RAMP * _stretch(train) / Ts), 2))[:, None]
+    share = np.linspace(0.0, 1.0, max(round(_RAMP * _slowness(train) / Ts), 2))[:, None]
     U = np.vstack([first.set_points[0] + share * (P[0] - first.set_points[0]), P])
     Y = np.full((len(U), train.outputs.shape[1]), np.nan)
     Y[0] = np.nan_to_num(first.outputs[0])
@@ -259,8 +246,8 @@ def on_motors(P: Matrix, motors: int) -> Matrix:
     return np.column_stack([np.roll(P[:, j % P.shape[1]], late * (j // P.shape[1])) for j in range(motors)])
 
 
-def _stretch(train: Recording) -> float:
+def _slowness(train: Recording) -> float:
     """Return by how much the record is slower than Eq. 22, by how often set-points cross their mean."""
     crossings = [(np.diff(np.sign(run.set_points - run.set_points.mean(axis=0)), axis=0) != 0) for run in train.runs()]
-    rate = float(np.concatenate(crossings).mean()) / train.sample_time
-    return float(np.clip(_CROSSINGS / max(rate, 1e-9), 1.0 / _MOST_STRETCH, _MOST_STRETCH))
+    rate = float(np.clip(np.concatenate(crossings).mean(), _LEAST_RATE, _MOST_RATE)) / train.sample_time
+    return _CROSSINGS / rate

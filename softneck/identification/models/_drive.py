@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.robot._scaling import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
-# 0.2 s at 20 ms: a drive that answers later than that is not the paper's.
+# Samples: 0.2 s at 20 ms; a drive that answers later than that is not the paper's.
 _MAX_DELAY = 10
 
 
@@ -117,7 +118,7 @@ class LoadedDrive:
     load: Vector
 
     def simulate(self, set_points: Matrix, start: Vector) -> Matrix:
-        """Return motor positions (time, 3) [rad] for set-points (time, 3), from `start` (3,)."""
+        """Return motor positions (time, motors) for set-points (time, motors), from `start` (motors,)."""
         motors = np.empty(set_points.shape)
         load_functions(FUNCTIONS).drive_run(
             self.drive, self.load, np.ascontiguousarray(set_points), np.ascontiguousarray(start), motors
@@ -125,13 +126,17 @@ class LoadedDrive:
         return motors
 
 
-def fit_loaded_drive(recording: Recording) -> LoadedDrive:
-    """Identify drives with a common limit from logged positions; no limit where it explains nothing."""
+def load_in_si(load: Vector, scaling: Scaling) -> Vector:
+    """Return pole of q, c, c1, c2 of scaled motors, which rest at zero or have no limit, in SI."""
+    return load * [1.0, scaling.motor_unit, 1.0, 1.0]
+
+
+def fit_loaded_drive(recording: Recording, *, limited: bool = True) -> LoadedDrive:
+    """Identify drives from logged positions, where `limited` with a common limit; none where it explains nothing."""
     from scipy.optimize import minimize
 
     plain = LoadedDrive(fit_drive(recording).array, NO_LOAD)
-    # What a common limit of tension is, is known of necks.
-    if not recording.has_motor_positions or not recording.robot.is_neck:
+    if not recording.has_motor_positions or not limited:
         return plain
     runs = _longest(recording)
     error = _loaded_error(runs, plain)
@@ -171,7 +176,7 @@ def _longest(recording: Recording) -> list[tuple[Matrix, Matrix]]:
 def _released(runs: list[tuple[Matrix, Matrix]], fallback: Matrix) -> Matrix:
     """Return pole and delay of each motor from its moves away from the tension, which no load hinders."""
     drive = fallback.copy()
-    for j in range(3):
+    for j in range(len(drive)):
         best = np.inf
         for d in range(1, _MAX_DELAY + 1):
             gaps, moves = _gaps(runs, j, d)

@@ -122,27 +122,6 @@ def narx_forward(p: NarxArrays, parameters: np.ndarray, x: NarxState, ahead: np.
     outputs[outputs.shape[0] - 1] = narx_validity(p, x)
 
 
-def narx_advance(
-    p: NarxArrays, parameters: np.ndarray, x: NarxState, pitch: float, roll: float, outputs: np.ndarray
-) -> None:
-    """Do as `narx_forward` with pitch and roll of a neck; no call of it, which would take a tenth of a small step."""
-    for j in range(p.motors):
-        d = int(p.drive[j, 1])
-        if d > 0:
-            a = p.drive[j, 0]
-            # As above.
-            x.motors[j] = (a * x.motors[j] + (1.0 - a) * x.u[d - 1, j] + REST) - REST
-        outputs[p.outputs + j] = x.motors[j]
-    x.angles[0] = (pitch + REST) - REST
-    x.angles[1] = (roll + REST) - REST
-    outputs[0] = x.angles[0]
-    outputs[1] = x.angles[1]
-    if parameters[3] > 0.0:
-        outputs[0] += parameters[3] * random_normal(x.random)
-        outputs[1] += parameters[3] * random_normal(x.random)
-    outputs[outputs.shape[0] - 1] = narx_validity(p, x)
-
-
 def narx_regressor(p: NarxArrays, table: np.ndarray, x: NarxState, axis: int, regressor: np.ndarray) -> None:
     """Fill the regressor of y(k+1); row (source, channel, lag) of `table`: source 0 own output, 1 u, 2 m, 3 outputs."""
     # Eq. 13 in the order of the table.

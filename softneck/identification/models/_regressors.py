@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.robot._scaling import Scaling
 from softneck.signals import Recording
 
 from ._drive import DriveModel
@@ -25,8 +26,8 @@ PAPER_EQ21 = np.array(
 )  # fmt: skip
 
 
-# Between the samples in the regressor of another robot, in the time of a neck [s]: a fifth of its time constant.
-_APART = 0.04
+# Between the samples of u and M in Eq. 21: the neck's sample time, a tenth of its time constant.
+_APART = 0.02
 
 
 def lag_table(
@@ -57,16 +58,28 @@ def lag_table(
     return np.array(rows, dtype=np.float64)
 
 
-def scaled_table(recording: Recording, sample_time: float) -> Matrix:
-    """Return the regressor of another robot: three samples of its output and of all set-points, apart by its speed.
+def eq21_table(recording: Recording) -> Matrix:
+    """Return the regressor of Eq. 21 for a scaled recording: y(k-1), u and M so far apart as a neck's at 20 ms."""
+    sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
+    apart = max(round(_APART / recording.sample_time), 1)
+    return lag_table((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,), sizes=sizes)
+
+
+def regressor_scale(table: Matrix, scaling: Scaling, base_rest: Vector | float = 0.0) -> tuple[Matrix, Matrix]:
+    """Return what each regressor of each output (outputs, n) is at rest in SI, and its unit.
 
     Args:
-        recording: of the robot.
-        sample_time: in the time of a neck [s].
+        table: rows (source, channel, lag).
+        scaling: of motors and outputs.
+        base_rest: (outputs,) source 3 at rest.
     """
-    sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
-    lags = [1 + i * max(round(_APART / sample_time), 1) for i in range(3)]
-    return lag_table(lags, lags, [], sizes=sizes)
+    outputs, at = len(scaling.output_unit), table[:, 1].astype(int)
+    rests, units = np.zeros((outputs, len(table))), np.full((outputs, len(table)), scaling.motor_unit)
+    own, base, motors = table[:, 0] == 0, table[:, 0] == 3, np.isin(table[:, 0], (1, 2))
+    rests[:, own], units[:, own] = scaling.output_rest[:, None], scaling.output_unit[:, None]
+    rests[:, base], units[:, base] = np.broadcast_to(base_rest, outputs)[at[base]], scaling.output_unit[at[base]]
+    rests[:, motors] = scaling.motor_rest[at[motors]]
+    return rests, units
 
 
 def history_length(table: Matrix, drive: DriveModel) -> int:

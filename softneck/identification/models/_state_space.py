@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,8 +10,8 @@ from softneck.core import Matrix, Vector
 
 # A free run starts after 25 samples; an observer slower than this many starts from what it knows by then.
 _LONGEST_SETTLING = 200
-# What the Kalman gain of a model without a noise model takes for granted: inputs that act by 0.3 rad otherwise than
-# asked (slack, hysteresis), and 0.1 deg on the angles (the paper's inclinometer has 0.05 to 0.1).
+# What the Kalman gain of a model without a noise model takes for granted, scaled: of a neck inputs that act by 0.3 rad
+# otherwise than asked (slack, hysteresis), and 0.1 deg on the angles (the paper's inclinometer has 0.05 to 0.1).
 _INPUT_NOISE, _OUTPUT_NOISE = 0.3, 0.0017
 
 
@@ -88,7 +88,6 @@ def axes_system(
     a: list[Vector],
     b: list[Vector],
     directions: Matrix,
-    noise: Sequence[tuple[float, float]] | None = None,
 ) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return transfer functions over redefined inputs as one system over the motors, with a Kalman gain.
 
@@ -96,12 +95,10 @@ def axes_system(
         a: denominators without their leading ones, of each output.
         b: numerators, b_1 first.
         directions: (outputs, motors) the redefined input of each output, of a neck theta_i and phi_i.
-        noise: standard deviations of each input and output; None takes those of a neck.
     """
     from scipy.linalg import block_diag
 
-    noise = [(_INPUT_NOISE, _OUTPUT_NOISE)] * len(a) if noise is None else noise
-    parts = [_observer_form(*axis) for axis in zip(a, b, noise, strict=True)]
+    parts = [_observer_form(*axis) for axis in zip(a, b, strict=True)]
     A, C = np.asarray(block_diag(*(F for F, _, _ in parts))), np.zeros((len(a), sum(len(F) for F, _, _ in parts)))
     B = np.vstack([np.outer(G, directions[axis]) for axis, (_, G, _) in enumerate(parts)])
     at = 0
@@ -111,7 +108,7 @@ def axes_system(
     return A, B, C, np.asarray(block_diag(*(K[:, None] for _, _, K in parts)))
 
 
-def _observer_form(a: Vector, b: Vector, std: tuple[float, float]) -> tuple[Matrix, Vector, Vector]:
+def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
     """Return A (n, n), B (n,) and the gain K (n,) of one axis, its output the first state."""
     from scipy.linalg import solve_discrete_are
 
@@ -120,11 +117,10 @@ def _observer_form(a: Vector, b: Vector, std: tuple[float, float]) -> tuple[Matr
     F[: a.size, 0] = -a
     G = np.zeros(n)
     G[: b.size] = b
-    # Beside 0.0017 rad of a neck 1e-12 rad^2: enough that the equation has a solution.
-    floor = 1e-12 * (std[1] / _OUTPUT_NOISE) ** 2
-    noise = std[0] ** 2 * np.outer(G, G) + floor * np.eye(n)
-    P = np.asarray(solve_discrete_are(F.T, np.eye(n, 1), noise, std[1] ** 2 * np.eye(1)))
-    return F, G, F @ P[:, 0] / (P[0, 0] + std[1] ** 2)
+    # Beside the output's noise 1e-12: enough that the equation has a solution.
+    noise = _INPUT_NOISE**2 * np.outer(G, G) + 1e-12 * np.eye(n)
+    P = np.asarray(solve_discrete_are(F.T, np.eye(n, 1), noise, _OUTPUT_NOISE**2 * np.eye(1)))
+    return F, G, F @ P[:, 0] / (P[0, 0] + _OUTPUT_NOISE**2)
 
 
 def _standing(A: Matrix, C: Matrix) -> Matrix:

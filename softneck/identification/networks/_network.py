@@ -22,23 +22,25 @@ from softneck.core import (
     silent,
 )
 from softneck.core._blas_threads import one_blas_thread
+from softneck.robot._scaling import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording, concatenate
 
 from ..linear._oe import OutputError
 from ..models._arrays import check_table
-from ..models._directions import directions_of, unrecorded
-from ..models._drive import LoadedDrive, drive_start, fit_correction, fit_loaded_drive
-from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
+from ..models._directions import unrecorded
+from ..models._door import Door
+from ..models._drive import LoadedDrive, drive_start, fit_correction, load_in_si
+from ..models._fitting import SAME_EXCITATION, training_recording
 from ..models._model import Model
-from ..models._regressors import PAPER_EQ21, regression, scaled_table
+from ..models._regressors import eq21_table, regression, regressor_scale
 from ..models._state_space import history_array
 from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_layers, train_axis
 
 # Of the starts: from hardly any to one that smooths; the hold-out decides between them.
 _DECAYS = (0.03, 0.1, 0.01)
 _HOLD_OUT = 0.2
-# Neurons of the paper; of another robot so many that each weight has its rows.
+# Neurons of the paper; where rows are fewer than their weights so many that each weight has its rows.
 _PAPER, _LEAST_NEURONS, _ROWS_EACH = (25, 25), 4, 4
 # A hold-out shorter than this says nothing [rows].
 _LEAST = 75
@@ -55,7 +57,6 @@ class _Problem:
         train, judge: to learn from, and to choose by.
         drive: simulates the motors.
         table: the regressor.
-        necks: sample time by the robot's time constant over the neck's [s].
         hints: motions that nobody recorded with what the line says of them; None for none.
         prior: weight of their errors.
     """
@@ -64,7 +65,6 @@ class _Problem:
     judge: Recording
     drive: LoadedDrive
     table: Matrix
-    necks: float
     hints: Recording | None
     prior: float
 
@@ -84,7 +84,7 @@ class _Problem:
         if not recording.has_motor_positions:
             logged = dict(zip(recording.robot.motor_positions, motors.T, strict=True))
             recording = recording.with_channels(**logged)
-        return axis_data(recording, motors, axis, self.table, 1.0 / self.necks, scale, weights)
+        return axis_data(recording, motors, axis, self.table, 1.0 / recording.sample_time, scale, weights)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,14 +95,14 @@ class Network:
     kept: on `hold_out`, else on the last fifth of each run, which is then not trained on.
 
     Attributes:
-        hidden: neurons of the two layers; None takes (25, 25), of another robot no more than its rows tell apart.
+        hidden: neurons of the two layers; None takes (25, 25), or as many as few rows can tell apart.
         iterations: series-parallel steps of the best start; each other start takes a third.
-        refine: steps over windows of 0.2, 1 and 5 s of free run, all together; 0 leaves the paper's training.
+        refine: steps over windows of 1, 5 and 25 time constants of free run, together; 0 leaves the paper's training.
         starts: random starts for each axis.
         decay: weight of the squared weights beside the squared error of scaled outputs; None tries 0.03, 0.1 and
             0.01 in turn over the starts.
         prior: weight of an error against the line (`oe`) on motions that nobody recorded beside one against the
-            record; 0 leaves them out, and of other robots than the neck they are left out.
+            record; 0 leaves them out.
         seed: of the starting weights.
     """
 
@@ -147,20 +147,18 @@ class Network:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        recording = training_recording(recordings, all_motors=True)
-        drive = fit_loaded_drive(recording)
-        directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
-        # In the time of a neck: windows and memories go by the robot's time constant.
-        necks = recording.sample_time / directions.stretch
-        table = PAPER_EQ21 if recording.robot.is_neck else scaled_table(recording, necks)
+        door = Door.of(training_recording(recordings, all_motors=True))
+        recording, drive = door.data, door.drive
+        table = eq21_table(recording)
         sized = self._sized(recording, table)
-        train, judge = recording, hold_out
-        if judge is None:
+        if hold_out is None:
             train, judge = recording.split(1.0 - _HOLD_OUT)
             if all(len(run) < _LEAST for run in judge.runs()):
                 train, judge = recording, recording
-        hints = _hints(train, drive) if self.prior > 0.0 and recording.robot.is_neck else None
-        axes, interrupted = sized._train(_Problem(train, judge, drive, table, necks, hints, self.prior), progress)
+        else:
+            train, judge = recording, door.scaled(hold_out)
+        hints = _hints(train, drive) if self.prior > 0.0 else None
+        axes, interrupted = sized._train(_Problem(train, judge, drive, table, hints, self.prior), progress)
         names = ("W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale")
         stacked = {name: np.array([axis[name] for axis in axes]) for name in names}
         arrays: dict[str, Matrix] = {
@@ -172,14 +170,12 @@ class Network:
             "correction": np.array([axis["correction"] for axis in axes]),
         }
         findings: dict = {"hold_out_fit": [axis["fit"] for axis in axes]}
-        if not recording.robot.is_neck:
-            findings |= directions.findings()
         if hold_out is None:
             findings["remark"] = SAME_EXCITATION
         if interrupted:
             findings["interrupted"] = INTERRUPTED
         progress(1.0, "done")
-        return fitted_model("nn", sized, recording, arrays=arrays, findings=findings)
+        return door.model("nn", sized, _in_si, arrays=arrays, findings=findings)
 
     def _sized(self, recording: Recording, table: Matrix) -> Network:
         """Return these settings with the numbers of neurons to take.
@@ -188,16 +184,17 @@ class Network:
             DataError: fewer rows than weights.
         """
         rows = min(regression(recording, table, axis)[1].size for axis in range(recording.outputs.shape[1]))
-        most, fewer = self.hidden or _PAPER, range(_PAPER[0], _LEAST_NEURONS - 1, -1)
-        if self.hidden is None and not recording.robot.is_neck:
-            sizes = [(n, n) for n in fewer if _ROWS_EACH * _weights(len(table), (n, n)) <= rows]
-            most = (sizes or [(_LEAST_NEURONS, _LEAST_NEURONS)])[0]
-        if rows < _weights(len(table), most):
+        hidden = self.hidden or _PAPER
+        if self.hidden is None and rows < _weights(len(table), _PAPER):
+            sizes = [(n, n) for n in range(_PAPER[0], _LEAST_NEURONS, -1)]
+            fitting = (size for size in sizes if _ROWS_EACH * _weights(len(table), size) <= rows)
+            hidden = next(fitting, (_LEAST_NEURONS, _LEAST_NEURONS))
+        if rows < _weights(len(table), hidden):
             raise DataError(
-                f"{rows} rows are fewer than the network's {_weights(len(table), most)} weights. Record longer or use "
-                "fewer neurons."
+                f"{rows} rows are fewer than the network's {_weights(len(table), hidden)} weights. "
+                "Record longer or use fewer neurons."
             )
-        return replace(self, hidden=most)
+        return replace(self, hidden=hidden)
 
     def _train(self, problem: _Problem, progress: Progress) -> tuple[list[dict], bool]:
         """Return the arrays of all axes, and whether Ctrl-C ended it."""
@@ -234,7 +231,7 @@ class Network:
             data, best, hidden=self.hidden or _PAPER, decays=decays, iterations=self.iterations, refine=self.refine,
             rng=np.random.default_rng([self.seed, axis]),
         )  # fmt: skip
-        correction = fit_correction(best.hold_out.one_step_errors(layers), problem.necks)
+        correction = fit_correction(best.hold_out.one_step_errors(layers), problem.train.sample_time)
         found = {name: getattr(layers, name) for name in ("W1", "b1", "W2", "b2", "w3", "b3")}
         return {**found, "input_scale": inputs, "output_scale": output, "correction": correction, "fit": best.free}
 
@@ -260,6 +257,20 @@ def _hints(train: Recording, drive: LoadedDrive) -> Recording | None:
         positions = zip(train.robot.motor_positions, motors.T, strict=True) if train.has_motor_positions else ()
         motions.append(motion.with_channels(**dict(zip(names, Y.T, strict=True)), **dict(positions)))
     return concatenate(motions)
+
+
+def _in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
+    """Return the arrays of a network in SI: what it sees are numbers without units anyway."""
+    rests, units = regressor_scale(arrays["table"], scaling)
+    mean, spread = arrays["input_scale"].transpose(1, 0, 2)
+    middle, size = arrays["output_scale"].T
+    out = scaling.output_unit
+    return {
+        **arrays,
+        "input_scale": np.stack([rests + units * mean, units * spread], axis=1),
+        "output_scale": np.stack([scaling.output_rest + out * middle, out * size], axis=1),
+        "load": load_in_si(arrays["load"], scaling),
+    }
 
 
 def _weights(inputs: int, hidden: tuple[int, int]) -> int:

@@ -143,11 +143,11 @@ def _cost(error: Vector, w: Vector, decay: float) -> float:
 
 
 FUNCTIONS = "softneck.identification.networks._nn_fit_runtime"
-# A row is learnt from so often [s], every third at 20 ms: neighbours say the same, and the time is that of the rows.
-_EVERY = 0.06
-# Rows that are too few to leave any out.
+# A row is learnt from so often, every third at 20 ms: neighbours say the same, and the time is that of the rows.
+_EVERY, _THIN = 0.06, 3
+# More are left out only where so many stay.
 _FEW = 2000
-# Windows of free run [s]: from a few steps over the neck's time constant to many of them.
+# Windows of free run: from a few steps over the time constant of 0.2 to many of them.
 _WINDOWS = (0.2, 1.0, 5.0)
 # Weight of an error of one step beside one of free run, which is some five times larger.
 _ONE_STEP_WEIGHT = 5.0
@@ -169,8 +169,7 @@ class AxisData:
         first: (time,) whether a run begins here.
         lags: (f,) of the first regressors, past outputs [samples].
         shift, gain: (f,) those from the scaled output, `shift + gain y`.
-        window: samples of one second of a neck.
-        neck: whether they are a neck's; of other robots the free run counts, however short their samples are.
+        window: samples of one scaled second.
         weight: (time,) of an error.
     """
 
@@ -182,14 +181,12 @@ class AxisData:
     shift: Vector
     gain: Vector
     window: float
-    neck: bool
     weight: Vector
 
     @property
     def thin(self) -> int:
         """Of so many rows one is learnt from."""
-        often = round(_EVERY * self.window)
-        return max(often if self.neck else min(often, self.target.size // _FEW), 1)
+        return max(min(round(_EVERY * self.window), max(self.target.size // _FEW, _THIN)), 1)
 
     def starts(self, length: int) -> Matrix:
         """(time, f) measured past outputs where they are from before a window of `length` samples; NaN elsewhere."""
@@ -246,7 +243,7 @@ def axis_data(
         motors: (time, motors) simulated [rad].
         axis: of the outputs.
         table: rows (source, channel, lag), past outputs first.
-        window: samples of one second of a neck.
+        window: samples of one scaled second.
         scale: of other data, to be used again.
         weights: (time,) of errors; None: all alike.
     """
@@ -286,7 +283,6 @@ def axis_data(
         shift=(middle - mean[fed]) / spread[fed],
         gain=size / spread[fed],
         window=window,
-        neck=recording.robot.is_neck,
         weight=np.concatenate(weight),
     )
     return data, scale[0], scale[1]
@@ -307,7 +303,7 @@ class Best:
         """Judge a network; return whether to go on."""
         one, free = self.hold_out.weights_fit(layers)
         top = max(self.one, one)
-        if self.layers is None or (free > self.free and (one > top - _ONE_STEP_LOSS or not self.hold_out.neck)):
+        if self.layers is None or (free > self.free and one > top - _ONE_STEP_LOSS):
             self.layers, self.free = layers, free
         self.one = top
         self.tell(f"{what}, loss {cost:.4g}, hold-out {self.free:.1f} %")
@@ -394,7 +390,7 @@ def _windows(
     Z, target = data.measured[rows], data.target[rows]
     # Of free runs, then of one step.
     weight = np.concatenate([
-        data.weight[:: data.thin][there], (_ONE_STEP_WEIGHT if data.neck else 1.0) * data.weight[rows]
+        data.weight[:: data.thin][there], _ONE_STEP_WEIGHT * data.weight[rows]
     ])  # fmt: skip
 
     def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:

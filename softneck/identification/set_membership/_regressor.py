@@ -6,22 +6,22 @@ to drift.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 from softneck.runtime import load_functions
 from softneck.runtime._compile import have_numba
 from softneck.signals import Recording
 
-from ..linear._regression import no_base
+from ..linear._regression import linear_in_si, no_base
+from ..models._door import Door
 from ..models._drive import DriveModel
-from ..models._fitting import in_display_unit
 from ..models._model import WARM_UP, Model
-from ..models._regressors import history_length, motor_signals, regression
+from ..models._regressors import history_length, motor_signals, regression, regressor_scale
 from ..models._scores import nrmse_fit
 from ..models._state_space import history_array
 from ._trees import slant_frames, slant_nodes, slant_order, tree_nodes, tree_order
@@ -70,26 +70,26 @@ def all_pairs_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Ve
 
 
 def require_feasible(
-    recording: Recording, table: Matrix, data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector
+    door: Door, table: Matrix, data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector
 ) -> None:
     """Raise DataError, naming two samples of the recording, where equal regressors deny epsilon whatever gamma is.
 
     Args:
-        recording: what the set was made of.
+        door: with what the set was made of.
         table: the regressor, rows (source, channel, lag).
         data: scaled regressors (n, N) and targets (N,) of each axis, in the recording's order.
         gamma: (outputs,) the least; beyond 1e100 there is none.
-        epsilon: (outputs,) [rad].
+        epsilon: (outputs,).
     """
     if gamma.max() <= 1e100:
         return
-    axis = int(np.argmax(gamma))
+    recording, axis = door.recording, int(np.argmax(gamma))
     points, values = data[axis]
     j, k = sorted(least_gammas(points, values, epsilon[axis : axis + 1])[1][0].tolist())
     rows = _rows_of(recording, table, axis, values.size)
     name, unit = recording.robot.outputs.names[axis], recording.robot.outputs.display_unit
-    tried = in_display_unit(recording.robot, epsilon)
-    rise = float(in_display_unit(recording.robot, np.abs(values[j] - values[k])))
+    tried = door.shown(epsilon)
+    rise = float(door.shown(np.full_like(epsilon, np.abs(values[j] - values[k])))[axis])
     where = f"samples {j} and {k} of the set"
     if rows is not None:
         where = " and ".join(
@@ -119,26 +119,18 @@ def _rows_of(recording: Recording, table: Matrix, axis: int, count: int) -> np.n
     return rows if rows.size == count else None
 
 
-# How far back the neck's state shows in its inputs [s]: the newest sample, then about one, two and four of its
-# time constants of 0.2 s. Denser or longer ones moved no free run by more than 2 points (virtual neck, `paper`).
+# How far back the state shows in the inputs: the newest sample of a neck, then about one, two and four time constants
+# of 0.2. Denser or longer ones moved no free run by more than 2 points (virtual neck, `paper`).
 _LOOKS_BACK = (0.02, 0.2, 0.4, 0.8)
-
-
-# The longest lag is at most this part of a run: twice as long the base settles.
+# The longest lag is at most this part of a run, as twice as long the base settles: a robot as slow as its record is
+# long says nothing of what was so long ago.
 _RUNS_SHARE = 8
 
 
-def residual_lags(sample_time: float, recording: Recording) -> tuple[int, ...]:
-    """Return the lags [samples] of the motors and of the base's outputs, where none were asked for.
-
-    Args:
-        sample_time: in the time of a neck [s].
-        recording: to learn from.
-    """
-    lags = {max(round(seconds / sample_time), 1) for seconds in _LOOKS_BACK}
-    if not recording.robot.is_neck:  # a robot as slow as its record is long says nothing of what was so long ago
-        most = max(len(run) for run in recording.runs()) // _RUNS_SHARE
-        lags = {max(min(lag, most), 1) for lag in lags}
+def residual_lags(recording: Recording) -> tuple[int, ...]:
+    """Return the lags [samples] of the motors and of the base's outputs for a scaled recording."""
+    most = max(len(run) for run in recording.runs()) // _RUNS_SHARE
+    lags = {max(min(round(seconds / recording.sample_time), most), 1) for seconds in _LOOKS_BACK}
     return tuple(sorted(lags))
 
 
@@ -149,17 +141,15 @@ def residual_rows(
     axis: int,
     *,
     measured: bool = False,
-    offset: Vector | float = 0.0,
 ) -> tuple[Matrix, Vector]:
     """Return regressors (n, N) and y(k) less the base's free run (N,), no row of a run before the base settled.
 
     Args:
         recording: what the set is made of.
         base: the linear model.
-        table: the regressor; source 3 is the base's free run, of other robots without the offset that the set adds.
+        table: the regressor; source 3 is the base's free run.
         axis: place of the output.
         measured: take logged motor positions instead of the drive model's.
-        offset: (outputs,) what is taken from the base's outputs.
 
     Raises:
         DataError: every run is too short.
@@ -173,7 +163,7 @@ def residual_rows(
             continue
         simulated = base.simulate(run, warm_up=1)
         motors = run.motor_positions if measured else simulated[:, outputs:both]
-        sources = {1: run.set_points, 2: motors, 3: simulated[:, :outputs] - offset}
+        sources = {1: run.set_points, 2: motors, 3: simulated[:, :outputs]}
         columns = np.array([sources[int(s)][settled - int(lag) : len(run) - int(lag), int(c)] for s, c, lag in table])
         target = run.outputs[settled:, axis] - sources[3][settled:, axis]
         there = np.isfinite(target) & np.isfinite(columns).all(axis=0)
@@ -196,22 +186,19 @@ class Ground:
         drive: supplies motor positions in free run.
         base: the linear model of form `residual`, or None.
         measured: whether the set is made of logged motor positions, where there are any.
-        units: (n,) of the regressor's components in the norm, see `regressor_units`.
     """
 
     table: Matrix
     drive: DriveModel
     base: Model | None
     measured: bool
-    units: Vector
 
     def data(self, recording: Recording) -> Data:
         """Return each axis' regressors (n, N), not scaled, and targets (N,)."""
         axes = range(recording.outputs.shape[1])
         if self.base is not None:
             base, measured = self.base, self.measured and recording.has_motor_positions
-            offset = base.arrays.get("offset", 0.0)  # of another robot; the values of the set hold it
-            return [residual_rows(recording, base, self.table, axis, measured=measured, offset=offset) for axis in axes]
+            return [residual_rows(recording, base, self.table, axis, measured=measured) for axis in axes]
         recording = motor_signals(recording, self.drive, again=not self.measured)
         pairs = [regression(recording, self.table, axis) for axis in axes]
         return [(X.T, y) for X, y in pairs]
@@ -221,9 +208,8 @@ class Ground:
         history = history_length(self.table, self.drive)
         base = no_base(len(self.drive.pole), len(data))
         if self.base is not None:
-            base = base_arrays(self.base)
-            least = self.base.arrays["history"][0] if "a" in self.base.arrays else 0.0
-            history = max(history, int(least), int(base["delay"].max()) + base["b"].shape[1], base["a"].shape[1])
+            base = {name: self.base.arrays[name] for name in base}
+            history = max(history, int(self.base.arrays["history"][0]))
         return {
             "history": history_array(history, len(data)),
             "drive": self.drive.array,
@@ -248,17 +234,23 @@ class Ground:
         return float(sum(fits)) if np.isfinite(fits).all() else -np.inf, coverage, float(np.mean(high - low))
 
 
-def base_arrays(base: Model) -> dict[str, Matrix]:
-    """Return redefinition, a, b and delay of a linear base: a neck's own, of another robot those of its axes."""
-    axes = base.findings.get("transfer_functions")
-    if axes is None:
-        return {name: base.arrays[name] for name in no_base()}
-    return {
-        "redefinition": np.array(base.findings["directions"]),
-        "a": np.array([entry["a"] for entry in axes.values()]),
-        "b": np.array([entry["b"] for entry in axes.values()]),
-        "delay": np.array([float(entry["delay"]) for entry in axes.values()]),
-    }
+def set_in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
+    """Return the arrays of a scaled set, and of its base, in SI; all outputs have one unit."""
+    out, rest = scaling.output_unit, scaling.output_rest
+    base = linear_in_si({name: arrays[name] for name in no_base()}, scaling)
+    moved = scaling.motor_rest.any() or rest.any()
+    if arrays["b"].size and moved:  # rows for the outputs alone say that the base is not zero at rest
+        base["redefinition"] = base["redefinition"][: len(out)]
+    # The base has no offset: it stands elsewhere in SI, and the set's values make up for it.
+    static = base["b"].sum(axis=1) / (1.0 + base["a"].sum(axis=1))
+    at_rest = static * (base["redefinition"][: len(out)] @ scaling.motor_rest)
+    rests, units = regressor_scale(arrays["table"], scaling, at_rest)
+    scale = arrays["scale"] / units[0]
+    points = [W + (scale * r)[:, None] for W, r in zip(arrays["points"], rests, strict=True)]
+    values = (rest - at_rest)[:, None] + out[:, None] * arrays["values"]
+    gamma, epsilon = out * arrays["bounds"].T
+    made = set_arrays(list(zip(points, values, strict=True)), gamma, epsilon)
+    return {**arrays, "scale": scale, **made, **base}
 
 
 def gammas(data: Data, scale: Vector, epsilons: Sequence[Vector]) -> list[Vector]:
@@ -282,13 +274,14 @@ def widened(data: Data, scale: Vector, epsilon: Vector) -> tuple[Vector, Vector]
     return epsilon, gamma
 
 
-def widening(chosen: Vector, taken: Vector, robot: Robot) -> dict[str, str]:
+def widening(chosen: Vector, taken: Vector, door: Door) -> dict[str, str]:
     """Return the finding that says where epsilon (outputs,) was widened; empty where it was not."""
     if np.array_equal(chosen, taken):
         return {}
-    wide, narrow = ("/".join(f"{value:.3g}" for value in in_display_unit(robot, values)) for values in (taken, chosen))
+    wide, narrow = ("/".join(f"{value:.3g}" for value in door.shown(values)) for values in (taken, chosen))
     why = "equal regressors have unequal outputs (several payloads?)"
-    return {"widened": f"epsilon is {wide} {robot.outputs.display_unit} instead of {narrow}: {why}"}
+    unit = door.recording.robot.outputs.display_unit
+    return {"widened": f"epsilon is {wide} {unit} instead of {narrow}: {why}"}
 
 
 def scaled(points: Matrix, scale: Vector) -> Matrix:

@@ -26,12 +26,12 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.robot import Robot
 from softneck.signals import Recording
 
-from ..models._directions import directions_of, regressor_units
+from ..models._door import Door
 from ..models._drive import DriveModel, fit_drive
-from ..models._fitting import fitted_model, in_display_unit, training_recording
+from ..models._fitting import in_display_unit, training_recording
 from ..models._model import WARM_UP, Model
-from ..models._regressors import lag_table
-from ._regressor import Data, Ground, gammas, require_feasible, residual_lags, scaled, widened, widening
+from ..models._regressors import eq21_table, lag_table
+from ._regressor import Data, Ground, gammas, require_feasible, residual_lags, scaled, set_in_si, widened, widening
 from ._trees import usual_width
 
 # Sources of a regressor's rows (`_narx_runtime`): own output or both of the base, set-points, motors.
@@ -56,10 +56,10 @@ class ScaleTrial:
     Attributes:
         output_weight, motor_weight: of the scale, or None.
         scale: (n,).
-        epsilon: (outputs,) [rad].
+        epsilon: (outputs,) scaled.
         score: sum of all axes' fits [%]; -inf where it left all bounds.
         coverage: part of the samples within f_l and f_u.
-        width: mean of f_u - f_l [rad].
+        width: mean of f_u - f_l, scaled.
         slope: the least gamma of all axes; 0: the set is a constant, as epsilon swallowed all there was to learn.
     """
 
@@ -72,9 +72,11 @@ class ScaleTrial:
     width: float
     slope: float
 
-    def row(self, robot: Robot) -> list[float | None]:
+    def row(self, door: Door) -> list[float | None]:
         """Weights, first epsilon, score, coverage and width as JSON values in the unit shown; None for none."""
-        epsilon, width = in_display_unit(robot, np.array([self.epsilon[0], self.width])).tolist()
+        epsilon, width = (
+            float(door.shown(values)[0]) for values in (self.epsilon, np.full_like(self.epsilon, self.width))
+        )
         judged = [value if np.isfinite(value) else None for value in (self.score, self.coverage, width)]
         return [self.output_weight, self.motor_weight, epsilon, *judged]
 
@@ -126,8 +128,7 @@ class HoldOut:
         return tried
 
     def _weights(self, weights: tuple[float, float]) -> list[ScaleTrial]:
-        scale = grouped_scale(self.ground.table, *weights) * self.ground.units
-        return list(self._scale(scale, *weights))
+        return list(self._scale(grouped_scale(self.ground.table, *weights), *weights))
 
     def _scale(self, scale: Vector, output: float | None, motor: float | None) -> Iterator[ScaleTrial]:
         for epsilon, gamma in zip(self.epsilons, gammas(self.data, scale, self.epsilons), strict=True):
@@ -145,7 +146,7 @@ _QUANTILE = 0.99
 
 
 def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> Vector:
-    """Return each axis' half-width [rad] that 99 % of the training rows stay below.
+    """Return each axis' half-width that 99 % of the training rows stay below.
 
     Args:
         data: scaled regressors (n, N) and targets (N,) of each axis, in order of time.
@@ -193,8 +194,6 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
 FORMS = ("paper_eq21", "residual")
 # Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
 _BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
-# Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3) at the neck's 20 ms; of another robot u and M so far apart by its time.
-_EQ21_APART = 0.02
 # Free run of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
 # 0.8 s leave unexplained, gamma and the width grow a hundredfold.
 _RESIDUAL_SIGMAS = (4.0, 8.0, 16.0, 32.0)
@@ -219,12 +218,12 @@ class SetMembership:
     """The estimator of Eq. 12-20 and Algorithm 1, one set for each axis, over the regressor of Eq. 21 or another.
 
     Attributes:
-        form: "paper_eq21", the lags of Eq. 21 (of another robot by its time constant); or "residual": set membership
-            over simulated signals on what the free run of a linear base leaves over, where nothing is fed back and so
+        form: "paper_eq21", the lags of Eq. 21 (by the robot's time constant); or "residual": set membership over
+            simulated signals on what the free run of a linear base leaves over, where nothing is fed back and so
             nothing drifts.
         output_weight: weight of the outputs in the norm of Eq. 16, all other components having 1; None chooses it, and
-            one of the motors, by free run on the last fifth of the training rows. Weights of another robot are for
-            components that move as much as a neck's.
+            one of the motors, by free run on the last fifth of the training rows. It is for scaled components, which
+            range as a neck's do.
         epsilon: noise bound of Eq. 15 [rad, or the SI unit of the outputs]; None chooses it by the same free run
             (form "residual": so that the bounds are narrowest among equal fits).
         base: linear kind of one pole that form "residual" stands on.
@@ -252,77 +251,59 @@ class SetMembership:
         Raises:
             DataError: too short, constant, or `epsilon` so small that no function fits the data.
         """
-        recording = training_recording(recordings)
-        robot = recording.robot
+        door = Door.of(training_recording(recordings), alike=True)
+        recording, robot = door.data, door.recording.robot
         noise = noise_levels(recording)
-        drive = fit_drive(recording)
-        directions = directions_of(recording, [run.set_points for run in recording.runs()])
-        # In the time of a neck: lags go by the robot's time constant.
-        necks = recording.sample_time / directions.stretch
-        ground = self._ground(recording, drive, necks)
+        ground = self._ground(recording, fit_drive(recording))
         data = ground.data(recording)
-        chosen, tried = self._choose(ground, recording, noise, necks, progress)
+        # One epsilon in SI, of outputs that have one unit.
+        asked = None if self.epsilon is None else self.epsilon / door.scaling.output_unit
+        chosen, tried = self._choose(ground, recording, noise, asked, progress)
         scale = chosen.scale
         sets = [(scaled(X, scale), y) for X, y in data]
         # An epsilon that was asked for is kept or refused.
-        if self.epsilon is None:
+        if asked is None:
             epsilon, gamma = widened(data, scale, chosen.epsilon)
         else:
             epsilon, gamma = chosen.epsilon, gammas(data, scale, [chosen.epsilon])[0]
-        require_feasible(recording, ground.table, sets, gamma, epsilon)
+        require_feasible(door, ground.table, sets, gamma, epsilon)
         arrays = ground.arrays(data, scale, gamma, epsilon)
         progress(1.0, "done")
         unit = robot.outputs.display_unit
-        findings = {"form": self.form, f"noise_{unit}": in_display_unit(robot, noise).tolist()}
-        findings |= _findings(replace(chosen, epsilon=epsilon), tried, scale, robot)
-        if self.epsilon is None:
+        findings = {"form": self.form, f"noise_{unit}": door.shown(noise).tolist()}
+        findings |= _findings(replace(chosen, epsilon=epsilon), tried, scale, door)
+        if asked is None:
             sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
-            findings |= widening(np.minimum(sigmas[-1] * noise, epsilon), epsilon, robot)
-        findings |= {"gamma": gamma.tolist(), "points": int(arrays["values"].shape[1])}
-        findings[usual_finding(robot)] = in_display_unit(robot, usual_widths(sets, gamma, epsilon)).tolist()
-        if not robot.is_neck:
-            findings |= directions.findings()
-        return fitted_model("nlsm", self, recording, arrays=arrays, findings=findings)
+            findings |= widening(np.minimum(sigmas[-1] * noise, epsilon), epsilon, door)
+        gamma_si = door.scaling.output_unit * gamma
+        findings |= {"gamma": gamma_si.tolist(), "points": int(arrays["values"].shape[1])}
+        findings[usual_finding(robot)] = door.shown(usual_widths(sets, gamma, epsilon)).tolist()
+        return door.model("nlsm", self, set_in_si, arrays=arrays, findings=findings)
 
-    def _ground(self, recording: Recording, drive: DriveModel, necks: float) -> Ground:
-        """Return the set's ground; the base of form `residual` is identified on `recording`.
-
-        Args:
-            recording: to identify from.
-            drive: of its motors.
-            necks: sample time by the robot's time constant over the neck's [s].
-        """
+    def _ground(self, recording: Recording, drive: DriveModel) -> Ground:
+        """Return the set's ground; the base of form `residual` is identified on `recording`."""
         residual = self.form == "residual"
+        table = eq21_table(recording)
         if residual:
-            own = residual_lags(necks, recording)
-            lags = (own, (), own)
-        else:
-            apart = 1 if recording.robot.is_neck else max(round(_EQ21_APART / necks), 1)
-            lags = ((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,))
-        sizes = len(drive.pole), recording.outputs.shape[1]
-        table = lag_table(*lags, both_outputs=residual, sizes=sizes)
+            own, sizes = residual_lags(recording), (len(drive.pole), recording.outputs.shape[1])
+            table = lag_table(own, (), own, both_outputs=True, sizes=sizes)
         return Ground(
             table=table,
             drive=drive,
             base=resolve(find_kind(self.base, "model").settings)().fit(recording) if residual else None,
             # What the set sees when it is used: the drive model's positions in simulation, which `residual` always is.
             measured=not residual,
-            units=regressor_units(recording, table),
         )
 
     def _choose(
-        self, ground: Ground, recording: Recording, noise: Vector, necks: float, progress: Progress
+        self, ground: Ground, recording: Recording, noise: Vector, asked: Vector | None, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
-        """Return scale and epsilon, and all that were tried."""
-        if self.epsilon is not None:
-            epsilons = [np.full(noise.size, self.epsilon)]
-        elif self.form == "residual":
-            epsilons = [sigmas * noise for sigmas in _RESIDUAL_SIGMAS]
-        else:
-            epsilons = [sigmas * noise for sigmas in _EPSILON_SIGMAS]
-        if self.epsilon is not None and self.output_weight is not None:
-            scale = grouped_scale(ground.table, self.output_weight) * ground.units
-            return ScaleTrial(self.output_weight, None, scale, epsilons[0], np.nan, np.nan, np.nan, np.nan), []
+        """Return scale and epsilon, that which was `asked` for where it was, and all that were tried."""
+        sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
+        epsilons = [factor * noise for factor in sigmas] if asked is None else [asked]
+        if asked is not None and self.output_weight is not None:
+            scale = grouped_scale(ground.table, self.output_weight)
+            return ScaleTrial(self.output_weight, None, scale, asked, np.nan, np.nan, np.nan, np.nan), []
         head, tail = recording.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
             raise DataError(
@@ -330,7 +311,7 @@ class SetMembership:
                 "output_weight."
             )
         # The drives are known from all rows: they are no part of what is chosen.
-        first = self._ground(head, ground.drive, necks)
+        first = self._ground(head, ground.drive)
         hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
         if self.output_weight is not None:
             outputs, motors = (self.output_weight,), ()
@@ -348,7 +329,7 @@ def noise_levels(recording: Recording) -> Vector:
 
 
 def noise_level(recording: Recording, axis: int) -> float:
-    """Return the standard deviation of white noise on one output in its SI unit, from its third differences.
+    """Return the standard deviation of white noise on one scaled output, from its third differences.
 
     A motion of 4 rad/s sampled at 20 ms leaves almost nothing there; the median is not moved by jerks.
     """
@@ -360,15 +341,15 @@ def noise_level(recording: Recording, axis: int) -> float:
     # 20 = 1 + 9 + 9 + 1, squares of the binomials; 0.6745 is the quartile of a standard normal.
     sigma = float(np.median(np.abs(d))) / 0.6745 / np.sqrt(20.0)
     # A noise-free simulation: rounding is left, of 1e-7 rad beside a neck's motion.
-    return max(sigma, 1e-7 if recording.robot.is_neck else 1e-6 * float(np.nanstd(recording.outputs[:, axis])))
+    return max(sigma, 1e-7)
 
 
-def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector, robot: Robot) -> dict[str, Any]:
+def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector, door: Door) -> dict[str, Any]:
     weights = {"output_weight": chosen.output_weight, "motor_weight": chosen.motor_weight}
     return {
-        f"epsilon_{robot.outputs.display_unit}": in_display_unit(robot, chosen.epsilon).tolist(),
+        f"epsilon_{door.recording.robot.outputs.display_unit}": door.shown(chosen.epsilon).tolist(),
         **{name: weight for name, weight in weights.items() if weight is not None},
         "scale": scale.tolist(),
         # Rows: both weights, epsilon of the first output [deg], sum of all fits [%], coverage, mean width [deg].
-        "hold_out_curve": [one.row(robot) for one in tried],
+        "hold_out_curve": [one.row(door) for one in tried],
     }

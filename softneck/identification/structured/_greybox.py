@@ -21,13 +21,12 @@ from softneck.runtime import load_functions
 from softneck.signals import Recording
 
 from ..models._arrays import memory_array, within
-from ..models._directions import Directions, directions_of
-from ..models._drive import drive_start, fit_echo, fit_loaded_drive
-from ..models._fitting import payload_of, row_hashes, training_recording
+from ..models._door import Door
+from ..models._drive import drive_start, fit_echo
+from ..models._fitting import payload_of, training_recording
 from ..models._model import Model
-from ..models._ports import MOST_PAYLOAD, trained_set_points
+from ..models._ports import MOST_PAYLOAD
 from ..models._state_space import history_array
-from ..models._validity import grounded
 from ._loaded_greybox_runtime import loaded_neck
 
 if TYPE_CHECKING:
@@ -108,7 +107,7 @@ _PRIOR = 0.005
 # The start is unknown for so long [s of a neck's time], a held input is forgotten after so long.
 _SETTLED, _MEMORY = 0.5, 3.0
 _DELAYS = (2, 1, 3, 4)
-# Of a slower robot they are in the neck's samples [s].
+# Those are samples of a neck.
 _NECK_SAMPLE = 0.02
 _TYPICAL_DRIVE_DELAY = 0.08
 _THIN = 2
@@ -150,9 +149,9 @@ class GreyBox:
             SettingsError: a robot that no tendons on winches bend.
         """
         recording = training_recording(recordings)
-        if not recording.robot.is_neck:
-            require_tendons(recording.robot, "kind `greybox`")
-        problem = _FitProblem.of(recording)
+        require_tendons(recording.robot, "kind `greybox`")
+        door = Door.of(recording, amplitudes=False)  # the equations are in rad
+        problem = _FitProblem.of(door)
         delays = problem.delays() if self.sensor_delay is None else (self.sensor_delay,)
         best: tuple[float, int, Vector] | None = None
         start = np.array([number.encode(number.guess) for number in problem.numbers])
@@ -172,7 +171,7 @@ class GreyBox:
                 start = found.x
         if best is None or not np.isfinite(best[0]):
             raise DataError("no numbers of the grey box give a finite error; look for wild values in the recording.")
-        model = _model(self, problem, recording, best[1], best[2])
+        model = _model(self, problem, door, best[1], best[2])
         progress(1.0, "done")
         if interrupted:
             return replace(model, findings={**model.findings, "interrupted": INTERRUPTED})
@@ -184,14 +183,13 @@ class _FitProblem:
     """All runs as arrays; the drives' dead times are known beforehand.
 
     Attributes:
-        sample_time: in the time of a neck [s].
+        sample_time: scaled.
         runs: set-points, start, motor positions and outputs of each.
         payloads: of each run [kg].
         drive: (motors, 2) pole and delay.
         logged: whether motor positions were.
         numbers: those that are searched; with one output not those across, with several payloads what these change.
-        tendons: what stands behind the numbers; nothing of a neck.
-        directions: of the robot.
+        tendons: what stands behind the numbers; nothing of three tendons 120 deg apart.
     """
 
     sample_time: float
@@ -201,14 +199,10 @@ class _FitProblem:
     logged: bool
     numbers: tuple[Number, ...]
     tendons: Vector
-    directions: Directions
 
     @classmethod
-    def of(cls, recording: Recording) -> _FitProblem:
-        drive = fit_loaded_drive(recording).drive.copy()
-        motors = [run.set_points for run in recording.runs()]
-        directions = directions_of(recording, motors)
-        Ts = recording.sample_time / directions.stretch
+    def of(cls, door: Door) -> _FitProblem:
+        recording, drive, Ts = door.data, door.drive.drive.copy(), door.data.sample_time
         if not recording.has_motor_positions:
             drive[:, 1] = max(round(_TYPICAL_DRIVE_DELAY / Ts), 1)
         drive[:, 1] = np.maximum(drive[:, 1], 1.0)
@@ -220,14 +214,11 @@ class _FitProblem:
         payloads = [payload_of(run) for run in recording.runs()]
         loads = LOADS if len(set(payloads)) > 1 else ()
         numbers = (*(number for number in NUMBERS if number.name not in across), *loads)
-        return cls(
-            Ts, runs, payloads, drive, recording.has_motor_positions, numbers, _tendons(recording.robot), directions
-        )
+        return cls(Ts, runs, payloads, drive, recording.has_motor_positions, numbers, _tendons(recording.robot))
 
     def delays(self) -> tuple[int, ...]:
         """Return the sensor's dead times to try [samples], the likeliest first."""
-        # A sensor is not faster for a robot that is.
-        samples = max(_NECK_SAMPLE / self.sample_time, 1.0) if self.tendons.size else 1.0
+        samples = max(_NECK_SAMPLE / self.sample_time, 1.0)  # a sensor is not faster for a robot that is
         return tuple(dict.fromkeys(round(delay * samples) for delay in _DELAYS))
 
     def decode(self, x: Vector) -> Vector:
@@ -293,10 +284,11 @@ class _FitProblem:
 
 
 def _tendons(robot: Robot) -> Vector:
-    """Return share, cosines and sines of the tendons as the equations read them; nothing of a neck."""
-    if robot.is_neck:
+    """Return share, cosines and sines of the tendons as the equations read them; nothing of those they have by heart."""
+    axes, angles = len(robot.outputs.names), robot.directions.angles_deg
+    if axes == 2 and len(angles) == 3 and np.allclose(np.mod(angles, 360.0), [0.0, 120.0, 240.0]):
         return np.zeros(0)
-    axes, weights = len(robot.outputs.names), robot.directions.weights()
+    weights = robot.directions.weights()
     e = np.zeros((2, len(robot.motors.names)))
     e[:axes] = 0.0 if weights is None else weights[:axes]
     largest = float(np.linalg.norm(e, 2)) ** 2
@@ -320,8 +312,8 @@ class _SearchProgress:
             self.progress(min(self.calls / self.expected, 0.99), f"{self.what}, loss {self.best[0]:.4g}")
 
 
-def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay: int, x: Vector) -> Model:
-    numbers, load, outputs = problem.decode(x), problem.load(x), recording.outputs.shape[1]
+def _model(settings: GreyBox, problem: _FitProblem, door: Door, delay: int, x: Vector) -> Model:
+    numbers, load, outputs = problem.decode(x), problem.load(x), door.data.outputs.shape[1]
     skip = round(_SETTLED / problem.sample_time)
     errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(x, delay), problem.runs, strict=True)]
     for error in errors:
@@ -338,21 +330,12 @@ def _model(settings: GreyBox, problem: _FitProblem, recording: Recording, delay:
         "memory": memory_array(_MEMORY, problem.sample_time),
         **({"payload": load} if load.size else {}),
     }
-    model = Model(
-        kind="greybox",
-        sample_time=recording.sample_time,
-        arrays=arrays,
-        settings={"evaluations": settings.evaluations, "sensor_delay": settings.sensor_delay},
-        findings={
-            "sensor_delay": delay,
-            "numbers": _table(problem, x, delay, errors),
-            **({} if recording.robot.is_neck else problem.directions.findings()),
-            **trained_set_points(recording),
-        },
-        training_rows=row_hashes(recording),
-        robot=recording.robot,
-    )
-    return grounded(model, recording)
+    table = _table(problem, x, delay, errors)
+    for number, row in zip(problem.numbers, table, strict=True):
+        if number.is_rate:
+            row |= {key: door.scaling.second**-1 * row[key] for key in ("value", "low", "high")}
+    findings = {"sensor_delay": delay, "numbers": table}
+    return door.model("greybox", settings, lambda arrays, _: dict(arrays), arrays=arrays, findings=findings)
 
 
 def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]) -> list[dict]:
@@ -369,13 +352,11 @@ def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]
     rows = []
     for i, number in enumerate(problem.numbers):
         value, low, high = (number.decode(x[i] + shift) for shift in (0.0, -half[i], half[i]))
-        # From the time of a neck.
-        speed = 1.0 / problem.directions.stretch if number.is_rate else 1.0
         at_bound = min(value - number.low, number.high - value) < 1e-3 * (number.high - number.low) * 0.01
         rows.append(
             {
-                "name": number.name, "unit": number.unit, "value": speed * value,
-                "low": speed * max(low, number.low), "high": speed * min(high, number.high),
+                "name": number.name, "unit": number.unit, "value": value,
+                "low": max(low, number.low), "high": min(high, number.high),
                 "at_bound": bool(at_bound), "about": number.about,
             }
         )  # fmt: skip

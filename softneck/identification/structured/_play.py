@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement, product
 
 import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, Vector, require_positive, require_whole, silent
 from softneck.core._blas_threads import one_blas_thread
+from softneck.robot._scaling import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
 from ..models._arrays import memory_array, within
-from ..models._directions import Directions, directions_of
-from ..models._drive import BEYOND, FUNCTIONS, LoadedDrive, drive_start, fit_echo, fit_loaded_drive
-from ..models._fitting import SAME_EXCITATION, fitted_model, training_recording
+from ..models._door import Door
+from ..models._drive import BEYOND, FUNCTIONS, LoadedDrive, drive_start, fit_echo, load_in_si
+from ..models._fitting import SAME_EXCITATION, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 from ..models._state_space import history_array
 
-# Rows of each run in which its unknown past still shows [s]: those that `validate` does not score either.
-_SETTLED = 0.5
 HOLD_OUT = 0.2
 # Rows held out that say something of a free run, where there are that many.
 _LEAST_HELD = 50
@@ -79,7 +78,6 @@ class Data:
         settled: (time,) rows to learn from and to judge.
         groups: masks (time,) of rows to hold out in turn: the last fifth of each run; of many runs a third of them.
         sample_time: [s].
-        stretch: by how much the robot is slower than a neck.
         redefinition: (inputs, motors) T of Eq. 9-11.
     """
 
@@ -89,19 +87,17 @@ class Data:
     settled: np.ndarray
     groups: list[np.ndarray]
     sample_time: float
-    stretch: float
     redefinition: Matrix
 
     @classmethod
-    def of(cls, recording: Recording, drive: LoadedDrive, directions: Directions, redefinition: Matrix) -> Data:
+    def of(cls, recording: Recording, drive: LoadedDrive, redefinition: Matrix) -> Data:
         """Simulate the motors of a recording."""
         runs = recording.runs()
-        # Of another robot what `validate` does not score either.
-        border = round(_SETTLED / recording.sample_time) if recording.robot.is_neck else WARM_UP
         outputs = recording.outputs
-        settled = np.concatenate([np.arange(len(run)) >= border for run in runs]) & np.isfinite(outputs).all(axis=1)
+        # The unknown past of a run shows in its first rows, which `validate` does not score either.
+        settled = np.concatenate([np.arange(len(run)) >= WARM_UP for run in runs]) & np.isfinite(outputs).all(axis=1)
         if settled.sum() < 2:
-            raise DataError(f"every run is shorter than the {border} samples in which its start is forgotten.")
+            raise DataError(f"every run is shorter than the {WARM_UP} samples in which its start is forgotten.")
         motors = [drive.simulate(run.set_points, drive_start(run)) for run in runs]
         logged = [run.motor_positions if run.has_motor_positions else m for run, m in zip(runs, motors, strict=True)]
         return cls(
@@ -111,7 +107,6 @@ class Data:
             settled=settled,
             groups=_groups([len(run) for run in runs]),
             sample_time=recording.sample_time,
-            stretch=directions.stretch,
             redefinition=redefinition,
         )
 
@@ -185,17 +180,17 @@ def _far(signals: Matrix, good: np.ndarray) -> np.ndarray:
     return distance > np.quantile(distance[good], 1.0 - HOLD_OUT)
 
 
-# What the hold-out chooses from: filters about as fast as the neck's 5 1/s and three times that; plays up to a
-# tenth of the motors' 6 rad.
+# What the hold-out chooses from, scaled: filters about as fast as the robot, 5, and three times that; plays up to a
+# tenth of the motors' range of 6.
 _RATES = (6.0, 15.0)
-# Of other robots, whose time constant is found only roughly, by that of the neck.
+# Of robots whose time constant is found from data, only roughly.
 _MORE_RATES = (4.0, 6.0, 10.0, 15.0, 25.0)
 _WIDTHS = ((), (0.3,), (0.1, 0.3, 0.6))
 _DEGREES = (1, 2, 3)
 _RIDGES = (1e-6, 1e-4, 1e-2)
 # Of forms whose fits on the hold-out differ by less than this [points], that with the fewest terms is taken.
 _ALIKE = 0.1
-# A held input is forgotten after this [s]: the slowest filter by far is that of the load, some 1 1/s.
+# A held input is forgotten after this: the slowest filter by far is that of the load, some 1.
 _MEMORY = 15.0
 # f is kept within the range of the training outputs, widened by half of it to either side.
 _BEYOND = 0.5
@@ -258,36 +253,40 @@ class Play:
         Raises:
             DataError: too short, constant, or fewer rows than terms.
         """
-        recording = training_recording(recordings, all_motors=True)
+        door = Door.of(training_recording(recordings, all_motors=True))
         progress(0.0, "drives")
-        drive = fit_loaded_drive(recording)
-        directions = directions_of(recording, [drive.simulate(r.set_points, drive_start(r)) for r in recording.runs()])
-        T = directions.inputs(recording)
-        data = Data.of(recording, drive, directions, T)
-        extra = None if hold_out is None else Data.of(hold_out, drive, directions, T)
-        form, weight, fit, tried = self._choose(data, extra, progress)
+        drive, T = door.drive, door.directions.all_inputs(door.data.set_points)
+        data = Data.of(door.data, drive, T)
+        extra = None if hold_out is None else Data.of(door.scaled(hold_out), drive, T)
+        settings = self._scaled(door.scaling)
+        known = door.recording.robot.time_constant_s is not None
+        form, weight, fit, tried = settings._choose(data, extra, _RATES if known else _MORE_RATES, progress)
         progress(0.95, "all rows")
         arrays = _arrays(data, drive, form, weight, self.echo)
         findings = {
-            "rate": form.rate,
-            "widths": list(form.widths),
+            "rate": form.rate / door.scaling.second,
+            "widths": [door.scaling.motor_unit * width for width in form.widths],
             "degree": form.degree,
             "ridge": weight,
             "terms": len(form.table),
             "hold_out_fit": fit,
             "tried": tried,
         }
-        if not recording.robot.is_neck:
-            findings |= directions.findings()
         if hold_out is None and tried > 1:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
-        return fitted_model("play", self, recording, arrays=arrays, findings=findings)
+        return door.model("play", self, _in_si, arrays=arrays, findings=findings)
 
-    def _choose(self, data: Data, extra: Data | None, progress: Progress) -> tuple[PlayStructure, float, float, int]:
+    def _scaled(self, scaling: Scaling) -> Play:
+        """Return these settings in scaled quantities."""
+        widths = None if self.widths is None else tuple(width / scaling.motor_unit for width in self.widths)
+        return replace(self, rate=None if self.rate is None else self.rate * scaling.second, widths=widths)
+
+    def _choose(
+        self, data: Data, extra: Data | None, rates: tuple[float, ...], progress: Progress
+    ) -> tuple[PlayStructure, float, float, int]:
         """Return form and ridge of the best free run on the hold-out, its fit [%], and how many were tried."""
         inputs, tilts = len(data.redefinition), min(len(data.redefinition), data.outputs.shape[1])
-        rates = _RATES if data.stretch == 1.0 else tuple(rate / data.stretch for rate in _MORE_RATES)
         forms = [
             PlayStructure(rate, self.order, widths, degree, inputs, tilts)
             for rate in (rates if self.rate is None else (self.rate,))
@@ -341,7 +340,33 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
         "weights": W,
         "range": limits,
         "echo": echo,
-        "memory": memory_array(_MEMORY * data.stretch, data.sample_time),
+        "memory": memory_array(_MEMORY, data.sample_time),
+    }
+
+
+def _in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
+    """Return the arrays of a polynomial of scaled signals, which are zero at rest, as one of signals in SI."""
+    table, per = arrays["table"].astype(int), 1.0 / scaling.motor_unit
+    signals = (1 + arrays["widths"].size) * int(arrays["chain"][1])  # of each redefined input
+    rests = np.repeat(arrays["redefinition"] @ scaling.motor_rest, signals)
+    places = {tuple(sorted(row.tolist())): i for i, row in enumerate(table)}
+    weights = np.zeros_like(arrays["weights"])
+    # Each product of (signal - rest) is a sum over the factors that are kept: with each term its lower ones are there.
+    for column, row in zip(arrays["weights"].T, table, strict=True):
+        factors = [i for i in row.tolist() if i >= 0]
+        for kept in product((False, True), repeat=len(factors)):
+            others = [-per * rests[i] for i, keep in zip(factors, kept, strict=True) if not keep]
+            own = [i for i, keep in zip(factors, kept, strict=True) if keep]
+            term = tuple(sorted([*own, *[-1] * (3 - len(own))]))
+            weights[:, places[term]] += column * per ** len(own) * np.prod(others)
+    weights *= scaling.output_unit[:, None]
+    weights[:, places[-1, -1, -1]] += scaling.output_rest
+    return {
+        **arrays,
+        "load": load_in_si(arrays["load"], scaling),
+        "widths": scaling.motor_unit * arrays["widths"],
+        "weights": weights,
+        "range": scaling.output_rest[:, None] + scaling.output_unit[:, None] * arrays["range"],
     }
 
 
