@@ -100,7 +100,7 @@ CRAFTED = [
     ("rls", "history", lambda a: a * 0 + 1e12, "history in samples is not a whole number"),
     ("rls", "delay", lambda a: a + 1e6, "a dead time is not a whole number"),
     ("rls", "drive", lambda a: a - 50.0, "a drive's delay"),
-    ("rls", "redefinition", lambda a: a[:1], "`redefinition` has shape"),
+    ("rls", "redefinition", lambda a: a[:1], "the number of redefined inputs"),
     ("mimo", "A", lambda a: a[:, :-1], "`A` has shape"),
     ("oe", "source", lambda a: a + 1.0, "the source is not a whole number"),
     ("oe2", "delay", lambda a: a + 1e6, "a dead time is not a whole number"),

@@ -276,21 +276,21 @@ class Rls:
 
     def _fit_siso(self, door: Door, progress: Progress) -> tuple[dict[str, Matrix], dict]:
         drive, directions, gains = fit_drive(door.data), door.directions, door.gains
-        runs = [(run.outputs, run.set_points @ directions.redefinition.T) for run in door.data.runs()]
+        runs = [(run.outputs, np.asarray(run.set_points @ directions.redefinition.T)) for run in door.data.runs()]
         thetas, delays, stds, numbers = [], [], [], []
         curves: dict[str, Curve] = {}
         for axis, name in enumerate(directions.names):
             progress(axis / len(directions.names), name)
-            one = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
+            one: list[tuple[Matrix, Matrix]] = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
             d, theta, std, curves[name], number = self._search(door.data.sample_time, one, name)
             thetas.append(theta)
             delays.append(d)
             stds.append((std * np.repeat([1.0, gains[axis]], [self.na, self.nb])).tolist())
             numbers.append(number)
         found = {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
-        a, b = np.split(np.array(thetas), [self.na], axis=1)
+        a, b = (np.array(part) for part in np.split(np.array(thetas), [self.na], axis=1))
         if door.has_offset:
-            found |= functions_found(door, a, b, delays)
+            found |= functions_found(door, [*a], [*b], delays)
             spread = [
                 np.concatenate([theta[: self.na], np.outer(weights, theta[self.na :]).ravel()])
                 for theta, weights in zip(thetas, directions.weights, strict=True)

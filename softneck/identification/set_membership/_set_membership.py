@@ -74,9 +74,8 @@ class ScaleTrial:
 
     def row(self, door: Door) -> list[float | None]:
         """Weights, first epsilon, score, coverage and width as JSON values in the unit shown; None for none."""
-        epsilon, width = (
-            float(door.shown(values)[0]) for values in (self.epsilon, np.full_like(self.epsilon, self.width))
-        )
+        widths = np.full_like(self.epsilon, self.width)
+        epsilon, width = (float(door.shown(values)[0]) for values in (self.epsilon, widths))
         judged = [value if np.isfinite(value) else None for value in (self.score, self.coverage, width)]
         return [self.output_weight, self.motor_weight, epsilon, *judged]
 

@@ -284,7 +284,7 @@ class _FitProblem:
 
 
 def _tendons(robot: Robot) -> Vector:
-    """Return share, cosines and sines of the tendons as the equations read them; nothing of those they have by heart."""
+    """Return share, cosines and sines of the tendons as the equations read them; nothing of three 120 deg apart."""
     axes, angles = len(robot.outputs.names), robot.directions.angles_deg
     if axes == 2 and len(angles) == 3 and np.allclose(np.mod(angles, 360.0), [0.0, 120.0, 240.0]):
         return np.zeros(0)

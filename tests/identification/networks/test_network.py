@@ -105,7 +105,7 @@ def test_hints_are_learnt_by_their_weight() -> None:
     hints = hints.with_channels(pitch=2.0 * hints.channels["pitch"], roll=2.0 * hints.channels["roll"])
     found = []
     for prior in (0.0, 1.0):
-        problem = _Problem(recording, hints, drive, PAPER_EQ21, recording.sample_time, hints, prior)
+        problem = _Problem(recording, hints, drive, PAPER_EQ21, hints, prior)
         found.append([axis["fit"] for axis in settings._train(problem, silent)[0]])
     # Half of it is missed without them.
     assert max(found[0]) < 60.0
@@ -115,7 +115,7 @@ def test_hints_are_learnt_by_their_weight() -> None:
 def test_a_prior_leaves_the_scales_of_the_record_and_weighs_its_own_rows_alone() -> None:
     recording = short_neck()
     drive = fit_loaded_drive(recording)
-    plain = _Problem(recording, recording, drive, PAPER_EQ21, recording.sample_time, None, 0.1)
+    plain = _Problem(recording, recording, drive, PAPER_EQ21, None, 0.1)
     own, *scales = plain.training(0)
     both, *same = replace(plain, hints=_hints(recording, drive)).training(0)
     rows = own.target.size
@@ -134,7 +134,7 @@ def test_progress_rises_to_one() -> None:
 
 def test_more_weights_than_rows_and_wrong_settings_are_refused() -> None:
     with pytest.raises(DataError, match=r"147 rows are fewer than the network's 951 weights"):
-        Network().fit(neck_recording(150))
+        Network(hidden=(25, 25)).fit(neck_recording(150))
     with pytest.raises(SettingsError, match="`hidden` must be two numbers of neurons"):
         Network(hidden=(3,))  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="`hidden` must be a whole number"):

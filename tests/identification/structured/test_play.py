@@ -7,7 +7,6 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
-from softneck.identification.models._directions import directions_of
 from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_echo, fit_loaded_drive
 from softneck.identification.structured._play import Data, PlayStructure, ridge, scores
 from softneck.runtime import load_functions
@@ -126,9 +125,7 @@ def test_training_sees_what_the_free_run_computes() -> None:
     recording = short_neck()
     model = Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording)
     drive = LoadedDrive(model.arrays["drive"], model.arrays["load"])
-    terms = Data.of(recording, drive, directions_of(recording, []), redefinition_matrix()).terms(
-        PlayStructure(15.0, 5, (0.2,), 3)
-    )
+    terms = Data.of(recording, drive, redefinition_matrix()).terms(PlayStructure(15.0, 5, (0.2,), 3))
     f = np.clip(terms @ model.arrays["weights"].T, *model.arrays["range"].T)
     free = model.simulate(recording, warm_up=1)[:, :2]
     # The echo of the one measured sample and its motors has died out after 200 samples.
@@ -169,8 +166,7 @@ def test_bad_settings_and_little_data_are_refused() -> None:
 
 def test_of_a_few_seconds_rows_are_held_out_too() -> None:
     """A fifth of 5 s is fewer than the rows that are asked for elsewhere: a mean of nothing chose between forms."""
-    data = Data.of(recording := neck_recording(250), fit_loaded_drive(recording), directions_of(recording, []),
-                   redefinition_matrix())  # fmt: skip
+    data = Data.of(recording := neck_recording(250), fit_loaded_drive(recording), redefinition_matrix())
     assert np.isfinite(scores(data, None, PlayStructure(15.0, 5, (0.2,), 2), (1e-3,))).all()
 
 
