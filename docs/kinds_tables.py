@@ -6,7 +6,7 @@ import importlib
 from typing import Any
 
 from softneck.core import KINDS
-from softneck.runtime._bundle import declared
+from softneck.runtime._bundle import layout_of
 from softneck.runtime._layout import Arrays, StateVector
 
 
@@ -24,7 +24,7 @@ def section(runtime: str, names: list[str]) -> str:
     """Return the two tables of one runtime."""
     inside = (importlib.import_module(runtime).__doc__ or "").partition("\n")[0].rstrip(":.")
     title = ", ".join(f"`{name}`" for name in names)
-    arrays, state = table(declared(runtime, Arrays), "array"), table(declared(runtime, StateVector), "state")
+    arrays, state = table(layout_of(runtime, Arrays), "array"), table(layout_of(runtime, StateVector), "state")
     return f"## {title}\n\n{inside}.\n\n{arrays}\n\n{state}"
 
 

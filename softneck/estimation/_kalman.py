@@ -16,7 +16,7 @@ from softneck.core import FileFormatError, Matrix, SettingsError, Vector, to_si,
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 from softneck.signals import Recording
 
 from ._forms import NOISES, STATES, noise_units, require_levels, system
@@ -126,7 +126,7 @@ class KalmanObserver(Shown):
         return Block(
             kind="kalman",
             role="observer",
-            runtime=sized(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            runtime=sized_name(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=self.arrays,
             inputs=inputs,

@@ -9,7 +9,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.runtime import load_functions
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
@@ -147,7 +147,7 @@ class Cost:
 
     def __init__(self, observer: KalmanObserver, runs: Sequence[Recording]) -> None:
         motors, outputs = len(observer.robot.motors.names), len(observer.robot.outputs.names)
-        self._functions = load_functions(sized("softneck.estimation._likelihood_runtime", motors, outputs))
+        self._functions = load_functions(sized_name("softneck.estimation._likelihood_runtime", motors, outputs))
         self._told = 2 * outputs + 2
         arrays = dict(zip(KalmanArrays.names(), observer.arrays, strict=False))  # without steady gains
         arrays["constants"] = constants = arrays["constants"].copy()

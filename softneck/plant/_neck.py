@@ -11,7 +11,7 @@ from softneck.core import Matrix, SettingsError, require_between, to_si
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 
 from ._parameters import NeckParameters
 from ._presets import PRESETS
@@ -157,7 +157,7 @@ class VirtualNeck(Shown):
         return Block(
             kind="virtual_neck",
             role="plant",
-            runtime=sized(RUNTIME, motors, outputs),
+            runtime=sized_name(RUNTIME, motors, outputs),
             sample_time=sample_time,
             arrays=([setup],),  # pyright: ignore[reportArgumentType]
             inputs=_as_shown(_inputs(self.robot, self.ranges()), self.robot),

@@ -1,7 +1,7 @@
-"""Blocks with `step`, and their runtime texts: bundled, compiled by numba, plain Python without it.
+"""Blocks with `step`, and their runtime source texts: bundled, compiled by numba, or run as plain Python without it.
 
 A runtime module (`_*_runtime.py`) imports numpy, math and other runtimes only.
-Knows no kind; may import `core`.
+Contains no kind; may import `core`.
 """
 
 import lazy_loader

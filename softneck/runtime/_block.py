@@ -1,4 +1,4 @@
-"""What can be stepped: ports, state, and the block that loops, FMUs and simulations share."""
+"""Blocks: discrete-time systems with ports and a state, shared by loops, FMUs and simulations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class State(Shown):
-    """All that a block remembers.
+    """The state of a block at one instant.
 
     Attributes:
         values: (n_state,) the state vector: delays, filters, random generator.
@@ -63,14 +63,14 @@ class Block(Shown):
     """A discrete-time system with named ports, described by a runtime module and its arrays.
 
     A plant's `step` holds the inputs over [t_k, t_k+1) and returns the outputs at t_k+1; that of an
-    observer, controller or reference returns what is valid at t_k (docs, "Timing").
+    observer, controller or reference returns the outputs at t_k (docs, "Timing").
 
     Attributes:
         kind: name in the table of kinds, or "virtual_neck".
         role: "plant", "observer", "controller" or "reference".
         runtime: dotted name of the runtime module.
         sample_time: [s].
-        arrays: what the runtime reads, float64.
+        arrays: data of the runtime, float64.
         inputs, outputs, parameters: the ports, in the runtime's order.
     """
 
@@ -125,7 +125,7 @@ class Block(Shown):
     def run_horizon(self, state: State, measured: Matrix, free: Matrix, horizon: int) -> Matrix:
         """Predict `horizon` steps ahead from every row; row k of the result is for t_k+1.
 
-        `measured` and `free` are (time, n_in): the inputs with and without what was measured.
+        `measured` and `free` are (time, n_in): the inputs with and without the measured outputs.
         """
         M, F = self.checked_inputs(measured), self.checked_inputs(free)
         Y = np.zeros((M.shape[0], len(self.outputs)))
@@ -133,7 +133,7 @@ class Block(Shown):
         return Y
 
     def checked_inputs(self, inputs: Matrix) -> Matrix:
-        """Return `inputs` (time, n_in) as a contiguous float array; raise DataError naming what is wrong."""
+        """Return `inputs` (time, n_in) as a contiguous float array; raise DataError naming the wrong input."""
         U = np.ascontiguousarray(inputs, dtype=np.float64)
         if U.ndim != 2 or U.shape[1] != len(self.inputs):
             names = ", ".join(port.name for port in self.inputs)

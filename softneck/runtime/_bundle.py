@@ -1,14 +1,14 @@
-"""One self-contained source text out of a kind's runtime modules.
+"""Bundles: one self-contained source text of a kind's runtime module and all runtime modules that it imports.
 
-A runtime module imports numpy, math and other runtime modules only. The bundle is what its functions need of those
-modules, behind each other, without words and with places for names (see `_names`). numba compiles it, and an FMU
-carries it: what runs in the kit and what runs in the host is the same text, under a name that its content decides.
-A line that changes reaches the kinds that need it and no other.
+A runtime module imports numpy, math and other runtime modules only. The bundle holds the functions that it needs of
+those modules, one after the other, without comments and with indices in place of names (see `_names`). numba compiles
+it, and an FMU contains it: softneck and the FMU's host run the same text. Its module name is a hash of the content, so
+    a changed line only affects the kinds that use it.
 
-A runtime may hold others: `outer(inner:11,other:13)` is module `outer` over member `inner`, which reads the first
-11 arrays behind those of `outer`, and `other`, which reads the next 13. Each member's names get a prefix, and the
-calls `member_*` of `_members_runtime` become calls of the members; one that calls `member_tangent` gets their
-derivatives with them.
+A runtime may contain others: `outer(inner:11,other:13)` is module `outer` with member `inner`, which reads the first
+11 arrays after those of `outer`, and member `other`, which reads the next 13. Each member's names get a prefix, and the
+calls `member_*` of `_members_runtime` become calls of the members. If the outer module calls `member_tangent`, the
+derivatives of the members are added.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from typing import Any
 from softneck.core import SettingsError
 
 from ._layout import Arrays, StateVector
-from ._names import lowered, state_size
+from ._names import lower, state_size
 from ._own import PREFIX, own_text
 from ._tangent import with_tangent
-from ._unrolled import unrolled
+from ._unrolled import unroll
 
-# Set from outside by whoever compiles; one for all (see `_compiled_runtime`).
+# Set by the code that compiles the bundle; shared by all members (see `_compiled_runtime`).
 _SHARED = {"COMPILED"}
 _CALLS = {
     "member_size": ("", "state_size", True),
     "member_initialise": (", parameters, state, outputs", "initialise", False),
     "member_step": (", parameters, state, inputs, outputs", "step", False),
 }
-_ROWS = "state_rows, inputs_rows, outputs_rows, moved"
-_TANGENT = {"member_tangent": (f", parameters, state, inputs, outputs, {_ROWS}", "step_tangent", False)}
+_ROW_ARGUMENTS = "state_rows, inputs_rows, outputs_rows, moved"
+_TANGENT = {"member_tangent": (f", parameters, state, inputs, outputs, {_ROW_ARGUMENTS}", "step_tangent", False)}
 
 
-def prefixed(text: str, prefix: str) -> str:
+def add_prefix(text: str, prefix: str) -> str:
     """Return a bundle without its imports, with `prefix` before every name that it defines."""
     tree = ast.parse(text)
     body = [node for node in tree.body if not isinstance(node, ast.Import | ast.ImportFrom)]
@@ -55,12 +55,12 @@ def prefixed(text: str, prefix: str) -> str:
 
 
 def member_calls(counts: list[int], own: int, *, texts: list[int] | None = None, tangents: bool = False) -> str:
-    """Return the functions of `_members_runtime` for members that read so many arrays, behind `own` others.
+    """Return the source of the functions of `_members_runtime` for members with these numbers of arrays.
 
     Args:
         counts: arrays of each member.
-        own: arrays before them.
-        texts: number of the text that each runs; None gives each its own.
+        own: number of arrays before those of the members.
+        texts: index of the source text that each member runs; None gives each its own.
         tangents: the members have a function `step_tangent`.
     """
     lines = ["", "def member_count():", f"    return {len(counts)}", ""]
@@ -68,7 +68,7 @@ def member_calls(counts: list[int], own: int, *, texts: list[int] | None = None,
         lines += ["", f"def {call}(arrays, member{arguments}):"]
         start = own
         for member, count in enumerate(counts):
-            # Constant borders: a compiler knows the type of each array then.
+            # Constant bounds: the compiler then knows the type of each array.
             part = f"arrays[{start}:{start + count}]"
             result = "return " if returns else ""
             text = member if texts is None else texts[member]
@@ -83,11 +83,11 @@ class _Prefix(ast.NodeTransformer):
         self._names, self._prefix = names, prefix
 
     def visit_Name(self, node: ast.Name) -> ast.Name:
-        """Rename a use; local variables of the same name follow, all alike."""
+        """Rename a use; local variables of the same name are renamed alike."""
         return ast.copy_location(ast.Name(self._new(node.id), node.ctx), node)
 
     def visit_arg(self, node: ast.arg) -> ast.arg:
-        """Rename a parameter that is called like a function."""
+        """Rename a parameter with the name of a function."""
         node.arg = self._new(node.arg)
         return node
 
@@ -103,19 +103,19 @@ class _Prefix(ast.NodeTransformer):
         return self._prefix + name if name in self._names else name
 
 
-_LOOPS = "softneck.runtime._loops_runtime"
-_MEMBERS = "softneck.runtime._members_runtime"
-_DECLARATIONS = "softneck.runtime._layout"
-# Motors and outputs of a neck, for which a text is written where its runtime's name says no others.
-_NECK = (3, 2)
-# `module@n` reads its sizes from its arrays: one text for all robots, as the compiled library holds it.
+_LOOPS_MODULE = "softneck.runtime._loops_runtime"
+_MEMBERS_MODULE = "softneck.runtime._members_runtime"
+_LAYOUT_MODULE = "softneck.runtime._layout"
+# Motors and outputs for which a text is written if the runtime's name does not give others: those of the neck.
+_DEFAULT_SIZES = (3, 2)
+# `module@n` reads its sizes from its arrays: one text for all robots, as in the compiled library.
 ANY_SIZE = "n"
-_ALLOWED = {"numpy", "math", "__future__", _DECLARATIONS}
+_ALLOWED = {"numpy", "math", "__future__", _LAYOUT_MODULE}
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """A function or a constant: what it defines, what it reads, and its text."""
+    """A function or a constant: the names that it defines, the names that it reads, and its text."""
 
     names: frozenset[str]
     reads: frozenset[str]
@@ -124,87 +124,87 @@ class _Piece:
 
 @cache
 def bundle(runtime: str, *, loops: bool = True, skip: tuple[str, ...] = (), linked: bool = False) -> str:
-    """Return the source text of runtime module `runtime` with all it needs.
+    """Return the source text of runtime module `runtime` with all functions and constants that it uses.
 
     Args:
         runtime: dotted name, with members in brackets.
         loops: add the loops over `step`; false for a module of plain functions.
-        skip: functions to leave out, which the caller writes otherwise.
-        linked: take the members' functions from where they are compiled already (see `load_runtime`), not their text;
-            but for derivatives, which are made of the text.
+        skip: functions to leave out because the caller supplies them.
+        linked: call the members' functions that are compiled already (see `load_runtime`) instead of including their
+            text; derivatives always include it.
 
     Raises:
-        SettingsError: a module imports what a runtime must not, or two define the same name.
+        SettingsError: a module has a forbidden import, or two modules define the same name.
     """
     outer, members = _members(runtime)
     outer, sizes = _sizes(outer)
     if outer.startswith(PREFIX):
-        loop = [piece.text for piece in _pieces(_LOOPS, sizes) if loops and "step" not in piece.names]
+        loop = [piece.text for piece in _pieces(_LOOPS_MODULE, sizes) if loops and "step" not in piece.names]
         return "\n".join(["import numpy as np", own_text(outer), *loop])
     order: list[str] = []
     _collect(outer, order)
     tangents = any(_asks_for_tangents(module) for module in order)
-    # Members of one runtime share its text: what is compiled once need not be compiled for each of them.
+    # Members with the same runtime share one text, which is then compiled once.
     names = [member for member, _ in members]
     homes = [names.index(name) for name in names]
     plain = {i: bundle(names[i], loops=False) for i in dict.fromkeys(homes)}
     if linked and not tangents:
         texts = [_link(names[i], content_name(text), f"m{i}_") for i, text in plain.items()]
     else:
-        texts = [prefixed(with_tangent(text) if tangents else text, f"m{i}_") for i, text in plain.items()]
-    if members and _MEMBERS in order:
-        order.remove(_MEMBERS)
+        texts = [add_prefix(with_tangent(text) if tangents else text, f"m{i}_") for i, text in plain.items()]
+    if members and _MEMBERS_MODULE in order:
+        order.remove(_MEMBERS_MODULE)
         texts.append(member_calls([count for _, count in members], own_arrays(outer), texts=homes, tangents=tangents))
     found = {module: [piece for piece in _pieces(module, sizes) if not set(skip) & piece.names] for module in order}
     home = next((module for module in order if _defines(found[module], "step")), None)
     if home is not None and not any(_defines(pieces, "state_size") for pieces in found.values()):
-        found[home].append(_piece(state_size(declared(home, Arrays), declared(home, StateVector), dict(sizes))))
+        found[home].append(_piece(state_size(layout_of(home, Arrays), layout_of(home, StateVector), dict(sizes))))
     if loops:
-        found[_LOOPS] = [piece for piece in _pieces(_LOOPS, sizes) if "step" not in piece.names]
+        found[_LOOPS_MODULE] = [piece for piece in _pieces(_LOOPS_MODULE, sizes) if "step" not in piece.names]
     _check_names(found)
-    kept = _needed(found, outer, {name for text in texts for name in _read(ast.parse(text))})
+    kept = _reachable_names(found, outer, {name for text in texts for name in _read(ast.parse(text))})
     parts = ["# A softneck runtime: generated, do not edit.", "import math", "", "import numpy as np", "", *texts]
     parts += [piece.text for pieces in found.values() for piece in pieces if kept & piece.names]
     return "\n".join(parts)
 
 
 def content_name(text: str, prefix: str = "softneck") -> str:
-    """Return a module name that the content of `text` decides."""
+    """Return a module name with a hash of `text`."""
     return f"{prefix}_{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
 def _link(runtime: str, content: str, prefix: str) -> str:
-    """Return lines that take a member's functions from its own module, whose content's name is among them."""
+    """Return lines that import a member's functions from its own module; they contain the hash of its text."""
     functions = ("state_size", "initialise", "step")
     lines = [f'{prefix}linked = load_runtime("{runtime}")', f'{prefix}content = "{content}"']
     lines += [f"{prefix}{name} = {prefix}linked.{name}" for name in functions]
     return "\n".join(["from softneck.runtime import load_runtime", "", *lines, f"del load_runtime, {prefix}linked", ""])
 
 
-def sized(runtime: str, motors: int, outputs: int) -> str:
-    """Return the name of a runtime whose text is for so many motors and outputs; that of a neck's is its own."""
-    return runtime if (motors, outputs) == _NECK else f"{runtime}@{motors}x{outputs}"
+def sized_name(runtime: str, motors: int, outputs: int) -> str:
+    """Return the name of a runtime for this number of motors and outputs; for the neck's, the name as it is."""
+    return runtime if (motors, outputs) == _DEFAULT_SIZES else f"{runtime}@{motors}x{outputs}"
 
 
 def _sizes(outer: str) -> tuple[str, tuple[tuple[str, int], ...]]:
-    """Return the module of a runtime's name, and the motors and outputs that its text is for; none: it reads them."""
+    """Return the module in a runtime's name, with its numbers of motors and outputs; empty if read from arrays."""
     module, _, size = outer.partition("@")
     if size == ANY_SIZE:
         return module, ()
-    motors, outputs = map(int, size.split("x")) if size else _NECK
+    motors, outputs = map(int, size.split("x")) if size else _DEFAULT_SIZES
     return module, (("motors", motors), ("outputs", outputs))
 
 
 def own_arrays(outer: str) -> int:
-    """Return how many arrays a module with members reads before those of its members."""
-    return len(declared(outer, Arrays).fields)
+    """Return the number of arrays that a module with members reads itself, before those of its members."""
+    return len(layout_of(outer, Arrays).fields)
 
 
-def declared(module: str, base: type) -> Any:
-    """Return the class of arrays or of the state that a module's `step` works on, or else its first function.
+def layout_of(module: str, base: type) -> Any:
+    """Return the subclass of `base` that annotates an argument of a module's `step`, or else of its first function.
 
     Raises:
-        SettingsError: it names none.
+        SettingsError: no argument has such an annotation.
     """
     module = module.partition("@")[0]
     functions = [node for node in _tree(module).body if isinstance(node, ast.FunctionDef)]
@@ -225,7 +225,7 @@ def _members(runtime: str) -> tuple[str, list[tuple[str, int]]]:
 
 
 def split_members(inner: str) -> list[str]:
-    """Split at the commas that are in no brackets: members may have members of their own."""
+    """Split at the commas outside brackets: members may have members of their own."""
     parts, depth, start = [], 0, 0
     for i, letter in enumerate(inner):
         depth += {"(": 1, ")": -1}.get(letter, 0)
@@ -236,8 +236,10 @@ def split_members(inner: str) -> list[str]:
 
 
 def _asks_for_tangents(module: str) -> bool:
-    """Return whether a module reads how the outputs of its members answer to their inputs."""
-    imports = [node for node in _tree(module).body if isinstance(node, ast.ImportFrom) and node.module == _MEMBERS]
+    """Return whether a module uses the derivatives of its members."""
+    imports = [
+        node for node in _tree(module).body if isinstance(node, ast.ImportFrom) and node.module == _MEMBERS_MODULE
+    ]
     return any(alias.name == "member_tangent" for node in imports for alias in node.names)
 
 
@@ -251,18 +253,18 @@ def _collect(module: str, order: list[str]) -> None:
 
 @cache
 def _pieces(module: str, sizes: tuple[tuple[str, int], ...]) -> tuple[_Piece, ...]:
-    """Return the functions and constants of a module, with places for names, written for a robot of these sizes."""
+    """Return the functions and constants of a module, with indices in place of names, for a robot of these sizes."""
 
     def find(name: str) -> Any:
         return None if hasattr(builtins, name) else getattr(import_module(module), name, None)
 
     kept: list[_Piece] = []
-    for statement in ast.parse(_source(module)).body:  # its own tree, as names become places in it
-        node = unrolled(statement, dict(sizes))
+    for statement in ast.parse(_source(module)).body:  # a new tree, as `lower` modifies it
+        node = unroll(statement, dict(sizes))
         if isinstance(node, ast.Import | ast.ImportFrom):
             _check_import(module, node)
         elif isinstance(node, ast.FunctionDef):
-            kept.append(_piece(lowered(node, find, module, dict(sizes))))
+            kept.append(_piece(lower(node, find, module, dict(sizes))))
         elif isinstance(node, ast.Assign):
             kept.append(_piece(node))
         elif not isinstance(node, ast.ClassDef | ast.Expr):
@@ -295,11 +297,11 @@ def _check_names(found: dict[str, list[_Piece]]) -> None:
             names[defined] = module
 
 
-def _needed(found: dict[str, list[_Piece]], outer: str, others: set[str]) -> set[str]:
-    """Return the names that the outer module offers, and all that these, the loops and `others` read."""
+def _reachable_names(found: dict[str, list[_Piece]], outer: str, others: set[str]) -> set[str]:
+    """Return the names that the outer module defines or imports, and all that these, the loops and `others` use."""
     reads = {name: piece.reads for pieces in found.values() for piece in pieces for name in piece.names}
-    waiting = ["state_size", *others, *(item for node in _tree(outer).body for item in _imported(node))]
-    waiting += [name for module in (outer, _LOOPS) for piece in found.get(module, ()) for name in piece.names]
+    waiting = ["state_size", *others, *(item for node in _tree(outer).body for item in _imported_names(node))]
+    waiting += [name for module in (outer, _LOOPS_MODULE) for piece in found.get(module, ()) for name in piece.names]
     kept: set[str] = set()
     while waiting:
         name = waiting.pop()
@@ -309,14 +311,14 @@ def _needed(found: dict[str, list[_Piece]], outer: str, others: set[str]) -> set
     return kept
 
 
-def _imported(node: ast.stmt) -> list[str]:
+def _imported_names(node: ast.stmt) -> list[str]:
     return [item.asname or item.name for item in node.names] if isinstance(node, ast.ImportFrom) else []
 
 
 def _check_import(module: str, node: ast.Import | ast.ImportFrom) -> None:
     imported = [node.module or ""] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
     for name in imported:
-        # By its full name: whoever has a kind of their own may share text between runtimes, as ours do.
+        # Only absolute imports of runtime modules; kinds of other packages may share text in the same way.
         runtime = name.endswith("_runtime") and not (isinstance(node, ast.ImportFrom) and node.level)
         if not runtime and name not in _ALLOWED:
             raise SettingsError(f"runtime module {module} imports `{name}`; only numpy and math are allowed.")

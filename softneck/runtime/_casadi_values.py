@@ -1,7 +1,7 @@
-"""Numbers of which some are CasADi symbols: what a runtime's arithmetic means on them.
+"""Arithmetic of a runtime on arrays that mix numbers and CasADi symbols.
 
-An array is a numpy array of objects, Python floats and scalar `casadi.SX` mixed: its slices are views, so what a
-runtime writes through them arrives, and what is known stays a number.
+An array is a numpy array of objects, Python floats and scalar `casadi.SX` mixed: its slices are views, so a runtime can
+write through them, and known entries stay numbers.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ _NUMPY_NAMES = {
     "abs": "fabs", "absolute": "fabs", "arctan": "atan", "arcsin": "asin", "arccos": "acos", "arctan2": "atan2",
     "maximum": "fmax", "minimum": "fmin",
 }  # fmt: skip
-_ONE = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "fabs")
-_TWO = ("atan2", "hypot", "fmax", "fmin")
+_UNARY_FUNCTIONS = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt", "fabs")
+_BINARY_FUNCTIONS = ("atan2", "hypot", "fmax", "fmin")
 _KNOWN_TWO: dict[str, Callable[..., Any]] = {
     "atan2": math.atan2, "hypot": math.hypot, "fmax": max, "fmin": min,
 }  # fmt: skip
@@ -36,12 +36,12 @@ class Values:
     """Arithmetic on numbers, symbols, and arrays of both.
 
     Attributes:
-        under: the condition on which the value in the making counts; None where it always does. Beside the other branch
-            of an `if` a division by zero is harmless as a value, but zero times its derivative is not a number.
+        under: the condition under which the current value is used; None if always. In the branch of an `if` that is not
+            taken, a division by zero is harmless as a value, but zero times its derivative is not a number.
     """
 
     def __init__(self) -> None:
-        """Start where nothing is conditional."""
+        """Start outside all conditions."""
         import casadi
 
         self._ca = casadi
@@ -67,9 +67,9 @@ class Values:
     def call(self, name: str, *values: Any) -> Any:
         """Return a function of `math` or numpy, entry by entry."""
         name = _NUMPY_NAMES.get(name, name)
-        if name in _ONE and len(values) == 1:
+        if name in _UNARY_FUNCTIONS and len(values) == 1:
             return self.each(lambda a: self._one(name, a), *values)
-        if name in _TWO and len(values) == 2:
+        if name in _BINARY_FUNCTIONS and len(values) == 2:
             return self.each(lambda a, b: self._two(name, a, b), *values)
         raise TypeError(f"the function `{name}` is not known here")
 
@@ -77,8 +77,8 @@ class Values:
         if not self.symbolic(a):
             return getattr(math, name)(a)
         if name == "sqrt":
-            # The derivative of a root is infinite at zero. Roots here are sizes of vectors, whose corner it is: 0 lies
-            # between its one-sided slopes.
+            # The derivative of a root is infinite at zero. Roots here are lengths of vectors, which have a kink there:
+            # 0 is between its one-sided slopes.
             zero = a == 0.0
             return self.choose(zero, 0.0, self._ca.sqrt(self.choose(zero, 1.0, self._apart(a))))
         return getattr(self._ca, name)(self._apart(a) if name == "log" else a)
@@ -89,7 +89,7 @@ class Values:
         return self._one("sqrt", a * a + b * b) if name == "hypot" else getattr(self._ca, name)(a, b)
 
     def _apart(self, value: Any) -> Any:
-        """Return a divisor or the like where it counts, and 1 where it does not."""
+        """Return the value (a divisor, or an argument of log) where its branch is taken, and 1 elsewhere."""
         if self.under is None or not self.symbolic(value):
             return value
         return self.choose(self.under, value, 1.0)
@@ -105,19 +105,19 @@ class Values:
         return self.each(lambda a, b: a if _same(a, b) else self._ca.if_else(test, a, b), yes, no)
 
     def both(self, first: Any, second: Any) -> Any:
-        """Return the condition that two conditions hold, of which the first may be None."""
+        """Return the conjunction of two conditions; the first may be None."""
         return second if first is None else self._ca.logic_and(first, second)
 
     def either(self, first: Any, second: Any) -> Any:
-        """Return the condition that one of two holds."""
+        """Return the disjunction of two conditions."""
         return self._ca.logic_or(first, second)
 
     def inverse(self, test: Any) -> Any:
-        """Return the condition that `test` does not hold."""
+        """Return the negation of a condition."""
         return self._ca.logic_not(test)
 
     def extreme(self, name: str, values: list[Any]) -> Any:
-        """Return the largest ("fmax") or least ("fmin") of several numbers."""
+        """Return the largest ("fmax") or smallest ("fmin") of several numbers."""
         return reduce(lambda a, b: self._two(name, a, b), values)
 
     def dot(self, left: Any, right: Any) -> Any:
@@ -125,22 +125,22 @@ class Values:
         return plain(np.dot(np.asarray(left).astype(object), np.asarray(right).astype(object)))
 
     def sort(self, values: np.ndarray) -> np.ndarray:
-        """Return a vector in order, symbols by a network of exchanges."""
+        """Return a sorted vector; symbols are sorted by a sorting network."""
         row = list(values)
         for end in range(len(row) - 1, 0, -1):
             for i in range(end):
                 row[i : i + 2] = self._two("fmin", *row[i : i + 2]), self._two("fmax", *row[i : i + 2])
-        return filled(np.empty(len(row), dtype=object), row)
+        return fill(np.empty(len(row), dtype=object), row)
 
     def each(self, function: Callable[..., Any], *values: Any) -> Any:
         """Return `function` of the entries of arrays, broadcast as numpy does, or of numbers."""
         if not any(isinstance(value, np.ndarray) for value in values):
             return function(*values)
-        return np.frompyfunc(function, len(values), 1)(*(boxed(value) for value in values))
+        return np.frompyfunc(function, len(values), 1)(*(as_objects(value) for value in values))
 
 
-def boxed(value: Any) -> np.ndarray:
-    """Return an array of objects; a number as one without axes: numpy must not look into a symbol."""
+def as_objects(value: Any) -> np.ndarray:
+    """Return an array of objects; a number becomes one without axes, so that numpy does not convert symbols."""
     if isinstance(value, np.ndarray):
         return value.astype(object)
     box = np.empty((), dtype=object)
@@ -149,17 +149,17 @@ def boxed(value: Any) -> np.ndarray:
 
 
 def plain(value: Any) -> Any:
-    """Return a number of numpy's as one of Python's, which leaves arithmetic to the symbol beside it."""
+    """Return a numpy scalar as a Python number, which leaves arithmetic to the other, symbolic operand."""
     return value.item() if isinstance(value, np.generic) else value
 
 
-def filled(array: np.ndarray, values: list[Any]) -> np.ndarray:
-    """Return a vector with `values` in it, one by one."""
+def fill(array: np.ndarray, values: list[Any]) -> np.ndarray:
+    """Write `values` into a vector, one by one, and return it."""
     for i, value in enumerate(values):
         array[i] = plain(value)
     return array
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Return whether two entries are one and the same; symbols are if they are one object."""
+    """Return whether two entries are equal; symbols are compared by identity."""
     return a is b or (isinstance(a, float | int) and isinstance(b, float | int) and type(a) is type(b) and a == b)

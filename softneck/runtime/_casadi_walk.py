@@ -1,8 +1,8 @@
-"""A runtime's `step` as a CasADi function: its text walked on numbers where they are known, else on symbols.
+"""A runtime's `step` as a CasADi function: an interpreter of its text, on numbers where known and symbols elsewhere.
 
-Arrays, parameters, loop bounds and table indices must be known. Where a test is on symbols both branches are walked,
-each on its own copy of all that is in reach, and merged entry by entry. What has no rule here is an error that names
-its line.
+Arrays, parameters, loop bounds and table indices must be known. If a test is on symbols, both branches are interpreted,
+each on its own copy of all reachable arrays, and merged entry by entry. A construct without a rule is an error that
+names its line.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from softneck.core import SettingsError, Vector
 
 from ._block import Block
 from ._bundle import bundle
-from ._casadi_values import Values, boxed, filled, plain
+from ._casadi_values import Values, as_objects, fill, plain
 
 _CONSTANTS = {"pi": np.pi, "inf": np.inf, "nan": np.nan, "e": np.e}
 _WRONG = (ArithmeticError, IndexError, KeyError, TypeError, ValueError, NotImplementedError, RuntimeError)
-# A loop without an end would otherwise not be noticed; the longest of a step has some hundreds of rounds.
+# Detects endless loops; the longest loop of a step has some hundreds of iterations.
 _MOST_ROUNDS = 1_000_000
 
 
@@ -55,16 +55,16 @@ class _Continue(Exception):
 
 
 class Walk:
-    """Walks functions of a text; `frames` are the variables of those that are being walked, the innermost last."""
+    """Interpreter of the functions of a text; `_frames` holds the variables of the active calls, innermost last."""
 
     def __init__(self, text: Text) -> None:
-        """Walk functions of `text`."""
+        """Create an interpreter of `text`."""
         self._text, self._v = text, Values()
         self._frames: list[dict[str, Any]] = []
         self._names: list[str] = []
 
     def call(self, name: str, values: Sequence[Any]) -> Any:
-        """Walk a function of the text and return what it returns."""
+        """Interpret a function of the text and return its result."""
         function = self._text.functions[name]
         arguments = [argument.arg for argument in function.args.args]
         self._frames.append(dict(zip(arguments, values, strict=True)))
@@ -118,8 +118,8 @@ class Walk:
         before = self._value(node.target)
         after = self._v.operate(node.op, before, self._value(node.value))
         if isinstance(before, np.ndarray):
-            # In place, as numpy does: whoever else holds the array sees it.
-            before[...] = boxed(after)
+            # In place, as numpy does: other references to the array see the change.
+            before[...] = as_objects(after)
         else:
             self._store(node.target, after)
 
@@ -134,12 +134,12 @@ class Walk:
 
     def _while(self, node: ast.While) -> None:
         for _ in range(_MOST_ROUNDS):
-            if not self._known(node.test) or not self._goes_on(node.body):
+            if not self._known_value(node.test) or not self._goes_on(node.body):
                 return
         self._fail(node, "this loop does not end")
 
     def _goes_on(self, body: list[ast.stmt]) -> bool:
-        """Walk the body of a loop once; return whether it was not left."""
+        """Interpret the body of a loop once; return False after `break`."""
         try:
             self._block(body)
         except _Break:
@@ -175,20 +175,20 @@ class Walk:
             branches.append((self._frames[-1], [array.copy() for array in before]))
         (yes, first), (no, second) = branches
         for array, a, b in zip(before, first, second, strict=True):
-            array[...] = boxed(self._v.choose(test, a, b))
-        # What only one branch defines is not defined behind it: a later use says so.
+            array[...] = as_objects(self._v.choose(test, a, b))
+        # A variable that only one branch defines is undefined after the `if`; a later use raises an error.
         self._frames[-1] = {
-            name: self._merged(node, test, yes[name], no[name], before) for name in yes if name in no
+            name: self._merge(node, test, yes[name], no[name], before) for name in yes if name in no
         }  # fmt: skip
 
     def _branch(self, node: ast.AST, body: list[ast.stmt]) -> None:
         try:
             self._block(body)
         except (_Return, _Break, _Continue):
-            self._fail(node, "a test on symbols decides where it goes on")
+            self._fail(node, "a test on symbols decides on `return`, `break` or `continue`")
 
-    def _merged(self, node: ast.AST, test: Any, yes: Any, no: Any, before: list[np.ndarray]) -> Any:
-        """Return what a variable is behind a test; an array that was there before has been merged in its place."""
+    def _merge(self, node: ast.AST, test: Any, yes: Any, no: Any, before: list[np.ndarray]) -> Any:
+        """Return a variable's value after a test; arrays that existed before it have been merged in place."""
         there = {id(array) for array in before}
         held = any(isinstance(value, np.ndarray) and id(_root(value)) in there for value in (yes, no))
         if held and yes is not no:
@@ -204,7 +204,7 @@ class Walk:
             self._v.under = before
 
     def _reach(self) -> list[np.ndarray]:
-        """Return the arrays that hold their own entries, of all that any variable in reach shows a part of."""
+        """Return the arrays that own the data of all variables of all frames, also of those that are views."""
         found: dict[int, np.ndarray] = {}
         waiting = [value for frame in self._frames for value in frame.values()]
         while waiting:
@@ -227,7 +227,7 @@ class Walk:
             array, place = self._value(target.value), self._place(target.slice)
             part = array[place]
             if isinstance(part, np.ndarray):
-                part[...] = boxed(value)
+                part[...] = as_objects(value)
             else:
                 array[place] = plain(value)
         else:
@@ -241,8 +241,8 @@ class Walk:
             self._fail(node, f"there is no rule for {type(node).__name__}")
         return handler(node)
 
-    def _known(self, node: ast.expr) -> Any:
-        """Return the value of an expression that must be no symbol."""
+    def _known_value(self, node: ast.expr) -> Any:
+        """Return the value of an expression; raise an error if it is a symbol."""
         return self._number(node, self._value(node))
 
     def _number(self, node: ast.expr, value: Any) -> Any:
@@ -277,10 +277,10 @@ class Walk:
     def _place(self, node: ast.expr) -> Any:
         if isinstance(node, ast.Slice):
             ends = (node.lower, node.upper, node.step)
-            return slice(*(None if end is None else self._known(end) for end in ends))
+            return slice(*(None if end is None else self._known_value(end) for end in ends))
         if isinstance(node, ast.Tuple):
             return tuple(self._place(item) for item in node.elts)
-        return self._known(node)
+        return self._known_value(node)
 
     def _unaryop(self, node: ast.UnaryOp) -> Any:
         value = self._value(node.operand)
@@ -296,13 +296,13 @@ class Walk:
     def _compare(self, node: ast.Compare) -> Any:
         values = [self._value(item) for item in (node.left, *node.comparators)]
         pairs = zip(node.ops, values, values[1:], strict=False)
-        return self._joined(True, (self._v.operate(op, left, right) for op, left, right in pairs))
+        return self._combine(True, (self._v.operate(op, left, right) for op, left, right in pairs))
 
     def _boolop(self, node: ast.BoolOp) -> Any:
-        return self._joined(isinstance(node.op, ast.And), (self._value(part) for part in node.values))
+        return self._combine(isinstance(node.op, ast.And), (self._value(part) for part in node.values))
 
-    def _joined(self, conjunction: bool, values: Iterator[Any]) -> Any:
-        """Return whether all conditions hold, or any; a known answer ends it, and what stands behind is not walked."""
+    def _combine(self, conjunction: bool, values: Iterator[Any]) -> Any:
+        """Return the conjunction or disjunction of conditions; as in Python, a known result skips the rest."""
         result: Any = conjunction
         for value in values:
             if not self._v.symbolic(value):
@@ -339,7 +339,7 @@ class Walk:
         if room == "":
             return self._builtin(node, name, values)
         if isinstance(node.func, ast.Attribute) and not values and last == "copy":
-            return boxed(self._value(node.func.value))
+            return as_objects(self._value(node.func.value))
         return self._fail(node, f"the method `{last}` is not known")
 
     def _builtin(self, node: ast.Call, name: str, values: list[Any]) -> Any:
@@ -355,7 +355,7 @@ class Walk:
 
     def _library(self, node: ast.Call, name: str, values: list[Any]) -> Any:
         if name in ("empty", "zeros", "ones"):
-            # Nothing can be computed with None: reading what was never written is an error, not a zero.
+            # Reading an entry that was never written is an error, as None has no arithmetic.
             return np.full(values[0], {"empty": None, "zeros": 0.0, "ones": 1.0}[name], dtype=object)
         if name in ("empty_like", "zeros_like"):
             return np.full(values[0].shape, None if name == "empty_like" else 0.0, dtype=object)
@@ -384,27 +384,27 @@ def step_function(block: Block, parameters: Vector, inputs: int) -> Any:
     """Return `casadi.Function` x, u -> x_next, y: one `step` of `block`.
 
     Args:
-        block: whose runtime is walked.
+        block: whose runtime is interpreted.
         parameters: numbers, in the block's order.
-        inputs: that many are symbols u, the others are not given (NaN).
+        inputs: number of inputs that are symbols u; the others are missing (NaN).
 
     Raises:
-        SettingsError: the text does what a function of symbols cannot; the message names function and line.
+        SettingsError: the text has a construct that symbols do not allow; the message names function and line.
     """
     import casadi as ca
 
     size = block.initial_state().values.size
     x, u = ca.SX.sym("x", size), ca.SX.sym("u", inputs)
-    state = filled(np.empty(size, dtype=object), [x[i] for i in range(size)])
+    state = fill(np.empty(size, dtype=object), [x[i] for i in range(size)])
     given = [u[i] for i in range(inputs)] + [np.nan] * (len(block.inputs) - inputs)
     outputs = np.zeros(len(block.outputs)).astype(object)
-    arrays = tuple(_fixed(array) for array in block.arrays)
+    arrays = tuple(_read_only(array) for array in block.arrays)
     text = Text(bundle(block.runtime, loops=False))
-    Walk(text).call("step", [arrays, _fixed(parameters), state, boxed(np.array(given, dtype=object)), outputs])
+    Walk(text).call("step", [arrays, _read_only(parameters), state, as_objects(np.array(given, dtype=object)), outputs])
     return ca.Function(block.kind, [x, u], [ca.vertcat(*state), ca.vertcat(*outputs)], ["x", "u"], ["x_next", "y"])
 
 
-def _fixed(array: np.ndarray) -> np.ndarray:
+def _read_only(array: np.ndarray) -> np.ndarray:
     view = np.asarray(array, dtype=np.float64).view()
     view.flags.writeable = False
     return view

@@ -1,4 +1,4 @@
-"""Runtime bundles as callable functions: compiled by numba where it is installed, plain Python where not."""
+"""Runtime bundles as callable functions: compiled by numba if it is installed, else plain Python."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ._tangent import with_tangent
 
 # No fast-math: compiled and plain Python must agree to rounding. No GIL: batches run on all cores.
 COMPILE_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-# Of functions that only compiled ones call: what Python would call them by takes as long to compile as they do.
+# For functions that only compiled ones call: their wrappers for Python take as long to compile as they do.
 _INNER: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-# One thread at a time loads: a cache alone lets two begin, and CPython 3.11's `ast` fails in two threads at once.
+# One thread at a time loads: `cache` alone would let two start, and CPython 3.11's `ast` fails in two threads at once.
 _LOADING = threading.RLock()
 
 
@@ -78,7 +78,7 @@ def load_tangent(module: str, *, compiled: bool = True) -> Callable[..., None]:
 
 @cache
 def _runtime(module: str, compiled: bool) -> Runtime:
-    # Members are linked where they are compiled already: six models in one text would take minutes.
+    # Members that are compiled already are linked: six models in one text would take minutes to compile.
     linked = compiled and have_numba() and "(" in module
     namespace = _import_text(bundle(module, linked=linked), compiled=compiled)
     names = ("state_size", "initialise", "step", "run_steps", "run_horizon")
@@ -106,25 +106,25 @@ def _namespace(text: str, compiled: bool) -> ModuleType:
 def load_linked(module: str, runtimes: Sequence[str]) -> ModuleType:
     """Return the functions of runtime module `module`, whose `part_step(part, ...)` calls the step of `runtimes[part]`.
 
-    The steps are those that `load_runtime` compiled: they are linked, not compiled again, and give the same bits.
-    What they step comes as `parts` = (arrays, parameters, states), each with an entry for each part.
+    The steps are those that `load_runtime` compiled: they are linked, not compiled again, and give equal results to the
+    bit. Their data is `parts` = (arrays, parameters, states), each with one entry for each part.
     """
     with _LOADING:
-        return _linked(module, tuple(runtimes))
+        return _link_parts(module, tuple(runtimes))
 
 
 @cache
-def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
+def _link_parts(module: str, runtimes: tuple[str, ...]) -> ModuleType:
     lines = ["from softneck.runtime import load_runtime"]
     for i, runtime in enumerate(runtimes):
-        # Its content's name is part of this text, and no comment: another runtime makes another module and cache.
+        # The hash of the runtime is part of this text, as a statement: another runtime makes another module and cache.
         lines += [f'linked_{i} = load_runtime("{runtime}").step', f'content_{i} = "{compiled_name(bundle(runtime))}"']
     lines += ["del load_runtime", "", "", "def part_step(part, time, parts, inputs, outputs):"]
     for i in range(len(runtimes)):
-        # Constant indices: a compiler knows the type of each part's arrays then.
+        # Constant indices: the compiler then knows the type of each part's arrays.
         step = f"linked_{i}(parts[0][{i}], parts[1][{i}], parts[2][{i}], inputs, outputs)"
         lines += [f"    if part == {i}:", f"        {step}"]
-    lines.append("    return False")  # nobody looked at the outputs
+    lines.append("    return False")  # no part has this index
     text = bundle(module, loops=False, skip=("part_step",)) + "\n".join(lines) + "\n"
     namespace = _import_text(text, compiled=True)
     _compile(namespace)
@@ -132,11 +132,11 @@ def _linked(module: str, runtimes: tuple[str, ...]) -> ModuleType:
 
 
 def compiled_name(text: str) -> str:
-    """Return the name under which the bundle `text` and its compiled code are kept; FMUs keep theirs there too.
+    """Return the module name under which the bundle `text` and its compiled code are cached, also for FMUs.
 
-    A bundle has no comments and no docstrings: where they alone change, nothing is compiled again.
+    A bundle has no comments and no docstrings: changing only these does not compile it again.
     """
-    # numba's cache does not look at its options: they belong to the name.
+    # numba's cache ignores the compile options, so they are part of the name.
     return content_name(f"{text}\n# {COMPILE_OPTIONS}")
 
 
@@ -150,7 +150,7 @@ def _compile(namespace: ModuleType, called: Sequence[str] | None = None) -> bool
         return False
     from numba import njit
 
-    _say_shapes_plainly()
+    _shorten_shape_errors()
     if "COMPILED" in vars(namespace):
         vars(namespace)["COMPILED"] = 1  # see `_compiled_runtime`; numba takes it as a constant
     for name, value in list(vars(namespace).items()):
@@ -161,11 +161,11 @@ def _compile(namespace: ModuleType, called: Sequence[str] | None = None) -> bool
 
 
 @cache
-def _say_shapes_plainly() -> None:
-    """Let a slice that was assigned too much say so without the sizes.
+def _shorten_shape_errors() -> None:
+    """Leave the sizes out of numba's message on an assignment to a slice of another size.
 
-    To format them numba compiles its own strings into every function with such an assignment, though ours are checked
-    before they run: a quarter of the time to compile a kind, and of the code that is loaded.
+    To format the sizes, numba compiles its string functions into every function with such an assignment, though our
+    arrays are checked before they run: a quarter of the time to compile a kind, and of the loaded code.
     """
     from numba.extending import overload
     from numba.np import arrayobj

@@ -1,4 +1,4 @@
 """Whether this bundle is compiled: a runtime may then choose loops over branches instead of whole arrays."""
 
-# The text says no; `load_runtime` says 1 before numba compiles, and so must whoever else compiles it.
+# 0 in the text; `load_runtime` sets 1 before numba compiles, and so must all other code that compiles it.
 COMPILED = 0

@@ -1,4 +1,4 @@
-"""Names for what a runtime reads and remembers: each kind declares its arrays and its state once, beside its equations.
+"""Layouts: each kind declares its arrays and its state once, with names, beside its equations.
 
     class LagArrays(Arrays):
         poles = array("n", "a of y+ = a y + (1 - a) u")
@@ -10,12 +10,12 @@
         for i in range(p.n):
             x.y[i] = p.poles[i] * x.y[i] + (1.0 - p.poles[i]) * inputs[i]
 
-From this follow the order in the file, the checks of shapes, the ranks in C, the length of the state and the reference
-page. The arrays stay a tuple and the state one vector: a bundle writes places for names (see `_names`), so that numba
-and C read what they would of numbers. A subclass adds behind what its base has.
+The layout determines the order in the file, the checks of shapes, the ranks in C, the length of the state and the
+reference page. The arrays stay a tuple and the state stays one vector: a bundle replaces names by indices (see
+`_names`), so that numba and C see plain indices. A subclass adds its fields after those of its base.
 
-Shapes are written in symbols: `n` is whatever length the array has there, `2 * n + 1` must fit, and `value` makes
-a symbol of an entry that holds a whole number.
+Shapes are written in symbols: `n` takes the length of the array, `2 * n + 1` must fit it, and `value` defines a symbol
+by an entry that holds a whole number.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Field:
     Attributes:
         shape: the length along each dimension, in symbols; empty for a single number of a state.
         meaning: one line with the unit, for the reference page.
-        open: the rest of the state, however long.
+        open: the rest of the state, of any length.
     """
 
     shape: tuple[str, ...]
@@ -53,10 +53,10 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A length that an array's entry holds, or that a function of the runtime makes of arrays.
+    """A length that is read from an entry of an array, or computed by a function of the runtime.
 
-    A `written` one is a number in the text, which is written for each size anew (see `_bundle.sized`): loops over the
-    three motors of a neck are as fast as if nobody could have more.
+    A `written` symbol is a constant in the text, which is generated for each size (see `_bundle.sized_name`): loops
+    over the three motors of a neck are as fast as with a fixed number of motors.
     """
 
     array: str
@@ -76,7 +76,7 @@ def cells(shape: str, meaning: str) -> Any:
 
 
 def rest(meaning: str) -> Any:
-    """Declare the last part of a state, which others fill: a composed kind's members."""
+    """Declare the last part of a state, which holds the states of a composed kind's members."""
     return Field((), meaning, open=True)
 
 
@@ -144,7 +144,7 @@ class Arrays(_Layout):
             FileFormatError: an array whose shape does not fit the others.
         """
         known: dict[str, int] = {}
-        # All first: `k * n` may stand before the array that tells k.
+        # Plain symbols first: `k * n` may come before the array with length k.
         for name, item in cls.fields.items():
             for text, length in zip(item.shape, arrays[name].shape, strict=False):
                 if text.isidentifier():
@@ -165,7 +165,7 @@ class Arrays(_Layout):
 
 
 class StateVector(_Layout):
-    """What a kind remembers, with names; inside a runtime, the annotation of the state vector."""
+    """A kind's state with names; inside a runtime, the annotation of the state vector."""
 
     if TYPE_CHECKING:  # it is a vector
 
@@ -199,7 +199,7 @@ def evaluate(text: str, known: Mapping[str, int]) -> int:
             return known[node.id]
         if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
             return _OPERATORS[type(node.op)](term(node.left), term(node.right))
-        raise SettingsError(f"the length `{text}` of a layout is not made of {', '.join(known) or 'numbers'}.")
+        raise SettingsError(f"the length `{text}` of a layout may only use {', '.join(known) or 'numbers'}.")
 
     return term(ast.parse(text, mode="eval").body)
 

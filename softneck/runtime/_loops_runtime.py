@@ -1,4 +1,4 @@
-"""Loops over `step`, bundled with every runtime: no kind writes its own."""
+"""Loops over `step`, bundled with every runtime."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ def step(
     inputs: np.ndarray,
     outputs: np.ndarray,
 ) -> None:
-    """Stand for the kind's own `step`, which replaces this one in a bundle."""
+    """Placeholder: a bundle has the kind's own `step` instead."""
     raise NotImplementedError
 
 
@@ -37,9 +37,9 @@ def run_horizon(
 ) -> None:
     """Predict `horizon` steps ahead from every row.
 
-    Row k of `measured` (time, n_in) holds the inputs at t_k with what was measured then; the same row of
-    `free` holds them without. `outputs[k]` becomes the prediction of the outputs at t_k+1 from what was
-    known at t_k+1-horizon (from the first row where that lies before it).
+    Row k of `measured` (time, n_in) holds the inputs at t_k with the outputs measured then; the same row of `free`
+    holds them without. `outputs[k]` becomes the prediction of the outputs at t_k+1 from the data up to t_k+1-horizon
+    (from the first row where that is earlier).
     """
     branch = np.empty_like(state)
     last = measured.shape[0]
@@ -49,11 +49,11 @@ def run_horizon(
         if horizon == 1:
             outputs[k] = scratch
             continue
-        # Known to t_k: from here on a copy runs free, and the row `horizon` ahead is noted.
+        # Data up to t_k: from here on a copy of the state is simulated, and the row `horizon` ahead is stored.
         branch[:] = state
         if k == 0:
             outputs[0] = scratch
         for j in range(k + 1, min(k + horizon, last)):
             step(arrays, parameters, branch, free[j], scratch)
-            if k == 0 or j == k + horizon - 1:  # from the first row those nearer too, which nobody else foresees
+            if k == 0 or j == k + horizon - 1:  # from the first row also the nearer ones, which no other row predicts
                 outputs[j] = scratch

@@ -1,6 +1,6 @@
-"""The members of a runtime that holds others; a bundle replaces these functions (see `_bundle`).
+"""Members of a composed runtime; a bundle replaces these functions (see `_bundle`).
 
-Theirs come behind the arrays that the outer module declares.
+The arrays of the members follow those that the outer module declares.
 """
 
 import numpy as np
@@ -47,5 +47,5 @@ def member_tangent(
     outputs_rows: np.ndarray,
     moved: int,
 ) -> None:
-    """Advance a member by one sample, and what its state is moved by along the first `moved` directions."""
+    """Advance a member by one sample, with the derivatives of its state and outputs along `moved` directions."""
     raise NotImplementedError

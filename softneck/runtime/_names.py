@@ -1,7 +1,7 @@
-"""Places for names: `p.W1` becomes `p[3]` and `x.y[i]` a place in the state vector, before anybody compiles them.
+"""Lowering of names to indices: `p.W1` becomes `p[3]` and `x.y[i]` an entry of the state vector, before compilation.
 
-A function's parameters say by their annotation which names they have (see `_layout`). Lengths that a shape's symbols
-stand for are read from the arrays once, where the function begins.
+The annotations of a function's parameters declare the names (see `_layout`). The lengths of symbols in shapes are read
+from the arrays once, at the start of the function.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from softneck.core import SettingsError
 from ._layout import Arrays, StateVector, Symbol
 
 
-def lowered(
+def lower(
     function: ast.FunctionDef, find: Callable[[str], Any], where: str, sizes: Mapping[str, int]
 ) -> ast.FunctionDef:
-    """Return `function` with places for names, without its docstring and the names of layouts.
+    """Return `function` with indices in place of names, without its docstring and layout annotations.
 
     Args:
         function: as it is written.
-        find: returns what a name in the function's module stands for.
+        find: returns the object of a name in the function's module.
         where: the module, for messages.
-        sizes: what symbols that are `written` are in this text.
+        sizes: values of the `written` symbols.
 
     Raises:
-        SettingsError: a name that the declaration does not have, or a part of a state used in a way that has no place.
+        SettingsError: an undeclared name, or a use of a part of a state that has no contiguous indices.
     """
 
     def layout(annotation: ast.expr | None) -> Any:
@@ -48,15 +48,15 @@ def lowered(
 
 
 def state_size(arrays: type[Arrays], state: type[StateVector], sizes: Mapping[str, int]) -> ast.FunctionDef:
-    """Return the function that tells the length of a state, for a kind that does not write it itself."""
+    """Return the function `state_size` for a kind that does not define it itself."""
     text = f"def state_size(p):\n    return {state.__name__}.size(p)\n"
     function = next(node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef))
     function.args.args[0].annotation = ast.Name(arrays.__name__)
-    return lowered(function, {arrays.__name__: arrays, state.__name__: state}.get, "state_size", sizes)
+    return lower(function, {arrays.__name__: arrays, state.__name__: state}.get, "state_size", sizes)
 
 
 class _Names(ast.NodeTransformer):
-    """Rewrites one function."""
+    """Rewriting of one function."""
 
     def __init__(
         self, layouts: Mapping[str, type], find: Callable[[str], Any], where: str, sizes: Mapping[str, int]
@@ -67,11 +67,11 @@ class _Names(ast.NodeTransformer):
         self._used: dict[str, ast.expr] = {}
 
     def begin(self) -> list[ast.stmt]:
-        """Return the statements that read the lengths in use."""
+        """Return the statements that read the used lengths."""
         return [ast.Assign([ast.Name(f"_{name}", ast.Store())], source) for name, source in self._used.items()]
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
-        """Return the place of `p.name` or `x.name`."""
+        """Return the indexed form of `p.name` or `x.name`."""
         layout = self._layout_of(node)
         if layout is None:
             return self.generic_visit(node)  # pyright: ignore[reportReturnType]
@@ -83,7 +83,7 @@ class _Names(ast.NodeTransformer):
         return self._symbol(node.attr)
 
     def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
-        """Return the place of `x.name[...]`."""
+        """Return the indexed form of `x.name[...]`."""
         layout = self._layout_of(node.value)
         if layout is None or not issubclass(layout, StateVector):
             return self.generic_visit(node)  # pyright: ignore[reportReturnType]
@@ -92,7 +92,7 @@ class _Names(ast.NodeTransformer):
         return self._part(owner, layout, name, [self.visit(item) for item in index], node.ctx)
 
     def visit_Call(self, node: ast.Call) -> ast.expr:
-        """Return the length that `NnState.size(p)` stands for."""
+        """Return the length of a state for `NnState.size(p)`."""
         owner = node.func.value if isinstance(node.func, ast.Attribute) else None
         if isinstance(owner, ast.Name) and node.func.attr == "size":  # type: ignore[attr-defined]
             layout = self._find(owner.id)
@@ -108,11 +108,11 @@ class _Names(ast.NodeTransformer):
     def _part(
         self, owner: str, layout: type[StateVector], name: str, index: list[ast.expr] | None, ctx: ast.expr_context
     ) -> ast.expr:
-        """Return a number of the state, a row, or a stretch of numbers."""
+        """Return one entry of the state, a row, or a slice of entries."""
         if name not in layout.fields:
             raise self._fail(f"{layout.__name__} declares no `{name}`")
         item, begin = layout.fields[name], self._begin(owner, layout, name)
-        shape = self._sized(item.shape)
+        shape = self._with_sizes(item.shape)
         place: ast.expr
         if item.open:
             place = ast.Slice(begin if index is None else _sum(begin, self._border(index[0])), None)
@@ -129,24 +129,24 @@ class _Names(ast.NodeTransformer):
             row = self._product(shape[1:])
             place = ast.Slice(_sum(begin, _times(first, row)), _sum(begin, _times(last, row)))
         else:
-            raise self._fail(f"`{name}[...]` of these indices is no stretch of the state")
+            raise self._fail(f"`{name}[...]` with these indices is no contiguous slice of the state")
         return ast.Subscript(ast.Name(owner, ast.Load()), place, ctx)
 
     def _rows(self, index: ast.expr, shape: tuple[str, ...]) -> tuple[ast.expr, ast.expr]:
         if not isinstance(index, ast.Slice):
             return index, _sum(index, ast.Constant(1))
         if index.step is not None:
-            raise self._fail("a stretch of the state has no step")
+            raise self._fail("a slice of the state cannot have a step")
         first = ast.Constant(0) if index.lower is None else index.lower
         return first, self._length(shape[0]) if index.upper is None else index.upper
 
     def _border(self, index: ast.expr) -> ast.expr:
         if isinstance(index, ast.Slice) and index.upper is None and index.lower is not None:
             return index.lower
-        raise self._fail("of the rest of a state only `[begin:]` can be taken")
+        raise self._fail("of the open part of a state only `[begin:]` can be used")
 
     def _begin(self, owner: str, layout: type[StateVector], name: str) -> ast.expr:
-        """Return where a part begins: a number, or a variable that the function fills at its begin."""
+        """Return the start index of a part: a number, or a variable that is set at the start of the function."""
         begin = self._offset(layout, name)
         if isinstance(begin, ast.Constant):
             return begin
@@ -155,13 +155,13 @@ class _Names(ast.NodeTransformer):
         return ast.Name(f"_{variable}", ast.Load())
 
     def _offset(self, layout: type[StateVector], name: str | None) -> ast.expr:
-        """Return where `name` begins in the state, or the length of all that is not open."""
+        """Return the start index of `name` in the state, or the length of all parts that are not open."""
         terms: dict[str, int] = {}
         for other, item in layout.fields.items():
             if other == name or item.open:
                 break
             factor, lengths = 1, []
-            for text in self._sized(item.shape):
+            for text in self._with_sizes(item.shape):
                 factor, lengths = (factor * int(text), lengths) if text.isdigit() else (factor, [*lengths, text])
             term = ast.unparse(self._product(tuple(lengths))) if lengths else ""
             terms[term] = terms.get(term, 0) + factor
@@ -177,7 +177,7 @@ class _Names(ast.NodeTransformer):
         return total
 
     def _length(self, text: str) -> ast.expr:
-        """Return a length of a shape, in the symbols that the function reads."""
+        """Return an expression for a length, with the variables that hold its symbols."""
         names = self
 
         class Symbols(ast.NodeTransformer):
@@ -187,7 +187,7 @@ class _Names(ast.NodeTransformer):
         return Symbols().visit(ast.parse(text, mode="eval").body)
 
     def _symbol(self, name: str) -> ast.expr:
-        """Return the variable that holds a symbol, which the function reads at its begin, or what it is written as."""
+        """Return the variable that holds a symbol's value, or its constant for `written` symbols."""
         if name in self._sizes:
             return ast.Constant(self._sizes[name])
         if name not in self._used:
@@ -197,8 +197,8 @@ class _Names(ast.NodeTransformer):
             self._used[name] = self._source(owner, self._layouts[owner], name)
         return ast.Name(f"_{name}", ast.Load())
 
-    def _sized(self, shape: tuple[str, ...]) -> tuple[str, ...]:
-        """Return a shape with numbers for the symbols that the text is written for."""
+    def _with_sizes(self, shape: tuple[str, ...]) -> tuple[str, ...]:
+        """Return a shape with numbers in place of the `written` symbols."""
         for name, size in self._sizes.items():
             shape = tuple(re.sub(rf"\b{name}\b", str(size), text) for text in shape)
         return shape

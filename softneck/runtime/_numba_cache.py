@@ -1,6 +1,6 @@
-"""Where numba keeps compiled runtimes, and what happens to an entry that does not load. It is in every FMU too.
+"""Folder of numba's cache of compiled runtimes, and recovery from entries that do not load; also part of every FMU.
 
-Standard library alone: an FMU has nothing of softneck on its host.
+Uses the standard library only: the host of an FMU need not have softneck.
 """
 
 import contextlib
@@ -10,10 +10,11 @@ from typing import Any
 
 
 def numba_cache_name(package: str) -> str:
-    """Return the name of the folder for what `package` ("softneck" or "fmu") compiles in this environment.
+    """Return the folder name for code that `package` ("softneck" or "fmu") compiles in this environment.
 
-    numba names entries by Python's version and by types, and the runtime's text is in the name of its file. What an
-    entry was compiled by is in neither: it may need softneck's own modules to load, or another numba or NumPy.
+    numba's entries are keyed by Python's version and by types, and the name of the source file contains its hash.
+    Neither
+    contains the compiling environment: an entry may need softneck's own modules to load, or another numba or NumPy.
     """
     versions = [f"py{sys.version_info[0]}.{sys.version_info[1]}"]
     for name in ("numba", "numpy"):
@@ -25,10 +26,10 @@ def numba_cache_name(package: str) -> str:
 
 
 def compile_without_failing_cache(dispatcher: Any) -> Any:
-    """Let numba's `dispatcher` compile anew what its cache cannot load, and go on where it cannot save; return it."""
+    """Make numba's `dispatcher` compile again if its cache fails to load, and ignore failures to save; return it."""
     cache: Any = getattr(dispatcher, "_cache", None)
     if not hasattr(cache, "flush"):
-        return dispatcher  # another numba, or one that keeps nothing
+        return dispatcher  # another numba, or one without a cache
     load, save = cache.load_overload, cache.save_overload
 
     def load_or_none(*args: Any) -> Any:
@@ -40,7 +41,7 @@ def compile_without_failing_cache(dispatcher: Any) -> Any:
             return None
 
     def save_if_possible(*args: Any) -> None:
-        with contextlib.suppress(Exception):  # a full disk, a folder that may be read alone
+        with contextlib.suppress(Exception):  # a full disk, or a read-only folder
             save(*args)
 
     cache.load_overload, cache.save_overload = load_or_none, save_if_possible

@@ -1,4 +1,4 @@
-"""Python objects that step themselves, as runtimes: plain Python, and a module of their own inside an FMU."""
+"""Python objects with a `step` method as runtimes: plain Python, with a module of their own inside an FMU."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 # Runtime modules of this name hold an object called `own`.
 PREFIX = "softneck_own_"
 _NUMBERS = count(1)
-_TEXT = """
+_SOURCE_TEMPLATE = """
 OWN = __import__("{module}").own
 
 
@@ -32,7 +32,7 @@ def step(p, parameters, state, inputs, outputs):
 
 
 class OwnStep:
-    """An object with `step(state, inputs)` between vectors; an FMU carries this text too."""
+    """Adapter of an object with `step(state, inputs)` to vectors; an FMU contains this text too."""
 
     def __init__(self, stepped: Any, names: Sequence[str]) -> None:
         """Step `stepped`, whose inputs are called `names`."""
@@ -50,7 +50,7 @@ class OwnStep:
 
 
 def own_runtime(own: OwnStep) -> str:
-    """Return the name of the runtime of an object, which lasts as long as this process."""
+    """Register an object as a runtime of this process and return the runtime's name."""
     module = ModuleType(f"{PREFIX}{next(_NUMBERS)}")
     vars(module)["own"] = own
     sys.modules[module.__name__] = module
@@ -58,10 +58,10 @@ def own_runtime(own: OwnStep) -> str:
 
 
 def own_of(runtime: str) -> OwnStep:
-    """Return the object behind a runtime's name."""
+    """Return the object registered under a runtime's name."""
     return sys.modules[runtime].own
 
 
 def own_text(module: str) -> str:
     """Return the runtime functions of the object in `module`."""
-    return _TEXT.format(module=module)
+    return _SOURCE_TEMPLATE.format(module=module)

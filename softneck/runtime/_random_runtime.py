@@ -1,7 +1,7 @@
-"""MRG32k3a: random numbers whose whole state is six floats (L'Ecuyer 1999, Operations Research 47:159).
+"""MRG32k3a: a random number generator with a state of six floats (L'Ecuyer 1999, Operations Research 47:159).
 
-All its arithmetic is exact in float64, so plain Python, numba and C give the same bits, and the
-generator's state travels inside a model's state vector.
+All its arithmetic is exact in float64, so plain Python, numba and C agree to the bit, and the generator's state is part
+of a model's state vector.
 """
 
 import math
@@ -20,7 +20,7 @@ def random_seed(s: np.ndarray, seed: float) -> None:
         # Park-Miller minimal standard generator: exact in float64, never 0.
         z = (16807.0 * z) % 2147483647.0
         s[i] = z
-    # Streams of neighbouring seeds begin alike: let them part.
+    # Streams of neighbouring seeds start alike: discard the first numbers.
     for _ in range(12):
         random_uniform(s)
 
@@ -49,6 +49,6 @@ def random_normal(s: np.ndarray) -> float:
         v = 2.0 * random_uniform(s) - 1.0
         w = 2.0 * random_uniform(s) - 1.0
         r = v * v + w * w
-        # The second number that the method has to give is let go: it would be one more to keep in the state.
+        # The second number that the method gives is discarded: the state would have to hold it.
         if 0.0 < r < 1.0:
             return v * math.sqrt(-2.0 * math.log(r) / r)

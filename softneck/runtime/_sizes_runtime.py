@@ -1,4 +1,4 @@
-"""Motors and outputs that a text is written for: a neck's, where its name says no others (see `_unrolled`)."""
+"""Numbers of motors and outputs that a text is generated for; the neck's unless its name has others (`_unrolled`)."""
 
 MOTORS = 3
 OUTPUTS = 2

@@ -1,7 +1,7 @@
-"""Which variables of a runtime's function depend on its state or inputs, and how many dimensions they have.
+"""Activity analysis: which variables of a runtime's function depend on state or inputs, and their number of dimensions.
 
-Only those carry rows of derivatives. The analysis looks at a function as a whole, without the order of its
-statements, once for each set of arguments that depend on them; whole numbers and tests never do.
+Only these active variables have tangents. The analysis treats a function as a whole, ignoring the order of its
+statements, once for each set of active arguments; whole numbers and tests are never active.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from itertools import product
 
 from softneck.core import SettingsError
 
-# Draws of random numbers are taken as they come: nothing moves them.
+# Random numbers do not depend on state or inputs.
 RANDOM = re.compile(r"(m\d+_)*random_\w+")
 _MEMBERS_NAME = re.compile(r"^(m\d+_)+")
-# Of arrays: what makes a new one. Of numbers: what is a step in any case, and has no derivative.
+# Functions that create arrays; functions that are piecewise constant and have no derivative.
 MAKERS = ("empty", "zeros", "ones", "empty_like", "zeros_like")
 STEPS = ("int", "bool", "len", "floor", "ceil", "round", "isfinite", "isnan", "isinf")
-# `low, high = f(..., w)` of a search among data is derived by the text's own `f_slopes(..., w, low, high, slopes)`.
+# A search among data `low, high = f(..., w)` is differentiated by the text's own `f_slopes(..., w, low, high, slopes)`.
 SLOPES = "_slopes"
 
-# A member that is not in the text: what is known of it is that its outputs and state follow from state and inputs.
+# Stand-in for a member that is not in the text: its outputs and state depend on state and inputs.
 MEMBER_STEP = "member_step"
 MEMBER_START = "member_initialise"
-_MEMBER = """
+_MEMBER_SOURCE = """
 def member_step(arrays, member, parameters, state, inputs, outputs):
     state[0] = state[0] + inputs[0]
     outputs[0] = state[0]
 """
 
-# What has no derivative yet, by one of its functions, and why.
+# Function of a runtime without derivative -> the reason.
 _WITHOUT = {
     "qp_solve": "it solves a quadratic program by iterations that are not differentiated.",
     "adaptive_update": "it learns its plant while it runs, with a covariance that is not differentiated.",
@@ -39,23 +39,23 @@ _WITHOUT = {
     "payload_start": "it carries several models and their spread, which are not differentiated.",
     "neck_substeps": "the virtual neck's integration is not differentiated; a model identified on it is.",
 }
-# All choices of dimensions are tried for so many products in one function.
+# Up to this number of products in one function, all choices of dimensions are tried.
 _MOST_PRODUCTS = 6
 
-# Argument -> number of its dimensions, for those that depend on state or inputs.
+# Active arguments, each with its number of dimensions.
 Pattern = tuple[tuple[str, int], ...]
 
 
 class TangentError(SettingsError):
-    """A runtime uses something that has no derivative, or none that is known here."""
+    """A runtime uses a function or construct without a derivative."""
 
 
 class Program:
-    """The functions of a bundle, and what is known of each with each pattern of arguments.
+    """The functions of a bundle, with the activity of each for each pattern of arguments.
 
     Attributes:
         functions: by name.
-        has_members: whether it calls members whose text is elsewhere.
+        has_members: whether it calls members that are not in the text.
     """
 
     def __init__(self, text: str) -> None:
@@ -65,7 +65,9 @@ class Program:
         stub = self.functions.get(MEMBER_STEP)
         self.has_members = stub is not None and isinstance(stub.body[-1], ast.Raise)
         if self.has_members:
-            self.functions |= {node.name: node for node in ast.parse(_MEMBER).body if isinstance(node, ast.FunctionDef)}
+            self.functions |= {
+                node.name: node for node in ast.parse(_MEMBER_SOURCE).body if isinstance(node, ast.FunctionDef)
+            }
         for name in self.functions:
             reason = _WITHOUT.get(_MEMBERS_NAME.sub("", name))
             if reason is not None:
@@ -74,7 +76,7 @@ class Program:
         self._open: set[tuple[str, Pattern]] = set()
 
     def activity(self, name: str, pattern: Pattern) -> Activity:
-        """Return the activity of a function whose arguments of `pattern` depend on state or inputs."""
+        """Return the activity of a function with the active arguments `pattern`."""
         key = (name, pattern)
         if key in self._open:
             raise TangentError(f"{name}: a function that calls itself has no known derivative.")
@@ -86,27 +88,27 @@ class Program:
                 self._open.discard(key)
         return self._done[key]
 
-    def searched(self, node: ast.AST) -> str | None:
-        """Return the name of this text's own search that `node` calls: one with slopes of its own."""
-        name = self.called(node)
+    def search_name(self, node: ast.AST) -> str | None:
+        """Return the name of this text's function with slopes that `node` calls; None for others."""
+        name = self.callee_name(node)
         return name if name is not None and name + SLOPES in self.functions else None
 
-    def called(self, node: ast.AST) -> str | None:
-        """Return the name of this text's own function that `node` calls, draws of random numbers aside."""
+    def callee_name(self, node: ast.AST) -> str | None:
+        """Return the name of this text's function that `node` calls; None for others and random numbers."""
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in self.functions:
             return None if RANDOM.fullmatch(node.func.id) else node.func.id
         return None
 
 
 class Activity:
-    """What depends on state or inputs in one function.
+    """The active variables of one function.
 
     Attributes:
         node: the function.
-        active: names of variables, arrays by what they are a view of.
+        active: names of variables; views by the name of their array.
         ranks: dimensions of names: 0 for numbers.
-        roots: name of a view -> name of the array that it shows.
-        result: whether what the function returns depends on them.
+        roots: name of a view -> name of its array.
+        result: whether the returned value is active.
     """
 
     def __init__(self, program: Program, node: ast.FunctionDef, pattern: Pattern) -> None:
@@ -130,7 +132,7 @@ class Activity:
 
     @property
     def written(self) -> dict[str, int]:
-        """The arguments that depend on state or inputs, those that the function makes so among them."""
+        """The active arguments, including those that the function makes active."""
         return {name: self.ranks.get(name, 1) for name in self.parameters if name in self.active}
 
     @property
@@ -140,7 +142,7 @@ class Activity:
 
     @property
     def numbers(self) -> tuple[str, ...]:
-        """The types of the several results that the function returns; none for one result."""
+        """The types of the results of a function that returns several; empty for one result."""
         returns = self.node.returns
         if isinstance(returns, ast.Subscript) and isinstance(returns.slice, ast.Tuple):
             return tuple(map(ast.unparse, returns.slice.elts)) if ast.unparse(returns.value) == "tuple" else ()
@@ -151,24 +153,24 @@ class Activity:
         """The arguments that the function writes into."""
         found = set()
         for part in ast.walk(self.node):
-            base = viewed(part) if isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store) else None
+            base = viewed_name(part) if isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store) else None
             found |= {self.root(base.id)} if base is not None else set()
-            name = self.program.called(part)
+            name = self.program.callee_name(part)
             if name is not None and isinstance(part, ast.Call):
                 callee = self.program.activity(name, self.pattern(part, name))
                 for parameter, value in zip(callee.parameters, part.args, strict=True):
-                    base = viewed(value)
+                    base = viewed_name(value)
                     found |= {self.root(base.id)} if base is not None and parameter in callee.stores else set()
         return found & set(self.parameters)
 
     def root(self, name: str) -> str:
-        """Return the array that a name shows."""
+        """Return the array of a view."""
         while name in self.roots:
             name = self.roots[name]
         return name
 
     def is_active(self, node: ast.AST) -> bool:
-        """Return whether the value of an expression depends on state or inputs."""
+        """Return whether an expression is active."""
         if isinstance(node, ast.Name):
             return self.root(node.id) in self.active
         if isinstance(node, ast.Compare | ast.BoolOp | ast.Constant | ast.Slice):
@@ -184,7 +186,7 @@ class Activity:
         return any(self.is_active(child) for child in ast.iter_child_nodes(node))
 
     def rank(self, node: ast.AST) -> int | None:
-        """Return the dimensions of an expression; None where they cannot be told."""
+        """Return the number of dimensions of an expression; None if it cannot be determined."""
         if isinstance(node, ast.Name):
             return self.ranks.get(node.id)
         if isinstance(node, ast.Constant | ast.Compare | ast.BoolOp):
@@ -209,7 +211,7 @@ class Activity:
         return TangentError(f"{self.node.name}: `{shown}`: {text}")
 
     def pattern(self, call: ast.Call, name: str) -> Pattern:
-        """Return which arguments of a call depend on state or inputs, and their dimensions."""
+        """Return the active arguments of a call, with their numbers of dimensions."""
         names = [argument.arg for argument in self.program.functions[name].args.args]
         if call.keywords or len(call.args) != len(names):
             raise self.fail(call, "arguments are given by position, all of them.")
@@ -218,9 +220,9 @@ class Activity:
             if self.is_active(value):
                 rank = self.rank(value)
                 if rank is None and isinstance(value, ast.Name) and value.id in self.parameters:
-                    rank = 1  # one that is written into: whoever calls knows better and comes again
+                    rank = 1  # an output argument: the analysis of the caller corrects it
                 if rank is None:
-                    raise self.fail(call, f"how many dimensions `{ast.unparse(value)}` has cannot be told.")
+                    raise self.fail(call, f"the number of dimensions of `{ast.unparse(value)}` cannot be determined.")
                 found[parameter] = rank
         return tuple(found.items())
 
@@ -231,8 +233,8 @@ class Activity:
                 quiet = function.attr in (*STEPS, *MAKERS)
                 return not quiet and any(self.is_active(value) for value in node.args)
             return self.is_active(function.value) or any(self.is_active(value) for value in node.args)
-        name = self.program.called(node)
-        if self.program.searched(node):
+        name = self.program.callee_name(node)
+        if self.program.search_name(node):
             return self.is_active(node.args[-1])
         if name is not None:
             pattern = self.pattern(node, name)
@@ -252,14 +254,14 @@ class Activity:
             if function.attr == "dot":
                 return self.products.get(id(node))
             return self.rank(node.args[0]) if node.args else None
-        name = self.program.called(node)
+        name = self.program.callee_name(node)
         returns = self.program.functions[name].returns if name else None
         if returns is not None:
             return {"float": 0, "int": 0, "bool": 0, "np.ndarray": 1}.get(ast.unparse(returns))
         return 0
 
     def _look(self, statement: ast.stmt) -> None:
-        """Follow one statement."""
+        """Update the activity by one statement."""
         if isinstance(statement, ast.For) and isinstance(statement.target, ast.Name):
             self.ranks[statement.target.id] = 0
         if isinstance(statement, ast.Return) and statement.value is not None:
@@ -274,10 +276,10 @@ class Activity:
         elif isinstance(statement, ast.AugAssign):
             self._mark(statement.target, self.is_active(statement.value))
             rank = self.rank(statement.value)
-            if isinstance(statement.target, ast.Name) and rank is not None:  # a number is never spread over an array
+            if isinstance(statement.target, ast.Name) and rank is not None:  # scalars are not broadcast
                 self.ranks.setdefault(statement.target.id, rank)
         for call in calls(statement):
-            name = None if self.program.searched(call) else self.program.called(call)
+            name = None if self.program.search_name(call) else self.program.callee_name(call)
             pattern = self.pattern(call, name) if name else ()
             if not name or not pattern:
                 continue
@@ -288,9 +290,9 @@ class Activity:
                     self._mark(value, True)
 
     def _is_number(self, call: ast.expr, place: int) -> bool:
-        """Return whether one of several results of a call may be moved: no whole number, no test."""
-        name = self.program.called(call)
-        if name is None or self.program.searched(call) or not isinstance(call, ast.Call):
+        """Return whether one of several results of a call is a float, and so may be active."""
+        name = self.program.callee_name(call)
+        if name is None or self.program.search_name(call) or not isinstance(call, ast.Call):
             return True
         kinds = self.program.activity(name, self.pattern(call, name)).numbers
         return not kinds or kinds[place] == "float"
@@ -302,7 +304,7 @@ class Activity:
             rank = self.rank(value)
             if rank is not None:
                 self.ranks[target.id] = max(rank, self.ranks.get(target.id, 0))
-            base = viewed(value)
+            base = viewed_name(value)
             if base is not None and rank and base.id != target.id and self.root(base.id) != target.id:
                 self.roots[target.id] = base.id
         self._mark(target, self.is_active(value))
@@ -315,7 +317,7 @@ class Activity:
             self.active.add(self.root(target.id))
 
     def _choose_products(self) -> None:
-        """Find how many dimensions each `np.dot` has: the one choice with which all fit, or vectors where many do."""
+        """Choose the number of dimensions of each `np.dot`: the only consistent choice, or vectors if several are."""
         nodes = [part for part in ast.walk(self.node) if is_numpy(part, "dot")]
         if not nodes:
             return
@@ -346,7 +348,7 @@ class Activity:
 
 
 def statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
-    """Go through statements and those within them, in order."""
+    """Yield statements and the statements inside them, in order."""
     for statement in body:
         yield statement
         for part in ("body", "orelse"):
@@ -354,21 +356,21 @@ def statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def calls(statement: ast.stmt) -> list[ast.Call]:
-    """Return the calls of a statement itself, not of statements within it."""
+    """Return the calls of a statement itself, without those of statements inside it."""
     own = [child for child in ast.iter_child_nodes(statement) if not isinstance(child, ast.stmt)]
     return [part for child in own for part in ast.walk(child) if isinstance(part, ast.Call)]
 
 
 def pairs(target: ast.expr, value: ast.expr) -> list[tuple[ast.expr, ast.expr | None]]:
-    """Return each target of an assignment with its value; None beside what a call returns several of."""
+    """Return each target of an assignment with its value; None if one call returns several values."""
     if isinstance(target, ast.Tuple):
         values = value.elts if isinstance(value, ast.Tuple) else [None] * len(target.elts)
         return list(zip(target.elts, values, strict=True))
     return [(target, value)]
 
 
-def viewed(node: ast.expr) -> ast.Name | None:
-    """Return the name of which an expression is a view; None for a copy or a number."""
+def viewed_name(node: ast.expr) -> ast.Name | None:
+    """Return the name of the array that an expression views; None for a copy or a number."""
     while isinstance(node, ast.Subscript):
         node = node.value
     return node if isinstance(node, ast.Name) else None

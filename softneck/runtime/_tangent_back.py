@@ -1,8 +1,8 @@
-"""Derivatives in reverse: the gradient of a function that makes one number out of loops or whole arrays.
+"""Reverse mode: the gradient of a function that reduces loops or whole arrays to one number.
 
-`f_back(..., seed, x_bar)` returns f and adds seed * df/dx to `x_bar`. Values are computed forward; then the statements
-come in reverse, each passing on what the result makes of its variable. A loop is run once more from its start, so it
-may carry on sums only; a short one of fixed length is written out.
+`f_back(..., seed, x_bar)` returns f and adds seed * df/dx to the adjoint `x_bar`. Values are computed forward; then the
+statements follow in reverse order, each propagating the adjoint of its variable. A loop is run once more from its
+start, so it may accumulate sums only; a short loop of fixed length is unrolled.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from collections.abc import Callable
 
 from ._tangent_activity import Activity, Pattern, is_numpy, statements
 from ._tangent_rows import Derived, without_unused
-from ._tangent_vectors import Lowering, Terms, inner, names, undefined
+from ._tangent_vectors import Lowering, Terms, inner, names, zero_undefined
 
-_LONGEST_WRITTEN_OUT = 4
-# tanh and the like of whole arrays: what they pass on, with v for their value and x for their argument.
+_MOST_UNROLLED = 4
+# Derivatives of elementwise functions, with v for the value and x for the argument.
 _EACH = {"tanh": "(1.0 - {v} * {v})", "exp": "{v}", "sin": "np.cos({x})", "cos": "-np.sin({x})", "sqrt": "0.5 / {v}"}
 
 
-def worth_it(activity: Activity, pattern: Pattern) -> bool:
-    """Return whether a function is better differentiated in reverse."""
+def is_reverse_better(activity: Activity, pattern: Pattern) -> bool:
+    """Return whether reverse mode suits a function: one number out of vectors, by loops or products."""
     node = activity.node
     returns = ast.unparse(node.returns) if node.returns else ""
     stores = any(isinstance(part, ast.Subscript) and isinstance(part.ctx, ast.Store) for part in ast.walk(node))
@@ -32,22 +32,22 @@ def worth_it(activity: Activity, pattern: Pattern) -> bool:
 
 
 class Back(Lowering):
-    """Writes the derivative in reverse of one function."""
+    """Generator of the reverse derivative of one function."""
 
     def __init__(self, activity: Activity, derived: Derived) -> None:
-        """Begin."""
+        """Start with no lines."""
         super().__init__(activity)
         self._derived = derived
-        # What to do behind the statement at hand, once its own terms are passed on.
+        # Lines that follow in reverse after the adjoints of the current statement.
         self._after: list[str] = []
         self._sums: set[str] = set()
 
     def text(self, name: str) -> str:
         """Return the derived function, called `name`; raise TangentError where it cannot be reversed."""
         act = self.activity
-        body = _written_out(act.node.body)
+        body = _unroll(act.node.body)
         if not isinstance(body[-1], ast.Return) or any(isinstance(s, ast.Return) for s in statements(body[:-1])):
-            raise self.fail(act.node, "it returns in its middle.")
+            raise self.fail(act.node, "it has a `return` before its last statement.")
         forward, back = self._block(body)
         arguments = [*act.parameters, "seed", *(f"{parameter}_bar" for parameter in act.written)]
         stored = {n.id for n in ast.walk(act.node) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)}
@@ -56,7 +56,7 @@ class Back(Lowering):
         return "\n".join([f"def {name}({', '.join(arguments)}):", *inner(lines)]) + "\n"
 
     def _block(self, body: list[ast.stmt]) -> tuple[list[str], list[str]]:
-        """Return the lines forward, and those in reverse."""
+        """Return the forward lines and the reverse lines."""
         forward: list[str] = []
         back: list[str] = []
         for node in body:
@@ -95,7 +95,7 @@ class Back(Lowering):
         if target.id not in self._sums:
             self.lines.append(f"{target.id} = {text}")
         own = [partial for partial, place in terms if place == f"{target.id}_bar"]
-        passed = self._passed([term for term in terms if term[1] != f"{target.id}_bar"], f"{target.id}_bar")
+        passed = self._propagate([term for term in terms if term[1] != f"{target.id}_bar"], f"{target.id}_bar")
         kept = [f"{target.id}_bar = {own[0]} * {target.id}_bar"] if own and own[0] != "1.0" else []
         return [*passed, *(kept if own else [f"{target.id}_bar = 0.0"]), *self._after]
 
@@ -106,10 +106,10 @@ class Back(Lowering):
         self._after = []
         text, terms = self.value(assert_value)
         self.lines.append(f"_result = {text}")
-        return [*self._passed(terms, "seed"), *self._after]
+        return [*self._propagate(terms, "seed"), *self._after]
 
-    def _passed(self, terms: Terms, bar: str) -> list[str]:
-        """Return the lines that pass `bar` on to the places of `terms`."""
+    def _propagate(self, terms: Terms, bar: str) -> list[str]:
+        """Return the lines that propagate the adjoint `bar` to the places of `terms`."""
         lines = []
         for partial, place in terms:
             passed = {"1.0": bar, "-1.0": f"-{bar}"}.get(partial, f"{partial} * {bar}")
@@ -119,9 +119,9 @@ class Back(Lowering):
     def _if(self, node: ast.stmt) -> list[str]:
         if not isinstance(node, ast.If):
             return []
-        test = self.kept(f"1.0 if {ast.unparse(node.test)} else 0.0", "c")
+        test = self.bind(f"1.0 if {ast.unparse(node.test)} else 0.0", "c")
         branches = [self._block(part) for part in (node.body, node.orelse)]
-        self.lines += undefined([forward for forward, _ in branches])
+        self.lines += zero_undefined([forward for forward, _ in branches])
         back = []
         for number, (forward, reverse) in enumerate(branches):
             head = f"if {test} {'>' if number == 0 else '<'} 0.5:"
@@ -141,7 +141,7 @@ class Back(Lowering):
         return [head, *inner([*forward, *back] or ["pass"])]
 
     def _sums_of(self, node: ast.For) -> set[str]:
-        """Return what a loop adds up and reads nowhere else; raise TangentError if it carries on anything more."""
+        """Return the sums of a loop that it does not read; raise TangentError if it carries other values."""
         used = [part for statement in node.body for part in ast.walk(statement) if isinstance(part, ast.Name)]
         reads = {name.id for name in used if isinstance(name.ctx, ast.Load)}
         written = {name.id for name in used if isinstance(name.ctx, ast.Store)}
@@ -159,13 +159,13 @@ class Back(Lowering):
                 added -= fresh
         sums = {name for name in added if name not in reads}
         if written - sums - fresh - loops:
-            raise self.fail(node, "what this loop carries on is not reversed.")
+            raise self.fail(node, "a value that this loop carries to its next iteration is not reversed.")
         return sums
 
     # Places
 
     def place(self, node: ast.Name | ast.Subscript) -> str:
-        """Return where what is passed on to a number is added up."""
+        """Return the adjoint of a number."""
         if isinstance(node, ast.Name):
             return f"{node.id}_bar"
         if not isinstance(node.value, ast.Name) or node.value.id not in self.activity.parameters:
@@ -173,7 +173,7 @@ class Back(Lowering):
         return f"{node.value.id}_bar[{self.index(node)}]"
 
     def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
-        """Write a call forward; its own reverse comes behind the statement's."""
+        """Write a call forward; its reverse call follows the reverse lines of the statement."""
         act = self.activity
         pattern = act.pattern(node, name)
         back = self._derived.back(name, pattern)
@@ -181,7 +181,7 @@ class Back(Lowering):
             raise self.fail(node, "this call is not reversed.")
         callee = act.program.activity(name, pattern)
         arguments = list(map(ast.unparse, node.args))
-        value = self.kept(f"{name}({', '.join(arguments)})")
+        value = self.bind(f"{name}({', '.join(arguments)})")
         bars = [f"{a}_bar" for p, a in zip(callee.parameters, arguments, strict=True) if p in callee.written]
         if not all(bar.removesuffix("_bar") in act.parameters for bar in bars):
             raise self.fail(node, "this call is not reversed.")
@@ -196,9 +196,9 @@ class Back(Lowering):
         if len(active) != 1 or self.activity.rank(node) != 0:
             raise self.fail(node, "this product is not reversed.")
         other = next(value for value in node.args if value is not active[0])
-        held, push = self._taken_apart(active[0])
+        held, push = self._split_vector(active[0])
         texts = [held if value is active[0] else ast.unparse(value) for value in node.args]
-        value = self.kept(f"np.dot({', '.join(texts)})")
+        value = self.bind(f"np.dot({', '.join(texts)})")
         self._after += push(f"({ast.unparse(other)} * {value}_bar)")
         return value, [("1.0", f"{value}_bar")]
 
@@ -208,12 +208,12 @@ class Back(Lowering):
             raise self.fail(node, "a vector that is overwritten is not reversed.")
         if sum(isinstance(n.ctx, ast.Load) for n in stores) > 1:
             raise self.fail(node, "a vector that is read twice is not reversed.")
-        held, push = self._taken_apart(value)
+        held, push = self._split_vector(value)
         self.lines.append(f"{target.id} = {held}")
         return push(f"{target.id}_bar")
 
-    def _taken_apart(self, node: ast.expr) -> tuple[str, Callable[[str], list[str]]]:
-        """Return a vector's text, and what passes on what it is given."""
+    def _split_vector(self, node: ast.expr) -> tuple[str, Callable[[str], list[str]]]:
+        """Return a vector's text, and the function that propagates its adjoint."""
         act = self.activity
         if not act.is_active(node):
             return f"({ast.unparse(node)})", lambda _: []
@@ -221,21 +221,21 @@ class Back(Lowering):
             sign = "+=" if node.id in act.parameters else "="
             return node.id, lambda bar: [f"{node.id}_bar {sign} {bar}"]
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add | ast.Sub | ast.Mult | ast.Div):
-            return self._pair_apart(node)
+            return self._split_pair(node)
         if is_numpy(node, *_EACH) and isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            text, push = self._taken_apart(node.args[0])
-            argument = self.kept(text, "x")
-            value = self.kept(f"np.{node.func.attr}({argument})", "x")
+            text, push = self._split_vector(node.args[0])
+            argument = self.bind(text, "x")
+            value = self.bind(f"np.{node.func.attr}({argument})", "x")
             slope = _EACH[node.func.attr].format(v=value, x=argument)
             return value, lambda bar: push(f"({bar} * {slope})")
         if is_numpy(node, "dot") and isinstance(node, ast.Call) and not act.is_active(node.args[0]):
             matrix = ast.unparse(node.args[0])
-            text, push = self._taken_apart(node.args[1])
+            text, push = self._split_vector(node.args[1])
             return f"np.dot({matrix}, {text})", lambda bar: push(f"np.dot({bar}, {matrix})")
         raise self.fail(node, "this array is not reversed.")
 
-    def _pair_apart(self, node: ast.BinOp) -> tuple[str, Callable[[str], list[str]]]:
-        (a, first), (b, second) = self._taken_apart(node.left), self._taken_apart(node.right)
+    def _split_pair(self, node: ast.BinOp) -> tuple[str, Callable[[str], list[str]]]:
+        (a, first), (b, second) = self._split_vector(node.left), self._split_vector(node.right)
         both = self.activity.is_active(node.left) and self.activity.is_active(node.right)
         if isinstance(node.op, ast.Add | ast.Sub):
             sign = "+" if isinstance(node.op, ast.Add) else "-"
@@ -247,31 +247,31 @@ class Back(Lowering):
         return f"({a} * {b})", lambda bar: first(f"({bar} * {b})") + second(f"({bar} * {a})")
 
 
-def _written_out(body: list[ast.stmt]) -> list[ast.stmt]:
-    """Return statements with short loops of fixed length written out."""
+def _unroll(body: list[ast.stmt]) -> list[ast.stmt]:
+    """Return statements with short loops of fixed length unrolled."""
     out: list[ast.stmt] = []
     for node in body:
         size = None
         if isinstance(node, ast.For) and isinstance(node.iter, ast.Call) and len(node.iter.args) == 1:
             size = node.iter.args[0].value if isinstance(node.iter.args[0], ast.Constant) else None
-        if isinstance(size, int) and size <= _LONGEST_WRITTEN_OUT and isinstance(node, ast.For):
+        if isinstance(size, int) and size <= _MOST_UNROLLED and isinstance(node, ast.For):
             counter = ast.unparse(node.target)
             for i in range(size):
-                text = [ast.unparse(_Replaced(counter, i).visit(copy.deepcopy(s))) for s in _written_out(node.body)]
+                text = [ast.unparse(_Replace(counter, i).visit(copy.deepcopy(s))) for s in _unroll(node.body)]
                 out += ast.parse("\n".join(text)).body
             continue
         new = copy.copy(node)
         for part in ("body", "orelse"):
             if getattr(new, part, None):
-                setattr(new, part, _written_out(getattr(new, part)))
+                setattr(new, part, _unroll(getattr(new, part)))
         out.append(new)
     return out
 
 
-class _Replaced(ast.NodeTransformer):
+class _Replace(ast.NodeTransformer):
     def __init__(self, name: str, value: int) -> None:
         self._name, self._value = name, value
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        """Put the number where the counter stood."""
+        """Replace the counter by its number."""
         return ast.Constant(self._value) if node.id == self._name else node

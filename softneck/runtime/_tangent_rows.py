@@ -1,7 +1,7 @@
-"""Derivatives in rows: a function of the text that carries, beside each number, what every direction moves it by.
+"""Forward mode: a function that computes, for each number, its derivative along every direction (its row of tangents).
 
-All lines between two calls, loops or branches that move numbers stand in one loop over the directions, behind the lines
-that compute. Numbers used in one such loop alone need no memory there.
+Between two calls, loops or branches, all lines that compute tangents are in one loop over the directions, after the
+lines that compute values. Tangents that are used in only one such loop need no array.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ _ROW = re.compile(r"<(\w+)>")
 
 
 class Derived(Protocol):
-    """What knows the other derived functions."""
+    """Access to the derivatives of other functions."""
 
     def rows(self, name: str, pattern: Pattern) -> str:
-        """Return the name of a function's derivative in rows."""
+        """Return the name of a function's forward derivative."""
         ...
 
     def back(self, name: str, pattern: Pattern) -> str | None:
-        """Return the name of a function's derivative in reverse; None where rows do better."""
+        """Return the name of a function's reverse derivative; None if forward mode is better."""
         ...
 
 
 class Rows(Vectors):
-    """Writes the derivative in rows of one function."""
+    """Generator of the forward derivative of one function."""
 
     def __init__(self, activity: Activity, derived: Derived) -> None:
-        """Begin."""
+        """Start with no lines."""
         super().__init__(activity)
         self._derived = derived
         self._waiting: list[str] = []
@@ -65,7 +65,7 @@ class Rows(Vectors):
         return "\n".join(head + inner(own + without_unused(body))) + "\n"
 
     def _rows_of_numbers(self) -> dict[str, int]:
-        """Return the numbers whose rows are kept between loops, each with its place."""
+        """Return the numbers whose tangents must be stored between loops, each with its row."""
         seen: dict[str, int] = {}
         for number, lines in enumerate(self._loops):
             for line in lines:
@@ -113,7 +113,7 @@ class Rows(Vectors):
     def _expression(self, node: ast.Expr) -> None:
         if isinstance(node.value, ast.Constant):
             return
-        name = self.activity.program.called(node.value)
+        name = self.activity.program.callee_name(node.value)
         if name is not None and isinstance(node.value, ast.Call) and self.activity.pattern(node.value, name):
             self._whole = node.value
             self.call(node.value, name)
@@ -125,12 +125,12 @@ class Rows(Vectors):
             self._whole, texts = node.value, []
             for place, one in enumerate(node.value.elts):
                 text, terms = self.value(one)
-                texts.append(self.kept(text))
+                texts.append(self.bind(text))
                 self._waiting.append(f"result_rows[{place}, _r] = {linear(terms)}")
             self._flush()
             self.lines.append(f"return {', '.join(texts)}")
         elif self.activity.result and self.activity.makes_vector and node.value is not None:
-            made, value = self.name("v"), self._hoisted(node.value)
+            made, value = self.name("v"), self._hoist(node.value)
             self._flush()
             self.lines += [f"{made} = {ast.unparse(value)}", f"{made}_rows = np.empty(({made}.shape[0], moved))"]
             self._fill(node, f"{made}_rows", "0", f"{made}.shape[0]", value)
@@ -138,7 +138,7 @@ class Rows(Vectors):
         elif self.activity.result and node.value is not None:
             self._whole = node.value
             text, terms = self.value(node.value)
-            text = self.kept(text)
+            text = self.bind(text)
             self._waiting.append(f"result_rows[_r] = {linear(terms)}")
             self._flush()
             self.lines.append(f"return {text}")
@@ -155,12 +155,12 @@ class Rows(Vectors):
         else:
             one = [pair for target in node.targets for pair in pairs(target, node.value)]
         if not any(act.is_active(target) for target, _ in one):
-            called = act.program.called(node.value)
+            called = act.program.callee_name(node.value)
             call = node.value if isinstance(node.value, ast.Call) else None
             pattern = act.pattern(call, called) if called and call else ()
             callee = act.program.activity(called, pattern) if called and pattern else None
             if callee is not None and called and call and callee.stores & set(callee.written):
-                self._whole = node.value  # nothing moves what it returns, but perhaps what it writes into
+                self._whole = node.value  # its result is not active, but its output arguments may be
                 said = ", ".join(ast.unparse(target) for target, _ in one)
                 self.lines.append(f"{said} = {self.call(call, called)[0]}")
             else:
@@ -169,7 +169,7 @@ class Rows(Vectors):
         if isinstance(node, ast.AugAssign) and isinstance(node.op, ast.Add | ast.Sub) and not act.is_active(node.value):
             self.lines.append(ast.unparse(node))
             return
-        if act.program.searched(node.value) and isinstance(node.value, ast.Call):
+        if act.program.search_name(node.value) and isinstance(node.value, ast.Call):
             self._search([target for target, _ in one], node.value)
             return
         if one[0][1] is None and isinstance(node.value, ast.Call):
@@ -180,7 +180,7 @@ class Rows(Vectors):
             if read & {ast.unparse(target) for target, _ in one}:
                 self._several(node, one)
                 return
-            for target, value in one:  # none is read behind a target: one after the other is the same
+            for target, value in one:  # no target is read later: assigning one by one is the same
                 if value is not None:
                     self._assign(ast.Assign([target], value, lineno=0))
             return
@@ -202,13 +202,13 @@ class Rows(Vectors):
             text, terms = self.value(value)
             moved = self.name("d")
             self._waiting.append(f"«{moved}» = {linear(terms)}")
-            values.append((target, self.kept(text), [("1.0", f"«{moved}»")]))
+            values.append((target, self.bind(text), [("1.0", f"«{moved}»")]))
         for target, text, terms in values:
             self._number(target, text, terms)
 
     def _numbers(self, node: ast.stmt, targets: list[ast.expr], call: ast.Call) -> None:
-        """Assign the several numbers that a call returns."""
-        name = self.activity.program.called(call)
+        """Assign the numbers of a call with several results."""
+        name = self.activity.program.callee_name(call)
         if name is None:
             raise self.fail(node, "the derivative of several results of a call is not known.")
         self._whole = call
@@ -217,14 +217,14 @@ class Rows(Vectors):
             self._number(target, f"{value}[{place}]", [("1.0", f"{rows}[{place}, _r]") for _, rows in terms])
 
     def _search(self, targets: list[ast.expr], call: ast.Call) -> None:
-        """Write a search and what its slopes make of the one vector that moves it."""
+        """Write a search and its tangents, from its slopes and the one active vector."""
         given = [ast.unparse(value) for value in call.args]
         if any(self.activity.is_active(value) for value in call.args[:-1]) or not isinstance(call.args[-1], ast.Name):
-            raise self.fail(call, "a search is moved by its last argument alone, a name.")
+            raise self.fail(call, "only the last argument of a search may be active, and it must be a name.")
         self._flush()
         slopes, found = self.name("g"), [ast.unparse(target) for target in targets]
         self.lines += [f"{', '.join(found)} = {ast.unparse(call)}", f"{slopes} = np.zeros((2, {given[-1]}.shape[0]))"]
-        self.lines.append(f"{self.activity.program.searched(call)}{SLOPES}({', '.join([*given, *found, slopes])})")
+        self.lines.append(f"{self.activity.program.search_name(call)}{SLOPES}({', '.join([*given, *found, slopes])})")
         for place, target in enumerate(found):
             self._stored.add(target)
             self.lines += ["for _r in range(moved):", f"    «{target}» = 0.0"]
@@ -239,7 +239,7 @@ class Rows(Vectors):
     # Numbers
 
     def place(self, node: ast.Name | ast.Subscript) -> str:
-        """Return where what a number is moved by stands, in the loop over directions."""
+        """Return the tangent of a number, in the loop over directions."""
         if isinstance(node, ast.Name):
             return f"{node.id}_rows[_r]" if node.id in self._given else f"«{node.id}»"
         if not isinstance(node.value, ast.Name):
@@ -259,24 +259,26 @@ class Rows(Vectors):
         if back is not None:
             return self._gradient(node, callee, back)
         if node is not self._whole and callee.stores:
-            raise self.fail(node, "a call that writes into its arguments stands alone, or alone behind `=`.")
+            raise self.fail(
+                node, "a call that writes into its arguments must be a statement, or the whole right side of one."
+            )
         given, rows = [], []
         for parameter, value in zip(callee.parameters, node.args, strict=True):
             if parameter not in callee.written:
                 given.append(ast.unparse(value))
             elif callee.written[parameter] == 0:
                 text, terms = self.value(value)
-                given.append(self.kept(text))
+                given.append(self.bind(text))
                 one = self.name("d")
                 self._waiting.append(f"«{one}» = {linear(terms)}")
                 self._stored.add(one)
                 rows.append(f"<{one}>")
             else:
-                value = self._hoisted(value)
+                value = self._hoist(value)
                 if is_copy(value) and isinstance(value, ast.Call) and isinstance(value.func, ast.Attribute):
                     rows.append(f"{self._rows(value.func.value)}.copy()")
                 else:
-                    value = self._named(value)
+                    value = self._bind_vector(value)
                     rows.append(self._rows(value))
                 given.append(ast.unparse(value))
         self._flush()
@@ -304,15 +306,15 @@ class Rows(Vectors):
         return value, [("1.0", f"«{one}»")]
 
     def _start(self, node: ast.Call) -> tuple[str, Terms]:
-        """Write a member's start, which nothing but parameters decides."""
+        """Write a member's start; its tangents are zero, as it only depends on parameters."""
         self._flush()
         self.lines.append(ast.unparse(node))
-        rows, first, count = self._stretch(node.args[3])
+        rows, first, count = self._part_of_rows(node.args[3])
         self.lines += loops(count, f"{rows}[{first} + _i, _r] = 0.0")
         return "", []
 
     def _gradient(self, node: ast.Call, callee: Activity, back: str) -> tuple[str, Terms]:
-        """Write a call in reverse, and what all directions make of its gradient."""
+        """Write a reverse call, and the tangents of its value from the gradient."""
         self._flush()
         gradients, lines = [], []
         value, one = self.name("v"), self.name("d")
@@ -324,7 +326,7 @@ class Rows(Vectors):
             gradient, partial = self.name("g"), self.name("p")
             self.lines.append(f"{gradient} = np.zeros({ast.unparse(argument)}.shape[0])")
             gradients.append(gradient)
-            # Most entries of a long history are in no regressor.
+            # Most entries of a long history are in no regressor, so their gradient is zero.
             lines += [
                 f"for _i in range({gradient}.shape[0]):",
                 f"    {partial} = {gradient}[_i]",
@@ -338,13 +340,13 @@ class Rows(Vectors):
 
 
 def without_unused(lines: list[str]) -> list[str]:
-    """Return lines without those that only set what no other line reads."""
+    """Return lines without assignments to variables that no other line reads."""
     while True:
         used: set[str] = set()
         for line in lines:
             target, sign, value = line.partition(" = ")
             text = value if sign and re.fullmatch(r"\s*_[vpi]\d+", target) else line
-            used |= set(re.findall(r"\b_[vpi]\d+\b", text))  # not `_v1_bar`: what it passes on needs no value
+            used |= set(re.findall(r"\b_[vpi]\d+\b", text))  # not `_v1_bar`: an adjoint needs no value
         left = []
         for line in lines:
             found = re.match(r"\s*(_[vpi]\d+) = (?!.*(_(tangent|back)\w*|random_\w+)\()", line)

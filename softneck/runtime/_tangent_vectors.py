@@ -1,8 +1,8 @@
-"""Expressions taken apart: the value as it was, and what it is moved by, linear in what moves; numbers, then vectors.
+"""Differentiation of expressions: the value and its tangent, linear in the tangents of its variables.
 
-`partial * place` are the terms of a derivative: the place is where what a variable is moved by stands. Partials are
-computed where the value is, and kept under names of their own, so that later statements may overwrite what they read.
-Vectors come in rows: what each of their entries is moved by, in loops of their own.
+The terms of a derivative are `partial * place`, where `place` is the tangent (or adjoint) of a variable. Partials are
+computed together with the value and bound to new names, so that later statements may overwrite their operands. The
+tangents of vectors are computed in loops over their entries.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ import ast
 import re
 from typing import Any
 
-from ._tangent_activity import MAKERS, Activity, is_numpy, viewed
+from ._tangent_activity import MAKERS, Activity, is_numpy, viewed_name
 
 Terms = list[tuple[str, str]]
 _KEPT = re.compile(r"_[a-z]\d+|-?\d+(\.\d*)?(e-?\d+)?")
 _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
-# f(x): its derivative, with v for f(x). A root of zero is moved by nothing: it has no finite slope.
+# Derivatives of f(x), with v for f(x). That of a root of zero is set to 0: it has no finite slope.
 _SLOPES = {
     "sin": "math.cos({x})", "cos": "-math.sin({x})", "tan": "1.0 + {v} * {v}", "tanh": "1.0 - {v} * {v}",
     "exp": "{v}", "log": "1.0 / {x}", "sqrt": "0.5 / {v} if {v} > 0.0 else 0.0", "atan": "1.0 / (1.0 + {x} * {x})",
     "arctan": "1.0 / (1.0 + {x} * {x})", "asin": "1.0 / math.sqrt(1.0 - {x} * {x})",
     "acos": "-1.0 / math.sqrt(1.0 - {x} * {x})",
 }  # fmt: skip
-# A length below 1e-12 is rounding, and has no direction.
+# A length below 1e-12 is rounding and has no direction; this is its square.
 _NO_LENGTH = 1e-24
 
 
 class Lowering:
-    """Writes the lines of one derived function; `lines` are without their indentation.
+    """Generator of the lines of one derived function; `lines` are without indentation.
 
-    A derivative in rows and one in reverse differ in what they make of places and calls.
+    Forward and reverse mode differ in their places and calls.
     """
 
     def __init__(self, activity: Activity) -> None:
@@ -40,7 +40,7 @@ class Lowering:
         self._count = 0
 
     def place(self, node: ast.Name | ast.Subscript) -> str:
-        """Return where what a number is moved by stands."""
+        """Return the tangent or adjoint of a number."""
         raise NotImplementedError
 
     def call(self, node: ast.Call, name: str) -> tuple[str, Terms]:
@@ -56,12 +56,12 @@ class Lowering:
         return self.activity.fail(node, text)
 
     def name(self, letter: str) -> str:
-        """Return a name that the text does not have."""
+        """Return a new name."""
         self._count += 1
         return f"_{letter}{self._count}"
 
-    def kept(self, text: str, letter: str = "v") -> str:
-        """Return a number under a name of its own, which nothing overwrites."""
+    def bind(self, text: str, letter: str = "v") -> str:
+        """Assign a number to a new name and return that name; names and constants stay as they are."""
         if _KEPT.fullmatch(text):
             return text
         name = self.name(letter)
@@ -81,10 +81,10 @@ class Lowering:
         """Return `terms` multiplied by a number."""
         if not terms or factor == "1.0":
             return terms
-        factor = self.kept(factor, "p")
+        factor = self.bind(factor, "p")
         scaled = []
         for partial, place in terms:
-            one = factor if partial == "1.0" else self.kept(f"{partial} * {factor}", "p")
+            one = factor if partial == "1.0" else self.bind(f"{partial} * {factor}", "p")
             scaled.append((one, place))
         return scaled
 
@@ -92,13 +92,13 @@ class Lowering:
         """Return the sum of both, each place once."""
         found = {place: partial for partial, place in first}
         for partial, place in second:
-            found[place] = self.kept(f"{found[place]} + {partial}", "p") if place in found else partial
+            found[place] = self.bind(f"{found[place]} + {partial}", "p") if place in found else partial
         return [(partial, place) for place, partial in found.items()]
 
     def index(self, node: ast.Subscript) -> str:
-        """Return the place of an entry, kept."""
+        """Return the indices of an entry, bound to names."""
         places = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
-        return ", ".join(self.kept(ast.unparse(place), "i") for place in places)
+        return ", ".join(self.bind(ast.unparse(place), "i") for place in places)
 
     # Terms
 
@@ -128,11 +128,11 @@ class Lowering:
         if sign in "+-":
             return f"({a} {sign} {b})", self.sum(first, second if sign == "+" else self.times(second, "-1.0"))
         if sign == "*":
-            a = self.kept(a) if second else a
-            b = self.kept(b) if first else b
+            a = self.bind(a) if second else a
+            b = self.bind(b) if first else b
             return f"({a} * {b})", self.sum(self.times(first, b), self.times(second, a))
-        b = self.kept(b)
-        value = self.kept(f"{a} / {b}")
+        b = self.bind(b)
+        value = self.bind(f"{a} / {b}")
         return value, self.sum(self.times(first, f"1.0 / {b}"), self.times(second, f"-{value} / {b}"))
 
     def _power(self, node: ast.BinOp) -> tuple[str, Terms]:
@@ -140,7 +140,7 @@ class Lowering:
         if not isinstance(n, int | float):
             raise self.fail(node, "powers are differentiated with a constant exponent.")
         text, terms = self.value(node.left)
-        text = self.kept(text)
+        text = self.bind(text)
         slope = f"{n} * {text}" if n == 2 else f"{n} * {text} ** {n - 1}"
         return f"({text} ** {n})", self.times(terms, slope)
 
@@ -157,7 +157,7 @@ class Lowering:
                 self.lines.append(f"{name} = {partial}")
                 found.append((name, place))
             written.append(self.lines)
-        self.lines = outside + undefined(written, {value})
+        self.lines = outside + zero_undefined(written, {value})
         self.lines += [f"if {ast.unparse(node.test)}:", *inner(written[0]), "else:", *inner(written[1])]
         terms: Terms = []
         for term in found:
@@ -165,7 +165,7 @@ class Lowering:
         return value, terms
 
     def _call(self, node: ast.Call) -> tuple[str, Terms]:
-        own = self.activity.program.called(node)
+        own = self.activity.program.callee_name(node)
         if own is not None:
             return self.call(node, own)
         function = node.func
@@ -185,10 +185,10 @@ class Lowering:
         text, terms = self.value(node.args[0])
         if name == "float":
             return f"float({text})", terms
-        text = self.kept(text)
+        text = self.bind(text)
         if name in ("abs", "fabs"):
-            return f"abs({text})", self._chosen(1, (text, terms), (f"-{text}", self.times(terms, "-1.0")))
-        value = self.kept(f"{ast.unparse(function)}({text})")
+            return f"abs({text})", self._select(1, (text, terms), (f"-{text}", self.times(terms, "-1.0")))
+        value = self.bind(f"{ast.unparse(function)}({text})")
         return value, self.times(terms, _SLOPES[name].format(x=text, v=value))
 
     def _extreme(self, node: ast.Call, sign: int) -> tuple[str, Terms]:
@@ -196,35 +196,35 @@ class Lowering:
         value, terms = self.value(node.args[0])
         for other in node.args[1:]:
             text, more = self.value(other)
-            value, text = self.kept(value), self.kept(text)
-            terms = self._chosen(sign, (value, terms), (text, more))
+            value, text = self.bind(value), self.bind(text)
+            terms = self._select(sign, (value, terms), (text, more))
             value = f"{function}({value}, {text})"
         return value, terms
 
     def _pair(self, node: ast.Call, name: str) -> tuple[str, Terms]:
         parts = [self.value(part) for part in node.args]
-        (a, first), (b, second) = ((self.kept(text), terms) for text, terms in parts)
-        value = self.kept(f"{ast.unparse(node.func)}({a}, {b})")
+        (a, first), (b, second) = ((self.bind(text), terms) for text, terms in parts)
+        value = self.bind(f"{ast.unparse(node.func)}({a}, {b})")
         if name == "hypot":
             return value, self._length(value, [(a, first), (b, second)])
-        square = self.kept(f"{a} * {a} + {b} * {b}")
+        square = self.bind(f"{a} * {a} + {b} * {b}")
         return value, self.sum(self.times(first, f"{b} / {square}"), self.times(second, f"-{a} / {square}"))
 
     def _root(self, node: ast.Call, nodes: list[ast.expr]) -> tuple[str, Terms]:
         parts = [self.value(part) for part in nodes]
-        parts = [(self.kept(text), terms) for text, terms in parts]
+        parts = [(self.bind(text), terms) for text, terms in parts]
         total = " + ".join(f"{text} * {text}" for text, _ in parts)
-        value = self.kept(f"{ast.unparse(node.func)}({total})")
+        value = self.bind(f"{ast.unparse(node.func)}({total})")
         return value, self._length(value, parts)
 
-    def _chosen(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
-        """Return the derivative of the larger (sign 1) or smaller (-1) of two; of equal ones the first grows."""
-        first = self.kept(f"1.0 if {a[0]} {'>=' if sign > 0 else '<'} {b[0]} else 0.0", "p")
+    def _select(self, sign: int, a: tuple[str, Terms], b: tuple[str, Terms]) -> Terms:
+        """Return the derivative of the larger (sign 1) or smaller (-1) of two; if equal, the first counts as larger."""
+        first = self.bind(f"1.0 if {a[0]} {'>=' if sign > 0 else '<'} {b[0]} else 0.0", "p")
         return self.sum(self.times(a[1], first), self.times(b[1], f"1.0 - {first}"))
 
     def _length(self, value: str, parts: list[tuple[str, Terms]]) -> Terms:
-        """Return the derivative of the length `value` of a vector; of zero length its first part grows."""
-        over = self.kept(f"1.0 / math.sqrt({value} * {value} + {_NO_LENGTH})", "p")
+        """Return the derivative of the length `value` of a vector; at zero that of its first component."""
+        over = self.bind(f"1.0 / math.sqrt({value} * {value} + {_NO_LENGTH})", "p")
         terms: Terms = []
         for number, (text, more) in enumerate(parts):
             slope = f"{text} * {over}"
@@ -233,7 +233,7 @@ class Lowering:
 
 
 def squares(node: ast.expr) -> list[ast.expr]:
-    """Return a, b, ... of `a * a + b * b + ...`, nothing for other expressions: a root of that is a length."""
+    """Return a, b, ... of `a * a + b * b + ...`, whose root is a length; empty for other expressions."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
         first, second = squares(node.left), squares(node.right)
         return first + second if first and second else []
@@ -243,12 +243,12 @@ def squares(node: ast.expr) -> list[ast.expr]:
 
 
 def inner(lines: list[str]) -> list[str]:
-    """Return lines one step further in."""
+    """Return lines with one more level of indentation."""
     return ["    " + line for line in lines]
 
 
-def undefined(branches: list[list[str]], others: set[str] | None = None) -> list[str]:
-    """Return lines that set to zero what only one of several branches sets: a compiler wants every name set."""
+def zero_undefined(branches: list[list[str]], others: set[str] | None = None) -> list[str]:
+    """Return lines that set the names of all branches to zero: compilers require every name to be set."""
     names = dict.fromkeys(sorted(others or ()))
     for line in (line for branch in branches for line in branch):
         found = re.match(r"\s*(_[a-z]\d+) = ", line)
@@ -258,7 +258,7 @@ def undefined(branches: list[list[str]], others: set[str] | None = None) -> list
 
 
 class Vectors(Lowering):
-    """Writes assignments of vectors."""
+    """Generator of assignments of vectors."""
 
     _whole: ast.expr | None
     _waiting: list[str]
@@ -267,7 +267,7 @@ class Vectors(Lowering):
 
     def _array(self, node: ast.stmt, target: ast.expr, value: ast.expr) -> None:
         act, said = self.activity, ast.unparse(node)
-        if (hoisted := self._hoisted(value)) is not value:
+        if (hoisted := self._hoist(value)) is not value:
             value, said = hoisted, f"{ast.unparse(target)} = {ast.unparse(hoisted)}"
         if isinstance(target, ast.Name) and not isinstance(node, ast.AugAssign):
             self._flush()
@@ -275,8 +275,8 @@ class Vectors(Lowering):
             if is_numpy(value, *MAKERS) and isinstance(value, ast.Call):
                 self.lines.append(f"{target.id}_rows = {made_rows(value)}")
             elif is_numpy(value, "sort") and isinstance(value, ast.Call):
-                self._sorted(target.id, value.args[0])
-            elif viewed(value) is not None or is_copy(value):
+                self._sort_rows(target.id, value.args[0])
+            elif viewed_name(value) is not None or is_copy(value):
                 copied = is_copy(value) and isinstance(value, ast.Call)
                 base = value.func.value if copied and isinstance(value.func, ast.Attribute) else value  # type: ignore[union-attr]
                 self.lines.append(f"{target.id}_rows = {self._rows(base)}{'.copy()' if copied else ''}")
@@ -288,24 +288,24 @@ class Vectors(Lowering):
         if act.rank(target) != 1:
             raise self.fail(node, "the derivative of whole matrices is not known.")
         self._flush()
-        rows, first, count = self._stretch(target)
-        first, count = self.kept(first, "i"), self.kept(count, "i")
+        rows, first, count = self._part_of_rows(target)
+        first, count = self.bind(first, "i"), self.bind(count, "i")
         if act.rank(value) == 0:  # a number for all entries
             text, terms = self.value(value)
-            text, one = self.kept(text), self.name("d")
+            text, one = self.bind(text), self.name("d")
             self._stored.add(one)
             self.lines += ["for _r in range(moved):", f"    «{one}» = {linear(terms)}"]
             self.lines += [*loops(count, f"{rows}[{first} + _i, _r] = «{one}»"), f"{ast.unparse(target)} = {text}"]
             return
         source = value.func.value if is_copy(value) else value  # type: ignore[union-attr]
-        base = viewed(source)
-        same = base is not None and act.root(base.id) == act.root(getattr(viewed(target), "id", ""))
+        base = viewed_name(source)
+        same = base is not None and act.root(base.id) == act.root(getattr(viewed_name(target), "id", ""))
         if same and isinstance(source, ast.Subscript | ast.Name):
-            other, start, _ = self._stretch(source)
+            other, start, _ = self._part_of_rows(source)
             if other != rows:
                 raise self.fail(node, "parts of one array are shifted under one name.")
             self.lines.append(f"tangent_shifted({rows}, {first}, {start}, {count}, moved)")
-        elif any(act.root(n.id) == act.root(getattr(viewed(target), "id", "")) for n in names(value)):
+        elif any(act.root(n.id) == act.root(getattr(viewed_name(target), "id", "")) for n in names(value)):
             aside = self.name("w")
             self.lines.append(f"{aside} = np.empty(({count}, moved))")
             self._fill(node, aside, "0", count, value)
@@ -314,11 +314,11 @@ class Vectors(Lowering):
             self._fill(node, rows, first, count, value)
         self.lines.append(said)
 
-    def _hoisted(self, node: ast.expr) -> ast.expr:
-        """Return an expression with names for the vectors that calls and products in it make, written before it."""
+    def _hoist(self, node: ast.expr) -> ast.expr:
+        """Write the calls and products that make vectors ahead of an expression; return it with their names."""
         act = self.activity
         if isinstance(node, ast.Call) and act.is_active(node) and act.rank(node) == 1:
-            name = act.program.called(node)
+            name = act.program.callee_name(node)
             if name is None and (not is_numpy(node, "dot") or act.is_active(node.args[0])):
                 return node
             self._flush()
@@ -329,27 +329,27 @@ class Vectors(Lowering):
             act.active.add(made)
             return ast.Name(made, ast.Load())
         if isinstance(node, ast.BinOp):
-            left, right = self._hoisted(node.left), self._hoisted(node.right)
+            left, right = self._hoist(node.left), self._hoist(node.right)
             return node if (left, right) == (node.left, node.right) else ast.BinOp(left, node.op, right)
         if isinstance(node, ast.UnaryOp):
-            operand = self._hoisted(node.operand)
+            operand = self._hoist(node.operand)
             return node if operand is node.operand else ast.UnaryOp(node.op, operand)
         if isinstance(node, ast.Subscript):
-            value = self._hoisted(node.value)
+            value = self._hoist(node.value)
             return node if value is node.value else ast.Subscript(value, node.slice, ast.Load())
         return node
 
     def _product(self, node: ast.Call) -> str:
-        """Write a matrix that nothing moves times a vector, and return its name."""
-        matrix, vector = node.args[0], self._named(self._hoisted(node.args[1]))
-        rows, first, _ = self._stretch(vector)
+        """Write the product of a constant matrix and a vector, and return its name."""
+        matrix, vector = node.args[0], self._bind_vector(self._hoist(node.args[1]))
+        rows, first, _ = self._part_of_rows(vector)
         made = self.name("v")
         self.lines.append(f"{made} = np.dot({ast.unparse(matrix)}, {ast.unparse(vector)})")
         self.lines.append(f"{made}_rows = tangent_product({ast.unparse(matrix)}, {rows}, {first}, moved)")
         return made
 
-    def _named(self, vector: ast.expr) -> ast.Name | ast.Subscript:
-        """Return a vector under a name of its own, or where it stands already."""
+    def _bind_vector(self, vector: ast.expr) -> ast.Name | ast.Subscript:
+        """Assign a vector to a new name and return that name; names and parts of arrays stay as they are."""
         if isinstance(vector, ast.Name | ast.Subscript):
             return vector
         aside = self.name("v")
@@ -358,7 +358,7 @@ class Vectors(Lowering):
         self._fill(ast.Expr(vector), f"{aside}_rows", "0", f"{aside}.shape[0]", vector)
         return ast.Name(aside, ast.Load())
 
-    def _sorted(self, name: str, value: ast.expr) -> None:
+    def _sort_rows(self, name: str, value: ast.expr) -> None:
         """Write the rows of a sorted vector: those of its entries, in their new order."""
         order = self.name("o")
         self.lines += [f"{order} = np.argsort({ast.unparse(value)})"]
@@ -366,20 +366,20 @@ class Vectors(Lowering):
         self.lines += loops(f"{name}.shape[0]", f"{name}_rows[_i, _r] = {self._rows(value)}[{order}[_i], _r]")
 
     def _fill(self, node: ast.stmt, rows: str, first: str, count: str, value: ast.expr) -> None:
-        """Write the loops that fill rows with what a vector is moved by."""
+        """Write the loops that fill rows with the tangents of a vector."""
         terms = self._vector(node, value)
         self.lines += loops(count, f"{rows}[{first} + _i, _r] = {linear(terms)}")
 
     def _vector(self, node: ast.stmt, value: ast.expr) -> Terms:
-        """Return the terms of entry `_i` of a vector."""
+        """Return the terms of the derivative of entry `_i` of a vector."""
         act = self.activity
         if not act.is_active(value):
             return []
         if is_copy(value):
             return self._vector(node, value.func.value)  # type: ignore[union-attr]
         if isinstance(value, ast.Name | ast.Subscript):
-            rows, start, _ = self._stretch(value)
-            return [("1.0", f"{rows}[{self.kept(start, 'i')} + _i, _r]")]
+            rows, start, _ = self._part_of_rows(value)
+            return [("1.0", f"{rows}[{self.bind(start, 'i')} + _i, _r]")]
         if isinstance(value, ast.UnaryOp) and isinstance(value.op, ast.USub):
             return self.times(self._vector(node, value.operand), "-1.0")
         if isinstance(value, ast.BinOp) and isinstance(value.op, ast.Add | ast.Sub):
@@ -391,7 +391,7 @@ class Vectors(Lowering):
             if act.is_active(right) and isinstance(value.op, ast.Mult):
                 left, right = right, left
             if act.rank(right) == 0 and not act.is_active(right):
-                factor = self.kept(ast.unparse(right))
+                factor = self.bind(ast.unparse(right))
                 return self.times(
                     self._vector(node, left), factor if isinstance(value.op, ast.Mult) else f"1.0 / {factor}"
                 )
@@ -401,15 +401,15 @@ class Vectors(Lowering):
         raise self.fail(node, "the derivative of this array is not known.")
 
     def _rows(self, node: ast.expr) -> str:
-        """Return the rows of an array or of a part of it."""
+        """Return the tangents of an array or of a part of it."""
         if isinstance(node, ast.Name):
             return f"{node.id}_rows"
         if isinstance(node, ast.Subscript):
             return f"{self._rows(node.value)}[{ast.unparse(node.slice)}]"
-        raise self.fail(node, "what this is moved by stands nowhere.")
+        raise self.fail(node, "this expression has no tangents.")
 
-    def _stretch(self, node: ast.expr) -> tuple[str, str, str]:
-        """Return the rows that a vector is a part of, where it begins there, and its length."""
+    def _part_of_rows(self, node: ast.expr) -> tuple[str, str, str]:
+        """Return the tangents of the array that contains a vector, the vector's start index, and its length."""
         if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Slice) and node.slice.step is None:
             low = ast.unparse(node.slice.lower) if node.slice.lower is not None else "0"
             high = f"{ast.unparse(node.value)}.shape[0]" if node.slice.upper is None else ast.unparse(node.slice.upper)
@@ -446,7 +446,7 @@ def names(node: ast.expr) -> list[ast.Name]:
 
 
 def made_rows(node: ast.Call) -> str:
-    """Return the rows of a new array."""
+    """Return the tangents of a new array."""
     name = node.func.attr if isinstance(node.func, ast.Attribute) else ""
     shape = node.args[0]
     sizes = list(map(ast.unparse, shape.elts)) if isinstance(shape, ast.Tuple) else [ast.unparse(shape)]

@@ -1,4 +1,4 @@
-"""Texts for so many motors and outputs: `MOTORS` and `OUTPUTS` become numbers, and what runs over them is written out.
+"""Unrolling for a number of motors and outputs: `MOTORS` and `OUTPUTS` become constants, and their loops are unrolled.
 
     pull = tuple(tension(x[j]) for j in range(MOTORS))     pull = (tension(x[0]), tension(x[1]), tension(x[2]))
     return (bend, *(speed[j] for j in range(MOTORS)))      return (bend, speed[0], speed[1], speed[2])
@@ -20,8 +20,8 @@ _NAMES = {"MOTORS": "motors", "OUTPUTS": "outputs"}
 _FOLDED = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul}
 
 
-def unrolled(node: ast.stmt, sizes: Mapping[str, int]) -> ast.stmt:
-    """Return a statement as it is for a robot of these sizes; one that names none comes back as it is."""
+def unroll(node: ast.stmt, sizes: Mapping[str, int]) -> ast.stmt:
+    """Return a statement unrolled for a robot of these sizes; a statement without size names stays as it is."""
     known = {name: sizes[size] for name, size in _NAMES.items() if size in sizes}
     if isinstance(node, ast.Assign) and any(isinstance(t, ast.Name) and t.id in known for t in node.targets):
         return node  # where the names are defined
@@ -33,11 +33,11 @@ class _Unroll(ast.NodeTransformer):
         self._known = known
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        """Return a known name's number."""
+        """Return the value of a size name."""
         return ast.Constant(self._known[node.id]) if node.id in self._known else node
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-        """Return the number that whole numbers come to, where one was a known name."""
+        """Evaluate an operation on whole numbers of which one was a size name."""
         if not _uses(node, self._known):
             return node
         self.generic_visit(node)
@@ -45,23 +45,25 @@ class _Unroll(ast.NodeTransformer):
         return node if left is None or right is None or fold is None else ast.Constant(fold(left, right))
 
     def visit_IfExp(self, node: ast.IfExp) -> ast.expr:
-        """Return the side that holds where a known name decides."""
-        holds = self._decided(node.test)
+        """Return the chosen side if the test depends on a size name alone."""
+        holds = self._evaluate_test(node.test)
         return self.generic_visit(node) if holds is None else self.visit(node.body if holds else node.orelse)  # pyright: ignore[reportReturnType]
 
     def visit_If(self, node: ast.If) -> Any:
-        """Return the statements of the side that holds where a known name decides."""
-        holds = self._decided(node.test)
+        """Return the statements of the chosen branch if the test depends on a size name alone."""
+        holds = self._evaluate_test(node.test)
         if holds is None:
             return self.generic_visit(node)
-        return [part for item in (node.body if holds else node.orelse) for part in _listed(self.visit(item))]
+        return [part for item in (node.body if holds else node.orelse) for part in _as_list(self.visit(item))]
 
     def visit_For(self, node: ast.For) -> Any:
-        """Return the statements of a loop over a known name, one after the other."""
+        """Return the unrolled statements of a loop over a size name."""
         count = self._count(node.iter)
         if count is None or not isinstance(node.target, ast.Name):
             return self.generic_visit(node)
-        return [part for i in range(count) for item in node.body for part in _listed(self._at(node.target.id, i, item))]
+        return [
+            part for i in range(count) for item in node.body for part in _as_list(self._at(node.target.id, i, item))
+        ]
 
     def visit_Call(self, node: ast.Call) -> ast.expr:
         """Return `tuple(... for j in range(MOTORS))` as a tuple."""
@@ -85,13 +87,13 @@ class _Unroll(ast.NodeTransformer):
         return _Unroll({**self._known, name: number}).visit(copy.deepcopy(node))
 
     def _count(self, node: Any) -> int | None:
-        """Return the rounds of `range(2 * MOTORS)` and the like; None where no known name tells them."""
+        """Return the number of iterations of `range(2 * MOTORS)` and the like; None without a size name."""
         if not isinstance(node, ast.Call) or len(node.args) != 1 or not _uses(node, self._known):
             return None
         return _whole(self.visit(copy.deepcopy(node.args[0])))
 
-    def _decided(self, test: ast.expr) -> bool | None:
-        """Return whether `OUTPUTS > 1` and the like hold; None where something else decides."""
+    def _evaluate_test(self, test: ast.expr) -> bool | None:
+        """Return whether `OUTPUTS > 1` and the like hold; None for other tests."""
         if not isinstance(test, ast.Compare) or not isinstance(test.ops[0], ast.Gt) or not _uses(test, self._known):
             return None
         left, right = (_whole(self.visit(copy.deepcopy(side))) for side in (test.left, test.comparators[0]))
@@ -106,5 +108,5 @@ def _whole(node: ast.expr) -> int | None:
     return node.value if isinstance(node, ast.Constant) and type(node.value) is int else None
 
 
-def _listed(found: Any) -> list[ast.stmt]:
+def _as_list(found: Any) -> list[ast.stmt]:
     return found if isinstance(found, list) else [found]

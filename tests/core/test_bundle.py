@@ -15,7 +15,7 @@ from softneck.core import KINDS, SettingsError, resolve
 from softneck.runtime import _bundle as bundle_module
 from softneck.runtime import bundle, load_runtime
 from softneck.runtime._bundle import content_name
-from softneck.runtime._compile import _linked, _runtime, compiled_name, load_linked
+from softneck.runtime._compile import _link_parts, _runtime, compiled_name, load_linked
 
 from ..data import slow_but
 
@@ -31,7 +31,7 @@ def runtime_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def _forget() -> None:
-    for cache in (bundle, bundle_module._source, bundle_module._tree, bundle_module._pieces, _runtime, _linked):
+    for cache in (bundle, bundle_module._source, bundle_module._tree, bundle_module._pieces, _runtime, _link_parts):
         cache.cache_clear()
 
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from softneck.core import KINDS, FileFormatError, SettingsError
 from softneck.runtime import load_runtime
-from softneck.runtime._bundle import declared
+from softneck.runtime._bundle import layout_of
 from softneck.runtime._layout import Arrays, StateVector, array, cells, evaluate, rest, value
-from softneck.runtime._names import lowered
+from softneck.runtime._names import lower
 
 RUNTIMES = sorted({kind.runtime for kind in KINDS.values() if kind.runtime} | {"softneck.plant._neck_runtime"})
 
@@ -45,7 +45,7 @@ def run(body: str, H: int = 3, n: int = 2, q: int = 2, x: np.ndarray | None = No
     function = ast.parse(f'def f(p: Matrices, x: Memory, i: int = 0):\n    """Words."""\n    {lines}').body[0]
     assert isinstance(function, ast.FunctionDef)
     names = {"Matrices": Matrices, "Memory": Memory}
-    text = ast.unparse(lowered(function, names.get, "here", {}))
+    text = ast.unparse(lower(function, names.get, "here", {}))
     assert "Words" not in text
     space: dict[str, Any] = {}
     exec(text, space)
@@ -90,8 +90,8 @@ def test_arrays_and_lengths_have_names() -> None:
     [
         ("return p.W7", "declares neither an array nor a length `W7`"),
         ("return x.speed", "Memory declares no `speed`"),
-        ("return x.y[0, :]", "no stretch of the state"),
-        ("return x.x[::2]", "no step"),
+        ("return x.y[0, :]", "no contiguous slice of the state"),
+        ("return x.x[::2]", "a slice of the state cannot have a step"),
         ("return x.tail[:3]", r"only `\[begin:\]`"),
     ],
 )
@@ -104,7 +104,7 @@ def test_a_part_whose_place_depends_on_arrays_needs_them() -> None:
     function = ast.parse("def f(x: Memory):\n    return x.x[0]").body[0]
     assert isinstance(function, ast.FunctionDef)
     with pytest.raises(SettingsError, match="needs the length `H` and has no arrays"):
-        lowered(function, {"Memory": Memory}.get, "here", {})
+        lower(function, {"Memory": Memory}.get, "here", {})
 
 
 def test_shapes_that_do_not_fit_each_other_are_named() -> None:
@@ -129,7 +129,7 @@ def test_a_length_is_whole_numbers_and_letters(text: str) -> None:
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
 def test_every_kind_says_what_each_array_and_part_is(runtime: str) -> None:
-    for layout in (declared(runtime, Arrays), declared(runtime, StateVector)):
+    for layout in (layout_of(runtime, Arrays), layout_of(runtime, StateVector)):
         assert layout.fields
         assert layout.__doc__
         named = [name for name, item in layout.fields.items() if item.meaning]

@@ -6,7 +6,7 @@ import ast
 
 import pytest
 
-from softneck.runtime._unrolled import unrolled
+from softneck.runtime._unrolled import unroll
 
 SIZES = {"motors": 2, "outputs": 1}
 
@@ -29,6 +29,6 @@ SIZES = {"motors": 2, "outputs": 1}
 def test_motors_become_a_number_and_loops_over_them_text(text: str, expected: str) -> None:
     (function,) = ast.parse("def f():\n" + "".join(f"    {line}\n" for line in text.splitlines())).body
     statement = ast.parse(text).body[0]
-    found = unrolled(statement if text.startswith(("P", "MOTORS")) else function, SIZES)
+    found = unroll(statement if text.startswith(("P", "MOTORS")) else function, SIZES)
     shown = ast.unparse(ast.fix_missing_locations(found))
     assert shown.removeprefix("def f():\n").replace("    ", "") == expected.replace("    ", "")

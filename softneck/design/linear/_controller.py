@@ -16,7 +16,7 @@ from softneck.core._shown import Shown
 from softneck.identification.models._linear_systems import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import Block, State
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 
 from ..plants._uncertain import held_line
 from ._linear_parts_runtime import LinearArrays
@@ -59,7 +59,7 @@ class LinearController(Shown):
         return Block(
             kind=self.kind,
             role="controller",
-            runtime=sized(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            runtime=sized_name(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=self.arrays,
             inputs=controller_inputs(self.robot),

@@ -34,7 +34,7 @@ from softneck.robot import Robot
 from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..linear._ports import LIMITS, MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs
@@ -369,7 +369,7 @@ class NmpcController(Shown):
     def _block(self) -> Block:
         # How far it can be trusted is no part of a prediction, and takes time in each of its steps.
         plant, robot = replace(self.model, arrays=without_validity(self.model.arrays)).block(), self.robot
-        outer = sized(_RUNTIME, len(robot.motors.names), len(robot.outputs.names))
+        outer = sized_name(_RUNTIME, len(robot.motors.names), len(robot.outputs.names))
         return Block(
             kind="nmpc",
             role="controller",

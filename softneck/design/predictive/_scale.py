@@ -17,7 +17,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 
 from ..linear._ports import MAX_MOTOR, MAX_REFERENCE, ControllerLimits, limits_of
 from ..plants._coupled import CoupledPlant
@@ -153,7 +153,7 @@ def _scaled(plant: Any, axis: int, gains: Vector) -> Any:
 def runtime_of(arrays: tuple[Matrix, ...]) -> str:
     """Return the runtime of a controller's arrays."""
     T = rt.MpcArrays(arrays).T
-    return sized("softneck.design.predictive._mpc_runtime", T.shape[1], T.shape[0] - 1)
+    return sized_name("softneck.design.predictive._mpc_runtime", T.shape[1], T.shape[0] - 1)
 
 
 def units_of(arrays: tuple[Matrix, ...]) -> tuple[float, Vector, Vector]:

@@ -20,7 +20,7 @@ from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
 from softneck.robot._search import find_robot
 from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 
 from ..linear._assembly import ReferenceFilter, assemble, pi_axis
 from ..linear._axis_loop import LOWEST, frequencies
@@ -299,7 +299,7 @@ class VaryingController(Shown):
         return Block(
             kind=self.kind,
             role="controller",
-            runtime=sized(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            runtime=sized_name(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
             inputs=controller_inputs(self.robot),

@@ -12,7 +12,7 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._neck_runtime import VirtualNeckArrays, VirtualNeckState
 from softneck.robot import Robot
 from softneck.runtime import load_functions
-from softneck.runtime._bundle import sized
+from softneck.runtime._bundle import sized_name
 
 from ._drives import Sample, SimulatedDrives, SimulatedSettings
 from ._servo_runtime import SERVO_GEARING
@@ -44,7 +44,7 @@ class SimulatedNeck(SimulatedDrives):
         # A drive with another gear than the neck's pulls with that one; what it has to accelerate stays the neck's.
         self.motion[:, SERVO_GEARING] = np.array(settings.gear) / parameters.gear_ratio
         self._functions: ModuleType = load_functions(
-            sized("softneck.drives.simulated._servo_runtime", motors, self._angles)
+            sized_name("softneck.drives.simulated._servo_runtime", motors, self._angles)
         )
         self._samples = 0
         self.newest = self._last = Sample(0.0, *self._shown(), valid=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from softneck.core import KINDS, FileFormatError, Matrix, SettingsError, Vector, resolve
 from softneck.runtime import load_runtime
-from softneck.runtime._bundle import declared, sized
+from softneck.runtime._bundle import layout_of, sized_name
 from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import AFFINE, STATE_SPACE
@@ -57,7 +57,7 @@ def with_validity(kind: str, arrays: Mapping[str, Matrix], ground: Matrix, doubt
 @cache
 def _names(module: str) -> tuple[str, ...]:
     """Return the names of a runtime's arrays; every step asks."""
-    return declared(module, Arrays).names()
+    return layout_of(module, Arrays).names()
 
 
 def prefixed_arrays(members: list[tuple[str, Mapping[str, Matrix]]]) -> dict[str, Matrix]:
@@ -103,11 +103,11 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
     history, module = arrays["history"], _module_of(kind, arrays)
     if kind not in COMPOSED:
-        return sized(module, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
+        return sized_name(module, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
     inner = ",".join(
         f"{runtime_of(member, part)}:{len(runtime_arrays(member, part))}" for member, part in members(arrays)
     )
-    outer = sized(module, int(history[2]), int(history[1])) if len(history) > 2 else module
+    outer = sized_name(module, int(history[2]), int(history[1])) if len(history) > 2 else module
     return f"{outer}({inner})"
 
 
@@ -130,8 +130,8 @@ def memory_of(arrays: Mapping[str, Matrix]) -> int:
 def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, y: Vector) -> None:
     """Write motors `m` (3,) and outputs `y` (2,) of now into a state, which a `step` has moved on."""
     runtime, arrays = runtime_of(kind, arrays).partition("(")[0], runtime_arrays(kind, arrays)
-    named = declared(runtime, Arrays)(list(arrays.values()))
-    parts = declared(runtime, StateVector).parts(named)
+    named = layout_of(runtime, Arrays)(list(arrays.values()))
+    parts = layout_of(runtime, StateVector).parts(named)
     if "motors" in parts:
         values[parts["motors"]], values[parts["angles"]] = m, y
     if "slow" in parts:
@@ -157,7 +157,7 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
     if kind in COMPOSED:
         _check_composed(kind, arrays)
         return
-    names = declared(runtime_of(kind, arrays), Arrays).names()
+    names = layout_of(runtime_of(kind, arrays), Arrays).names()
     if not _named(arrays, names):
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
     _check_numbers(kind, runtime_arrays(kind, arrays), runtime_of(kind, arrays))
@@ -169,7 +169,7 @@ def _named(arrays: Mapping[str, Matrix], names: tuple[str, ...]) -> bool:
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
-    names = declared(KINDS[kind].runtime, Arrays).names()
+    names = layout_of(KINDS[kind].runtime, Arrays).names()
     own, parts = own_arrays(arrays), members(arrays)
     if tuple(arrays)[: len(own)] != tuple(own) or not _named(own, names):
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
@@ -188,7 +188,7 @@ def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> Non
     for name, what in {"history": "its history in samples", "memory": "its memory in samples"}.items():
         if name in arrays:  # before its number is a length of others
             within(arrays[name], 1, _LONGEST_HISTORY, what)
-    sizes = declared(runtime, Arrays).lengths(arrays)
+    sizes = layout_of(runtime, Arrays).lengths(arrays)
     if "drive" in arrays:
         within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
     _check_validity(arrays, sizes)

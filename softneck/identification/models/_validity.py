@@ -15,7 +15,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, Vector, require_positive, to_si
 from softneck.robot import Robot
 from softneck.runtime import Block
-from softneck.runtime._bundle import declared
+from softneck.runtime._bundle import layout_of
 from softneck.runtime._layout import Arrays
 from softneck.signals import Recording
 
@@ -156,7 +156,7 @@ def farthest(block: Block, motors: Matrix) -> tuple[int, bool, float, float]:
         block: of a model that knows its validity.
         motors: positions (time, motors) up to the instant that is asked for.
     """
-    ground = block.arrays[declared(block.runtime.partition("(")[0], Arrays).place("ground")]
+    ground = block.arrays[layout_of(block.runtime.partition("(")[0], Arrays).place("ground")]
     n = motors.shape[1]
     z = np.concatenate([motors[-1], held(motors)[-1]])
     inverse = np.linalg.inv(ground[:, 1:])

@@ -27,7 +27,7 @@ from softneck.identification.uncertainty._guarded import (
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.runtime import bundle, load_runtime
-from softneck.runtime._bundle import prefixed
+from softneck.runtime._bundle import add_prefix
 from softneck.runtime._compile import Runtime, load_tangent
 from softneck.signals import Recording, concatenate, signal
 
@@ -294,7 +294,7 @@ def test_crafted_members_are_refused(models: dict[str, Model]) -> None:
 def test_names_of_a_member_get_a_prefix_and_nothing_else_changes() -> None:
     text = "SIZE = 2\nCOMPILED = 0\n\ndef size(SIZE):\n    return SIZE\n\ndef f(x):\n    return size(x) + SIZE"
     space: dict = {}
-    exec(prefixed(text, "m0_"), space)
+    exec(add_prefix(text, "m0_"), space)
     assert space["m0_f"](3) == 5
     assert space["COMPILED"] == 0
     assert "f" not in space

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 
-from softneck.runtime._bundle import ANY_SIZE, declared
+from softneck.runtime._bundle import ANY_SIZE, layout_of
 from softneck.runtime._layout import Arrays
 
 _NECKS = (
@@ -94,4 +94,4 @@ def is_known(module: str) -> bool:
 
 def ranks_of(module: str) -> tuple[int, ...]:
     """Return the rank of each array of a runtime, before those of its members."""
-    return declared(module, Arrays).ranks()
+    return layout_of(module, Arrays).ranks()
