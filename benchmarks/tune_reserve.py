@@ -50,7 +50,9 @@ def pairs(neck: str, count: int) -> Pairs:
         begin, rows = seconds(), []
         task = replace(task_of(known(neck), {"reserve": dict.fromkeys(METRICS.values(), 0.0)}, 0), digest=neck)
         ready = made_ready(task)
-        for number, space in enumerate(spaces(KINDS, rise=GOALS["rise"], cocontraction=task.cocontraction, neck=True)):
+        for number, space in enumerate(
+            spaces(KINDS, rise=GOALS["rise"], cocontraction=task.cocontraction, robot=task.robot)
+        ):
             rng = np.random.default_rng(number)
             for x in space.start + STEP * rng.standard_normal((count, space.start.size)):
                 try:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from softneck.core import atomic_write, file_hash, write_certificate
+from softneck.loop._result import shown_unit
 from softneck.plots import write_page
 from softneck.verification._plants import nominal_plants
 from softneck.verification._verify import sources_of
@@ -112,14 +113,13 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     taut = task.cocontraction is not None
     at = _LOOP_TAUT if taut else _LOOP_AT
     neck = task.asked.certificate.sim
-    first, unit = robot.outputs.names[0], robot.outputs.display_unit
-    stepped = f"{first}_{unit}" if robot.is_neck else first
+    first, unit = robot.outputs.names[0], shown_unit(robot)[0]
     table: dict[str, Any] = {
         "duration_s": at + float(neck["duration_s"]),
         "plant": {_plant_key(path): _relative(path, folder)},
         **({"observer": {"file": OBSERVER}} if found.observed else {}),
         "controller": {"file": BEST},
-        "reference": {"kind": "step", stepped: float(neck["size_deg"]), "at_s": at},
+        "reference": {"kind": "step", f"{first}_{unit}": float(neck["size_deg"]), "at_s": at},
     }  # fmt: skip
     if any(plant.payload and plant.name == name for plant in found.own):
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}

@@ -15,8 +15,9 @@ from softneck.design.linear._rise import least_rise
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import usual_rise
+from softneck.verification._scale import digits
 
-from ._requirements import TuneRequirements
+from ._requirements import TuneRequirements, circles
 
 # What has settled has risen before.
 _RISES = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
@@ -54,21 +55,19 @@ def quickest(plant: Any) -> float:
 
 
 def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
-    """Return the rise [s] that is asked of a neck by default: of the slowest axis; None where no step is reached."""
+    """Return the rise [s] that is asked by default: of the slowest axis; None where no step is reached."""
     uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
-    limits, size = (
-        LoopSettings().limits(uncertain.robot),
-        asked.certificate.si(float(asked.certificate.sim["size_deg"])),
-    )
-    found = []
+    limits, size = LoopSettings().limits(uncertain.robot), asked.certificate.si(asked.certificate.sim["size_deg"])
+    time, found = asked.certificate.scale.time, []
     for name in uncertain.names:
         axis = uncertain.axis(name)
         test = axis_test(axis.nominal, limits, uncertain.redefinition[1])
         latest = max((plant.delay + 1) * plant.sample_time for plant in (axis.nominal, *axis.samples))
         least = least_rise(axis.nominal, test, size)
-        found.append(usual_rise(least, latest) if math.isfinite(least) else math.inf)
+        found.append(usual_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
     # Who asks for an earlier settling asks for a rise before it.
-    return min(max(found), asked.wanted("sim.settling_s") or math.inf) if max(found) < math.inf else None
+    most = digits(time * max(found))
+    return min(most, asked.wanted("sim.settling_s") or math.inf) if most < math.inf else None
 
 
 def _refuse_order(asked: TuneRequirements) -> None:
@@ -85,16 +84,14 @@ def _refuse_order(asked: TuneRequirements) -> None:
 
 
 def _refuse_quiet(asked: TuneRequirements) -> None:
-    """Refuse a steady state that is quieter than the sensor: white noise is in what it tells, whatever is done.
-
-    Of another robot the defaults are stretched to it and the noise is not: only what somebody asked counts.
-    """
-    metric, noise = f"sim.{asked.certificate.name_of('steady_rms_deg')}", asked.track["noise_deg"]
+    """Refuse a steady state that is quieter than the sensor: white noise is in what it tells, whatever is done."""
+    name_of, noise = asked.certificate.scale.name_of, asked.track["noise_deg"]
+    metric = f"sim.{name_of('steady_rms_deg')}"
     limit = min((b.limit for b in asked.bounds if b.metric == metric and b.bound != "min" and b.asked), default=noise)
     if limit < noise:
         raise SettingsError(
-            f"`{metric}` <= {limit:g} cannot be: the noise of the sensor alone is {noise:g} (`[track] noise_deg`); "
-            "allow more, or state the noise of yours."
+            f"`{metric}` <= {limit:g} cannot be: the noise of the sensor alone is {noise:g} (`[track] "
+            f"{name_of('noise_deg')}`); allow more, or state the noise of yours."
         )
 
 
@@ -123,13 +120,15 @@ def _refuse_rise(
 
 def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
     """Refuse a circle beyond a bandwidth of 1/delay: slower ones a filter leads, but for overshoot."""
-    limit = asked.wanted("track.circle_rms_deg")
+    scale = asked.certificate.scale
+    metric = f"track.{scale.name_of('circle_rms_deg')}"
+    limit = asked.wanted(metric)
     dead, turn = (plant.delay + 1) * plant.sample_time, asked.track["circle_rad_s"]
     # Who stands still in the middle is as far behind as the circle is large.
-    if limit is None or not asked.certificate.robot.is_neck or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
+    if limit is None or not circles(scale.robot) or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
         return
     raise SettingsError(
-        f"`track.circle_rms_deg` <= {limit:g} cannot be: a circle at {turn:g} rad/s is beyond the bandwidth that the "
+        f"`{metric}` <= {limit:g} cannot be: a circle at {turn:g} rad/s is beyond the bandwidth that the "
         f"dead time of {name}, {1e3 * dead:.0f} ms, allows, {1.0 / dead:.3g} rad/s; ask for a slower one, or for "
         "`track.ahead_rms_deg`, of a reference that is known ahead."
     )
@@ -142,12 +141,13 @@ def _refuse_turn(
 
     No input within them has more of it than the square wave of the range, or the triangle of the slew.
     """
-    if not asked.certificate.robot.is_neck:
+    scale = asked.certificate.scale
+    if not circles(scale.robot):
         return
     size, turn = asked.track["circle_deg"], asked.track["circle_rad_s"]
     share = float(np.abs(uncertain.redefinition[1][:, uncertain.names.index(name)]).max())
     most = 4.0 / math.pi * min(limits.position_limit, limits.slew_limit / turn) / share
-    reached = math.degrees(most * float(np.abs(plant.response(np.array([turn])))[0]))
+    reached = float(scale.shown(most * np.abs(plant.response(np.array([turn])))[0]))
     # Of one output alone; a sine has its amplitude over the root of two.
     least = (size - reached) / math.sqrt(2.0)
     for metric in ("track.circle_rms_deg", "track.ahead_rms_deg"):
@@ -172,12 +172,12 @@ def _refuse_sensitivity(asked: TuneRequirements, name: str) -> None:
 def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
     """Refuse a load rejected sooner than the dead time lets anybody act on it."""
     certificate = asked.certificate
-    metric = f"step.{certificate.name_of('load_rms_deg')}"
+    metric = f"step.{certificate.scale.name_of('load_rms_deg')}"
     limit = asked.wanted(metric)
     if limit is None:
         return
     rows = round(float(certificate.step["duration_s"]) / plant.sample_time)
-    load = certificate.motor_si(float(certificate.step["load_rad"]))
+    load = certificate.step_test(0).load
     # Felt a dead time late, and answered one more later: until then it acts alone.
     alone = np.zeros(rows)
     felt = load * _step_response(plant, plant.delay + 2)

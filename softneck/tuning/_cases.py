@@ -9,14 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Vector, to_si
-from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, SensorFault, StepReference, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, SensorFault, run_loop
 from softneck.loop._references import Reference
 from softneck.loop._robot_references import RobotReference
 from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at
 
-from ._requirements import Task, TuneRequirements
+from ._requirements import Task, TuneRequirements, circles
 
 # The circle is led in over so long [s], then goes round so often, of which the last turn is judged.
 _LED, _TURNS = 2.0, 2.0
@@ -59,7 +59,7 @@ def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tup
             found += [Case(number, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)]
             found += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
             found.append(Case(number, kg, angles[0], noise=True, late=True))
-            if robot.is_neck:
+            if circles(robot):
                 found.append(Case(number, kg, circle=True))
     return tuple(dict.fromkeys(found))
 
@@ -67,7 +67,7 @@ def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tup
 def run_case(
     case: Case, plant: OwnPlant, block: Block, order: str, task: Task, observer: Block | None = None
 ) -> tuple[dict[str, float], Vector | None]:
-    """Return the metrics of a loop by the names of requirements; of a circle its distance for each lead [deg]."""
+    """Return the metrics of a loop by the names of requirements; of a circle its distance for each lead, as shown."""
     loop = loop_of(case, plant, block, order, task, observer)
     if case.circle:
         return {}, _distances(loop, task)
@@ -75,9 +75,10 @@ def run_case(
     values, result = judge_loop(loop, compiled=True, angle="measured")
     asked = task.asked.certificate
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
-    found = {f"sim.{asked.name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
+    name_of = asked.scale.name_of
+    found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
     if case.noise and case.part < 1.0:
-        found["track.variation_rad_s"] = math.inf if result is None else variation(result)
+        found[f"track.{name_of('variation_rad_s')}"] = math.inf if result is None else variation(result)
     if case.part < 1.0:
         # A small step of a neck with friction is judged by where it goes, not by percent of little.
         found = {name: value for name, value in found.items() if not name.endswith(("overshoot_pct", "settling_s"))}
@@ -87,12 +88,12 @@ def run_case(
 def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, observer: Block | None = None) -> Loop:
     """Return the loop of a case."""
     asked, track, robot = task.asked.certificate, task.asked.track, task.robot
-    at = step_at(block)
+    time, at = asked.scale.time, step_at(block, asked)
     common = task.cocontraction or 0.0
     pulls = any(port.name == "least_cocontraction" for port in block.parameters)
     together = 0.0 if pulls else common
     if together:
-        at = max(at, 3.0)
+        at = max(at, 3.0 * time)
     size = case.part * asked.si(float(asked.sim["size_deg"]))
     ends = tuple(size * share for share in direction(case.orientation, robot))
     duration = at + float(asked.sim["duration_s"])
@@ -102,16 +103,12 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, o
     Ts = block.sample_time
     if case.late and round(track["delay_ms"] / 1e3 / Ts):
         faults.append(SensorFault(kind="delay", delay=Ts * round(track["delay_ms"] / 1e3 / Ts)))
+    reference = RobotReference(kind="step", values=ends, at=at)
     if case.circle:
         frequency = track["circle_rad_s"] / (2.0 * math.pi)
-        reference = RotationReference(
-            inclination=math.radians(track["circle_deg"]), frequency=frequency, at=at, rise=_LED
-        )
-        duration = at + _LED + _TURNS / frequency
-    elif robot.is_neck:
-        reference = StepReference(pitch=ends[0], roll=ends[1], at=at)
-    else:
-        reference = RobotReference(kind="step", values=ends, at=at)
+        led, inclination = _LED * time, (asked.si(track["circle_deg"]),) * 2
+        reference = RobotReference(kind="rotation", values=inclination, frequency=frequency, at=at, rise=led)
+        duration = at + led + _TURNS / frequency
     return Loop(
         plant=plant.quiet(Ts), controller=BlockPart(block), observer=None if observer is None else BlockPart(observer),
         reference=_Together(reference, together),
@@ -148,8 +145,9 @@ def variation(result: LoopResult) -> float:
 
 
 def _distances(loop: Loop, task: Task) -> Vector:
-    """Return the rms distance [deg] of the last turn to where the circle was 0, 1, ... samples ago (leads,)."""
-    leads = round(_AHEAD / loop.controller.sample_time)
+    """Return the rms distance of the last turn to where the circle was 0, 1, ... samples ago (leads,), as shown."""
+    scale = task.asked.certificate.scale
+    leads = round(scale.time * _AHEAD / loop.controller.sample_time)
     try:
         result = run_loop(loop, compiled=True)
     except DataError:
@@ -160,4 +158,4 @@ def _distances(loop: Loop, task: Task) -> Vector:
     r = np.stack([result[f"{name}_reference"] for name in names])
     rows = r.shape[1]
     each = [y - r[:, rows - turn - lead : rows - lead] for lead in range(leads + 1)]
-    return np.degrees([math.sqrt(float((part**2).sum(axis=0).mean())) for part in each])
+    return scale.shown(np.array([math.sqrt(float((part**2).sum(axis=0).mean())) for part in each]))

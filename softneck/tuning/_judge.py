@@ -22,7 +22,7 @@ from softneck.verification._linear import LARGE, SMALL, ControllerUnderTest, jud
 from softneck.verification._linear import judge as under_test
 from softneck.verification._neck_loops import OwnPlant, loops_under_test, own_plant
 from softneck.verification._plants import Plants, all_plants
-from softneck.verification._steps import StepTest, run_steps
+from softneck.verification._steps import run_steps
 from softneck.verification._tested import tested_axes
 from softneck.verification._verify import sources_of
 
@@ -44,7 +44,7 @@ class Ready:
     Attributes:
         plants: linear ones, without the delay that a loop's order adds.
         frequency: on which they are judged [rad/s].
-        weights: of the motors in each axis's input; None for a neck.
+        weights: of the motors in each axis's input.
         uncertain: what linear designs make of the task's plant, made once.
         own: simulation models.
         all: the loops.
@@ -98,7 +98,7 @@ def made_ready(task: Task) -> Ready:
         plants = all_plants(sources, _PLANTS, int(certificate.sampling["seed"]))
         own = tuple(own_plant(thing, name, task.robot) for name, thing in task.own.items())
         kept["ready"] = Ready(
-            plants, judged(plants.sample_time), sources[0].weights,
+            plants, judged(plants.sample_time, certificate.scale.time), sources[0].weights,
             uncertain_plant(task.plant), own,
             cases(own, task.asked, task.robot),
         )  # fmt: skip
@@ -163,12 +163,10 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
                 for group in (item.axis, "axes", *(("mimo",) if last == "disk_margin" else ())):
                     worse(found, f"{group}.{last}", float(value))
             worse(found, "robust.mu", item.mu)
-    test = StepTest(
-        step=asked.si(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
-        noise=asked.si(asked.step["noise_deg"]), load=asked.motor_si(float(asked.step["load_rad"])), seed=task.seed,
-    )  # fmt: skip
-    steps = run_steps(plants, judged_one.block, test, workers=1, robot=task.robot, weights=ready.weights)
-    return found | {f"step.{asked.name_of(name)}": float(values.max()) for name, values in steps.metrics.items()}
+    steps = run_steps(
+        plants, judged_one.block, asked.step_test(task.seed), workers=1, robot=task.robot, weights=ready.weights
+    )
+    return found | {f"step.{asked.scale.name_of(name)}": float(values.max()) for name, values in steps.metrics.items()}
 
 
 def worse(found: dict[str, float], name: str, value: float) -> None:
@@ -194,8 +192,9 @@ def loop_metrics(
         most = np.max(shifts, axis=0)
         best = int(np.argmin(most))
         Ts = block.sample_time
-        found |= {"track.ahead_rms_deg": float(most[best]), "track.ahead_s": best * Ts,
-                  "track.circle_rms_deg": float(most[0])}  # fmt: skip
+        name_of = task.asked.certificate.scale.name_of
+        found |= {f"track.{name_of('ahead_rms_deg')}": float(most[best]), "track.ahead_s": best * Ts,
+                  f"track.{name_of('circle_rms_deg')}": float(most[0])}  # fmt: skip
     return found
 
 
@@ -203,6 +202,6 @@ def margin_metrics(
     task: Task, ready: Ready, block: Block, order: str, observer: Block | None = None
 ) -> dict[str, float]:
     """Return the margins by experiment on the simulation models."""
-    loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer, robot=task.robot)
+    loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer)
     found = crossing_values(crossings(loops, overall=True)) if loops else {}
     return {name: float(values.min()) for name, (values, _) in found.items() if name.startswith("axes.")}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +16,8 @@ from softneck.identification import Model
 from softneck.loop import default_limits
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
-from softneck.verification._requirements import TRACK_METRICS, VERSION, Requirement, kept_back, with_groups
+from softneck.verification._requirements import VERSION, Requirement, check_number, kept_back, metric_names, with_groups
+from softneck.verification._scale import Scale, digits
 
 _RISE = "sim.rise_s"
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
@@ -49,7 +51,7 @@ class TuneRequirements:
     def wanted(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric of the robot itself: its limit with the reserve."""
         limit = self.limit(metric)
-        return None if limit is None else round(limit + self.reserve.get(metric, 0.0), 9)
+        return None if limit is None else digits(limit + self.reserve.get(metric, 0.0))
 
     def limit(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric on the plants; None where nothing bounds it."""
@@ -68,22 +70,25 @@ class TuneRequirements:
 
 
 def read_tune_requirements(
-    path: str | Path | None = None, *, robot: Robot | None = None, stepping: bool = True, rise: float | None = None
-) -> TuneRequirements:
+    path: str | Path | None = None, *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
+    rise: float | None = None,
+) -> TuneRequirements:  # fmt: skip
     """Return the defaults, with what the file at `path` says instead.
 
     Args:
         path: a requirements file, also one for `verify`.
         robot: whose controller is asked for; None: a neck's.
+        scale: by which the defaults are the robot's; None: by what the robot alone tells.
         stepping: whether there are simulation models; else `sim.*` of the defaults is asked of the linear plants.
-        rise: the default of a neck's [s]; None: that of the paper's neck.
+        rise: the default [s]; None: that of the paper's neck, by the robot's time constant.
 
     Raises:
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
+    given: Any = {"robot": robot, "scale": scale, "stepping": stepping, "rise": rise}
     if path is None:
-        return make_tune_requirements({}, robot=robot, stepping=stepping, rise=rise)
+        return make_tune_requirements({}, **given)
     if not isinstance(path, str | Path):
         raise SettingsError(f"requirements are a file or a table; got a {type(path).__name__}.")
     try:
@@ -97,35 +102,44 @@ def read_tune_requirements(
     if table.get("version") != VERSION:
         raise FileFormatError(f"{path}: must say `version = {VERSION}`; it says {table.get('version')}.")
     try:
-        return make_tune_requirements(table, robot=robot, stepping=stepping, rise=rise)
+        return make_tune_requirements(table, **given)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from error
 
 
 def make_tune_requirements(
-    table: Mapping[str, Any], *, robot: Robot | None = None, stepping: bool = True, rise: float | None = None
-) -> TuneRequirements:
+    table: Mapping[str, Any], *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
+    rise: float | None = None,
+) -> TuneRequirements:  # fmt: skip
     """Return the defaults with what a table like a requirements file says instead."""
-    whose = Robot.preset() if robot is None else robot
-    table = with_groups(table, whose, stepping=stepping, more=TRACK_METRICS)
+    scale = scale or Scale.of(robot or Robot.preset())
+    whose = scale.robot
+    table = with_groups(table, whose, stepping=stepping, track=True)
     defaults = tomllib.loads(default_text())
+    limits = defaults["require"]
+    if not circles(whose):
+        limits = {metric: limit for metric, limit in limits.items() if not metric.startswith("track.")}
+    usual = {
+        name: scale.table(limits if name == "require" else defaults[name]) for name in defaults if name != "version"
+    }
     if rise is not None:
-        defaults["require"][_RISE] = {"max": rise}
-    # The defaults of tuning are a neck's; those of `verify` know how other robots differ.
-    usual = _for_linear(defaults) if not stepping else defaults
-    if not whose.is_neck:
-        usual = {"track": defaults["track"]}
+        usual["require"][_RISE] = {"max": rise}
+    if not stepping:
+        usual = _for_linear(usual)
     merged = {
         key: {**usual.get(key, {}), **table.get(key, {})} if isinstance(usual.get(key, {}), Mapping)
         and isinstance(table.get(key, {}), Mapping) else table[key]
         for key in dict.fromkeys((*usual, *table)) if key != "version"
     }  # fmt: skip
-    track = _numbers(merged.get("track", {}), defaults["track"])
+    track = _numbers(merged.get("track", {}), defaults["track"], scale)
     require, reserve = kept_back(merged.get("require", {}), merged.get("reserve", {}))
     extra = tuple(
-        bound for metric, entry in require.items() if metric.startswith("track.") for bound in _bounds(metric, entry)
+        bound
+        for metric, entry in require.items()
+        if metric.startswith("track.")
+        for bound in _bounds(metric, entry, whose)
     )
-    certificate = make_requirements(merged, robot=whose)
+    certificate = make_requirements(merged, scale=scale)
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
         table={"version": VERSION, **merged},
@@ -140,21 +154,14 @@ def default_text() -> str:
     return DEFAULT_FILE.read_text(encoding="utf-8") + default_limits.as_toml(limits)
 
 
-def with_certificate(asked: TuneRequirements, certificate: Requirements) -> TuneRequirements:
-    """Return them with those of `verify` scaled to another robot; noise and delay of [track] scale as well."""
-    own = tuple(item for item in asked.bounds if item.metric.startswith("track."))
-    usual = {"noise_deg": certificate.step["noise_deg"], "delay_ms": certificate.scale[0] * asked.track["delay_ms"]}
-    free = {key: value for key, value in usual.items() if f"track.{key}" not in asked.stated}
-    track = {**asked.track, **free}
-    return replace(
-        asked, certificate=certificate, bounds=(*certificate.bounds, *own), track=track,
-        table={**asked.table, "track": track},
-    )  # fmt: skip
+def circles(robot: Robot) -> bool:
+    """Return whether a robot can follow a circle: of two angles."""
+    return len(robot.outputs.names) == 2 and to_si(robot.outputs.unit)[1] == "rad"
 
 
 def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:
     """Return them with other largest values of some metrics on the plants; what is kept back of them stays."""
-    require = {metric: {"max": round(limit + asked.reserve.get(metric, 0.0), 9)} for metric, limit in limits.items()}
+    require = {metric: {"max": digits(limit + asked.reserve.get(metric, 0.0))} for metric, limit in limits.items()}
     table = {**asked.table, "require": {**asked.table.get("require", {}), **require}}
     if "sim.settling_s" in limits:  # a file states seconds of the robot: so must the duration it is compared with
         table["sim"] = {"duration_s": asked.certificate.sim["duration_s"], **table.get("sim", {})}
@@ -167,29 +174,31 @@ def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequir
     return replace(asked, certificate=certificate, bounds=bounds, table=table)
 
 
-def _for_linear(defaults: Mapping[str, Any]) -> dict[str, Any]:
-    require = {f"step.{name.partition('.')[2]}": limit for name, limit in defaults["require"].items()
-               if name.startswith("sim.")}  # fmt: skip
-    tracked = {name: limit for name, limit in defaults["require"].items() if name.startswith("track.")}
+def _for_linear(usual: dict[str, Any]) -> dict[str, Any]:
+    """Return the defaults without simulation models: what they ask of these is asked of the linear plants."""
+    require = {re.sub(r"^sim\.", "step.", name): limit for name, limit in usual["require"].items()}
     # Presets are foreign plants, which decide nothing and take half a minute.
-    return {**defaults, "reserve": {}, "sim": {**defaults["sim"], "necks": 0}, "require": {**require, **tracked}}
+    return {**usual, "reserve": {}, "sim": {**usual["sim"], "necks": 0}, "require": require}
 
 
-def _numbers(given: Any, defaults: Mapping[str, float]) -> dict[str, float]:
+def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[str, float]:
+    """Return the table [track] by the neck's names of its keys, which files up to 0.2 have of every robot."""
     if not isinstance(given, Mapping):
         raise SettingsError("`track` must be a table: [track].")
+    inside = {key: key for key in defaults} | {scale.name_of(key): key for key in defaults}
+    found = dict(zip(defaults, scale.table(defaults).values(), strict=True))
     for key, value in given.items():
-        if key not in _TRACK:
-            raise SettingsError(f"unknown key `{key}` of [track]; it takes {', '.join(_TRACK)}.")
-        low, high, unit = _TRACK[key]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise SettingsError(f"`[track] {key}` must be from {low:g} to {high:g} {unit}; got {value!r}.".strip())
-    return {**defaults, **{key: float(value) for key, value in given.items()}}
+        if key not in inside:
+            raise SettingsError(f"unknown key `{key}` of [track]; it takes {', '.join(map(scale.name_of, defaults))}.")
+        check_number(f"[track] {key}", value, inside[key], _TRACK[inside[key]], scale)
+        found[inside[key]] = float(value)
+    return found
 
 
-def _bounds(metric: str, entry: Any) -> list[Requirement]:
-    if metric not in TRACK_METRICS:
-        raise SettingsError(f"unknown metric `{metric}`; of [track] there are {', '.join(TRACK_METRICS)}.")
+def _bounds(metric: str, entry: Any, robot: Robot) -> list[Requirement]:
+    known = [name for name in metric_names(robot, track=True) if name.startswith("track.")]
+    if metric not in known:
+        raise SettingsError(f"unknown metric `{metric}`; of [track] there are {', '.join(known)}.")
     if entry is False:
         return []
     if not isinstance(entry, Mapping) or list(entry) != ["max"]:
@@ -215,7 +224,7 @@ class Task:
         own: by name, simulation models.
         asked: the requirements.
         robot: whose controller is tuned.
-        cocontraction: at which the loops are held [rad, else SI]; None: by the controller's own rule.
+        cocontraction: at which the loops are held [SI unit of the motors]; None: by the controller's own rule.
         seed: of the noise.
         observer: of the loops of kinds that have one (`mpc`, `nmpc`); None: these have none either.
     """

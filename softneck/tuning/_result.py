@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,11 @@ import numpy as np
 from softneck.core import SoftneckError, Vector
 from softneck.cosim.studies._store import pareto_rows
 from softneck.loop import run_loop
-from softneck.loop._result import shown_unit
 from softneck.verification._linear import LARGE
 from softneck.verification._neck_loops import judge_loop
 from softneck.verification._requirements import Requirement
-from softneck.verification._steps import StepTest, run_steps
+from softneck.verification._scale import digits
+from softneck.verification._steps import run_steps
 from softneck.verification._verify import Verdict
 
 from ._cases import Case, loop_of
@@ -27,7 +27,7 @@ from ._search import Candidate, ratio
 # What is traded, the first of each that was found; of the least ones the reciprocal counts.
 _OBJECTIVES = (
     ("sim.rise_s", "step.rise_s"), ("sim.overshoot_pct", "step.overshoot_pct"), ("step.load_rms_",),
-    ("sim.steady_rms_", "step.steady_rms_"), ("track.circle_rms_deg",), ("track.variation_rad_s",),
+    ("sim.steady_rms_", "step.steady_rms_"), ("track.circle_rms_",), ("track.variation_",),
     ("axes.sensitivity",), ("axes.gain_margin",),
 )  # fmt: skip
 # Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
@@ -137,7 +137,7 @@ def _above(value: float) -> float:
     if not 0.0 < value < math.inf:
         return math.inf
     step = 10.0 ** (math.floor(math.log10(_ROOM * value)) - 1)
-    return round(math.ceil(_ROOM * value / step - 1e-9) * step, 9)
+    return digits(math.ceil(_ROOM * value / step - 1e-9) * step)
 
 
 def _small(name: str, value: float) -> float:
@@ -152,20 +152,18 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
     ready = made_ready(task)
     controller = designed(task, ready, item.kind, item.settings)
     block, order = controller.block(), str(getattr(controller, "order", "sequential"))
-    name, factor = task.robot.outputs.names[0], shown_unit(task.robot)[1]
-    per = math.radians(1.0) if factor is None else factor
-    asked = task.asked.certificate
+    name, asked = task.robot.outputs.names[0], task.asked.certificate
+    shown = asked.scale.shown
     if not ready.own:
-        step = asked.si(asked.step["size_deg"])
-        test = StepTest(step=step, duration=float(asked.step["duration_s"]), noise=0.0, load=0.0, seed=task.seed)
+        test = replace(asked.step_test(task.seed), noise=0.0, load=0.0)
         found = run_steps(ready.plants.take(0), block, test, workers=1, robot=task.robot, weights=ready.weights)
         half = found.time.size // 2
-        return found.time[:half], found.angles[0, 0, :half] / per, np.full(half, step / per)
+        return found.time[:half], shown(found.angles[0, 0, :half]), np.full(half, shown(test.step))
     case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.sim["payloads_kg"]))))
     result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, watched(task, item.kind)), compiled=True)
     reference = result[f"{name}_reference"]
     first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))
-    return result.time[first:] - result.time[first], result.angle(name)[first:] / per, reference[first:] / per
+    return result.time[first:] - result.time[first], shown(result.angle(name)[first:]), shown(reference[first:])
 
 
 def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:
@@ -181,7 +179,7 @@ def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirem
             worst |= _worst(worst, judge_loop(loop)[0])
     except SoftneckError:
         return False
-    named = {f"sim.{task.asked.certificate.name_of(name)}": value for name, value in worst.items()}
+    named = {f"sim.{task.asked.certificate.scale.name_of(name)}": value for name, value in worst.items()}
     return bool(named) and all(ratio(b, named[b.metric]) <= 1.0 for b in bounds if b.metric in named)
 
 

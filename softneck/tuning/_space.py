@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, SettingsError, Vector, resolve
+from softneck.core import KINDS, SettingsError, Vector, resolve, to_si
 from softneck.core._kinds import kinds_of
 from softneck.design.linear._axis_settings import AxisSettings
+from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 
 #: Kinds that are searched where nobody names any; `nmpc` needs a nonlinear model of its own and minutes.
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "lqg", "adaptive", "mpc")
@@ -72,7 +74,7 @@ _LEAD = 0.6
 # The second number of `reference_time`.
 _LEADING = Dimension("lead", 0.2, 2.5, 1.0)
 # These plan with it.
-_PLANNED = {kind: Dimension("lead_limit", 0.4, 2.0, 0.8) for kind in ("mpc", "nmpc")}
+_PLANNED = ("mpc", "nmpc")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +117,7 @@ def spaces(
     *,
     rise: float,
     cocontraction: float | None,
-    neck: bool,
+    robot: Robot,
     least: float = 0.0,
 ) -> list[Space]:
     """Return the space of every kind.
@@ -124,13 +126,15 @@ def spaces(
         kinds: of controllers.
         rise: the longest that is allowed [s].
         cocontraction: at which the robot was recorded, in the unit of its motors; None: no rule is set.
-        neck: whether it is a neck: of another robot limits are those of its file.
+        robot: whose they are; only tendons on winches may lead their motors too far.
         least: the rise that the motors can give at best [s].
 
     Raises:
         SettingsError: an unknown kind, or one with nothing to search.
     """
     found, least = [], min(least, rise)
+    lead = Scaling.of(robot).motor_unit / to_si(robot.motors.unit)[0] if robot.tendon_angles is not None else None
+    planned = () if lead is None else (Dimension("lead_limit", 0.4 * lead, 2.0 * lead, 0.8 * lead),)
     for kind in kinds:
         if kind not in _OWN:
             raise SettingsError(
@@ -146,11 +150,11 @@ def spaces(
         if issubclass(settings, AxisSettings):
             # A step is led into the motors' limits at once, and a circle is followed the closer.
             speed = (Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), _LEADING)
-        wanted = (*speed, *_OWN[kind], *((_PLANNED[kind],) if neck and kind in _PLANNED else ()))
-        fixed: dict[str, Any] = {"lead_limit": _LEAD} if neck and kind not in _PLANNED else {}
+        wanted = (*speed, *_OWN[kind], *(planned if kind in _PLANNED else ()))
+        fixed: dict[str, Any] = {"lead_limit": _LEAD * lead} if lead is not None and kind not in _PLANNED else {}
         if cocontraction is not None and "least_cocontraction" in names:
             fixed["least_cocontraction"] = cocontraction
-        if cocontraction is not None and neck and kind == "nmpc":
+        if cocontraction is not None and planned and kind == "nmpc":
             # Its plan begins where the recordings were: elsewhere the tendons hang, and it is refused.
             fixed["minimum_tautness"] = cocontraction
         found.append(Space(kind, tuple(item for item in wanted if item.name in names), fixed))

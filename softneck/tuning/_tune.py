@@ -13,14 +13,16 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.core._progress import shown_progress
 from softneck.cosim.studies._executors import crew
 from softneck.estimation import KalmanSettings
-from softneck.estimation._axis import robot_of
+from softneck.estimation._axis import directions_of, robot_of
 from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
 from softneck.robot._opened import opened
+from softneck.robot._scaling import Scaling
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
 from softneck.verification._neck_loops import OwnPlant, is_own_plant, named_plants
-from softneck.verification._verify import scaled, sources_of, standing_for
+from softneck.verification._scale import Scale
+from softneck.verification._verify import sources_of, standing_for
 
 from ._beforehand import default_rise, quickest, refuse_impossible
 from ._judge import LEVELS, designed, made_ready, watched
@@ -31,7 +33,6 @@ from ._requirements import (
     loosened,
     make_tune_requirements,
     read_tune_requirements,
-    with_certificate,
 )
 from ._result import Loosened, binding, front, kept_with, nearest, objectives
 from ._search import Candidate, Search
@@ -47,7 +48,7 @@ _VERIFIED = 2
 _UNCERTIFIED = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
 # The rise that is aimed at where nothing limits it, in time constants of the nominal plant.
 _USUAL_RISE = 2.0
-# Motors that are held closer to zero than this [rad] have no rule for their co-contraction.
+# Motors that are held closer to zero than this, of a neck [rad], have no rule for their co-contraction.
 _TAUT = 0.05
 
 
@@ -155,7 +156,7 @@ def tune(
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)
     each = spaces(
-        chosen, rise=_aimed(task), cocontraction=task.said_cocontraction, neck=task.robot.is_neck,
+        chosen, rise=_aimed(task), cocontraction=task.said_cocontraction, robot=task.robot,
         least=quickest(task.plant),
     )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)
@@ -191,10 +192,8 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
             "alone."
         )
     asked = _asked(requirements, robot, list(linear.values()), stepping=bool(own))
-    if not robot.is_neck:
-        asked = with_certificate(asked, scaled(asked.certificate, sources_of(linear, asked.certificate)))
     return Task(
-        digest="", linear=linear, own=own, asked=asked, robot=robot, cocontraction=_held(linear), seed=seed
+        digest="", linear=linear, own=own, asked=asked, robot=robot, cocontraction=_held(linear, robot), seed=seed
     )  # fmt: skip
 
 
@@ -211,23 +210,24 @@ def _asked(
     """Return what is asked, the default rise as the robot's slew, range and dead time have it."""
     if isinstance(requirements, TuneRequirements):
         return requirements
+    scale = Scale.of(robot, sources_of({str(k): thing for k, thing in enumerate(linear)}))
     if isinstance(requirements, Mapping):
-        read = partial(make_tune_requirements, requirements, robot=robot, stepping=stepping)
+        read = partial(make_tune_requirements, requirements, scale=scale, stepping=stepping)
     else:
-        read = partial(read_tune_requirements, requirements, robot=robot, stepping=stepping)
-    return read(rise=default_rise(linear, read())) if robot.is_neck else read()
+        read = partial(read_tune_requirements, requirements, scale=scale, stepping=stepping)
+    return read(rise=default_rise(linear, read()))
 
 
-def _held(linear: Mapping[str, Any]) -> float | None:
-    """Return the co-contraction [rad] around which families were recorded: that of the heaviest payload."""
+def _held(linear: Mapping[str, Any], robot: Robot) -> float | None:
+    """Return the co-contraction [SI] around which families were recorded, where there is one: of the heaviest load."""
     made = [part for thing in linear.values()
             for part in getattr(thing, "findings", {}).get("tested", {}).get("conditions", [])]  # fmt: skip
-    if not made:
+    if not made or not robot.redefinition(directions_of(next(iter(linear.values()))))[1][:, -1].any():
         return None
-    heaviest = max(max(part["payload_kg"]) for part in made)
+    heaviest, unit = max(max(part["payload_kg"]) for part in made), Scaling.of(robot).motor_unit
     middles = [sum(part["cocontraction"]) / 2.0 for part in made if max(part["payload_kg"]) >= heaviest]
-    common = round(sorted(middles)[len(middles) // 2], 3)
-    return common if common > _TAUT else None
+    common = round(sorted(middles)[len(middles) // 2] / unit, 3)
+    return common * unit if common > _TAUT else None
 
 
 def _aimed(task: Task) -> float:
@@ -256,9 +256,8 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     names = objectives(compared)
     # Loops of tuning have noise, and plants that are later than they say: `verify` has neither.
     looped = [b for b in bounds if b.metric.startswith(("sim.", "track."))]
-    holds = verification.holds
-    if looped and task.own:
-        holds = holds and _level(best) >= 1 and best.holds(looped, tested=False)
+    closed = not looped or not task.own or _level(best) >= 1
+    holds = verification.holds and closed and (not looped or not task.own or best.holds(looped, tested=False))
     stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=task.tested)
     known = [verdict for verdict in verification.failed if verdict.value is not None]
     if not holds and stuck is None and known:
@@ -275,7 +274,7 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
-    return found if holds else _nearest(found, files, progress)
+    return found if holds or not closed else _nearest(found, files, progress)
 
 
 def _nearest(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:

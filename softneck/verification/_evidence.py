@@ -23,12 +23,13 @@ from ._neck_loops import (
     neck_changes,
     no_virtual_plant,
     payloads_left_out,
+    preset_of,
     run_necks,
     step_at,
 )
 from ._plants import Plants, UncertainNeck, all_plants, join
 from ._requirements import Requirements
-from ._steps import UNTOLD, Steps, StepTest, run_steps
+from ._steps import UNTOLD, Steps, run_steps
 from ._structured import SearchResult, StructuredResult, search, structured
 from ._tested import TestedAxis, tested_axes
 
@@ -124,26 +125,22 @@ def gather(
     seed = int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
     plants = base.later(controller.extra)
-    w = judged(base.sample_time)
+    w = judged(base.sample_time, asked.scale.time)
     linear = []
     for number, (name, law) in enumerate(controller.laws.items()):
         progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
         linear.append(_linear(name, law, plants, sources, controller.extra, w, asked))
     progress(0.5, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
-    test = StepTest(
-        step=asked.si(asked.step["size_deg"]), duration=float(asked.step["duration_s"]),
-        noise=asked.si(asked.step["noise_deg"]), load=asked.motor_si(float(asked.step["load_rad"])), seed=seed,
-    )  # fmt: skip
-    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=sources[0].weights)
+    steps = run_steps(
+        stepped, controller.block, asked.step_test(seed), robot=controller.robot, weights=sources[0].weights
+    )
     why = no_virtual_plant(controller.robot, asked)
     runs = run_necks(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
     ) if own or not why else []  # fmt: skip
-    loops = loops_under_test(
-        controller.block, own, asked, order=controller.order, observer=observer, robot=controller.robot
-    )
+    loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
     # What nobody requires of an axis alone need not be found of it.
     alone = {f"{axis}.{name}" for axis in plants.axes for name in ("gain_margin", "delay_margin_ms")}
     overall = all(item.metric not in alone for item in asked.bounds)
@@ -168,15 +165,13 @@ def _linear(
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    parts = [structured(neck, law, extra=extra) for neck in necks]
+    parts = [structured(neck, law, extra=extra, time=asked.scale.time) for neck in necks]
     return LinearEvidence(name, law, tried, table, found, parts)
 
 
 def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
-    """Return whether the necks in the loops are presets that nobody asked to decide; a neck file is the user's own."""
-    if not asked.robot.is_neck and "preset" not in asked.own.get("sim", {}):
-        return False  # its own file says what stands for it
-    return not (own or asked.sim["decides"] or str(asked.sim["preset"]).endswith(".toml"))
+    """Return whether the loops are over a preset that nobody asked to decide; a file is the user's own."""
+    return not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
 
 
 def _tell_data(evidence: Evidence) -> None:
@@ -229,13 +224,13 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         )
     _tell_data(evidence)
     for name, values in evidence.steps.metrics.items():
-        metrics[f"step.{asked.name_of(name)}"] = Values(values, _step_describer(evidence, name))
+        metrics[f"step.{asked.scale.name_of(name)}"] = Values(values, _step_describer(evidence, name))
     if not evidence.necks:
         return
     describe = _neck_describer(evidence, controller, asked)
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
-        metrics[f"sim.{asked.name_of(name)}"] = Values(values, describe)
+        metrics[f"sim.{asked.scale.name_of(name)}"] = Values(values, describe)
     if np.isnan(metrics["sim.slack_s"].values).any():
         del metrics["sim.slack_s"]
         absent["sim.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
@@ -330,7 +325,7 @@ def _step_describer(evidence: Evidence, name: str) -> Describe:
 
 def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
-        run, at = evidence.necks[row], step_at(controller.block)
+        run, at = evidence.necks[row], step_at(controller.block, asked)
         size = float(asked.sim["size_deg"])
         parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {

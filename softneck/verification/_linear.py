@@ -12,7 +12,6 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_one_of
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation._axis import robot_of
-from softneck.identification.models._linear_systems import redefined_input
 from softneck.loop._loop import ORDERS
 from softneck.robot import Robot
 from softneck.runtime import Block
@@ -23,6 +22,8 @@ from ._plants import Plants, mixing
 LARGE = ("disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
 SMALL = ("sensitivity", "complementary", "control_sensitivity")
 MIMO = "mimo_disk_margin"
+#: Of a neck [rad/s].
+LOWEST = 0.02
 # Plants whose responses are held in memory at once.
 _CHUNK = 64
 # The cosine of pi, up to 1e-6 rad.
@@ -51,9 +52,7 @@ class LinearLaw:
 
     @classmethod
     def of(cls, system: Any, robot: Robot | None = None) -> LinearLaw:
-        """Return it of a system from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i).
-
-        Of another robot than the neck from its outputs to their inputs, such as (x_reference, x) to (x_input).
+        """Return it of a system from a robot's references and outputs to their inputs, such as theta_i and phi_i.
 
         Raises:
             SettingsError: other channels or not discrete.
@@ -66,9 +65,7 @@ class LinearLaw:
             )
         whose = Robot.preset() if robot is None else robot
         names = whose.outputs.names
-        wanted = (
-            [*(f"{name}_reference" for name in names), *names], [redefined_input(whose, name) for name in names]
-        )  # fmt: skip
+        wanted = [*(f"{name}_reference" for name in names), *names], list(whose.input_names)
         given = (list(system.input_labels), list(system.output_labels))
         if given != wanted:
             raise SettingsError(
@@ -93,7 +90,7 @@ class LinearLaw:
     @property
     def coupled(self) -> bool:
         """Whether one axis' angle moves another's input."""
-        Ky = np.abs(self.feedback(np.geomspace(0.1, math.pi / self.sample_time, 20)))
+        Ky = np.abs(self.feedback(np.geomspace(0.002, math.pi, 20) / self.sample_time))
         # 1e-9: rounding of an allocation that is diagonal.
         others = Ky[:, ~np.eye(Ky.shape[1], dtype=bool)].sum(axis=1)
         return bool(others.max() > 1e-9 * Ky.max())
@@ -107,9 +104,12 @@ class LinearLaw:
         return self.C @ inner + D
 
 
-def judged(sample_time: float, points: int = 360) -> Vector:
-    """Return the frequencies [rad/s] on which loops are judged, from 0.02 up to the Nyquist frequency."""
-    return np.geomspace(0.02, math.pi / sample_time, points)
+def judged(sample_time: float, time: float = 1.0, points: int = 360) -> Vector:
+    """Return the frequencies [rad/s] on which loops are judged, up to the Nyquist frequency.
+
+    From 0.02 rad/s of a neck, of a robot that is `time` as slow from less.
+    """
+    return np.geomspace(LOWEST / time, math.pi / sample_time, points)
 
 
 def radii(plants: Plants, law: LinearLaw) -> Vector:
@@ -271,8 +271,8 @@ class ControllerUnderTest:
 def judge(controller: Any, *, order: str | None, observer: bool) -> ControllerUnderTest:
     """Return what of `controller` can be judged.
 
-    A linear controller has `ss()` (or `to_lti()`), from (pitch_reference, roll_reference, pitch, roll) to (theta_i,
-    phi_i); one that is linear at each point of operation has `ss_at(point)` and `points()`, name -> point.
+    A linear controller has `ss()` (or `to_lti()`), from references and outputs to the redefined inputs; one that is
+    linear at each point of operation has `ss_at(point)` and `points()`, name -> point.
 
     Args:
         controller: anything with `block()`.

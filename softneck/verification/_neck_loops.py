@@ -12,19 +12,21 @@ from typing import Any, cast
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, SoftneckError
+from softneck.core import DataError, Progress, SettingsError, SoftneckError, to_si
 from softneck.cosim import FmuPart
 from softneck.estimation._axis import robot_of
-from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
+from softneck.loop import BlockPart, Loop, LoopResult, Part, metrics, run_loop
 from softneck.loop._robot_references import RobotReference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
 from softneck.robot import Robot
 from softneck.robot._opened import opened
+from softneck.robot._scaling import Scaling
 from softneck.runtime import Block
 
 from ._experiments import LoopUnderTest
-from ._requirements import Requirements, metric_ends
+from ._requirements import Requirements
+from ._scale import Scale
 from ._steps import Steps
 
 # Set by hand [rad]: pretension changes by some 3 % of itself.
@@ -153,14 +155,21 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
     )  # fmt: skip
 
 
-def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Steps) -> dict[str, str]:
+def not_recorded(
+    tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Steps, robot: Robot | None = None
+) -> dict[str, str]:
     """Return why nothing is known of the "loop" and of simulation models, "sim"; nothing where all was recorded.
 
     Args:
         tested: by the names of families, what each says of its recordings.
         own: simulation models.
         steps: which show where the loop holds the motors.
+        robot: whose; None: the neck. Only tendons can be slack.
     """
+    robot = robot or Robot.preset()
+    if robot.tendon_angles is None:
+        return {}
+    factor, unit, same = to_si(robot.motors.unit)[0], robot.motors.unit, _SAME * Scaling.of(robot).motor_unit
     half = steps.motors.shape[2] // 2
     # Of most plants: where motors reach their limits their mean is another.
     held = float(np.median(steps.motors[:, :, half - 1].mean(axis=-1)))
@@ -171,14 +180,15 @@ def not_recorded(tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Step
             if not any(_carries(plant, kg, held) for plant in own):
                 found["sim"] = (
                     f"not supported by the data: {name} was recorded with {kg:g} kg, and no simulation model carries "
-                    f"that at a co-contraction of {held:.2g} rad; `softneck identify greybox` a recording that does, "
-                    "or calibrate a neck to it (`softneck.calibrate` in Python)"
+                    f"that at a co-contraction of {held / factor:.2g} {unit}; `softneck identify greybox` a recording "
+                    "that does, or calibrate a neck to it (`softneck.calibrate` in Python)"
                 )
             at = [end for part in made if _within(kg, part["payload_kg"]) for end in part["cocontraction"]]
-            if not _within(held, at, _SAME):
+            if not _within(held, at, same):
                 found["loop"] = (
-                    f"not supported by the data: the loop holds its motors at a co-contraction of {held:.2g} rad, and "
-                    f"with {kg:g} kg {name} was recorded at {min(at):.2g} to {max(at):.2g} rad; design with such a "
+                    f"not supported by the data: the loop holds its motors at a co-contraction of {held / factor:.2g} "
+                    f"{unit}, and with {kg:g} kg {name} was recorded at {min(at) / factor:.2g} to "
+                    f"{max(at) / factor:.2g} {unit}; design with such a "
                     "`least_cocontraction`, or record around the loop's (`softneck record --cocontraction`)"
                 )
     return found
@@ -193,7 +203,7 @@ def payloads_left_out(own: Sequence[OwnPlant], asked: Requirements) -> dict[str,
         for name, heavy in left.items()
         if heavy
     ]
-    if not (said and asked.robot.is_neck):
+    if not said or asked.robot.neck is None:
         return {}
     way = "`softneck identify greybox` recordings that say theirs, in a column `payload [kg]`"
     return {"loops with payload": f"{'; '.join(said)}; {way}"}
@@ -249,26 +259,29 @@ def no_virtual_plant(robot: Robot, asked: Requirements) -> str:
     try:
         virtual_plant(robot, asked)
     except SettingsError as error:
-        if robot.is_neck or "preset" in asked.own.get("sim", {}):
+        if robot.neck is not None or "preset" in asked.own.get("sim", {}):
             raise
         return f"no virtual plant stands for `{robot.name}`: {error}"
     return ""
 
 
+def preset_of(asked: Requirements) -> str:
+    """Return the preset or neck file of the loops: the one that is asked for, else the robot's own."""
+    own = asked.own.get("sim", {}).get("preset", asked.robot.neck)
+    return str(asked.sim["preset"] if own is None else own)
+
+
 def virtual_plant(robot: Robot, asked: Requirements) -> tuple[str, VirtualNeck]:
-    """Return the virtual plant that is asked for, of another robot its own where nobody says otherwise, by its name."""
-    if robot.is_neck:
-        return str(asked.sim["preset"]), VirtualNeck(NeckParameters.preset(str(asked.sim["preset"])))
+    """Return the virtual plant that is asked for, else the robot's own, and its name."""
     given = asked.own.get("sim", {}).get("preset")
     plant = VirtualNeck.of(robot, None if given is None else NeckParameters.preset(str(given)))
-    return str(robot.neck if given is None else given), plant
+    return preset_of(asked), plant
 
 
 def neck_file_of(robot: Robot, asked: Requirements) -> Path:
     """Return what names the physics of the loops: a preset or a neck file."""
-    if robot.is_neck or "preset" in asked.own.get("sim", {}):
-        return Path(str(asked.sim["preset"]))
-    return (robot.folder or Path()) / str(robot.neck)
+    given = "preset" in asked.own.get("sim", {})
+    return Path(preset_of(asked)) if given or robot.folder is None else robot.folder / preset_of(asked)
 
 
 def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
@@ -277,10 +290,10 @@ def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
     return (math.cos(orientation), math.sin(orientation), *[0.0] * (outputs - 2))[:outputs]
 
 
-def step_at(controller: Block) -> float:
+def step_at(controller: Block, asked: Requirements) -> float:
     """Return when the step comes [s]."""
     pulls = any(port.name == "least_cocontraction" and (port.start or 0.0) > 0.0 for port in controller.parameters)
-    return _TAUT_AT if pulls else _STEP_AT
+    return asked.scale.time * (_TAUT_AT if pulls else _STEP_AT)
 
 
 def run_necks(
@@ -351,17 +364,13 @@ def _loop(
     observer: Block | None,
     seed: int,
 ) -> Loop:
-    size, robot, at = asked.si(float(asked.sim["size_deg"])), asked.robot, step_at(controller)
+    size, robot, at = asked.si(float(asked.sim["size_deg"])), asked.robot, step_at(controller, asked)
     ends = tuple(size * share for share in direction(orientation, robot))
-    reference = (
-        StepReference(pitch=ends[0], roll=ends[1], at=at) if robot.is_neck
-        else RobotReference(kind="step", values=ends, at=at)
-    )  # fmt: skip
     return Loop(
         plant=plant.make(seed, controller.sample_time),
         controller=BlockPart(controller),
         observer=None if observer is None else BlockPart(observer),
-        reference=reference,
+        reference=RobotReference(kind="step", values=ends, at=at),
         duration=at + float(asked.sim["duration_s"]),
         order=order,
         robot=robot,
@@ -391,7 +400,7 @@ def judge_loop(
         # Numbers overflowed: the loop is not stable, whatever its margins say.
         return dict.fromkeys((*_AXIS, *_MOTORS), math.inf), None
     table, robot = metrics(result, angle=angle), result.robot
-    names = metric_ends(robot)
+    names = Scale(robot=robot).name_of
     sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in robot.outputs.names}
     stepped = [axis for axis, size in sizes.items() if size > _SMALL * max(sizes.values())]
     values = {}
@@ -407,7 +416,7 @@ def judge_loop(
 
 
 def loops_under_test(
-    controller: Block, own: Sequence[OwnPlant], asked: Requirements, *, order: str, observer: Block | None, robot: Robot
+    controller: Block, own: Sequence[OwnPlant], asked: Requirements, *, order: str, observer: Block | None
 ) -> list[LoopUnderTest]:
     """Return the loops for margins by experiment: each simulation model, with its lightest and its heaviest payload.
 
@@ -416,8 +425,8 @@ def loops_under_test(
         own: simulation models.
         asked: whose payloads count, and how slow and large the robot is.
         order: of the loop.
-        robot: whose it is.
     """
+    robot, scale = asked.robot, asked.scale
     names = robot.outputs.names
     axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
     known = [(plant, plant.payloads(asked.sim["payloads_kg"])) for plant in own]
@@ -427,8 +436,8 @@ def loops_under_test(
             plant=lambda plant=plant: plant.quiet(controller.sample_time), observer=observer,
             order=order, constants=plant.carrying(kg),
             # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
-            axes=axes if kg == min(payloads) else axes[-1:], robot=robot, time=asked.scale[0],
-            size=1.0 if robot.is_neck else asked.si(math.degrees(asked.scale[1])),
+            axes=axes if kg == min(payloads) else axes[-1:], robot=robot, time=scale.time,
+            size=scale.si(scale.size) / math.radians(1.0),
         )
         for plant, payloads in known for kg in sorted({float(min(payloads)), float(max(payloads))})
     ]  # fmt: skip
@@ -436,7 +445,7 @@ def loops_under_test(
 
 def neck_changes(parameters: NeckParameters, robot: Robot) -> dict[str, float]:
     """Return the parameters of a robot's neck that differ from the preset `paper` standing for it."""
-    plain = NeckParameters.paper() if robot.is_neck else VirtualNeck.of(robot, NeckParameters.paper()).parameters
+    plain = VirtualNeck.of(robot, NeckParameters.paper()).parameters
     names = [item.name for item in dataclasses.fields(parameters)]
     return {name: getattr(parameters, name) for name in names if getattr(parameters, name) != getattr(plain, name)}
 

@@ -11,14 +11,14 @@ from softneck.core import Vector, to_si
 from softneck.loop._result import shown_unit
 from softneck.plots import Chart, Curve, Level, Panel, Section, Table, page
 from softneck.plots._style import BLUE, GREEN, GREY, ORANGE
-from softneck.robot import Robot
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
 from ._neck_loops import NeckRun, direction
 from ._plants import Plants, mixing
+from ._scale import Scale
 from ._steps import Steps
-from ._verify import Verdict, Verification
+from ._verify import Verdict, Verification, gain_unit
 
 RED, PURPLE = "#D55E00", "#CC79A7"
 # Of 1 to 8 motors.
@@ -31,8 +31,12 @@ _CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: 
 _LARGEST = 1e9
 
 
-def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
-    """Return Bode envelopes of the open loops, the gang of four of each axis, and their sensitivities."""
+def frequency_charts(part: LinearEvidence, w: Vector, gain: str = "rad/rad") -> list[Chart]:
+    """Return Bode envelopes of the open loops, the gang of four of each axis, and their sensitivities.
+
+    `gain` is the SI unit of the plants' static gains.
+    """
+    back = "/".join(reversed(gain.split("/")))
     rows = _chosen(part)
     P, L = loops(part.plants.take(rows), part.law, w)
     S = inverse(np.eye(len(part.plants.axes)) + L)
@@ -41,9 +45,9 @@ def frequency_charts(part: LinearEvidence, w: Vector) -> list[Chart]:
     for i, axis in enumerate(part.plants.axes):
         own = S[..., i, i]
         gang = {
-            "|S|, from load at the angle": np.abs(own), "|T|, from reference to angle": np.abs(1.0 - own),
-            "|PS|, from load at the input [rad/rad]": np.abs(PS[..., i, i]),
-            "|CS|, from noise to input [rad/rad]": np.abs(CS[..., i, i]),
+            "|S|, from load at the output": np.abs(own), "|T|, from reference to output": np.abs(1.0 - own),
+            f"|PS|, from load at the input [{gain}]": np.abs(PS[..., i, i]),
+            f"|CS|, from noise to input [{back}]": np.abs(CS[..., i, i]),
         }  # fmt: skip
         worst = _worst_in(part, rows, f"{axis}.disk_margin")
         panels = [_envelope(w, values, name, worst) for name, values in gang.items()]
@@ -103,13 +107,6 @@ def _envelope(
     return Panel(curves, label, levels=levels, log_x=True, log_y=log, y_range=y_range)
 
 
-def gain_unit(robot: Robot) -> tuple[str, float]:
-    """Return in which unit static gains are shown, and its factor from SI."""
-    motors = 1.0 if robot.is_neck else to_si(robot.motors.unit)[0]
-    unit, factor = shown_unit(robot)
-    return f"{unit}/{robot.motors.unit}", motors * (math.degrees(1.0) if factor is None else 1.0 / factor)
-
-
 def mu_charts(part: LinearEvidence) -> list[Chart]:
     """Return the structured singular value over frequency with its bounds; nothing where the middle is not stable."""
     panels = []
@@ -128,18 +125,14 @@ def mu_charts(part: LinearEvidence) -> list[Chart]:
     )
 
 
-def step_chart(steps: Steps, plants: Plants, robot: Robot) -> Chart:
+def step_chart(steps: Steps, plants: Plants, scale: Scale) -> Chart:
     """Return the steps of all plants, the worst drawn through, and what its motors did."""
     t = steps.time
     panels = []
     finite: np.ndarray = np.asarray(np.isfinite(steps.angles).all(axis=2))
     worst = int(np.argmax(steps.metrics["overshoot_pct"]))
     axis_of = int(steps.worse["overshoot_pct"][worst])
-    unit, factor = shown_unit(robot)
-
-    def shown(y: np.ndarray) -> np.ndarray:
-        return np.degrees(y) if factor is None else y / factor
-
+    robot, shown, unit = scale.robot, scale.shown, shown_unit(scale.robot)[0]
     for i, axis in enumerate(plants.axes):
         y = shown(steps.angles[i][finite[i]]) if finite[i].any() else np.zeros((1, t.size))
         row = worst if i == axis_of else int(np.argmax(np.where(finite[i], np.max(steps.angles[i], axis=1), -np.inf)))
@@ -151,7 +144,7 @@ def step_chart(steps: Steps, plants: Plants, robot: Robot) -> Chart:
             Curve(t, shown(_drawable(steps.angles[i, 0])), "nominal", "black", width=1.2),
         ]
         panels.append(Panel(curves, f"{axis} [{unit}]"))
-    per = 1.0 if robot.is_neck else to_si(robot.motors.unit)[0]
+    per = to_si(robot.motors.unit)[0]
     motors = [
         Curve(t, _drawable(steps.motors[axis_of, worst, :, j]) / per, f"motor {j + 1}", colour, "step")
         for j, colour in zip(range(len(robot.motors.names)), SERIES, strict=False)
@@ -165,14 +158,14 @@ def _drawable(y: Vector) -> Vector:
     return np.where(np.isfinite(y) & (np.abs(y) < _LARGEST), y, np.nan)
 
 
-def neck_chart(evidence: Evidence, robot: Robot) -> Chart:
-    """Return all loops over the virtual neck: the way along the step, the worst overshoot drawn through."""
+def neck_chart(evidence: Evidence, scale: Scale) -> Chart:
+    """Return all loops over simulation models: the way along the step, the worst overshoot drawn through."""
     runs = [run for run in evidence.necks if run.result is not None]
     if not runs:
-        raise ValueError("no loop over the virtual neck came to its end")
+        raise ValueError("no simulated loop came to its end")
     worst = max(runs, key=lambda run: run.metrics["overshoot_pct"])
     slow = max(runs, key=lambda run: run.metrics["settling_s"])
-    along = {id(run): _along(run) for run in runs}
+    along = {id(run): scale.shown(_along(run)) for run in runs}
     table = np.array(list(along.values()))
     t = runs[0].result.time if runs[0].result is not None else np.zeros(0)
     curves = [
@@ -181,8 +174,8 @@ def neck_chart(evidence: Evidence, robot: Robot) -> Chart:
         Curve(t, along[id(worst)], f"largest overshoot: {worst.name}", RED, width=1.2),
         Curve(t, table[0], runs[0].name, "black", width=1.2),
     ]
-    what = "virtual neck" if robot.is_neck else f"virtual {robot.name}"
-    return Chart(f"Steps of the {what}", [Panel(curves, "true angle along the step [deg]")], row_height=3.4)
+    title, unit = f"Steps of the virtual {scale.robot.name}", shown_unit(scale.robot)[0]
+    return Chart(title, [Panel(curves, f"true output along the step [{unit}]")], row_height=3.4)
 
 
 def _along(run: NeckRun) -> Vector:
@@ -190,7 +183,7 @@ def _along(run: NeckRun) -> Vector:
         return np.zeros(0)
     robot = run.result.robot
     shares = zip(direction(run.orientation, robot), robot.outputs.names, strict=True)
-    return np.degrees(np.sum([share * run.result.angle(name) for share, name in shares], axis=0))
+    return np.asarray(np.sum([share * run.result.angle(name) for share, name in shares], axis=0))
 
 
 _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
@@ -241,21 +234,21 @@ def verification_page(found: Verification, controller: str, certificate: str = "
         found: the verification.
         controller, certificate: names of their files, for the title and the text.
     """
-    evidence, robot = found.evidence, found.controller.robot
-    first, *others = robot.outputs.names
-    stepped = step_chart(evidence.steps, evidence.stepped, robot)
+    evidence, scale = found.evidence, found.requirements.scale
+    first, *others = scale.robot.outputs.names
+    stepped = step_chart(evidence.steps, evidence.stepped, scale)
     sections = [_first(found, certificate, stepped)]
     for part in evidence.linear:
         sections += _linear_sections(found, part)
     each = f" and, in a run of its own, of {' and '.join(others)}" if others else ""
     text = [
-        "The controller's own runtime with all its limits, against every plant with its delay and noisy angles: a step "
-        f"of {first}{each}; half way a load is added to the plant's input."
+        "The controller's own runtime with all its limits, against every plant with its delay and noisy outputs: a "
+        f"step of {first}{each}; half way a load is added to the plant's input."
     ]
     sections.append(Section("Steps", tables=[_spread(found, "step")], method=text))
     if evidence.necks:
-        charts = [neck_chart(evidence, robot)] if any(run.result is not None for run in evidence.necks) else []
-        sections.append(Section("Virtual neck", tables=[_spread(found, "sim"), _runs(found)], charts=charts))
+        charts = [neck_chart(evidence, scale)] if any(run.result is not None for run in evidence.necks) else []
+        sections.append(Section("Simulated loops", tables=[_spread(found, "sim"), _runs(found)], charts=charts))
     sections.append(_plants(found))
     words = "holds" if found.holds else "does not hold"
     return page(
@@ -315,7 +308,7 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
         Section(
             f"Frequency responses{title}",
             tables=[_margin_table(part)],
-            charts=frequency_charts(part, found.evidence.frequency),
+            charts=frequency_charts(part, found.evidence.frequency, gain_unit(found.controller.robot)),
         ),
         Section(
             f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
@@ -346,27 +339,30 @@ def _runs(found: Verification) -> Table:
     runs = found.evidence.necks
     names = list(runs[0].metrics)
     rows = [[run.name, *(number(run.metrics[name]) for name in names)] for run in runs]
-    return Table("Each loop", ["neck, payload, direction", *names], rows)
+    return Table("Each loop", ["plant, payload, direction", *names], rows)
 
 
 def _plants(found: Verification) -> Section:
     rows = []
-    unit, factor = gain_unit(found.controller.robot)
-    digits = "2f" if found.controller.robot.is_neck else "4g"
+    robot, scale = found.controller.robot, found.requirements.scale
+    motor = to_si(robot.motors.unit)[0]
     for neck in found.necks:
         for axis, box in zip(neck.names, neck.axes, strict=True):
             for title, values in (("least", box.low), ("nominal", box.nominal), ("largest", box.high)):
-                numbers = [f"{factor * values[0]:.{digits}}", f"{values[1]:.2f}", f"{1e3 * values[2]:.0f}"]
+                numbers = [f"{motor * scale.shown(values[0]):.4g}", f"{values[1]:.4g}", f"{1e3 * values[2]:.4g}"]
                 rows.append([neck.name, axis, title, *numbers])
-    head = ["source", "axis", "", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
+    head = [
+        "source",
+        "axis",
+        "",
+        f"static gain [{shown_unit(robot)[0]}/{robot.motors.unit}]",
+        "pole [1/s]",
+        "dead time [ms]",
+    ]
     cross = [
-        f"{neck.name}: phi_i into pitch {neck.cross[0]:+.3f} of theta_i's gain, theta_i into roll {neck.cross[1]:+.3f}."
-        for neck in found.necks if neck.robot.is_neck
-    ] + [
-        f"{neck.name}: the input of {other} into {axis} {neck_mixing[i, j]:+.3f} of its own gain."
-        for neck in found.necks if not neck.robot.is_neck
-        for neck_mixing in [mixing(neck.cross, len(neck.names))]
-        for i, axis in enumerate(neck.names) for j, other in enumerate(neck.names) if i != j
+        f"{neck.name}: {robot.input_names[j]} into {axis} {mixed[i, j]:+.3f} of its own gain."
+        for neck in found.necks for mixed in [mixing(neck.cross, len(neck.names))]
+        for i, axis in enumerate(neck.names) for j in range(len(neck.names)) if i != j
     ]  # fmt: skip
     files = [[role, path, digest] for role, (path, digest) in found.files.items()]
     tables = [Table("Boxes", head, rows, text=3)]

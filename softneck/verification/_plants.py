@@ -19,7 +19,6 @@ from softneck.estimation import AxisPlant, axis_plant
 from softneck.estimation._axis import directions_of, robot_of
 from softneck.identification.uncertainty._measured import AxisMeasured, response_of
 from softneck.robot import Robot
-from softneck.robot._redefined import redefinition_of
 
 # Halvings of the way to a plant that is excluded: to a thousandth.
 _HALVINGS = 10
@@ -27,7 +26,7 @@ _HALVINGS = 10
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisBox:
-    """What one axis may be; numbers are static gain [rad/rad], pole [1/s], dead time [s].
+    """What one axis may be; numbers are static gain [rad/rad, else SI], pole [1/s], dead time [s].
 
     Attributes:
         nominal: (3,).
@@ -111,8 +110,8 @@ def _products(rows: Matrix, polynomial: Vector) -> Matrix:
     return np.stack([np.convolve(row, polynomial) for row in rows])
 
 
-# A pole that does not count: so fast [1/s] that a sample is over before it shows.
-_NO_POLE = 1e4
+# A pole that does not count, by the sample rate: so fast that a sample is over before it shows.
+_NO_POLE = 200.0
 _ROUNDING = 1e-6
 
 
@@ -128,7 +127,7 @@ class UncertainNeck:
             of a neck phi_i into pitch, and theta_i into roll.
         kind: "family" or "model".
         robot: whose plant it is.
-        weights: (m, motors) of the motors in each axis's input; None for a neck, whose are Eq. 9, 10.
+        weights: (m, motors) of the motors in each axis's input: of a neck Eq. 9, 10.
     """
 
     name: str
@@ -136,8 +135,8 @@ class UncertainNeck:
     axes: tuple[AxisBox, ...]
     cross: Vector
     kind: str
+    weights: Matrix
     robot: Robot = field(default_factory=Robot.preset)
-    weights: Matrix | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -217,7 +216,7 @@ def neck_of_family(family: Any, name: str) -> UncertainNeck:
     cross = np.nan_to_num(between(family.cross[:, : len(names)] / own[:, None]))
     return UncertainNeck(
         name=name, sample_time=family.sample_time, axes=tuple(boxes), cross=cross, kind="family",
-        robot=robot_of(family), weights=getattr(family, "directions", None),
+        robot=robot_of(family), weights=directions_of(family),
     )  # fmt: skip
 
 
@@ -249,14 +248,9 @@ def neck_of_model(model: Any, name: str, spread: Mapping[str, float]) -> Uncerta
             raise SettingsError(f"{name}: {error}") from error
     if not all(math.isclose(plants[0].sample_time, plant.sample_time, rel_tol=1e-9) for plant in plants):
         raise SettingsError(f"{name}: {' and '.join(names)} have different sample times.")
-    weights = None if robot.is_neck else directions_of(model)
-    if weights is None:
-        cross = np.array([_cross_gain(model, axis, plant) for axis, plant in zip(names, plants, strict=True)])
-    else:
-        cross = _cross_gains(model, plants, weights)
     return UncertainNeck(
         name=name, sample_time=plants[0].sample_time, axes=tuple(_axis_of(plant, spread) for plant in plants),
-        cross=cross, kind="model", robot=robot, weights=weights,
+        cross=_cross_gains(model, plants, robot), kind="model", robot=robot, weights=directions_of(model),
     )  # fmt: skip
 
 
@@ -267,7 +261,7 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
     dead = plant.delay * Ts
     if abs(slowest.imag) > 1e-9 or slowest.real <= 1e-6:
         # No slowest real pole to be uncertain about: one that does not show, and all else is certain.
-        nominal = np.array([gain, _NO_POLE, dead])
+        nominal = np.array([gain, _NO_POLE / Ts, dead])
         rest = (np.append(plant.numerator, 0.0) / gain, plant.denominator)
         pole_spread = 0.0
     else:
@@ -283,23 +277,20 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
     return AxisBox(nominal=nominal, low=low, high=high, samples=np.zeros((0, 3)), rest=rest)
 
 
-def _cross_gain(model: Any, axis: str, plant: AxisPlant) -> float:
-    other = {"pitch": "phi_i", "roll": "theta_i"}[axis]
-    try:
-        value = float(np.real(model.tf(axis, input=other).dcgain()))
-    except (SettingsError, TypeError, ValueError):
-        return 0.0  # a model of two single axes
-    return value / plant.static_gain if math.isfinite(value) else 0.0
+def _cross_gains(model: Any, plants: list[AxisPlant], robot: Robot) -> Vector:
+    """Return what the others' inputs do to each axis in steady state, as parts of its own gain."""
 
+    def gain(axis: str, name: str) -> float:
+        try:
+            return float(np.real(model.tf(axis, input=name).dcgain()))
+        except (SettingsError, TypeError, ValueError):
+            return 0.0  # a model of single axes
 
-def _cross_gains(model: Any, plants: list[AxisPlant], weights: Matrix) -> Vector:
-    """Return them of another robot's model, from what each motor does in steady state."""
-    robot = model.robot
-    inverse = redefinition_of(weights, robot.outputs.names)[1][:, :-1]
-    gains = np.atleast_2d(np.real(model.ss().dcgain()))
-    cross = between(gains @ inverse / np.array([[plant.static_gain] for plant in plants]))
+    gains = [[gain(axis, name) / plant.static_gain for name in robot.input_names]
+             for axis, plant in zip(robot.outputs.names, plants, strict=True)]  # fmt: skip
+    cross = np.nan_to_num(between(np.array(gains)), posinf=0.0, neginf=0.0)
     # What rounding leaves of axes that do not meet.
-    return np.where(np.abs(cross) < _ROUNDING, 0.0, np.nan_to_num(cross))
+    return np.where(np.abs(cross) < _ROUNDING, 0.0, cross)
 
 
 def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:

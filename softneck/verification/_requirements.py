@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,14 @@ from softneck.core._certificate import sim_name
 from softneck.core._errors import did_you_mean
 from softneck.core._shown import Shown
 from softneck.loop import default_limits
-from softneck.loop._result import shown_unit
 from softneck.robot import Robot
 
 from ._linear import LARGE, SMALL
-from ._steps import METRICS
+from ._scale import Scale, digits
+from ._steps import METRICS, StepTest
 
-#: Metrics of the loops of [track], which `softneck tune` alone closes.
-TRACK_METRICS = ("track.circle_rms_deg", "track.ahead_rms_deg", "track.variation_rad_s")
+#: Of the loops of [track], which `softneck tune` alone closes.
+_TRACK_METRICS = ("circle_rms_deg", "ahead_rms_deg", "variation_rad_s")
 
 
 def for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
@@ -31,13 +31,13 @@ def for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
     require = found.get("require", {})
     if isinstance(require, Mapping):
         kept, _ = kept_back(require, own.get("reserve", {}))
-        found["require"] = {metric: entry for metric, entry in kept.items() if metric not in TRACK_METRICS}
+        found["require"] = {metric: entry for metric, entry in kept.items() if not metric.startswith("track.")}
     return found
 
 
 def left_to_tune(own: Mapping[str, Any]) -> list[str]:
     """Return what of a file's requirements `verify` does not look at."""
-    return [metric for metric in TRACK_METRICS if own.get("require", {}).get(metric)]
+    return [metric for metric, entry in own.get("require", {}).items() if metric.startswith("track.") and entry]
 
 
 def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
@@ -67,7 +67,7 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
                 f"`{metric}` <= {limit:g} leaves nothing beside its reserve of {value:g}; ask for more, or state "
                 f"another one ([reserve])."
             )
-        less[metric] = {**entry, "max": round(limit - value, 9)}
+        less[metric] = {**entry, "max": digits(limit - value)}
         kept[metric] = float(value)
     return less, kept
 
@@ -79,28 +79,26 @@ _SIM_METRICS = (
     "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
     "slack_s",
 )  # fmt: skip
-_NECK = Robot.preset("neck")
 # Of requirements files, `tune`'s included.
 _TABLES = ("version", "uncertainty", "sampling", "step", "sim", "require", "track", "reserve")
 
 
-def metric_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of all metrics that a requirement of a robot can be about."""
-    shown = _Names(robot)
+def metric_names(robot: Robot, *, track: bool = False) -> tuple[str, ...]:
+    """Return the names of all metrics that a requirement of a robot can be about; `track`: those of [track] too."""
+    name_of = Scale(robot=robot).name_of
     return (
         "stability.radius",
         "stability.searched_radius",
         *(f"{axis}.{name}" for axis in ("axes", *robot.outputs.names) for name in _AXIS_METRICS),
         "mimo.disk_margin",
         "robust.mu",
-        *(f"step.{shown.of(name)}" for name in METRICS),
-        *(f"sim.{shown.of(name)}" for name in _SIM_METRICS),
+        *(f"step.{name_of(name)}" for name in METRICS),
+        *(f"sim.{name_of(name)}" for name in _SIM_METRICS),
+        *(f"track.{name_of(name)}" for name in _TRACK_METRICS if track),
     )
 
 
-def with_groups(
-    table: Mapping[str, Any], robot: Robot, *, stepping: bool, more: tuple[str, ...] = ()
-) -> dict[str, Any]:
+def with_groups(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track: bool = False) -> dict[str, Any]:
     """Return a table like a requirements file of one that may be flat: `{"overshoot_pct": 5}`.
 
     A metric without its group is one of the simulation models if there are any, else of the linear ones, or of the only
@@ -108,7 +106,7 @@ def with_groups(
     """
     table = with_sim(table, robot)
     order = ("sim", "step", "track") if stepping else ("step", "track")
-    known = (*metric_names(robot), *more)
+    known = metric_names(robot, track=track)
     nested: dict[str, Any] = {key: value for key, value in table.items() if key in _TABLES}
     for key, value in table.items():
         full = [key, *(f"{group}.{key}" for group in (*order, "axes", "robust", "mimo", "stability"))]
@@ -140,31 +138,8 @@ def with_sim(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
     return found
 
 
-def metric_ends(robot: Robot) -> Callable[[str], str]:
-    """Return what turns the end of a neck's metric into that of a robot's."""
-    return _Names(robot).of
-
-
-@dataclass(frozen=True, slots=True)
-class _Names:
-    """What a neck's deg and rad at the end of a name are of another robot."""
-
-    robot: Robot
-
-    def of(self, name: str) -> str:
-        """Return a neck's name as this robot's: `load_rms_mm` for `load_rms_deg`, `max_bar` for `max_rad`."""
-        return self._ended(self._ended(name, "_deg", shown_unit(self.robot)[0]), "_rad", self.robot.motors.unit)
-
-    def key(self, name: str) -> str:
-        """Return a neck's key as this robot's; an orientation is an angle of any robot's."""
-        return name if name == "orientations_deg" else self.of(name)
-
-    def _ended(self, name: str, end: str, unit: str) -> str:
-        return name.removesuffix(end) + "_" + unit.replace("/", "_") if name.endswith(end) else name
-
-
 #: Of a neck.
-METRIC_NAMES = metric_names(_NECK)
+METRIC_NAMES = metric_names(Robot.preset())
 # What no loop can do: least or largest value of a metric.
 _POSSIBLE = {"sensitivity": (1.0, math.inf), "disk_margin": (0.0, 2.0), "gain_margin": (1.0, math.inf)}
 _BOUNDS = ("min", "max", "below")
@@ -203,12 +178,6 @@ class Requirement:
     limit: float
     asked: bool
 
-    def stretched(self, time: float, size: float, robot: Robot) -> Requirement:
-        """Return it with its limit for another robot's time and size."""
-        group, _, name = self.metric.partition(".")
-        sized = group in ("step", "sim") and name.endswith("_" + shown_unit(robot)[0])
-        return replace(self, limit=self.limit * (size if sized else time if name.endswith(("_s", "_ms")) else 1.0))
-
     def holds(self, value: float) -> bool:
         """Return whether `value` keeps it; NaN does not."""
         if self.bound == "min":
@@ -222,11 +191,10 @@ class Requirements(Shown):
 
     Attributes:
         bounds: in the order of the file.
-        uncertainty, sampling, step, sim: the tables of the file; keys that end in `_deg` or `_rad` hold what they hold
-            of a neck, or numbers in the units of another robot's outputs and motors.
-        robot: whose controller is judged.
+        uncertainty, sampling, step, sim: the tables of the file by the neck's names of their keys; what ends in `_deg`
+            or `_rad` is in the units of the robot's outputs and motors.
+        scale: by which the defaults are the robot's.
         own: what the user's file says.
-        scale: time and size of another robot over the neck's, by which the defaults are stretched.
     """
 
     bounds: tuple[Requirement, ...]
@@ -234,95 +202,84 @@ class Requirements(Shown):
     sampling: Mapping[str, Any]
     step: Mapping[str, Any]
     sim: Mapping[str, Any]
-    robot: Robot = _NECK
+    scale: Scale = field(default_factory=Scale)
     own: Mapping[str, Any] = field(default_factory=dict)
-    scale: tuple[float, float] = (1.0, 1.0)
 
-    def name_of(self, name: str) -> str:
-        """Return what a neck's metric such as `load_rms_deg` is called of the robot."""
-        return _Names(self.robot).of(name)
+    @property
+    def robot(self) -> Robot:
+        """Whose controller is judged."""
+        return self.scale.robot
 
     def si(self, value: float) -> float:
-        """Return an angle in deg in rad, or another robot's output in its display unit in SI."""
-        factor = shown_unit(self.robot)[1]
-        return math.radians(value) if factor is None else factor * value
+        """Return an output as people see it, such as in deg, in SI."""
+        return self.scale.si(value)
 
-    def motor_si(self, value: float) -> float:
-        """Return a number in the unit of the motors in SI; of a neck it is rad."""
-        return to_si(self.robot.motors.unit)[0] * value
+    def step_test(self, seed: int) -> StepTest:
+        """Return the step that is made on linear plants."""
+        load = to_si(self.robot.motors.unit)[0] * float(self.step["load_rad"])
+        return StepTest(
+            step=self.si(self.step["size_deg"]), duration=float(self.step["duration_s"]),
+            noise=self.si(self.step["noise_deg"]), load=load, seed=seed,
+        )  # fmt: skip
 
     def table(self, name: str) -> dict[str, Any]:
         """Return a table by the robot's names of its keys."""
-        return {_Names(self.robot).key(key): value for key, value in getattr(self, name).items()}
+        return {self.scale.name_of(key): value for key, value in getattr(self, name).items()}
 
-    def of_robot(self, robot: Robot) -> Requirements:
-        """Return them as asked of another robot than the one they were read for."""
-        return self if robot.hash == self.robot.hash else make_requirements(self.own, robot=robot)
-
-    def scaled(self, time: float, size: float, load: float, noise: float | None) -> Requirements:
-        """Return them with the defaults stretched to another robot: what the user's file says stays.
-
-        Args:
-            time: over the neck's time constant.
-            size: of outputs, over the neck's, in the display unit for deg.
-            load: at the plant's input, in the unit of the motors.
-            noise: of the sensor in the display unit; None for the neck's by `size`.
-        """
-        said = {name: self.own.get(name, {}) for name in _NUMBERS}
-        known = _Names(self.robot)
-
-        def with_free(name: str, **defaults: float) -> dict[str, Any]:
-            free = {key: value for key, value in defaults.items() if known.key(key) not in said[name]}
-            return {**getattr(self, name), **free}
-
-        step, sim, size_deg = self.step, self.sim, size * self.step["size_deg"]
-        quiet = size * step["noise_deg"] if noise is None else noise
-        return replace(
-            self,
-            bounds=tuple(item if item.asked else item.stretched(time, size, self.robot) for item in self.bounds),
-            uncertainty=with_free("uncertainty", delay_ms=time * self.uncertainty["delay_ms"]),
-            step=with_free(
-                "step", size_deg=size_deg, duration_s=time * step["duration_s"], noise_deg=quiet, load_rad=load
-            ),
-            sim=with_free("sim", size_deg=size * sim["size_deg"], duration_s=time * sim["duration_s"]),
-            scale=(time, size),
-        )
+    def at(self, scale: Scale) -> Requirements:
+        """Return them with the defaults of a scale, unless those of the same robot are known."""
+        kept = scale.robot.hash == self.robot.hash and self.scale.known
+        return self if kept else make_requirements(self.own, scale=scale)
 
 
-def read_requirements(path: str | Path | None = None, *, robot: Robot = _NECK) -> Requirements:
+def read_requirements(
+    path: str | Path | None = None, *, robot: Robot | None = None, scale: Scale | None = None
+) -> Requirements:
     """Return the defaults, with what the file at `path` says instead.
 
-    Of another robot than the neck keys and metrics in deg are in its outputs' display unit and called by it, such as
-    `size_mm` and `step.load_rms_mm`; angles stay in deg.
+    Keys and metrics in deg or rad are in the units of the robot and called by them, such as `size_mm` and
+    `step.load_rms_mm`; angles stay in deg.
+
+    Args:
+        path: of the file.
+        robot: whose controller is judged; None: a neck's.
+        scale: by which the defaults are the robot's; None: by what the robot alone tells.
 
     Raises:
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
-    defaults = _defaults()
     if path is None:
-        return _requirements(defaults, {}, robot)
+        return make_requirements({}, robot=robot, scale=scale)
     if not isinstance(path, str | Path):
         raise SettingsError(f"requirements are a file or a table; got a {type(path).__name__}.")
     table = _read(Path(path))
     try:
-        return _requirements(defaults, table, robot)
+        return make_requirements(table, robot=robot, scale=scale)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from error
 
 
-def make_requirements(table: Mapping[str, Any], *, robot: Robot = _NECK) -> Requirements:
+def make_requirements(
+    table: Mapping[str, Any], *, robot: Robot | None = None, scale: Scale | None = None
+) -> Requirements:
     """Return the defaults with what a table like a requirements file says instead."""
-    return _requirements(_defaults(), {"version": VERSION, **table}, robot)
+    scale = scale or Scale.of(robot or Robot.preset())
+    said = {"version": VERSION, **with_sim(table, scale.robot)}
+    own, defaults = for_verify(said), tomllib.loads(default_text())
+    for key in own:
+        if key not in ("version", *_NUMBERS, "require"):
+            raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(_NUMBERS)}, require.")
+    tables: Any = {name: _table(name, defaults[name], own.get(name, {}), scale) for name in _NUMBERS}
+    bounds = _bounds(scale.table(defaults["require"]), own.get("require", {}), scale.robot)
+    _refuse_contradictions(bounds, scale.robot)
+    _refuse_weak(bounds, tables, scale)
+    return Requirements(bounds, **tables, scale=scale, own=said)
 
 
 def default_text() -> str:
     """Return the defaults as a requirements file."""
     return DEFAULT_FILE.read_text(encoding="utf-8") + default_limits.as_toml(default_limits.VERIFY)
-
-
-def _defaults() -> dict[str, Any]:
-    return tomllib.loads(default_text())
 
 
 def _read(source: Path) -> dict[str, Any]:
@@ -341,45 +298,23 @@ def _read(source: Path) -> dict[str, Any]:
     return table
 
 
-def _requirements(defaults: Mapping[str, Any], own: Mapping[str, Any], robot: Robot) -> Requirements:
-    said = with_sim(own, robot)
-    own = for_verify(said)
-    known = ("version", *_NUMBERS, "require")
-    for key in own:
-        if key not in known:
-            raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(known[1:])}.")
-    shown = _Names(robot)
-    tables = {name: _table(name, defaults[name], own.get(name, {}), shown) for name in _NUMBERS}
-    bounds = _bounds({_shown(metric, shown): entry for metric, entry in defaults["require"].items()},
-                     own.get("require", {}), robot)  # fmt: skip
-    _refuse_contradictions(bounds, robot)
-    _refuse_weak(bounds, tables)
-    found: Any = tables  # one table each, by name
-    return replace(Requirements(bounds, **found), robot=robot, own=dict(said))
-
-
-def _shown(metric: str, shown: _Names) -> str:
-    group, _, name = metric.partition(".")
-    return f"{group}.{shown.of(name)}" if group in ("step", "sim") else metric
-
-
-def _table(name: str, defaults: Mapping[str, Any], own: Any, shown: _Names) -> dict[str, Any]:
+def _table(name: str, defaults: Mapping[str, Any], own: Any, scale: Scale) -> dict[str, Any]:
     if not isinstance(own, Mapping):
         raise SettingsError(f"`{name}` must be a table: [{name}].")
-    inside = {shown.key(key): key for key in defaults}
-    found = dict(defaults)
+    inside = {scale.name_of(key): key for key in defaults}
+    found = dict(zip(defaults, scale.table(defaults).values(), strict=True))
     for given, value in own.items():
         if given not in inside:
             raise SettingsError(f"unknown key `{given}` of [{name}]; it takes {', '.join(inside)}.")
         key = inside[given]
         found[key] = value
         if key in _NUMBERS[name]:
-            low, high, unit = _NUMBERS[name][key]
-            if key != given:  # another unit than the neck's has other borders
-                low, high, unit = -math.inf if low < 0.0 else 0.0, math.inf, given.rpartition("_")[2]
-            _check_number(f"[{name}] {given}", value, low, high, unit, whole=key in _WHOLE)
+            check_number(f"[{name}] {given}", value, key, _NUMBERS[name][key], scale)
         elif isinstance(defaults[key], list):
-            _check_list(f"[{name}] {key}", value, 5.0 if key == "payloads_kg" else 360.0)
+            if not isinstance(value, list) or not value:
+                raise SettingsError(f"`[{name}] {key}` must be a list of numbers; got {value!r}.")
+            for number in value:
+                check_number(f"[{name}] {key}", number, key, (0.0, 5.0 if key == "payloads_kg" else 360.0, ""), scale)
         elif isinstance(defaults[key], bool):
             if not isinstance(value, bool):
                 raise SettingsError(f"`[{name}] {key}` must be true or false; got {value!r}.")
@@ -388,19 +323,18 @@ def _table(name: str, defaults: Mapping[str, Any], own: Any, shown: _Names) -> d
     return found
 
 
-def _check_number(name: str, value: Any, low: float, high: float, unit: str, *, whole: bool) -> None:
+def check_number(name: str, value: Any, key: str, ends: tuple[float, float, str], scale: Scale) -> None:
+    """Raise SettingsError unless a value is a number between ends of the neck's, as far as the robot's are known."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SettingsError(f"`{name}` must be a number; got {value!r}.")
-    if whole:
+    low, high, unit = ends
+    if key in _WHOLE:
         require_whole(name, value, int(low), int(high))
+    own = scale.name_of(key)
+    if own != key or scale.factor(key) != 1.0:
+        size, unit = scale.factor("size_deg" if key == "noise_deg" else key), own.rpartition("_")[2]
+        low, high = (size * low, size * high) if scale.known else (-math.inf if low < 0.0 else 0.0, math.inf)
     require_between(name, float(value), low, high, unit)
-
-
-def _check_list(name: str, value: Any, largest: float) -> None:
-    if not isinstance(value, list) or not value:
-        raise SettingsError(f"`{name}` must be a list of numbers; got {value!r}.")
-    for number in value:
-        _check_number(name, number, 0.0, largest, "", whole=False)
 
 
 def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requirement, ...]:
@@ -412,7 +346,7 @@ def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requir
             raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(names)}.")
     found = []
     for metric, entry in {**defaults, **own}.items():
-        if entry is False or (metric == "sim.slack_s" and metric not in own and robot.directions.kind != "tendons"):
+        if entry is False or (metric == "sim.slack_s" and metric not in own and robot.tendon_angles is None):
             continue
         if not isinstance(entry, Mapping) or not entry or any(key not in _BOUNDS for key in entry):
             raise SettingsError(
@@ -462,7 +396,7 @@ _ALWAYS_AT_MOST = {"disk_margin": 2.0, "phase_margin_deg": 180.0}
 _STABILITY = ("stability.radius", "stability.searched_radius", "robust.mu")
 
 
-def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[str, Any]]) -> None:
+def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[str, Any]], scale: Scale) -> None:
     """Refuse what would hold whatever the controller does, and what is probably another unit."""
     for key in ("gain_pct", "pole_pct"):
         if 0.0 < (value := float(tables["uncertainty"][key])) < 1.0:
@@ -482,7 +416,12 @@ def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[s
                 + ("allows unstable loops; 1 is the limit." if not always else "always holds, so it says nothing.")
             )
         group, _, name = item.metric.partition(".")
-        if name == "settling_s" and item.bound != "min" and item.limit > float(tables[group]["duration_s"]):
+        if (
+            name == "settling_s"
+            and scale.known
+            and item.bound != "min"
+            and item.limit > float(tables[group]["duration_s"])
+        ):
             raise SettingsError(
                 f"`[{group}] duration_s` = {tables[group]['duration_s']:g} is shorter than the settling time that "
                 f"`{item.metric}` allows ({item.limit:g} s); nobody would see whether it settles."

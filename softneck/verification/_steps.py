@@ -15,9 +15,7 @@ from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.design.linear._ports import motor_ranges
 from softneck.loop._result import SETTLING_BAND, shown_unit
 from softneck.robot import Robot
-from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, load_functions
-from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._plants import Plants, mixing
 
@@ -34,7 +32,7 @@ _RISE, _STEADY_PART = (0.1, 0.9), 0.25
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepTest:
-    """A step of one axis after the other, then a load; of another robot in SI for rad.
+    """A step of one axis after the other, then a load; where outputs are no angles, SI stands for rad.
 
     Attributes:
         step: size [rad].
@@ -53,7 +51,7 @@ class StepTest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """What all plants did, of the step in each axis; of another robot in SI for rad.
+    """What all plants did, of the step in each axis; where outputs are no angles, SI stands for rad.
 
     Attributes:
         time: (rows,) [s].
@@ -96,12 +94,10 @@ def run_steps(
         test: what is asked.
         workers: threads; all cores where None.
         robot: whose they are; None for a neck.
-        weights: (axes, motors) of another robot's motors in each axis's input.
+        weights: (axes, motors) of the motors in each axis's input; None: those that the robot's file gives.
     """
     whose = Robot.preset() if robot is None else robot
-    T = redefinition_matrix(np.asarray(TENDON_ANGLES))
-    if weights is not None:
-        T = redefinition_of(weights, whose.outputs.names)[0]
+    T = whose.redefinition(weights)[0]
     m, around = len(plants.axes), middle_of(whose)
     before = T @ middle_motors(whose, block)
     Ts = plants.sample_time
@@ -138,17 +134,21 @@ def run_steps(
 
 
 def middle_of(robot: Robot) -> Vector:
-    """Return around which outputs steps are made: no reference goes where the robot's outputs may not."""
-    low, high = robot.outputs.min, robot.outputs.max
-    if low is None or high is None:
-        return np.zeros(len(robot.outputs.names))
-    return 0.5 * to_si(robot.outputs.unit)[0] * (np.array(low) + np.array(high))
+    """Return around which outputs steps are made: at rest, or else in the middle of what the robot's may be."""
+    outputs, factor = robot.outputs, to_si(robot.outputs.unit)[0]
+    if outputs.rest is not None:
+        return factor * np.array(outputs.rest)
+    if outputs.min is None or outputs.max is None:
+        return np.zeros(len(outputs.names))
+    return 0.5 * factor * (np.array(outputs.min) + np.array(outputs.max))
 
 
 def middle_motors(robot: Robot, block: Block) -> Vector:
     """Return around which set-points (motors,) steps are made: from one end of their range motors go only one way."""
+    if robot.motors.rest is not None:
+        return to_si(robot.motors.unit)[0] * np.array(robot.motors.rest)
     limits = {port.name: port.start for port in block.parameters}
-    ranges = None if robot.is_neck else motor_ranges(robot, limits.get("position_limit"))
+    ranges = motor_ranges(robot, limits.get("position_limit"))
     return np.zeros(len(robot.set_points)) if ranges is None else 0.5 * (ranges[0] + ranges[1])
 
 

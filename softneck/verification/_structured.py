@@ -159,19 +159,20 @@ class StructuredResult:
         return float(self.upper.max())
 
 
-def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int) -> list[StructuredResult]:
+def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int, time: float = 1.0) -> list[StructuredResult]:
     """Return the bounds of each axis, or of both together where plant or controller couple them.
 
     Args:
         neck: with its box.
         law: the controller's linear form.
         extra: samples of delay that the loop's order adds.
+        time: by which the robot is slower than the neck.
     """
     Ts = neck.sample_time
     results = []
     for axes in axes_together(neck, law):
         bands = [box.measured.band for box in (neck.axes[i] for i in axes) if box.measured is not None]
-        low, high = [max(ends) for ends in zip(*((a, -b) for a, b in bands), (0.05, -math.pi / Ts), strict=True)]
+        low, high = [max(ends) for ends in zip(*((a, -b) for a, b in bands), (0.05 / time, -math.pi / Ts), strict=True)]
         peaks = _real_peaks(neck, law, np.geomspace(low, -high, _FINE), axes, extra)
         w = np.union1d(np.geomspace(low, -high, _FREQUENCIES), peaks)
         M, blocks = interconnection(neck, law, w, axes, extra)

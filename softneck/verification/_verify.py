@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,6 @@ from softneck.core._progress import shown_progress
 from softneck.core._shown import Shown
 from softneck.design.linear._own import own_controller
 from softneck.estimation._axis import robot_of
-from softneck.estimation._forms import Reach
-from softneck.estimation._reach import REACHED, motor_ends
-from softneck.identification.models._directions import NECK_SECONDS
-from softneck.loop._result import shown_unit
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.robot._opened import opened
@@ -33,54 +29,9 @@ from ._linear import ControllerUnderTest, judge
 from ._neck_loops import ALONE, check_blocks, is_own_plant, named_plants, not_recorded, own_plant
 from ._plants import UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, make_requirements, read_requirements, with_groups
+from ._scale import Scale
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
-
-# The load of the defaults over the largest input that the neck's motors give, 12 rad.
-_LOAD = 1.0 / 12.0
-
-
-def scaled(asked: Requirements, sources: Sequence[UncertainNeck]) -> Requirements:
-    """Return the requirements with their defaults for the robot of `sources`; what the user's file says stays.
-
-    What was stretched before, as `tune` does for all that it judges, stays as well.
-
-    Times go by the slowest pole over the neck's 0.2 s, sizes by the least that an output reaches and may over the
-    neck's 40 deg, the load by what the motors can give.
-
-    Raises:
-        SettingsError: the robot does not say where its set-points end.
-    """
-    if asked.scale != (1.0, 1.0):
-        return asked
-    robot = asked.robot
-    boxes = [box for source in sources for box in source.axes]
-    slowest = max(1.0 / float(box.nominal[1]) for box in boxes)
-    low, high = motor_ends(robot, "verification")
-    most = [np.abs(_weights(source)) @ (0.5 * (high - low)) for source in sources]
-    reached = min(
-        REACHED * abs(float(box.nominal[0])) * float(v)
-        for source, each in zip(sources, most, strict=True) for box, v in zip(source.axes, each, strict=True)
-    )  # fmt: skip
-    outputs = robot.outputs
-    if outputs.min is not None and outputs.max is not None:
-        spans = 0.5 * to_si(outputs.unit)[0] * (np.array(outputs.max) - np.array(outputs.min))
-        reached = min(reached, float(spans.min()))
-    factor = shown_unit(robot)[1]
-    # Of the neck's 40 deg; in another unit the numbers of the defaults are so many deg.
-    size = reached / Reach().start if factor is None else reached / factor / math.degrees(Reach().start)
-    told = robot.noise_std
-    noise = None if told is None else told * to_si(robot.outputs.unit)[0]
-    shown = None if noise is None else math.degrees(noise) if factor is None else noise / factor
-    load = _LOAD * float(asked.step["load_rad"]) * min(float(each.min()) for each in most)
-    time = max(slowest, max(source.sample_time for source in sources)) / NECK_SECONDS
-    return asked.scaled(time, size, load / to_si(robot.motors.unit)[0], shown)
-
-
-def _weights(source: UncertainNeck) -> np.ndarray:
-    if source.weights is None:
-        raise ValueError("a neck's requirements are not scaled")
-    return source.weights
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -194,11 +145,12 @@ class Verification(Shown):
         return certificate_contents("verify", holds=self.holds, files=self.files, more=plain(more))
 
     def _robot(self) -> dict[str, Any]:
-        """Return of another robot than the neck who it is, and by what the defaults were stretched to it."""
-        robot, (time, size) = self.controller.robot, self.requirements.scale
-        if robot.is_neck:
+        """Return of another robot than the preset `neck` who it is, and by what the defaults are its own."""
+        scale, robot = self.requirements.scale, self.controller.robot
+        if not robot.in_header():
             return {}
-        return {"robot": {"name": robot.name, "hash": robot.hash}, "scale": {"time": time, "size": size}}
+        said = {"time": scale.time, "size": scale.size}
+        return {"robot": {"name": robot.name, "hash": robot.hash}, "scale": said}
 
     def write_worst(
         self, folder: str | Path, *, controller: str | Path, observer: str | Path | None = None, force: bool = False
@@ -233,18 +185,22 @@ class Verification(Shown):
 
 def standing_for(thing: Any, robot: Robot) -> Any:
     """Return a plant of one's own, a neck's physics as those of the robot that it stands for."""
-    return VirtualNeck.of(robot, thing) if isinstance(thing, NeckParameters) and not robot.is_neck else thing
+    return VirtualNeck.of(robot, thing) if isinstance(thing, NeckParameters) else thing
 
 
-def sources_of(things: Mapping[str, Any], requirements: Requirements) -> list[UncertainNeck]:
+def sources_of(things: Mapping[str, Any], requirements: Requirements | None = None) -> list[UncertainNeck]:
     """Return models and families as sources of plants: name -> model (anything with `tf`) or family.
+
+    Models are as uncertain as the requirements say; without requirements they are certain.
 
     Raises:
         SettingsError: none, an empty family, one that is not linear.
     """
     if not things:
         raise SettingsError("no plant: give at least one MODEL or FAMILY.")
-    asked = requirements.uncertainty
+    asked = (
+        dict.fromkeys(("gain_pct", "pole_pct", "delay_ms"), 0.0) if requirements is None else requirements.uncertainty
+    )
     spread = {"gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3}
     necks = []
     for name, thing in things.items():
@@ -299,18 +255,17 @@ def verify(
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
         # Physics and functions of one's own say nothing of a robot: their ports have to be its own.
-        if robot.is_neck or hasattr(thing, "robot") or not is_own_plant(thing):
+        if hasattr(thing, "robot") or not is_own_plant(thing):
             require_same_robot(robot_of(thing), robot, f"the controller and {what}")
     own = {name: standing_for(thing, robot) for name, thing in named.items() if is_own_plant(thing)}
     linear = {name: thing for name, thing in named.items() if name not in own}
+    scale = Scale.of(robot, sources_of(linear))
     if isinstance(requirements, Requirements):
-        asked = requirements.of_robot(robot)
+        asked = requirements.at(scale)
     elif isinstance(requirements, Mapping):
-        asked = make_requirements(with_groups(requirements, robot, stepping=bool(own)), robot=robot)
+        asked = make_requirements(with_groups(requirements, robot, stepping=bool(own)), scale=scale)
     else:
-        asked = read_requirements(requirements, robot=robot)
-    if not robot.is_neck:
-        asked = scaled(asked, sources_of(linear, asked))
+        asked = read_requirements(requirements, scale=scale)
     necks = sources_of(linear, asked)
     eyes = None if observer is None else observer.block()
     judged = judge(controller, order=order, observer=observer is not None)
@@ -326,7 +281,7 @@ def verify(
     with shown_progress("verify", progress) as tell:
         evidence = gather(judged, necks, asked, observer=eyes, progress=tell, families=linear, own=step)
     tested = {name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})}
-    elsewhere = not_recorded(tested, step, evidence.steps) if robot.is_neck else {}
+    elsewhere = not_recorded(tested, step, evidence.steps, robot)
     if tested and not judged.laws:
         elsewhere["margins"] = ALONE
     return Verification(
@@ -414,10 +369,15 @@ def _box(neck: UncertainNeck) -> dict[str, Any]:
     return {
         axis: {
             "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
-            "unit": ["rad/rad" if neck.robot.is_neck else "SI", "1/s", "s"],
+            "unit": [gain_unit(neck.robot), "1/s", "s"],
         }
         for axis, box in zip(neck.names, neck.axes, strict=True)
     }  # fmt: skip
+
+
+def gain_unit(robot: Robot) -> str:
+    """Return the SI unit of static gains, `rad/rad` of a neck."""
+    return f"{to_si(robot.outputs.unit)[1]}/{to_si(robot.motors.unit)[1]}"
 
 
 def plain(value: Any) -> Any:

@@ -14,9 +14,8 @@ from numpy.typing import ArrayLike
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
 from softneck.loop._result import shown_unit
 from softneck.robot import Robot
-from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port
-from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix, write_recording
+from softneck.signals import Recording, write_recording
 
 from ._plants import mixing
 from ._requirements import Requirements
@@ -97,9 +96,7 @@ def linear_plant(
         raise SettingsError("`numerator` must begin with 0 and `denominator` with 1: the input acts one sample later.")
     if min(delay) < 0:
         raise SettingsError(f"`delay` must not be negative; got {list(delay)}.")
-    T = redefinition_matrix(np.asarray(TENDON_ANGLES))
-    if directions is not None:
-        T = redefinition_of(np.asarray(directions, dtype=np.float64), names)[0]
+    T = whose.redefinition(None if directions is None else np.asarray(directions, dtype=np.float64))[0]
     unit, motor = to_si(whose.outputs.unit)[1], to_si(whose.motors.unit)[1]
     motors = [
         Port(name=name, unit=motor, description=f"set-point of motor {j}") for j, name in enumerate(whose.set_points, 1)
@@ -130,7 +127,7 @@ def linear_plant(
 
 def write_linear(
     folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, asked: Requirements,
-    block: Block, weights: Matrix | None = None, force: bool
+    block: Block, weights: Matrix, force: bool
 ) -> Path:  # fmt: skip
     """Write `name.toml` and the plant beside it; return the loop file.
 
@@ -143,20 +140,24 @@ def write_linear(
         controller: its file.
         asked: the requirements.
         block: the controller.
-        weights: (outputs, motors) of another robot's directions.
+        weights: (outputs, motors) of the motors in each axis's input.
         force: replace what stands there.
     """
     robot, step = asked.robot, asked.step
-    axes, more = "pitch (from theta_i) and roll (phi_i)", ""
-    around, before = middle_of(robot), np.zeros(len(robot.outputs.names) + 1)
-    if weights is not None:
-        axes = f"{', '.join(robot.outputs.names)} from their inputs"
-        more = f"\n        robot={robot.as_dict()!r},\n        directions={np.asarray(weights).tolist()!r},"
-        before = redefinition_of(np.asarray(weights), robot.outputs.names)[0] @ middle_motors(robot, block)
-        if before.any() or around.any():
-            more += f"\n        inputs={before[:-1].tolist()!r},\n        outputs={around.tolist()!r},"
+    around, names = middle_of(robot), robot.outputs.names
+    inputs = " and ".join(f"{axis} (from {name})" for axis, name in zip(names, robot.input_names, strict=True))
+    before = robot.redefinition(weights)[0] @ middle_motors(robot, block)
+    more = f"\n        robot={robot.as_dict()!r}," if robot.in_header() else ""
+    own = robot.weights()
+    more += (
+        ""
+        if own is not None and np.array_equal(own, weights)
+        else f"\n        directions={np.asarray(weights).tolist()!r},"
+    )
+    if before.any() or around.any():
+        more += f"\n        inputs={before[:-1].tolist()!r},\n        outputs={around.tolist()!r},"
     named = {**worst, "name": str(worst["name"]).replace("\\", "/").replace('"', "'")}
-    text = _PLANT.format(**named, axes=axes, more=more)
+    text = _PLANT.format(**named, axes=inputs, more=more)
     # Modules of one name are imported once: another plant needs another name.
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     _write(folder / f"{module}.py", text, force=True)
@@ -169,8 +170,7 @@ def write_linear(
         _write_reference(folder / f"{name}_reference.csv", robot, levels, Ts, force=force)
         wanted = f'kind = "recording"\nfile = "{name}_reference.csv"'
     else:
-        factor = shown_unit(robot)[1]
-        wanted = _step(robot, np.degrees(stepped) if factor is None else stepped / factor, 0.0)
+        wanted = _step(robot, asked.scale.shown(stepped), 0.0)
     noise = f"noise_std = {asked.si(step['noise_deg'])!r}"
     text = _loop(
         folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from softneck.cosim.studies._executors import Crew, Here
+from softneck.robot import Robot
 from softneck.tuning import _search
 from softneck.tuning._judge import Judgement
 from softneck.tuning._log import Log
@@ -41,7 +42,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) 
     task: Any = SimpleNamespace(
         asked=SimpleNamespace(bounds=BOUNDS), own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
-    each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, neck=True)
+    each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
     found = Search(task, each, Crew(1, Here()), Log(None, ""), budget, lambda *_: None)
     found.run()
     return found

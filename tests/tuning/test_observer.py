@@ -13,6 +13,7 @@ from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import FamilySettings, GreyBox, Model
 from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.robot import Robot
 from softneck.signals import Recording, signal
 from softneck.tuning import tune
 from softneck.tuning._cases import Case, loop_of
@@ -44,7 +45,7 @@ def task(several: Model) -> Task:
 
 
 def controller(task: Task, kind: str) -> Any:
-    (space,) = spaces((kind,), rise=0.4, cocontraction=None, neck=True)
+    (space,) = spaces((kind,), rise=0.4, cocontraction=None, robot=Robot.preset())
     return designed(task, made_ready(task), kind, space.settings(space.start))
 
 

@@ -20,6 +20,7 @@ from softneck.robot import Robot
 from softneck.tuning._beforehand import refuse_impossible
 from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements
 from softneck.verification import make_requirements, read_requirements
+from softneck.verification._scale import Scale
 
 TS = 0.02
 GAIN, POLE, DELAY = math.radians(5.23), 5.293, 4
@@ -77,7 +78,7 @@ def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path,
     assert again.lines() == asked.lines()
     theirs = read_requirements(path)
     assert theirs.bounds == asked.certificate.bounds
-    assert theirs.of_robot(Robot.preset("antagonist")).own == theirs.own
+    assert theirs.at(Scale.of(Robot.preset("antagonist"))).own == theirs.own
     for name in ("uncertainty", "sampling", "step", "sim"):
         assert getattr(theirs, name) == getattr(asked.certificate, name) == getattr(again.certificate, name)
     assert asked.limit("track.ahead_rms_deg") is None
@@ -93,8 +94,8 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
     ("table", "match"),
     [
         ({"track": {"circle": 3.0}}, "unknown key `circle`"),
-        ({"track": {"circle_deg": -1.0}}, "must be from 0.1 to 40"),
-        ({"track": {"noise_deg": True}}, "must be from"),
+        ({"track": {"circle_deg": -1.0}}, "must be between 0.1 and 40"),
+        ({"track": {"noise_deg": True}}, "must be a number"),
         ({"require": {"track.lap_s": {"max": 1.0}}}, r"unknown metric `track.lap_s`"),
         ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must say"),
         ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "must be a positive number"),

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, resolve
 from softneck.core._kinds import make_settings
+from softneck.robot import Robot
 from softneck.tuning import tune
 from softneck.tuning._log import FILE, Job, Log
 from softneck.tuning._result import binding, front
@@ -160,7 +161,7 @@ def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
 
 @pytest.mark.parametrize("kind", [*KINDS_SEARCHED, "nmpc"])
 def test_every_point_of_a_space_is_a_setting_of_its_kind(kind: str) -> None:
-    (space,) = spaces((kind,), rise=0.4, cocontraction=1.0, neck=True)
+    (space,) = spaces((kind,), rise=0.4, cocontraction=1.0, robot=Robot.preset())
     made = resolve(KINDS[kind].settings)
     rng = np.random.default_rng(0)
     n = len(space.dimensions)
@@ -176,7 +177,7 @@ def test_every_point_of_a_space_is_a_setting_of_its_kind(kind: str) -> None:
 def test_what_cannot_be_tuned_is_refused() -> None:
     for kind, match in (("custom", "cannot be tuned"), ("pie", "unknown kind")):
         with pytest.raises(SettingsError, match=match):
-            spaces((kind,), rise=0.4, cocontraction=None, neck=True)
+            spaces((kind,), rise=0.4, cocontraction=None, robot=Robot.preset())
     with pytest.raises(SettingsError, match="no linear plant"):
         tune({})
 

@@ -33,6 +33,7 @@ from softneck.verification._neck_loops import (
     step_at,
 )
 from softneck.verification._plants import all_plants, neck_of_family
+from softneck.verification._scale import Scale
 from softneck.verification._steps import Steps
 from softneck.verification._structured import structured
 from softneck.verification._tested import axis_on_data
@@ -311,8 +312,10 @@ def _labelled(system: Any) -> Any:
 
 def test_a_step_waits_for_the_motors_that_pull_tendons_taut() -> None:
     taut = PiSettings(least_cocontraction=0.6).design(linear_neck())
-    assert step_at(pi().block()) == 0.5
-    assert step_at(taut.block()) == 3.0
+    asked = make_requirements({})
+    assert step_at(pi().block(), asked) == 0.5
+    assert step_at(taut.block(), asked) == 3.0
+    assert step_at(taut.block(), replace(asked, scale=Scale(time=10.0))) == 30.0
 
 
 def test_a_tested_family_holds_no_plant_that_its_recordings_exclude_and_reaches_to_the_weight() -> None:

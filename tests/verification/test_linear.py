@@ -167,7 +167,8 @@ def _hidden() -> tuple[UncertainNeck, LinearLaw]:
     box = AxisBox(
         nominal=low, low=low, high=low + np.array([0.0, 0.0, 0.08]), samples=np.zeros((0, 3)),
     )  # fmt: skip
-    neck = UncertainNeck(name="hidden", sample_time=TS, axes=(box, box), cross=np.zeros(2), kind="model")
+    neck = UncertainNeck(name="hidden", sample_time=TS, axes=(box, box), cross=np.zeros(2), kind="model",
+                        weights=np.eye(2))  # fmt: skip
     law = LinearLaw.of(controller_of(sign * np.array([1.0, -1.0]), below))
     return neck, law
 

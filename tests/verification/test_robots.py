@@ -114,12 +114,12 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays(tmp_path: P
     found = verify(controller, model, asked)
     limits = {item.requirement.metric: item.requirement.limit for item in found.verdicts}
     assert limits["step.settling_s"] == 1.5
-    time, size = found.requirements.scale
+    time, size = found.requirements.scale.time, found.requirements.scale.size
     # A pole of 0.9 at 20 ms over the neck's 0.2 s.
     assert time == pytest.approx(-0.02 / math.log(0.9) / 0.2)
     # The directions sum to 1.4, 1.4 and 2 of 1.5 bar, by 1e-7 m/Pa: 0.64 of the least are 13 mm. The robot may go 10 mm
-    # from the middle of its range; over the neck's 40 deg, in mm.
-    assert size == pytest.approx(10.0 / 40.0)
+    # from the middle of its range; over the 0.8 rad of a neck, in mm.
+    assert size == pytest.approx(10.0 / math.degrees(0.8))
     assert limits["step.load_rms_mm"] == pytest.approx(2.0 * size)
     assert found.requirements.si(found.requirements.step["size_deg"]) == pytest.approx(3e-3)
     verdicts = {item.requirement.metric: item for item in found.verdicts}

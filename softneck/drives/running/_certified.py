@@ -13,6 +13,7 @@ from softneck.loop import Loop, LoopResult, LoopRun
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 from softneck.verification import read_requirements
+from softneck.verification._scale import Scale
 
 # What `softneck verify` must have shown before a controller gets to drives, each at least as strictly as its defaults
 # ask. What arming asks for later is a line here.
@@ -124,12 +125,11 @@ def _require_minimum(found: Certificate, robot: Robot) -> None:
 
     Of another robot the defaults are those that `verify` stretched to it, by what stands in the certificate.
     """
-    asked = read_requirements(robot=robot)
-    scale = found.contents.get("scale") or {"time": 1.0, "size": 1.0}
-    bounds = [item.stretched(float(scale["time"]), float(scale["size"]), robot) for item in asked.bounds]
-    defaults = {item.metric: item for item in bounds}
+    said = found.contents.get("scale") or {}
+    scale = Scale(robot=robot, time=float(said.get("time", 1.0)), size=float(said.get("size", 1.0)))
+    defaults = {item.metric: item for item in read_requirements(scale=scale).bounds}
     for neck_metric, what in ARMING.items():
-        metric = asked.name_of(neck_metric)
+        metric = scale.name_of(neck_metric)
         least = defaults[metric]
         rows = [row for row in found.rows if row.get("metric") == metric]
         if not rows:

@@ -1,0 +1,131 @@
+"""How requirements of a robot are said: defaults are numbers of the neck, times its range and its time constant."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from softneck.core import to_si
+from softneck.estimation._forms import Reach
+from softneck.estimation._reach import REACHED, motor_ends
+from softneck.loop._result import shown_unit
+from softneck.robot import Robot
+from softneck.robot._scaling import MOTOR_RANGE, Scaling
+
+from ._plants import UncertainNeck
+
+# Of the defaults [deg].
+_NOISE_DEG = 0.05
+# Angles of every robot, whatever the unit of its outputs is.
+_ANGLES = ("orientations_deg", "phase_margin_deg")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scale:
+    """What the neck's numbers are multiplied by to be a robot's; of the neck all are one.
+
+    Attributes:
+        robot: whose requirements they are.
+        time: of seconds.
+        size: of degrees, in the unit that outputs are shown in.
+        load: of radians at the plant's input, in the unit of the motors.
+        noise: of degrees of the sensor's noise, as `size`.
+        known: whether robot and plants told all of it; else what a user states is not held against it.
+    """
+
+    robot: Robot = field(default_factory=Robot.preset)
+    time: float = 1.0
+    size: float = 1.0
+    load: float = 1.0
+    noise: float = 1.0
+    known: bool = True
+
+    @classmethod
+    def of(cls, robot: Robot, sources: Sequence[UncertainNeck] = ()) -> Scale:
+        """Return it by what the robot gives, else by its ranges and by the plants that stand for it.
+
+        Raises:
+            SettingsError: plants of a robot that does not say where its set-points end.
+        """
+        slowest = [1.0 / float(box.nominal[1]) for source in sources for box in source.axes]
+        scaling = Scaling.of(robot, time_constant=max([*slowest, *(s.sample_time for s in sources)], default=None))
+        motors, outputs = robot.motors, robot.outputs
+        load, output = scaling.motor_unit, float(scaling.output_unit.min())
+        if sources and (motors.nominal is None or outputs.nominal is None):
+            low, high = motor_ends(robot, "verification")
+            most = [np.abs(source.weights) @ (0.5 * (high - low)) for source in sources]
+            load = min(float(each.min()) for each in most) / (2.0 * MOTOR_RANGE)
+            reached = min(
+                REACHED * abs(float(box.nominal[0])) * float(v) / Reach().start
+                for source, each in zip(sources, most, strict=True) for box, v in zip(source.axes, each, strict=True)
+            )  # fmt: skip
+            output = reached if outputs.min is None or outputs.max is None else min(output, reached)
+        size = output * math.radians(1.0) / _shown(robot)
+        noise = size * _NOISE_DEG
+        if robot.noise_std is not None:
+            noise = robot.noise_std * to_si(outputs.unit)[0] / _shown(robot)
+        return cls(
+            robot=robot, time=scaling.second, size=size, load=load / to_si(motors.unit)[0],
+            noise=digits(noise / _NOISE_DEG),
+            known=bool(sources) or None not in (robot.time_constant_s, motors.nominal, outputs.nominal),
+        )  # fmt: skip
+
+    def factor(self, name: str) -> float:
+        """Return what a number of the neck is multiplied by: of a key or metric such as `size_deg`, `settling_s`."""
+        if name == "load_rad":
+            return self.load
+        if name == "noise_deg":
+            return self.noise
+        if name == "circle_rad_s":
+            return 1.0 / self.time
+        if name.endswith("_deg") and name not in _ANGLES:
+            # What stands still is no quieter than the sensor.
+            return max(self.size, self.noise) if name == "steady_rms_deg" else self.size
+        return self.time if name.endswith(("_s", "_ms")) else 1.0
+
+    def name_of(self, name: str) -> str:
+        """Return a neck's key or metric as the robot's: `load_rms_mm` for `load_rms_deg`, `max_bar` for `max_rad`."""
+        if name.rpartition(".")[2] in _ANGLES:
+            return name
+        motor = self.robot.motors.unit.replace("/", "_")
+        own = re.sub(r"_deg$", f"_{shown_unit(self.robot)[0]}", name)
+        return re.sub(r"_rad$", f"_{motor}", own.replace("variation_rad_s", f"variation_{motor}_s"))
+
+    def table(self, defaults: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a table of defaults as the robot's: keys in its units, numbers by its range and its time constant."""
+        return {
+            self.name_of(key): _times(self.factor(key.rpartition(".")[2]), value) for key, value in defaults.items()
+        }
+
+    def si(self, value: float) -> float:
+        """Return an output as people see it, such as in deg, in SI."""
+        factor = shown_unit(self.robot)[1]
+        return math.radians(value) if factor is None else factor * value
+
+    def shown(self, values: Any) -> Any:
+        """Return outputs in SI as people see them."""
+        factor = shown_unit(self.robot)[1]
+        return np.degrees(values) if factor is None else values / factor
+
+
+def _shown(robot: Robot) -> float:
+    factor = shown_unit(robot)[1]
+    return math.radians(1.0) if factor is None else factor
+
+
+def _times(factor: float, value: Any) -> Any:
+    """Return numbers times a factor, also in tables; lists, texts and switches as they are."""
+    if isinstance(value, Mapping):
+        return {key: _times(factor, item) for key, item in value.items()}
+    plain = isinstance(value, bool) or not isinstance(value, int | float) or factor == 1.0
+    return value if plain else digits(factor * value)
+
+
+def digits(value: float) -> float:
+    """Return it to 12 digits: without what conversions of units round."""
+    return float(f"{value:.12g}")
