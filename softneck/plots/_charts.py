@@ -15,7 +15,7 @@ from softneck.signals import Recording
 from softneck.signals.recording._channels import NECK
 
 from ._chart import Chart, Curve, Level, Panel, chart_figure
-from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, MOTOR_COLOURS, ORANGE, RED, SKY, looks, shown
+from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, ORANGE, RED, SKY, looks, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -183,16 +183,15 @@ def loop_chart(
     """
     panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
-    colours = MOTOR_COLOURS if robot.is_neck else ALL_MOTOR_COLOURS
     for j, (name, position) in enumerate(zip(robot.set_points, robot.motor_positions, strict=True)):
-        motors.append(Curve(time, signals[name] / to_si(unit)[0], f"set-point {j + 1}", colours[j], "step"))
+        motors.append(Curve(time, signals[name] / to_si(unit)[0], f"set-point {j + 1}", ALL_MOTOR_COLOURS[j], "step"))
         if position in signals:
             measured = signals[position] / to_si(unit)[0]
-            motors.append(Curve(time, measured, f"position {j + 1}", colours[j], "dashed", 0.8))
+            motors.append(Curve(time, measured, f"position {j + 1}", ALL_MOTOR_COLOURS[j], "dashed", 0.8))
     panels.append(Panel(motors, f"motor [{unit}]"))
     if "tension_1" in signals:
         pulls = [
-            Curve(time, signals[f"tension_{j}"], f"tendon {j}", colours[j - 1])
+            Curve(time, signals[f"tension_{j}"], f"tendon {j}", ALL_MOTOR_COLOURS[j - 1])
             for j in range(1, len(robot.motors.names) + 1) if f"tension_{j}" in signals
         ]  # fmt: skip
         panels.append(Panel(pulls, "tension [N]"))

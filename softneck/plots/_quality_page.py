@@ -63,8 +63,8 @@ def _values(recording: Recording, name: str) -> Vector:
 
 def quality_page(recording: Recording, quality: Quality, title: str) -> str:
     """Return the HTML text of a recording's quality: findings and tables."""
-    neck, bandwidth = quality.robot.is_neck, quality.spectrum.bandwidth
-    spectrum = f"Power of the {'redefined inputs' if neck else 'set-points'} (Welch, never across runs)."
+    bandwidth = quality.spectrum.bandwidth
+    spectrum = f"Power of {', '.join(quality.spectrum.inputs)} (Welch, never across runs)."
     if not np.isnan(bandwidth):
         spectrum += f" What has none up to the bandwidth of {bandwidth:.3g} rad/s cannot be identified."
     faults = faults_chart(recording, quality, "What was measured, with the rows of each fault marked")

@@ -17,7 +17,6 @@ from softneck.core._shown import Shown
 from softneck.robot import Robot
 
 from ..recording._channels import NECK
-from ..recording._redefinition import motors_from
 
 #: Sample time of the paper's experiments [s].
 SAMPLE_TIME = 0.02
@@ -62,12 +61,12 @@ class Pulls:
     Attributes:
         angles: (motors,) tendon angles [rad]; evenly around where a robot gives none.
         rows: (outputs, motors) weights of the motors in each output, the largest 1 or -1.
-        neck: these are the paper's.
+        inverse: (motors, outputs + 1) motors that move each output, and all together.
     """
 
     angles: Vector
     rows: Matrix
-    neck: bool
+    inverse: Matrix
 
     @classmethod
     def of(cls, robot: Robot) -> Pulls:
@@ -81,7 +80,10 @@ class Pulls:
             )
         size = np.abs(weights).max(axis=1, keepdims=True)
         # Rounded: -1/2 is -1/2, not the nearest that a cosine comes to.
-        return cls(angles, np.round(weights / np.where(size > 1e-9, size, 1.0), 12), robot.is_neck)
+        rows = np.round(weights / np.where(size > 1e-9, size, 1.0), 12)
+        if robot.weights() is not None and motors == outputs + 1:
+            return cls(angles, rows, robot.redefinition()[1])
+        return cls(angles, rows, np.column_stack([2.0 / 3.0 * rows.T, np.ones(motors)]))
 
 
 def signal_names() -> tuple[str, ...]:
@@ -138,9 +140,10 @@ def _in_range(P: Matrix, robot: Robot) -> Matrix:
 def eq22(t: Vector, pulls: Pulls) -> Matrix:
     """Return the identification signal of Eq. 22 with Table 2, (time, motors) [rad]; others spread its phi_4."""
     w1, w2, w3, w4, w5, w6, w7 = _OMEGA
-    phi_1 = _PHI_1 if pulls.neck else pulls.angles
+    printed = pulls.angles.size == 3 and np.abs(pulls.angles - _PHI_1).max() < 0.01
+    phi_1 = _PHI_1 if printed else pulls.angles
     # Each motor another: tendons that face each other would mirror each other else, and nothing be known of their sum.
-    phi_4 = _PHI_4 if pulls.neck else np.linspace(_PHI_4[0], _PHI_4[-1], phi_1.size)
+    phi_4 = _PHI_4 if printed else np.linspace(_PHI_4[0], _PHI_4[-1], phi_1.size)
     T = t[:, None]
     carrier = 0.6 * np.sin(2.0 * np.sin(w1 * T + phi_1) + np.cos(w1 * T + phi_1))
     envelope = (
@@ -182,9 +185,7 @@ def _rotation(t: Vector, pulls: Pulls) -> Matrix:
 def _aprbs(t: Vector, rng: np.random.Generator, pulls: Pulls) -> Matrix:
     """Amplitude-modulated PRBS along each output and on co-contraction; each level held for 0.4 to 2.4 s."""
     inputs = np.column_stack([_levels(t, rng, size) for size in (*(4.0,) * len(pulls.rows), 0.8)])
-    # Of the neck the inverse redefinition, which is two thirds of the weights.
-    motors = motors_from(inputs) if pulls.neck else 2.0 / 3.0 * inputs[:, :-1] @ pulls.rows + inputs[:, -1:]
-    return np.clip(motors, -4.5, 4.5)
+    return np.clip(inputs @ pulls.inverse.T, -4.5, 4.5)
 
 
 def _sample_time(t: Vector) -> float:

@@ -151,8 +151,8 @@ def _layout(draft: Draft, found: dict[str, Unit], robot: Robot) -> Layout:
 
     tilt = "inclination" in draft.picks and "orientation" in draft.picks
     asked = [term.column for name in SET_POINTS if name in draft.picks for term in draft.picks[name].terms]
-    absent = {name for name in draft.picks if any(name.startswith(axis) for axis in OUTPUTS) and not robot.is_neck
-              and not name.startswith(robot.outputs.names[0])}  # fmt: skip
+    absent = {name for name in draft.picks if any(name.startswith(axis) for axis in OUTPUTS)
+              and not name.startswith(robot.outputs.names)}  # fmt: skip
     return replace(
         draft.sniffed.form,
         # A set-point is never missed, as a measurement may be: where it is not said it holds.

@@ -1,6 +1,6 @@
 """What the inputs tell: spectrum against the bandwidth, and correlation.
 
-Inputs are a neck's theta_i, phi_i and delta_i, and the set-points of another robot's motors.
+Inputs are the redefined ones and co-contraction where the robot gives its directions, else the motors' set-points.
 """
 
 from __future__ import annotations
@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
+from softneck.robot import Robot
 
 from ..recording._recording import Recording
-from ..recording._redefinition import redefine
 
 # The paper's section 3.1: the system's bandwidth [rad/s].
 BANDWIDTH = 4.0
-INPUTS = ("theta_i", "phi_i", "delta_i")
 # 41 s at 20 ms: lines 0.15 rad/s apart, and several segments to average over in an identification recording.
 _SEGMENT = 2048
 _NECK_STEP = 0.02 * BANDWIDTH
@@ -65,10 +64,10 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     """Return the spectrum of the inputs, averaged over runs by their rows."""
     from scipy.signal import welch
 
-    neck = recording.robot.is_neck
-    runs = [redefine(run.set_points) if neck else run.set_points for run in recording.runs()]
+    names, T = _inputs(recording.robot)
+    runs = [run.set_points @ T.T for run in recording.runs()]
     segment = _SEGMENT
-    if not neck and not np.isnan(bandwidth):
+    if not np.isnan(bandwidth):
         # As many lines up to the bandwidth as a neck has.
         segment = max(16, round(_SEGMENT * _NECK_STEP / (bandwidth * recording.sample_time)))
     size = min(segment, max(len(u) for u in runs))
@@ -83,9 +82,17 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     omega = 2.0 * np.pi * f
     density /= 2.0 * np.pi * max(rows, 1)
     pooled = np.concatenate(runs)
-    names = INPUTS if neck else recording.robot.set_points
     ranges = np.column_stack([pooled.min(axis=0), pooled.max(axis=0)])
     return Spectrum(names, bandwidth, omega, density, *_shares(omega, density, bandwidth), _crest(pooled), ranges)
+
+
+def _inputs(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
+    """Return names and T (inputs, motors) of the inputs."""
+    if robot.weights() is None:
+        return robot.set_points, np.eye(len(robot.set_points))
+    T = robot.redefinition()[0]
+    names = (*robot.input_names, robot.cocontraction_name)
+    return (names, T) if T[-1].any() else (names[:-1], T[:-1])
 
 
 def _shares(omega: Vector, density: Matrix, bandwidth: float) -> tuple[Vector, Vector]:

@@ -12,6 +12,7 @@ import numpy as np
 from softneck.core import Matrix, require_positive, to_si
 from softneck.core._shown import Shown
 from softneck.robot import Robot
+from softneck.robot._scaling import TIME_CONSTANT, Scaling
 
 from ..recording._recording import Recording
 from ._channel_faults import ChannelQuality, Stretch, check_channel, count_rows
@@ -21,6 +22,8 @@ SEVERITIES = ("ok", "note", "warning")
 # A loop must stop when the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a
 # model may lose as many rows.
 _LONG_GAP, _MANY_MISSED = 0.1, 0.05
+# Of the scaled co-contraction, which goes from -6 to 6: below, its effect drowns.
+_LEAST_COCONTRACTION = 0.5
 # Below so many levels in the range a step of the sensor is over 1 % of the motion.
 _COARSE = 100.0
 # Pair correlation: two motors share half and nine tenths of their variance.
@@ -146,14 +149,14 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
 
     Args:
         recording: to check.
-        bandwidth: up to where the outputs follow the motors [rad/s]; a neck's is 4 (section 3.1), and the spectrum of
-            another robot is not judged where it is not given.
+        bandwidth: up to where the outputs follow the motors [rad/s]; None: by the robot's time constant, of a neck 4
+            (section 3.1). Without either the spectrum is not judged.
 
     Raises:
         SettingsError: a bandwidth that is not positive.
     """
     if bandwidth is None:
-        bandwidth = BANDWIDTH if recording.robot.is_neck else float("nan")
+        bandwidth = BANDWIDTH * TIME_CONSTANT / (recording.robot.time_constant_s or np.nan)
     else:
         require_positive("bandwidth", bandwidth, "rad/s")
     return Quality(
@@ -172,8 +175,8 @@ def findings(quality: Quality) -> tuple[Finding, ...]:
     said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality)]
     said += [*_excitation(quality), *_directions(quality), *_ranges(quality), *_correlation(quality)]
     topics = {finding.topic for finding in said if finding.severity != "ok"}
-    moved = "pitch and roll are excited" if quality.robot.is_neck else "every motor moves"
-    clean = _CLEAN | {"excitation": f"{moved} up to the bandwidth of {quality.spectrum.bandwidth:.3g} rad/s."}
+    moved, bandwidth = ", ".join(quality.spectrum.inputs), quality.spectrum.bandwidth
+    clean = _CLEAN | {"excitation": f"{moved} move up to the bandwidth of {bandwidth:.3g} rad/s."}
     said += [Finding("ok", topic, "", text) for topic, text in clean.items() if topic not in topics]
     return tuple(sorted(said, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
@@ -252,41 +255,39 @@ def _resolution(channel: ChannelQuality, outputs: tuple[str, ...]) -> Iterator[F
 
 
 def _excitation(quality: Quality) -> Iterator[Finding]:
+    common = quality.robot.cocontraction_name
+    least = _LEAST_COCONTRACTION * Scaling.of(quality.robot).motor_unit
     if np.isnan(quality.spectrum.bandwidth):
         message = "nothing is known of how fast the outputs follow the motors: the spectrum is not judged."
         yield Finding("note", "excitation", "", message)
-    elif quality.robot.is_neck:  # theta_i moves pitch, phi_i roll
-        for i, axis in enumerate(quality.robot.outputs.names):
-            yield from _power(quality.spectrum, i, f"{axis} ", "neck")
-    else:
-        for i in range(len(quality.spectrum.inputs)):
-            yield from _power(quality.spectrum, i, "", "robot")
-    if quality.robot.is_neck and not np.ptp(quality.spectrum.ranges[2]) > 0.5:
+    for i in () if np.isnan(quality.spectrum.bandwidth) else range(len(quality.spectrum.inputs)):
+        if quality.spectrum.inputs[i] != common:
+            yield from _power(quality.spectrum, i)
+    if common in quality.spectrum.inputs and not np.ptp(quality.spectrum.ranges[-1]) > least:
         message = "hardly changes (co-contraction, the mean of the motors): its effect cannot be identified."
         advice = "Play `mixed`, which has co-contraction moves, if stiffness matters."
-        yield Finding("note", "co-contraction", "delta_i", message, advice)
+        yield Finding("note", "co-contraction", common, message, advice)
 
 
-def _power(spectrum: Spectrum, i: int, moved: str, robot: str) -> Iterator[Finding]:
+def _power(spectrum: Spectrum, i: int) -> Iterator[Finding]:
     name, limit = spectrum.inputs[i], spectrum.bandwidth
     highest, share = spectrum.highest[i], spectrum.below_bandwidth[i]
     if highest < _REACHED * limit:
-        message = f"moves {moved}with real power up to {highest:.2g} rad/s only; the {robot}'s bandwidth is "
+        message = f"moves with real power up to {highest:.2g} rad/s only; the robot's bandwidth is "
         advice = "Add a faster signal (multisine, aprbs, mixed): a model is guesswork beyond."
         severity = "warning" if highest < _SLOW * limit else "note"
         yield Finding(severity, "excitation", name, f"{message}{limit:.3g} rad/s.", advice)
     elif share < 0.5:
         above = f"{100 * (1 - share):.0f} % of its power above {limit:.3g} rad/s"
         advice = "Move more slowly, or take the chatter out of the loop that made it."
-        yield Finding("note", "excitation", name, f"has {above}, where the {robot} hardly moves.", advice)
+        yield Finding("note", "excitation", name, f"has {above}, where the robot hardly moves.", advice)
 
 
 def _directions(quality: Quality) -> Iterator[Finding]:
     motors = len(quality.robot.set_points)
     if 0 < quality.directions < motors:
         message = f"the motors move along {quality.directions} direction(s) only, of {motors}."
-        needs = "theta_i and phi_i" if quality.robot.is_neck else "the robot's directions"
-        advice = f"A linear model in {needs} needs no more; others want motors that move independently."
+        advice = "A linear model in the redefined inputs needs no more; others want motors that move independently."
         yield Finding("note", "directions", "", message, advice)
 
 

@@ -98,9 +98,9 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
         raise DataError(f"column `{name}` names no unit; {hint}.")
     name, unit = robot.own(match["name"]), match["unit"].strip()
     if name not in table:
-        whose = "" if robot.is_neck else f" of robot {robot.label()}"
         raise DataError(
-            f"column `{name}` is not a channel of a recording{whose} (those are {', '.join(table)}, run); "
+            f"column `{name}` is not a channel of a recording of robot {robot.label()} "
+            f"(those are {', '.join(table)}, run); "
             "rename or drop it, or use `softneck import` with a layout."
         )
     factor, unit_si = to_si(unit)

@@ -89,8 +89,8 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
 
 
 def _robot_line(robot: Robot) -> str:
-    """Return the line that says whose recording a text is; that of the neck has none, as it always had."""
-    return "" if robot.is_neck else f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n"
+    """Return the line that names the robot of a recording; a file of the preset `neck` has none."""
+    return f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n" if robot.in_header() else ""
 
 
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path, before: str) -> None:
@@ -106,7 +106,7 @@ def recording_frame(recording: Recording) -> pd.DataFrame:
     import pandas as pd
 
     frame = pd.DataFrame(_titled(recording))
-    if not recording.robot.is_neck:
+    if recording.robot.in_header():
         frame.attrs["robot"] = recording.robot.as_dict()
     return frame
 

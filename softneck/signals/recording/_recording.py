@@ -258,9 +258,9 @@ class Recording(Shown):
         required, known = (*self.robot.set_points, *self.robot.outputs.names), known_channels(self.robot)
         missing = [name for name in required if name not in self.channels]
         if missing:
-            whose = "" if self.robot.is_neck else f" of robot {self.robot.label()}"
             raise DataError(
-                f"a recording{whose} needs the channels {', '.join(required)}; missing: {', '.join(missing)}."
+                f"a recording of robot {self.robot.label()} needs the channels {', '.join(required)}; "
+                f"missing: {', '.join(missing)}."
             )
         if len(self) == 0:
             raise DataError("the recording has no rows.")
