@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from softneck.core._budget import require_steps
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
-from ._references import RampReference, RecordingReference, Reference, RotationReference, SineReference, StepReference
+from ._references import SHAPES, RecordingReference, Reference, RobotReference, reference_range
 from ._wiring import reference_ports
 
 
@@ -55,19 +55,29 @@ class AheadReference:
         return np.array([*self.reference(time), 1.0, *self.reference(time + self.ahead)[: self._count]])
 
 
-_KINDS: tuple[type, ...] = (StepReference, RampReference, SineReference, RotationReference)
-_RECORDED, _WRITTEN = 4, 5
-# The runtime's order; the starts of those that a kind does not have are never read.
-_PARAMETERS = (
-    Port(name="pitch", unit="rad", minimum=-0.8, maximum=0.8, description="end value or amplitude"),
-    Port(name="roll", unit="rad", minimum=-0.8, maximum=0.8, description="end value or amplitude"),
-    Port(name="cocontraction", unit="rad", minimum=-6.0, maximum=6.0, description="delta_i (Eq. 11)"),
-    Port(name="inclination", unit="rad", minimum=0.0, maximum=0.8, description="of a rotation"),
-    Port(name="frequency", unit="1", minimum=0.0, start=0.2, description="of a sine or rotation [Hz]"),
-    Port(name="at", unit="s", description="time at which it begins"),
-    Port(name="rise", unit="s", minimum=1e-9, start=1.0, description="time over which it rises"),
-    Port(name="enabled_start", boolean=True, start=1.0, description="value of `enabled`"),
-)
+_RECORDED = 4
+
+
+def _parameters(robot: Robot) -> tuple[Port, ...]:
+    """Return the parameters, in the runtime's order; the starts of those that a kind does not have are never read."""
+    outputs = to_si(robot.outputs.unit)[1]
+
+    def port(name: str, unit: str, description: str, shown: str) -> Port:
+        low, high, of = reference_range(name, robot)
+        low, high = (to_si(of)[0] * end if math.isfinite(end) else None for end in (low, high))
+        return Port(name=name, unit=unit, description=description, minimum=low, maximum=high, display_unit=shown)
+
+    common = f"{robot.cocontraction_name} (Eq. 11)" if robot.directions.names else "mean of the motors"
+    turned = port("inclination", outputs, "of a rotation", robot.outputs.shown)
+    return (
+        *(port(name, outputs, "end value or amplitude", robot.outputs.shown) for name in robot.outputs.names),
+        port("cocontraction", to_si(robot.motors.unit)[1], common, robot.motors.shown),
+        replace(turned, minimum=0.0),
+        Port(name="frequency", unit="1", minimum=0.0, start=0.2, description="of a sine or rotation [Hz]"),
+        Port(name="at", unit="s", description="time at which it begins"),
+        Port(name="rise", unit="s", minimum=1e-9, start=1.0, description="time over which it rises"),
+        Port(name="enabled_start", boolean=True, start=1.0, description="value of `enabled`"),
+    )
 
 
 class ReferenceBlock:
@@ -86,7 +96,7 @@ class ReferenceBlock:
         Args:
             reference: one of softneck's own, or any function of time if `duration` is given.
             sample_time: [s].
-            duration: for how long a function of your own, or of another robot, is written down, sample by sample [s].
+            duration: for how long a function of your own is written down, sample by sample [s].
             robot: whose; None: the neck's.
         """
         require_positive("sample_time", sample_time, "s")
@@ -100,8 +110,7 @@ class ReferenceBlock:
             SettingsError: a function of the user's own without a duration.
         """
         kind, starts, table = self._described()
-        ports = _PARAMETERS if self._robot.is_neck else _PARAMETERS[-1:]
-        parameters = tuple(replace(port, start=starts.get(port.name, port.start)) for port in ports)
+        parameters = tuple(replace(port, start=starts.get(port.name, port.start)) for port in _parameters(self._robot))
         return Block(
             kind="reference", role="reference", runtime="softneck.loop._reference_runtime",
             sample_time=self.sample_time, arrays=(np.array([float(kind), self.sample_time]), table), inputs=(),
@@ -112,19 +121,16 @@ class ReferenceBlock:
         """Return a line for people."""
         name = type(self.reference).__name__
         values = ", ".join(f"{key} = {value:g}" for key, value in self._described()[1].items())
-        return f"{name}{f' ({values}; rad, s)' if values else ''} at {1e3 * self.sample_time:g} ms"
+        return f"{name}{f' ({values}; SI)' if values else ''} at {1e3 * self.sample_time:g} ms"
 
     def _described(self) -> tuple[int, dict[str, float], np.ndarray]:
-        reference = self.reference
-        if not self._robot.is_neck:
-            return _WRITTEN, {}, self._table()
-        for kind, known in enumerate(_KINDS):
-            if isinstance(reference, known):
-                starts = {item.name: float(getattr(reference, item.name)) for item in fields(known)}
-                return kind, starts, np.zeros((1, 4))
-        if isinstance(reference, RecordingReference):
-            return _RECORDED, {}, reference.table
-        return _RECORDED, {}, self._table()
+        made, columns = self.reference, len(self._robot.outputs.names) + 2
+        if isinstance(made, RobotReference):
+            names = ("inclination",) if made.kind == "rotation" else self._robot.outputs.names
+            starts = dict(zip(names, made.values, strict=True)) | {"cocontraction": made.cocontraction}
+            starts |= {name: getattr(made, name) for name in SHAPES[made.kind]}
+            return list(SHAPES).index(made.kind), starts, np.zeros((1, columns))
+        return _RECORDED, {}, made.table if isinstance(made, RecordingReference) else self._table()
 
     def _table(self) -> np.ndarray:
         """Return (rows, 1 + values): the reference's values, sample by sample."""

@@ -1,4 +1,4 @@
-"""References: what pitch, roll and co-contraction are to be, for loops (`_references.py`) and the reference FMU.
+"""References: what outputs and co-contraction are to be, for loops (`_references.py`) and the reference FMU.
 
 `step` from sample k returns the reference at sample k + 1, which is where a master reads it.
 """
@@ -13,8 +13,8 @@ from softneck.runtime._layout import Arrays, StateVector, array, cells
 class ReferenceArrays(Arrays):
     """Which reference, and the rows of a recorded one."""
 
-    setup = array("2", "kind: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording, 5 of any robot; sample time [s]")
-    table = array("rows, columns", "time [s], pitch, roll, co-contraction [rad] of a recording; outputs of any robot")
+    setup = array("2", "kind: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording; sample time [s]")
+    table = array("rows, columns", "time [s], outputs and co-contraction of a recording")
 
 
 class ReferenceState(StateVector):
@@ -40,76 +40,55 @@ def step(
 
 
 def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, outputs: np.ndarray) -> None:
-    """Write pitch, roll, co-contraction and enabled at the state's sample.
+    """Write the outputs' references, co-contraction and enabled at the state's sample.
 
-    Parameters: pitch, roll, cocontraction, inclination [rad], frequency [Hz], at, rise [s], enabled.
+    Parameters: outputs, cocontraction, inclination [SI], frequency [Hz], at, rise [s], enabled.
     """
-    kind = int(p.setup[0])
+    kind, m = int(p.setup[0]), p.columns - 2
     time = x.sample * p.setup[1]  # from a count: sums of sample times would drift
-    if kind == 5:
-        k = reference_row(time, p.table, int(x.row))
-        x.row = float(k)
-        for j in range(1, p.columns):
-            outputs[j - 1] = p.table[k, j]
-        outputs[p.columns - 1] = parameters[0]  # its one parameter: enabled
-        return
-    pitch, roll, cocontraction = parameters[0], parameters[1], parameters[2]
-    frequency, at, rise = parameters[4], parameters[5], parameters[6]
-    if kind == 0:
-        pitch, roll, cocontraction = reference_step(time, pitch, roll, cocontraction, at)
-    elif kind == 1:
-        pitch, roll, cocontraction = reference_ramp(time, pitch, roll, cocontraction, at, rise)
-    elif kind == 2:
-        pitch, roll, cocontraction = reference_sine(time, pitch, roll, cocontraction, frequency, at)
-    elif kind == 3:
-        pitch, roll, cocontraction = reference_rotation(time, parameters[3], cocontraction, frequency, at, rise)
-    else:
+    frequency, at, rise = float(parameters[m + 2]), float(parameters[m + 3]), float(parameters[m + 4])
+    if kind == 4:
         # Time only goes forward: the search goes on where it was.
         k = reference_row(time, p.table, int(x.row))
         x.row = float(k)
-        pitch, roll, cocontraction = p.table[k, 1], p.table[k, 2], p.table[k, 3]
-    outputs[0], outputs[1], outputs[2], outputs[3] = pitch, roll, cocontraction, parameters[7]
+        for j in range(m + 1):
+            outputs[j] = p.table[k, j + 1]
+    elif kind == 3:
+        outputs[0], outputs[1] = reference_rotation(time, float(parameters[m + 1]), frequency, at, rise)
+        outputs[m] = parameters[m]
+    else:
+        for j in range(m + 1):
+            outputs[j] = reference_value(kind, time, float(parameters[j]), frequency, at, rise)
+        if kind == 2:
+            outputs[m] = parameters[m]
+    outputs[m + 1] = parameters[m + 5]
 
 
-def reference_step(
-    time: float, pitch: float, roll: float, cocontraction: float, at: float
-) -> tuple[float, float, float]:  # fmt: skip
-    """Jump from zero at `at`."""
-    # Times are multiples of a sample time; half a nanosecond covers their rounding.
-    if time >= at - 5e-10:
-        return pitch, roll, cocontraction
-    return 0.0, 0.0, 0.0
-
-
-def reference_ramp(
-    time: float, pitch: float, roll: float, cocontraction: float, at: float, rise: float
-) -> tuple[float, float, float]:
-    """Rise linearly from zero over `rise`."""
-    part = min(1.0, max(0.0, (time - at) / rise))
-    return pitch * part, roll * part, cocontraction * part
-
-
-def reference_sine(
-    time: float, pitch: float, roll: float, cocontraction: float, frequency: float, at: float
-) -> tuple[float, float, float]:
-    """Swing in phase from `at` on."""
-    wave = math.sin(2.0 * math.pi * frequency * max(0.0, time - at))
-    return pitch * wave, roll * wave, cocontraction
+def reference_value(kind: int, time: float, value: float, frequency: float, at: float, rise: float) -> float:
+    """Jump from zero at `at` (0), rise linearly over `rise` (1), or swing from `at` on (2)."""
+    if kind == 0:
+        # Times are multiples of a sample time; half a nanosecond covers their rounding.
+        if time >= at - 5e-10:
+            return value
+        return 0.0
+    if kind == 1:
+        return value * min(1.0, max(0.0, (time - at) / rise))
+    return value * math.sin(2.0 * math.pi * frequency * max(0.0, time - at))
 
 
 def reference_rotation(
-    time: float, inclination: float, cocontraction: float, frequency: float, at: float, rise: float
-) -> tuple[float, float, float]:
-    """Go around: pitch = A cos(w t), roll = A sin(w t), A rising from zero over `rise`."""
+    time: float, inclination: float, frequency: float, at: float, rise: float
+) -> tuple[float, float]:  # fmt: skip
+    """Go around: A cos(w t) and A sin(w t), A rising from zero over `rise`."""
     elapsed = max(0.0, time - at)
     # Out of the upright on a spiral: a circle begun at once would be a step.
     a = inclination * min(1.0, elapsed / rise)
     angle = 2.0 * math.pi * frequency * elapsed
-    return a * math.cos(angle), a * math.sin(angle), cocontraction
+    return a * math.cos(angle), a * math.sin(angle)
 
 
 def reference_row(time: float, table: np.ndarray, k: int) -> int:
     """Return the row of a recording that holds at `time`, from row `k` on."""
-    while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:  # rounding of the times, as in `reference_step`
+    while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:  # rounding of the times, as in `reference_value`
         k += 1
     return k

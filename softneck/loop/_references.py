@@ -1,9 +1,10 @@
-"""References: what pitch, roll and co-contraction are to be at a time."""
+"""References: what the outputs of a robot and its co-contraction are to be at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -12,27 +13,34 @@ from softneck.core import (
     DataError,
     Matrix,
     SettingsError,
+    SoftneckError,
     Vector,
-    require_between,
     require_finite,
     require_one_of,
     require_positive,
     to_si,
 )
 from softneck.core._shown import Shown
+from softneck.robot import Robot
 
-from ._reference_runtime import reference_ramp, reference_rotation, reference_row, reference_sine, reference_step
+from ._reference_runtime import reference_rotation, reference_row, reference_value
 
-Triple = tuple[float, float, float]
-# The neck bends by at most 40 deg = 0.7 rad (paper, section 5); more is a value in degrees.
-_MAX_ANGLE = 0.8
+_NECK = Robot.preset("neck")
+#: Kind, in the order of the runtime -> what else than values it takes, with where it begins without being told.
+SHAPES: dict[str, dict[str, float]] = {
+    "step": {"at": 0.0},
+    "ramp": {"at": 0.0, "rise": 1.0},
+    "sine": {"at": 0.0, "frequency": 0.2},
+    "rotation": {"at": 0.0, "rise": 3.0, "frequency": 0.2},
+}
+_ENDINGS = {"at": "s", "rise": "s", "frequency": "hz"}
+_TIMES = {"": 1.0, "s": 1.0, "ms": 1e-3, "hz": 1.0}
+# No output turns further [rad]; more is a value in degrees.
+_HALF_TURN = np.pi
 
 
 class Reference(Protocol):
-    """Anything that returns pitch [rad], roll [rad] and co-contraction delta_i [rad] at `time` [s].
-
-    Of another robot all outputs, then co-contraction.
-    """
+    """Anything that returns all outputs and co-contraction at `time` [s], in SI: of a neck pitch, roll and delta_i."""
 
     def __call__(self, time: float, /) -> tuple[float, ...]:
         """Return the reference at `time`."""
@@ -40,112 +48,40 @@ class Reference(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StepReference:
-    """All three jump from zero at `at`.
+class RobotReference:
+    """A step (a jump from zero at `at`), ramp (over `rise`), sine (in phase from `at` on) or rotation of two angles.
+
+    In a rotation the tilt goes around: A cos(w t) and A sin(w t), A rising from zero over `rise`.
 
     Attributes:
-        pitch, roll: [rad].
-        cocontraction: delta_i [rad].
-        at: [s].
+        kind: "step", "ramp", "sine" or "rotation".
+        values: (outputs,) end values or amplitudes [SI]; of a rotation its inclination A, for both outputs.
+        cocontraction: wanted mean of the motors, delta_i of a neck [SI]; that of sine and rotation is constant.
+        at, rise: [s].
+        frequency: [Hz].
     """
 
-    pitch: float = 0.0
-    roll: float = 0.0
-    cocontraction: float = 0.0
-    at: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check_angles(self.pitch, self.roll, self.cocontraction)
-        require_finite("at", self.at, "s")
-
-    def __call__(self, time: float, /) -> Triple:
-        """Return the reference at `time`."""
-        return reference_step(time, self.pitch, self.roll, self.cocontraction, self.at)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RampReference:
-    """All three rise linearly from zero over `rise`, from `at` on.
-
-    Attributes:
-        pitch, roll: end values [rad].
-        cocontraction: end value [rad].
-        at: [s].
-        rise: [s].
-    """
-
-    pitch: float = 0.0
-    roll: float = 0.0
+    kind: str
+    values: tuple[float, ...]
     cocontraction: float = 0.0
     at: float = 0.0
     rise: float = 1.0
+    frequency: float = 0.2
 
     def __post_init__(self) -> None:
-        _check_angles(self.pitch, self.roll, self.cocontraction)
+        require_one_of("kind", self.kind, tuple(SHAPES))
         require_finite("at", self.at, "s")
         require_positive("rise", self.rise, "s")
-
-    def __call__(self, time: float, /) -> Triple:
-        """Return the reference at `time`."""
-        return reference_ramp(time, self.pitch, self.roll, self.cocontraction, self.at, self.rise)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SineReference:
-    """Pitch and roll swing in phase from `at` on; co-contraction is constant.
-
-    Attributes:
-        pitch, roll: amplitudes [rad].
-        cocontraction: delta_i [rad].
-        frequency: [Hz].
-        at: [s].
-    """
-
-    pitch: float = 0.0
-    roll: float = 0.0
-    cocontraction: float = 0.0
-    frequency: float = 0.2
-    at: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check_angles(self.pitch, self.roll, self.cocontraction)
         require_positive("frequency", self.frequency, "Hz")
-        require_finite("at", self.at, "s")
 
-    def __call__(self, time: float, /) -> Triple:
-        """Return the reference at `time`."""
-        return reference_sine(time, self.pitch, self.roll, self.cocontraction, self.frequency, self.at)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RotationReference:
-    """The tilt goes around: pitch = A cos(w t), roll = A sin(w t), A rising from zero over `rise`.
-
-    Attributes:
-        inclination: A [rad].
-        cocontraction: delta_i [rad].
-        frequency: turns a second [Hz].
-        at: [s].
-        rise: [s].
-    """
-
-    inclination: float = 0.0
-    cocontraction: float = 0.0
-    frequency: float = 0.2
-    at: float = 0.0
-    rise: float = 3.0
-
-    def __post_init__(self) -> None:
-        _check_angles(self.inclination, 0.0, self.cocontraction)
-        require_positive("frequency", self.frequency, "Hz")
-        require_finite("at", self.at, "s")
-        require_positive("rise", self.rise, "s")
-
-    def __call__(self, time: float, /) -> Triple:
-        """Return the reference at `time`."""
-        return reference_rotation(
-            time, self.inclination, self.cocontraction, self.frequency, self.at, self.rise
-        )  # fmt: skip
+    def __call__(self, time: float, /) -> tuple[float, ...]:
+        """Return the reference at `time` [s]: all outputs, then co-contraction."""
+        kind, times = tuple(SHAPES).index(self.kind), (self.frequency, self.at, self.rise)
+        if self.kind == "rotation":
+            return (*reference_rotation(time, self.values[0], *times), self.cocontraction)
+        values = tuple(reference_value(kind, time, value, *times) for value in self.values)
+        common = self.cocontraction
+        return (*values, common if self.kind == "sine" else reference_value(kind, time, common, *times))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -179,71 +115,130 @@ class RecordingReference(Shown):
         return tuple(self.table[reference_row(time, self.table, near), 1:].tolist())
 
 
-_Setting = type[StepReference] | type[RampReference] | type[SineReference] | type[RotationReference]
-_KINDS: dict[str, _Setting] = {
-    "step": StepReference,
-    "ramp": RampReference,
-    "sine": SineReference,
-    "rotation": RotationReference,
-}
+def reference(kind: str, robot: Robot = _NECK, **values: float) -> RobotReference:
+    """Return a reference of outputs, `inclination`, `cocontraction`, `at`, `rise` and `frequency`, all in SI.
 
-_ENDINGS = {
-    "pitch": "_rad", "roll": "_rad", "inclination": "_rad", "cocontraction": "_rad", "frequency": "_hz", "at": "_s",
-    "rise": "_s",
-}  # fmt: skip
+    Raises:
+        SettingsError: unknown kind or name, a value beyond what the output may be, or a rotation of no two angles.
+    """
+    if kind == "rotation" and (len(robot.outputs.names) != 2 or to_si(robot.outputs.unit)[1] != "rad"):
+        names = ", ".join(robot.outputs.names)
+        raise SettingsError(f'kind = "rotation" is for two angles; {robot.label()} has {names}.')
+    wanted = {**dict.fromkeys(_units(kind, robot), 0.0), **SHAPES[kind]}
+    for name, value in values.items():
+        if name not in wanted:
+            raise SettingsError(
+                f"unknown key `{name}` of a {kind} reference; it takes {', '.join(wanted)} with a unit."
+            )
+        require_finite(name, value, "SI")
+        _check_range(name, value, robot)
+    wanted |= values
+    times = {name: wanted.pop(name) for name in SHAPES[kind]}
+    common = wanted.pop("cocontraction")
+    return RobotReference(kind=kind, values=tuple(wanted.values()), cocontraction=common, **times)
 
 
-def make_reference(kind: str, values: Mapping[str, float]) -> Reference:
-    """Return a reference from the keys of a loop file, which end in their unit: `pitch_deg`, `at_s`.
+#: Of a neck: `pitch`, `roll` or `inclination`, and `cocontraction` [rad]; `at`, `rise` [s]; `frequency` [Hz].
+StepReference = partial(reference, "step")
+RampReference = partial(reference, "ramp")
+SineReference = partial(reference, "sine")
+RotationReference = partial(reference, "rotation")
+
+
+def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
+    """Return a reference from the keys of a loop file: `x_mm = 10`, or `x = 10` in the output's unit; `at_s`.
 
     The kinds are step, ramp, sine and rotation; a recorded one is made of its arrays by `RecordingReference`.
 
     Raises:
-        SettingsError: unknown kind or key, or a value out of range.
+        SettingsError: as of `reference`.
     """
-    require_one_of("kind", kind, tuple(_KINDS))
-    setting = _KINDS[kind]
-    names = [item.name for item in fields(setting)]
-    chosen: dict[str, float] = {}
+    require_one_of("kind", kind, tuple(SHAPES))
+    chosen = {}
     for key, value in values.items():
-        name, factor = _split(key)
-        if name not in names:
-            raise SettingsError(f"unknown key `{key}` of a {kind} reference; it takes {', '.join(names)} with a unit.")
+        name, factor = reference_key(kind, key, robot)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise SettingsError(f"`{key}` must be a number; got {value!r}.")
         chosen[name] = factor * value
-    return setting(**chosen)
+    return reference(kind, robot, **chosen)
 
 
-def reference_field(kind: str, key: str) -> str | None:
-    """Return the field that a key of a loop file such as `pitch_deg` sets in a reference of `kind`, if there is one."""
-    setting = _KINDS.get(kind)
-    name = _split(key)[0]
-    return name if setting is not None and name in {item.name for item in fields(setting)} else None
+def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
+    """Return what a key such as `x_mm` or `at_s` sets in a reference of `kind`, and its factor to SI.
+
+    Raises:
+        SettingsError: nothing.
+    """
+    units, times = _units(kind, robot), SHAPES.get(kind, {})
+    name, _, unit = (key, "", "") if key in units or key in times else key.rpartition("_")
+    if name in times and unit in _TIMES:
+        return name, _TIMES[unit]
+    if name in units:
+        try:
+            factor, si = to_si(unit or units[name])
+        except SoftneckError:
+            factor, si = 1.0, ""
+        if si == to_si(units[name])[1]:
+            return name, factor
+    raise SettingsError(
+        f"unknown key `{key}` of a {kind} reference; it takes {', '.join((*units, *times))} with a unit."
+    )
 
 
-def reference_keys(reference: Reference) -> dict[str, float | str] | None:
-    """Return the keys of a loop file that describe `reference`; None if it is not a step, ramp, sine or rotation."""
-    for kind, setting in _KINDS.items():
-        if isinstance(reference, setting):
-            named = {f"{item.name}{_ENDINGS[item.name]}": getattr(reference, item.name) for item in fields(setting)}
-            return {"kind": kind, **named}
-    return None
+def reference_keys(made: object, robot: Robot = _NECK) -> dict[str, float | str] | None:
+    """Return the keys of a loop file that describe a reference; None if it is not a step, ramp, sine or rotation."""
+    if not isinstance(made, RobotReference):
+        return None
+    values = (*made.values, made.cocontraction)
+    keys = {f"{name}_{to_si(unit)[1]}": value
+            for (name, unit), value in zip(_units(made.kind, robot).items(), values, strict=True)}  # fmt: skip
+    return {
+        "kind": made.kind,
+        **keys,
+        **{f"{name}_{_ENDINGS[name]}": getattr(made, name) for name in SHAPES[made.kind]},
+    }
 
 
-def _split(key: str) -> tuple[str, float]:
-    """Return the field's name and the factor to SI of `key`, such as `pitch_deg`."""
+def same_quantity(one: str, other: str) -> bool:
+    """Return whether two keys say the same, perhaps in two units, such as `x_mm` and `x`."""
+    return _stem(one) == _stem(other)
+
+
+def _stem(key: str) -> str:
     name, _, unit = key.rpartition("_")
-    if unit == "hz":
-        return name, 1.0
-    if unit in ("deg", "rad", "s", "ms"):
-        return name, to_si(unit)[0]
-    return key, 1.0
+    try:
+        return name if unit in _TIMES or to_si(unit) else key
+    except SoftneckError:
+        return key
 
 
-def _check_angles(pitch: float, roll: float, cocontraction: float) -> None:
-    for name, value in (("pitch", pitch), ("roll", roll)):
-        require_finite(name, value, "rad")
-        if abs(value) > _MAX_ANGLE:
-            raise SettingsError(f"`{name}` must be within +-{_MAX_ANGLE} rad; got {value:g}: degrees?")
-    require_between("cocontraction", cocontraction, -6.0, 6.0, "rad")
+def _units(kind: str, robot: Robot) -> dict[str, str]:
+    outputs = ("inclination",) if kind == "rotation" else robot.outputs.names
+    return {**dict.fromkeys(outputs, robot.outputs.unit), "cocontraction": robot.motors.unit}
+
+
+def reference_range(name: str, robot: Robot) -> tuple[float, float, str]:
+    """Return lowest and highest value of an output, the inclination or co-contraction, and the unit they are in."""
+    outputs, motors = robot.outputs, robot.motors
+    if name == "cocontraction":
+        return min(motors.setpoint_min or (-np.inf,)), max(motors.setpoint_max or (np.inf,)), motors.unit
+    half = _HALF_TURN / to_si(outputs.unit)[0] if to_si(outputs.unit)[1] == "rad" else np.inf
+    if name == "inclination":
+        most = min(outputs.max or (half,))
+        return -most, most, outputs.unit
+    at = outputs.names.index(name)
+    low = -half if outputs.min is None else outputs.min[at]
+    return low, half if outputs.max is None else outputs.max[at], outputs.unit
+
+
+def _check_range(name: str, value: float, robot: Robot) -> None:
+    if name in _ENDINGS or (name == "cocontraction" and value == 0.0):
+        return
+    low, high, unit = reference_range(name, robot)
+    factor, si = to_si(unit)
+    if not low * factor <= value <= high * factor:
+        hint = ": degrees?" if si == "rad" and name != "cocontraction" else "."
+        raise SettingsError(
+            f"`{name}` must be within {low:g} to {high:g} {unit}, as robot {robot.label()} may be; "
+            f"got {value / factor:g}{hint}"
+        )

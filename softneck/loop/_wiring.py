@@ -18,13 +18,6 @@ from softneck.runtime import Port
 
 from ._part import Part
 
-REFERENCE_PORTS = (
-    Port(name="pitch_reference", unit="rad", description="wanted pitch"),
-    Port(name="roll_reference", unit="rad", description="wanted roll"),
-    Port(name="cocontraction_reference", unit="rad", description="wanted co-contraction delta_i (Eq. 11)"),
-    Port(name="enabled", description="whether the controller may move the motors", start=1.0, boolean=True),
-)
-
 _HEALTHY = (("observer", "healthy"), ("plant", "measurement_valid"))
 _NECK = Robot.preset("neck")
 _USUAL = ("plant", "observer", "controller", "reference")
@@ -34,14 +27,15 @@ _DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
 
 def reference_ports(robot: Robot = _NECK) -> tuple[Port, ...]:
     """Return the outputs of a reference of `robot`."""
-    if robot.is_neck:
-        return REFERENCE_PORTS
-    unit, motor = to_si(robot.outputs.unit)[1], to_si(robot.motors.unit)[1]
+    outputs, motors = robot.outputs, robot.motors
+    unit, motor = to_si(outputs.unit)[1], to_si(motors.unit)[1]
+    common = f"co-contraction {robot.cocontraction_name} (Eq. 11)" if robot.directions.names else "mean of the motors"
     return (
-        *(Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}") for name in robot.outputs.names),
-        Port(name="cocontraction_reference", unit=motor, description="wanted mean of the motors"),
-        REFERENCE_PORTS[-1],
-    )
+        *(Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}", display_unit=outputs.shown)
+          for name in outputs.names),
+        Port(name="cocontraction_reference", unit=motor, description=f"wanted {common}", display_unit=motors.shown),
+        Port(name="enabled", description="whether the controller may move the motors", start=1.0, boolean=True),
+    )  # fmt: skip
 
 
 def measured_names(robot: Robot) -> tuple[str, ...]:

@@ -53,6 +53,11 @@ class Motors:
         if not set(self.sign) <= {1.0, -1.0}:
             raise SettingsError(f"`motors.sign` must be 1 or -1; got {_first_not(self.sign, (1.0, -1.0)):g}.")
 
+    @property
+    def shown(self) -> str:
+        """In which unit tools show set-points and positions: `unit`; "" of angles, which have a usual one."""
+        return "" if to_si(self.unit)[1] == "rad" else self.unit
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outputs:
@@ -89,6 +94,11 @@ class Outputs:
         _one_each("outputs", self.names, self.min, self.max, self.nominal, self.rest)
         _positive("outputs.nominal", self.nominal, self.unit)
         check_range("outputs", "min", "max", self.min, self.max)
+
+    @property
+    def shown(self) -> str:
+        """In which unit tools show outputs: `display_unit`; "" for deg, which is usual for angles."""
+        return "" if self.display_unit == "deg" else self.display_unit
 
 
 def motor_channels(motors: Sequence[str], outputs: Sequence[str], what: str) -> tuple[str, ...]:

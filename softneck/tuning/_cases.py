@@ -10,8 +10,7 @@ import numpy as np
 
 from softneck.core import DataError, Vector, to_si
 from softneck.loop import BlockPart, Loop, LoopResult, SensorFault, run_loop
-from softneck.loop._references import Reference
-from softneck.loop._robot_references import RobotReference
+from softneck.loop._references import Reference, RobotReference
 from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at
@@ -106,7 +105,7 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, o
     reference = RobotReference(kind="step", values=ends, at=at)
     if case.circle:
         frequency = track["circle_rad_s"] / (2.0 * math.pi)
-        led, inclination = _LED * time, (asked.si(track["circle_deg"]),) * 2
+        led, inclination = _LED * time, (asked.si(track["circle_deg"]),)
         reference = RobotReference(kind="rotation", values=inclination, frequency=frequency, at=at, rise=led)
         duration = at + led + _TURNS / frequency
     return Loop(

@@ -16,7 +16,7 @@ from softneck.core import DataError, Progress, SettingsError, SoftneckError, to_
 from softneck.cosim import FmuPart
 from softneck.estimation._axis import robot_of
 from softneck.loop import BlockPart, Loop, LoopResult, Part, metrics, run_loop
-from softneck.loop._robot_references import RobotReference
+from softneck.loop._references import RobotReference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
 from softneck.robot import Robot

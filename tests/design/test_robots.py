@@ -22,7 +22,7 @@ from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
 from softneck.loop._reference_parts import AheadReference
-from softneck.loop._robot_references import robot_reference
+from softneck.loop._references import make_reference
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.signals import signal
@@ -111,7 +111,7 @@ def test_a_reference_is_known_ahead_by_the_outputs_of_its_robot() -> None:
     np.testing.assert_allclose(known[:-15], np.degrees(result["pitch_reference"])[15:], atol=1e-12)
     assert (known[9], known[10]) == pytest.approx((0.0, 6.0))
     assert "roll_reference_ahead" not in result.signals.signals
-    told = robot_reference("ramp", {"x": 41.0, "z_mm": 45.0, "rise_s": 1.0}, BELLOWS)
+    told = make_reference("ramp", {"x": 41.0, "z_mm": 45.0, "rise_s": 1.0}, BELLOWS)
     part = AheadReference(told, 0.5, robot=BELLOWS)
     names = [port.name for port in part.outputs]
     assert names[:5] == ["x_reference", "y_reference", "z_reference", "cocontraction_reference", "enabled"]
@@ -186,7 +186,7 @@ def test_the_whole_way_over_the_virtual_plant(name: str) -> None:
     [
         ({"roll_deg": 3.0}, "unknown key `roll_deg` of a step reference"),
         ({"pitch_mm": 3.0}, "unknown key `pitch_mm` of a step reference"),
-        ({"pitch": 80.0}, r"`pitch` is beyond what `antagonist` .* may do: -0.8 to 0.8 rad"),
+        ({"pitch": 80.0}, r"`pitch` must be within -0.8 to 0.8 rad, as robot `antagonist` .* may be"),
         ({"kind": "rotation", "inclination_deg": 3.0}, 'kind = "rotation" is for two angles'),
         ({"pitch": "far"}, "`pitch` must be a number"),
     ],

@@ -29,7 +29,7 @@ from softneck.loop import (
 from softneck.loop._disturbed_bus import ActiveFault, FaultStages
 from softneck.loop._faults import fault_field, fault_keys, make_fault
 from softneck.loop._faults_runtime import faults_act
-from softneck.loop._references import make_reference, reference_field, reference_keys
+from softneck.loop._references import make_reference, reference_keys, same_quantity
 from softneck.runtime import Port
 
 from ._parts import SETPOINTS, FunctionPart, lag_plant, ports
@@ -46,10 +46,6 @@ TS = 0.02
         (MotorFault, {"kind": "stuck"}, "motor", 0, 3),
         (MotorFault, {"kind": "stuck"}, "size", -6.0, 6.0),
         (SensorFault, {"kind": "freeze"}, "seed", 0, 2**31 - 1),
-        (StepReference, {}, "pitch", -0.8, 0.8),
-        (RampReference, {}, "roll", -0.8, 0.8),
-        (SineReference, {}, "cocontraction", -6.0, 6.0),
-        (RotationReference, {}, "inclination", -0.8, 0.8),
     ],
 )
 def test_borders_belong_to_the_range(kind: Any, given: Mapping[str, Any], name: str, least: Any, most: Any) -> None:
@@ -179,9 +175,10 @@ def test_fields_behind_keys_are_known() -> None:
     assert fault_field("sensor_bias", "start_s") == "start"
     assert fault_field("sensor_bias", "rate_rad_s") is None
     assert fault_field("nothing", "size_deg") is None
-    assert reference_field("step", "pitch_deg") == "pitch"
-    assert reference_field("step", "frequency_hz") is None
-    assert reference_field("nothing", "pitch_deg") is None
+    assert same_quantity("pitch_deg", "pitch_rad")
+    assert same_quantity("x", "x_mm")
+    assert not same_quantity("pitch_deg", "roll_deg")
+    assert same_quantity("at_ms", "at_s")
 
 
 @pytest.mark.parametrize(
@@ -199,6 +196,19 @@ def test_a_reference_written_to_a_file_is_the_reference_again(made: Any) -> None
     kind = str(keys.pop("kind"))
     assert make_reference(kind, {name: float(value) for name, value in keys.items()}) == made
     assert reference_keys(lambda _: (0.0, 0.0, 0.0)) is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "most"),
+    [(StepReference, "pitch", 0.8), (RampReference, "roll", 0.8), (SineReference, "cocontraction", 6.0),
+     (RotationReference, "inclination", 0.8)],
+)  # fmt: skip
+def test_references_stay_within_what_the_robot_may_do(kind: Any, name: str, most: float) -> None:
+    for value in (-most, most):
+        made = kind(**{name: value})
+        assert value in (*made.values, made.cocontraction)
+        with pytest.raises(SettingsError, match="must be within"):
+            kind(**{name: value * (1.0 + 1e-6)})
 
 
 # -- references -------------------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def test_file_keys_carry_their_unit() -> None:
         ("jump", {}, "`kind` must be one of step"),
         ("step", {"yaw_deg": 1.0}, "unknown key `yaw_deg` of a step reference"),
         ("step", {"pitch_deg": "15"}, "`pitch_deg` must be a number"),
-        ("step", {"pitch_rad": 15.0}, r"within \+-0\.8 rad; got 15: degrees\?"),
+        ("step", {"pitch_rad": 15.0}, r"within -0\.8 to 0\.8 rad, .*; got 15: degrees\?"),
         ("sine", {"frequency_hz": -1.0}, "`frequency` must be positive"),
         ("ramp", {"rise_s": 0.0}, "`rise` must be positive"),
     ],

@@ -21,7 +21,6 @@ from softneck.design.linear._own import own_controller
 from softneck.loop import BlockPart, Part, RecordingReference, Reference
 from softneck.loop._reference_parts import AheadReference
 from softneck.loop._references import make_reference
-from softneck.loop._robot_references import robot_reference
 from softneck.loop._wiring import Link
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
@@ -182,8 +181,7 @@ class PartOpener:
             raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCES)}.")
         values = {key: value for key, value in table.items() if key != "kind"}
         if table["kind"] != "recording":
-            return make_reference(table["kind"], values) if robot.is_neck else robot_reference(
-                table["kind"], values, robot)  # fmt: skip
+            return make_reference(table["kind"], values, robot)
         refuse_unknown("[reference]", values, ("file",))
         recording = read_recording(self._file("reference", str(values.get("file", ""))))
         require_same_robot(robot, recording.robot, "[reference] file and the loop")

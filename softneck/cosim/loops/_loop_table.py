@@ -9,8 +9,7 @@ from typing import Any
 from softneck.core import SettingsError
 from softneck.loop import BlockPart, Loop, Part
 from softneck.loop._faults import fault_field, fault_keys
-from softneck.loop._references import reference_field, reference_keys
-from softneck.loop._robot_references import reference_key
+from softneck.loop._references import reference_key, reference_keys, same_quantity
 from softneck.loop._wiring import Link
 from softneck.robot import Robot
 
@@ -38,10 +37,10 @@ def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
             table.setdefault("part", []).append({"name": name, "role": part.role, **described})
         else:
             table[name] = described
-    if not plain.robot.is_neck:
+    if plain.robot.in_header():
         table["robot"] = plain.robot
     if "reference" not in table:
-        table["reference"] = reference_keys(plain.reference) or {OBJECT: plain.reference}  # pyright: ignore[reportArgumentType]
+        table["reference"] = reference_keys(plain.reference, plain.robot) or {OBJECT: plain.reference}  # pyright: ignore[reportArgumentType]
     if plain.faults:
         table["fault"] = [fault_keys(fault) for fault in plain.faults]
     if plain.connections:
@@ -90,8 +89,8 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
         reference = table.get("reference", {})
         if OBJECT not in reference and "fmu" not in reference:
             kind = str(reference.get("kind"))
-            known = _field(kind, rest, robot) or ("file" if rest == "file" and kind == "recording" else None)
-            _check_field(key, rest, known, f"a {kind} reference")
+            if not (rest == "file" and kind == "recording"):
+                _check_field(key, rest, _field(kind, rest, robot), f"a {kind} reference")
             return
     elif head not in table:
         raise SettingsError(f"the loop has no {head}, so no key `{key}`.")
@@ -100,11 +99,9 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
 
 def _field(kind: str, key: str, robot: Robot) -> str | None:
     """Return what a key sets in a reference of `kind`, if there is something."""
-    if robot.is_neck:
-        return reference_field(kind, key)
     try:
         return reference_key(kind, key, robot)[0]
-    except (KeyError, SettingsError):
+    except SettingsError:
         return None
 
 
@@ -162,14 +159,11 @@ def _put(table: dict[str, Any], key: str, value: Any) -> None:
         entry, place, rest = _entry(table, key)
         changed = dict(entry)
         table[head] = [*table[head][:place], changed, *table[head][place + 1 :]]
-        field = fault_field if head == "fault" else None
     else:
         changed = table[head] = dict(table.get(head, {}))
-        field = reference_field if head == "reference" else None
-    if field is not None:
+    if head in ("fault", "reference"):
         # The same in another unit gives way.
-        kind = str(changed.get("kind"))
-        for old in [k for k in changed if k != "kind" and field(kind, k) == (field(kind, rest) or "")]:
+        for old in [k for k in changed if k != "kind" and same_quantity(k, rest)]:
             del changed[old]
         changed[rest] = value
     elif rest in _SOURCES:

@@ -15,8 +15,8 @@ from softneck.core import FileFormatError, SettingsError, SoftneckError, file_ha
 from softneck.core._shown import Shown
 from softneck.design.linear._own import own_attributes, own_controller
 from softneck.loop import Loop, LoopRun
+from softneck.loop._references import reference_key
 from softneck.loop._result import metric_names, shown_unit
-from softneck.loop._robot_references import reference_key
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 

@@ -12,7 +12,7 @@ import tomli_w
 
 from softneck.cli.start._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
 from softneck.loop._result import metric_names
-from softneck.loop._robot_references import robot_reference
+from softneck.loop._references import make_reference
 from softneck.robot import Robot
 from softneck.signals import signal
 
@@ -59,7 +59,7 @@ def test_a_robot_of_one_output_is_asked_for_that_output_alone(call: Call) -> Non
     assert made(call, TUNED, "--force") == 0
     reference = {key: value for key, value in table("loop.toml")["reference"].items() if key != "kind"}
     # It takes no key of an output that the robot does not have.
-    assert robot_reference("step", reference, Robot.read("p/robot.toml")).values == pytest.approx([np.radians(10.0)])
+    assert make_reference("step", reference, Robot.read("p/robot.toml")).values == pytest.approx([np.radians(10.0)])
     varied = {key.partition(".")[2] for key in table("study.toml")["vary"] if key.startswith("reference.")}
     assert varied <= set(reference)
 
