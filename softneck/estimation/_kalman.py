@@ -262,14 +262,12 @@ def delay_source(header: Mapping[str, Any]) -> str:
 
 def observer_ports(form: str, robot: Robot = _NECK) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
     """Return the inputs and outputs of a filter of one form."""
-    names, unit, shown = robot.outputs.names, to_si(robot.outputs.unit)[1], robot.outputs.display_unit
+    names, unit, shown = robot.outputs.names, to_si(robot.outputs.unit)[1], robot.outputs.shown
     factor, motor = to_si(robot.motors.unit)
-    # In SI the usual unit is shown.
-    told = "" if robot.motors.unit == motor else robot.motors.unit
     ends = [[None] * len(robot.set_points) if given is None else [factor * value for value in given]
             for given in (robot.motors.setpoint_min, robot.motors.setpoint_max)]  # fmt: skip
     u = tuple(
-        Port(name=name, unit=motor, minimum=low, maximum=high, display_unit=told)
+        Port(name=name, unit=motor, minimum=low, maximum=high, display_unit=robot.motors.shown)
         for name, low, high in zip(robot.set_points, *ends, strict=True)
     )
     y = tuple(
