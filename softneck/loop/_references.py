@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -138,11 +137,24 @@ def reference(kind: str, robot: Robot = _NECK, **values: float) -> RobotReferenc
     return RobotReference(kind=kind, values=tuple(wanted.values()), cocontraction=common, **times)
 
 
-#: Of a neck: `pitch`, `roll` or `inclination`, and `cocontraction` [rad]; `at`, `rise` [s]; `frequency` [Hz].
-StepReference = partial(reference, "step")
-RampReference = partial(reference, "ramp")
-SineReference = partial(reference, "sine")
-RotationReference = partial(reference, "rotation")
+def StepReference(**values: float) -> RobotReference:
+    """Return a step of a neck: `pitch`, `roll`, `cocontraction` [rad], `at` [s]."""
+    return reference("step", **values)
+
+
+def RampReference(**values: float) -> RobotReference:
+    """Return a ramp of a neck: `pitch`, `roll`, `cocontraction` [rad], `at`, `rise` [s]."""
+    return reference("ramp", **values)
+
+
+def SineReference(**values: float) -> RobotReference:
+    """Return a sine of a neck: `pitch`, `roll`, `cocontraction` [rad], `frequency` [Hz], `at` [s]."""
+    return reference("sine", **values)
+
+
+def RotationReference(**values: float) -> RobotReference:
+    """Return a rotation of a neck: `inclination`, `cocontraction` [rad], `frequency` [Hz], `at`, `rise` [s]."""
+    return reference("rotation", **values)
 
 
 def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
