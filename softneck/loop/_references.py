@@ -158,7 +158,7 @@ def RotationReference(**values: float) -> RobotReference:
 
 
 def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
-    """Return a reference from the keys of a loop file: `x_mm = 10`, or `x = 10` in the output's unit; `at_s`.
+    """Return a reference from the keys of a loop file: `x_mm = 10`, or `x = 10` in its display unit; `at_s`.
 
     The kinds are step, ramp, sine and rotation; a recorded one is made of its arrays by `RecordingReference`.
 
@@ -179,13 +179,16 @@ def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
     """Return what a key such as `x_mm` or `at_s` sets in a reference of `kind`, and its factor to SI.
 
     Raises:
-        SettingsError: nothing.
+        SettingsError: nothing, or an angle without unit where the robot's file is in another than people see.
     """
     units, times = _units(kind, robot), SHAPES.get(kind, {})
     name, _, unit = (key, "", "") if key in units or key in times else key.rpartition("_")
     if name in times and unit in _TIMES:
         return name, _TIMES[unit]
     if name in units:
+        at = robot.outputs
+        if not unit and name != "cocontraction" and at.unit != at.display_unit and to_si(at.unit)[1] == "rad":
+            raise SettingsError(f"`{key}` may be in rad or deg; write `{key}_rad` or `{key}_deg`.")
         try:
             factor, si = to_si(unit or units[name])
         except SoftneckError:
@@ -226,7 +229,7 @@ def _stem(key: str) -> str:
 
 def _units(kind: str, robot: Robot) -> dict[str, str]:
     outputs = ("inclination",) if kind == "rotation" else robot.outputs.names
-    return {**dict.fromkeys(outputs, robot.outputs.unit), "cocontraction": robot.motors.unit}
+    return {**dict.fromkeys(outputs, robot.outputs.display_unit), "cocontraction": robot.motors.unit}
 
 
 def reference_range(name: str, robot: Robot) -> tuple[float, float, str]:

@@ -186,9 +186,9 @@ def test_the_whole_way_over_the_virtual_plant(name: str) -> None:
     [
         ({"roll_deg": 3.0}, "unknown key `roll_deg` of a step reference"),
         ({"pitch_mm": 3.0}, "unknown key `pitch_mm` of a step reference"),
-        ({"pitch": 80.0}, r"`pitch` must be within -0.8 to 0.8 rad, as robot `antagonist` .* may be"),
+        ({"pitch_deg": 80.0}, r"`pitch` must be within -0.8 to 0.8 rad, as robot `antagonist` .* may be"),
         ({"kind": "rotation", "inclination_deg": 3.0}, 'kind = "rotation" is for two angles'),
-        ({"pitch": "far"}, "`pitch` must be a number"),
+        ({"pitch_deg": "far"}, "`pitch_deg` must be a number"),
     ],
 )
 def test_references_that_a_robot_cannot_follow_are_refused(reference: dict[str, Any], said: str) -> None:

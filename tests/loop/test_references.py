@@ -59,12 +59,13 @@ def test_file_keys_carry_their_unit() -> None:
     [
         ("jump", {}, "`kind` must be one of step"),
         ("step", {"yaw_deg": 1.0}, "unknown key `yaw_deg` of a step reference"),
+        ("step", {"pitch": 0.2}, "`pitch` may be in rad or deg; write `pitch_rad`"),
         ("step", {"pitch_deg": "15"}, "`pitch_deg` must be a number"),
         ("step", {"pitch_rad": 15.0}, r"within -0\.8 to 0\.8 rad, .*; got 15: degrees\?"),
         ("sine", {"frequency_hz": -1.0}, "`frequency` must be positive"),
         ("ramp", {"rise_s": 0.0}, "`rise` must be positive"),
     ],
-    ids=["kind", "key", "text", "degrees", "frequency", "rise"],
+    ids=["kind", "key", "bare", "text", "degrees", "frequency", "rise"],
 )
 def test_wrong_references_are_refused(kind: str, values: dict[str, float], message: str) -> None:
     with pytest.raises(SettingsError, match=message):

@@ -11,8 +11,8 @@ import pytest
 import tomli_w
 
 from softneck.cli.start._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
-from softneck.loop._result import metric_names
 from softneck.loop._references import make_reference
+from softneck.loop._result import metric_names
 from softneck.robot import Robot
 from softneck.signals import signal
 
