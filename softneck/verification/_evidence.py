@@ -165,7 +165,7 @@ def _linear(
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    parts = [structured(neck, law, extra=extra, time=asked.scale.time) for neck in necks]
+    parts = [structured(neck, law, extra=extra, scale=asked.scale) for neck in necks]
     return LinearEvidence(name, law, tried, table, found, parts)
 
 

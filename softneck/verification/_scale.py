@@ -75,6 +75,11 @@ class Scale:
             known=bool(sources) or None not in (robot.time_constant_s, motors.nominal, outputs.nominal),
         )  # fmt: skip
 
+    @property
+    def gain(self) -> float:
+        """One of a gain in scaled quantities, in SI."""
+        return self.si(self.size) / math.radians(1.0) / (to_si(self.robot.motors.unit)[0] * self.load)
+
     def factor(self, name: str) -> float:
         """Return what a number of the neck is multiplied by: of a key or metric such as `size_deg`, `settling_s`."""
         if name == "load_rad":

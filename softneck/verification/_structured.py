@@ -25,6 +25,7 @@ from softneck.identification.uncertainty._measured import response_of
 
 from ._linear import LinearLaw, inverse, loops, radii
 from ._plants import AxisBox, Plants, UncertainNeck, join, make_plants, measured_plant, mixing
+from ._scale import Scale
 
 # Members of a generation per unknown.
 _CROWD = 10
@@ -159,23 +160,26 @@ class StructuredResult:
         return float(self.upper.max())
 
 
-def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int, time: float = 1.0) -> list[StructuredResult]:
+def structured(
+    neck: UncertainNeck, law: LinearLaw, *, extra: int, scale: Scale | None = None
+) -> list[StructuredResult]:
     """Return the bounds of each axis, or of both together where plant or controller couple them.
 
     Args:
         neck: with its box.
         law: the controller's linear form.
         extra: samples of delay that the loop's order adds.
-        time: by which the robot is slower than the neck.
+        scale: of the robot; None: the neck's. The bound is descended to in scaled quantities.
     """
+    time, gain = (1.0, 1.0) if scale is None else (scale.time, scale.gain)
     Ts = neck.sample_time
     results = []
     for axes in axes_together(neck, law):
         bands = [box.measured.band for box in (neck.axes[i] for i in axes) if box.measured is not None]
         low, high = [max(ends) for ends in zip(*((a, -b) for a, b in bands), (0.05 / time, -math.pi / Ts), strict=True)]
-        peaks = _real_peaks(neck, law, np.geomspace(low, -high, _FINE), axes, extra)
+        peaks = _real_peaks(neck, law, np.geomspace(low, -high, _FINE), axes, extra, gain)
         w = np.union1d(np.geomspace(low, -high, _FREQUENCIES), peaks)
-        M, blocks = interconnection(neck, law, w, axes, extra)
+        M, blocks = interconnection(neck, law, w, axes, extra, gain)
         name = together(neck, axes)
         if not _middle_is_stable(neck, law, axes, extra):
             # The bound grows the box from a stable middle; without one there is nothing to grow.
@@ -186,12 +190,12 @@ def structured(neck: UncertainNeck, law: LinearLaw, *, extra: int, time: float =
     return results
 
 
-def _real_peaks(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int) -> Vector:
+def _real_peaks(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float) -> Vector:
     """Return where a real scalar alone could make the loop unstable: peaks that no grid meets.
 
     Packard and Pandey, 1993: mu of real scalars is not continuous in frequency.
     """
-    M, blocks = interconnection(neck, law, w, axes, extra)
+    M, blocks = interconnection(neck, law, w, axes, extra, gain)
     own = np.imag(np.diagonal(M, axis1=1, axis2=2))[:, [kind < 0 for kind, _ in blocks]]
     i, k = np.nonzero(np.diff(np.signbit(own), axis=0))
     return w[i] + own[i, k] / (own[i, k] - own[i + 1, k]) * (w[i + 1] - w[i])
@@ -210,13 +214,13 @@ def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], 
 
 
 def interconnection(
-    neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int
+    neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float = 1.0
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
-    """Return M (m, rows, columns) over `w` [rad/s] and its blocks."""
+    """Return M (m, rows, columns) over `w` [rad/s] and its blocks; `gain` is one of scaled quantities, in SI."""
     n = len(axes)
-    parts = [_axis(neck.axes[i], w, neck.sample_time, extra) for i in axes]
+    parts = [_axis(neck.axes[i], w, neck.sample_time, extra, gain) for i in axes]
     X = np.eye(n) if n == 1 else mixing(neck.cross, n)
-    Ky = law.feedback(w)[:, list(axes)][:, :, list(axes)]
+    Ky = gain * law.feedback(w)[:, list(axes)][:, :, list(axes)]
     V = X @ Ky
     m = w.size
     P = np.zeros((m, n, n), dtype=complex)
@@ -240,16 +244,15 @@ def _uncertain(neck: UncertainNeck, axis: int, start: int) -> list[int]:
     return [start + k for k in range(3) if widths[k] > 0.0 or k == 2]
 
 
-def _axis(box: Any, w: Vector, Ts: float, extra: int) -> tuple[np.ndarray, ...]:
+def _axis(box: Any, w: Vector, Ts: float, extra: int, gain: float = 1.0) -> tuple[np.ndarray, ...]:
     """Return P (m,), H (m, 3), F (m, 3), E (m, 3, 3) of one axis around the middle of its box."""
     z = np.exp(1j * w * Ts)
     if box.measured is not None:
-        P, W = response_of(box.measured.model, w, Ts) * z**-extra, box.measured.weight_at(w)
+        P, W = response_of(box.measured.model, w, Ts) * z**-extra / gain, box.measured.weight_at(w)
         none = np.zeros((w.size, 3, 3), dtype=complex)
         own = np.array([0.0, 0.0, 1.0])
         return P, W[:, None] * own, P[:, None] * own, none
-    K, _, L = box.middle
-    rK = box.widths[0]
+    L, K, rK = box.middle[2], box.middle[0] / gain, box.widths[0] / gain
     ends = 1.0 - np.exp(-np.array([box.low[1], box.high[1]]) * Ts)
     alpha, r = 0.5 * (ends[0] + ends[1]), 0.5 * (ends[1] - ends[0])
     middle = _middle_pole(box, Ts)
