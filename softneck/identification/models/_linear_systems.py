@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -12,10 +12,8 @@ from softneck.core import Matrix, SettingsError, Vector, require_one_of, require
 from softneck.core._checks import finite_vector
 from softneck.robot import Robot
 from softneck.robot._channels import is_set_point
-from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, State
 from softneck.runtime._compile import load_tangent
-from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ._state_space import system_of
 
@@ -25,61 +23,97 @@ if TYPE_CHECKING:
 KINDS = ("rls", "oe")
 STATE_SPACE = "softneck.identification.linear._state_space_runtime"
 AFFINE = "softneck.identification.linear._affine_runtime"
-_OUTPUTS = ("pitch", "roll")
-_REDEFINED = ("theta_i", "phi_i", "delta_i")
-_MOTORS = ("motor_setpoint_1", "motor_setpoint_2", "motor_setpoint_3")
+UNITS = ("SI", "robot")
 
 
-def transfer_function(model: Any, output: str, input: str | None, angle_unit: str) -> control.TransferFunction:
+def transfer_function(
+    model: Any, output: str, input: str | None, angle_unit: str = "rad", units: str = "SI"
+) -> control.TransferFunction:
     """Return the discrete transfer function from `input` to `output`, with its delay in full.
 
     Raises:
         SettingsError: the kind is not linear, or an unknown input, output or unit.
     """
-    import control
-
-    name, scale = _checked(model, output, input, angle_unit)
-    axes = model.findings.get("transfer_functions")
-    if not model.robot.is_neck:
-        numerator, denominator, delay = _of_robot(model, output, name)
-    elif axes is not None:
-        numerator, denominator, delay = _of_findings(axes, _OUTPUTS.index(output), name)
-    elif "A" in model.arrays:
-        numerator, denominator, delay = _of_state_space(model.arrays, _OUTPUTS.index(output), name)
-    else:
-        numerator, denominator, delay = _of_axis(model.arrays, _OUTPUTS.index(output), name)
+    name = _checked(model, output, input)
+    b, a, delay = _function(model, output, name)
     # In powers of z: the numerator b_1 z^(n-1-d)... needs n = max(na, nb + d) so that no power is negative.
-    a, b = denominator[1:], numerator
     n = max(a.size, b.size + delay)
     below, above = np.zeros(n + 1), np.zeros(n + 1)
-    below[: a.size + 1] = denominator
+    below[: a.size + 1] = [1.0, *a]
     above[1 + delay : 1 + delay + b.size] = b
+    return _named(model, (above, below, model.sample_time), (name, output), angle_unit, units)
+
+
+def _named(
+    model: Any, G: tuple[Any, ...], names: tuple[str, str], angle_unit: str, units: str
+) -> control.TransferFunction:
+    """Return a transfer function in other units, with names."""
+    import control
+
+    name, output = names
+    require_one_of("angle_unit", angle_unit, ("rad", "deg"))
+    _, per_input, inputs = _shown(model.robot, [name], units)
+    per_output, _, outputs = _shown(model.robot, [output], units)
+    if angle_unit == "deg" and units == "SI" and to_si(model.robot.outputs.unit)[1] == "rad":
+        per_output = 180.0 / np.pi
     return control.TransferFunction(
-        scale * above, below, model.sample_time, inputs=[name], outputs=[output], name=f"G_{output}"
+        per_output * (per_input * G[0]), *G[1:], inputs=inputs, outputs=outputs, name=f"G_{output}"
     )
 
 
-def state_space(model: Any) -> control.StateSpace:
-    """Return both outputs as one discrete state space, from the motors where the model has them as inputs."""
+def _shown(robot: Robot, names: Sequence[str], units: str) -> tuple[float, float, list[str]]:
+    """Return what an output in SI and a gain over an input in SI are multiplied by, and the names of signals.
+
+    In the robot's units names say which: `pressure_setpoint [kPa]`; those of SI are the names alone.
+    """
+    require_one_of("units", units, UNITS)
+    if units == "SI":
+        return 1.0, 1.0, list(names)
+    shown, motor = robot.outputs.display_unit, robot.motors.unit
+    known = dict.fromkeys(robot.outputs.names, shown)
+    return 1.0 / to_si(shown)[0], to_si(motor)[0], [f"{name} [{known.get(name, motor)}]" for name in names]
+
+
+def state_space(model: Any, units: str = "SI") -> control.StateSpace:
+    """Return all outputs as one discrete state space, from the motors where the model has them as inputs."""
     import control
 
     _require_linear(model.kind)
-    if not model.robot.is_neck or ("A" in model.arrays and "transfer_functions" not in model.findings):
+    robot = model.robot
+    if _over_motors(model):
         A, B, C, _ = system_of(model.arrays)
         A, B, C = _delayed(A, B, C, int(model.arrays["delay"][0]))
-        inputs = list(model.robot.set_points)
+        inputs = robot.set_points
     else:
-        parts = [control.ss(transfer_function(model, output, None, "rad")) for output in _OUTPUTS]
+        parts = [control.ss(transfer_function(model, output, None)) for output in robot.outputs.names]
         joined: Any = control.append(*parts)
         A, B, C = np.asarray(joined.A), np.asarray(joined.B), np.asarray(joined.C)
-        inputs = list(_REDEFINED[:2])
+        inputs = robot.input_names
+    return shown_system(model, (A, B, C), (inputs, robot.outputs.names), "neck" if robot.neck else "robot", units)
+
+
+def shown_system(
+    model: Any, system: tuple[Matrix, Matrix, Matrix], names: tuple[Sequence[str], Sequence[str]], name: str, units: str
+) -> control.StateSpace:
+    """Return A, B, C in SI with the names of inputs and outputs, in other units."""
+    import control
+
+    (A, B, C), robot = system, model.robot
+    _, per_input, inputs = _shown(robot, names[0], units)
+    per_output, per_motor, outputs = _shown(robot, names[1], units)
+    positions = np.isin(names[1], robot.motor_positions)  # a linearised model has these too
+    C = np.where(positions, 1.0 / per_motor, per_output)[:, None] * C
     D = np.zeros((len(C), B.shape[1]))
-    outputs, name = list(model.robot.outputs.names), "neck" if model.robot.is_neck else "robot"
-    return control.StateSpace(A, B, C, D, model.sample_time, inputs=inputs, outputs=outputs, name=name)
+    return control.StateSpace(A, per_input * B, C, D, model.sample_time, inputs=inputs, outputs=outputs, name=name)
+
+
+def _over_motors(model: Any) -> bool:
+    """Return whether the inputs of a model are motors, not redefined inputs."""
+    return "A" in model.arrays and ("offset" in model.arrays or "transfer_functions" not in model.findings)
 
 
 def continuous_function(
-    model: Any, output: str, input: str | None, angle_unit: str, pade: int
+    model: Any, output: str, input: str | None, angle_unit: str, pade: int, units: str
 ) -> control.TransferFunction:
     """Return the continuous-time transfer function behind samples held by a zero-order hold.
 
@@ -88,52 +122,112 @@ def continuous_function(
     """
     import control
 
-    name, scale = _checked(model, output, input, angle_unit)
+    name = _checked(model, output, input)
     require_whole("pade", pade, 0, 12)
     b, a, delay = _continuous(model, output, name)
-    G = control.TransferFunction(scale * b, a)
+    G = control.TransferFunction(b, a)
     if pade > 0 and delay > 0.0:
         G = G * control.TransferFunction(*control.pade(delay, pade))
-    return control.TransferFunction(G.num, G.den, inputs=[name], outputs=[output], name=f"G_{output}")
+    return _named(model, (np.asarray(G.num[0][0]), G.den), (name, output), angle_unit, units)
 
 
 def describe(model: Any) -> list[str]:
-    """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in degrees, where it has one real pole."""
-    if not model.robot.is_neck or ("A" in model.arrays and "transfer_functions" not in model.findings):
+    """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in the robot's units, where it has one pole."""
+    if "A" in model.arrays and "transfer_functions" not in model.findings:
         poles = np.linalg.eigvals(model.arrays["A"])
         delay = model.arrays["delay"][0] * model.sample_time
         return [f"{poles.size} states, dead time {delay:.3g} s, poles {np.array2string(poles, precision=4)}"]
-    return [_describe_axis(model, axis) for axis in (0, 1)]
+    return [_describe_axis(model, name) for name in model.robot.outputs.names]
 
 
-def _describe_axis(model: Any, axis: int) -> str:
-    name = _OUTPUTS[axis]
-    numbers = continuous_parameters(model.sample_time, model.arrays, axis)
+def _describe_axis(model: Any, name: str) -> str:
+    outputs, motors = model.robot.outputs, model.robot.motors
+    per, unit = to_si(motors.unit)[0] / to_si(outputs.display_unit)[0], f"{outputs.display_unit}/{motors.unit}"
+    a, b, delay = axis_functions(model)[name]
+    numbers = one_pole(model.sample_time, a, b, delay)
     if numbers is None:
-        G: Any = transfer_function(model, name, None, "deg")
-        poles = np.roots(np.trim_zeros(np.asarray(G.den[0][0]), "b"))
-        gain = float(G.dcgain())
-        delay = _dead_time(np.asarray(G.num[0][0]), np.asarray(G.den[0][0])) * model.sample_time
+        poles, gain = np.roots([1.0, *a]), per * b.sum() / (1.0 + a.sum())
         return (
             f"{name}: discrete poles {np.array2string(poles, precision=4)}, "
-            f"static gain {gain:.3f} deg/rad, dead time {delay:.2f} s"
+            f"static gain {gain:.3f} {unit}, dead time {delay * model.sample_time:.3g} s"
         )
     K, p, L = numbers
-    gain = np.degrees(K / p)
-    return f"{name}: G(s) = exp(-{L:.2f} s) {np.degrees(K):.3f}/(s + {p:.3f}) deg/rad, static gain {gain:.3f}"
+    gain = per * K / p
+    return f"{name}: G(s) = exp(-{L:.3g} s) {per * K:.3f}/(s + {p:.3f}) {unit}, static gain {gain:.3f}"
 
 
 def continuous_parameters(
     sample_time: float, arrays: Mapping[str, Matrix], axis: int
 ) -> tuple[float, float, float] | None:
-    """Return K [rad/(rad s)], pole p [1/s] and dead time L [s] of a one-pole axis; None for another order."""
+    """Return `one_pole` of an axis of arrays over redefined inputs; None for others."""
     if "a" not in arrays:
         return None
-    a, b = arrays["a"][axis], arrays["b"][axis]
+    return one_pole(sample_time, arrays["a"][axis], arrays["b"][axis], int(arrays["delay"][axis]))
+
+
+def one_pole(sample_time: float, a: Vector, b: Vector, delay: int) -> tuple[float, float, float] | None:
+    """Return K [of the output/(of the input s)], pole p [1/s] and dead time L [s]; None for another order."""
     if a.size != 1 or b.size != 1 or not 0.0 < -a[0] < 1.0:
         return None
     p = -np.log(-a[0]) / sample_time
-    return float(b[0] * p / (1.0 + a[0])), float(p), float(arrays["delay"][axis] * sample_time)
+    return float(b[0] * p / (1.0 + a[0])), float(p), float(delay * sample_time)
+
+
+def axis_functions(model: Any) -> dict[str, tuple[Vector, Vector, int]]:
+    """Return output -> a, b and dead time [samples] from its own redefined input, in SI; {} of a model over motors."""
+    said, arrays, names = model.findings.get("transfer_functions"), model.arrays, model.robot.outputs.names
+    if said is not None:
+        return {name: (np.array(said[name]["a"]), np.array(said[name]["b"]), int(said[name]["delay"]))
+                for name in names}  # fmt: skip
+    if "a" not in arrays:
+        return {}
+    return {name: (arrays["a"][i], arrays["b"][i], int(arrays["delay"][i])) for i, name in enumerate(names)}
+
+
+def weights_of(model: Any) -> Matrix:
+    """Return the weights (outputs, motors) of the motors in each output's direction, given or learned.
+
+    Raises:
+        SettingsError: the robot's directions are to be identified, and the model says nothing of them.
+    """
+    weights = model.robot.weights()
+    if weights is None:
+        found = model.findings.get("directions")
+        if found is None:
+            raise SettingsError(
+                f"the model of kind `{model.kind}` says nothing of the directions of robot {model.robot.label()}, "
+                'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
+            )
+        weights = np.array(found, dtype=np.float64)
+    return weights
+
+
+def redefined_input(robot: Robot, output: str) -> str:
+    """Return what the redefined input of an output is called: of a neck theta_i and phi_i."""
+    return robot.input_names[robot.outputs.names.index(output)]
+
+
+def _function(model: Any, output: str, name: str) -> tuple[Vector, Vector, int]:
+    """Return numerator, denominator without its leading one, and dead time [samples] to an output from any input."""
+    robot = model.robot
+    axis, motor = robot.outputs.names.index(output), name in robot.set_points
+    functions = axis_functions(model)
+    if functions:
+        a, b, delay = functions[output]
+        # A redefined input moves its own output alone (what Eq. 9-11 neglect).
+        weight = weights_of(model)[axis, robot.set_points.index(name)] if motor else float(
+            name == redefined_input(robot, output))  # fmt: skip
+        return weight * b, a, delay
+    A, B, C, _ = system_of(model.arrays)
+    if motor:
+        column = B[:, robot.set_points.index(name)]
+    else:
+        inverse = robot.redefinition(weights_of(model))[1]
+        column = B @ inverse[:, [*robot.input_names, robot.cocontraction_name].index(name)]
+    # c (zI - A)^-1 b = (det(zI - A + b c) - det(zI - A)) / det(zI - A).
+    denominator = np.real(np.poly(A))
+    numerator = np.real(np.poly(A - np.outer(column, C[axis]))) - denominator
+    return numerator[1:], denominator[1:], int(model.arrays["delay"][0])
 
 
 def _continuous(model: Any, output: str, name: str) -> tuple[Vector, Vector, float]:
@@ -141,7 +235,7 @@ def _continuous(model: Any, output: str, name: str) -> tuple[Vector, Vector, flo
     import control
     from scipy.linalg import logm
 
-    G = transfer_function(model, output, name, "rad")
+    G = transfer_function(model, output, name)
     below, above = np.asarray(G.den[0][0]), np.trim_zeros(np.asarray(G.num[0][0]), "f")
     delay = _dead_time(above, below)
     S: Any = control.ss(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
@@ -165,82 +259,6 @@ def _dead_time(numerator: Vector, denominator: Vector) -> int:
     return min(at_zero, denominator.size - above.size - 1) if above.size else 0
 
 
-def redefined_input(robot: Robot, output: str) -> str:
-    """Return what the redefined input of an output is called: of a neck theta_i and phi_i."""
-    return _REDEFINED[_OUTPUTS.index(output)] if robot.is_neck else f"{output}_input"
-
-
-def weights_of(model: Any) -> Matrix:
-    """Return the weights (outputs, motors) of the motors in each output's direction, given or learned.
-
-    Raises:
-        SettingsError: the robot's directions are to be identified, and the model says nothing of them.
-    """
-    weights = model.robot.weights()
-    if weights is None:
-        found = model.findings.get("directions")
-        if found is None:
-            raise SettingsError(
-                f"the model of kind `{model.kind}` says nothing of the directions of robot {model.robot.label()}, "
-                'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
-            )
-        weights = np.array(found, dtype=np.float64)
-    return weights
-
-
-def _of_robot(model: Any, output: str, name: str) -> tuple[Vector, Vector, int]:
-    """Return numerator, denominator and dead time to an output from a motor, or from its own redefined input."""
-    axis = model.robot.outputs.names.index(output)
-    if name in model.robot.set_points:
-        return _of_motor(model.arrays, axis, model.robot.set_points.index(name))
-    entry = model.findings.get("transfer_functions", {}).get(output)
-    if entry is not None:  # one axis alone: the state space has the poles of all
-        return np.array(entry["b"]), np.concatenate([[1.0], entry["a"]]), int(entry["delay"])
-    inverse = redefinition_of(weights_of(model), model.robot.outputs.names)[1]
-    return _of_column(model.arrays, axis, model.arrays["B"] @ inverse[:, axis])
-
-
-def _of_findings(axes: Mapping[str, Any], axis: int, name: str) -> tuple[Vector, Vector, int]:
-    """Return one axis of a model whose arrays hold both in one state space."""
-    entry = axes[_OUTPUTS[axis]]
-    arrays = {
-        "redefinition": redefinition_matrix(TENDON_ANGLES),
-        "a": np.array([entry["a"]] * 2),
-        "b": np.array([entry["b"]] * 2),
-        "delay": np.array([entry["delay"]] * 2),
-    }
-    return _of_axis(arrays, axis, name)
-
-
-def _of_axis(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector, Vector, int]:
-    weight = 1.0
-    if name in _MOTORS:
-        weight = float(arrays["redefinition"][axis, _MOTORS.index(name)])
-    elif name != _REDEFINED[axis]:
-        weight = 0.0  # what Eq. 9-11 neglect
-    return weight * arrays["b"][axis], np.concatenate([[1.0], arrays["a"][axis]]), int(arrays["delay"][axis])
-
-
-def _of_state_space(arrays: Mapping[str, Matrix], axis: int, name: str) -> tuple[Vector, Vector, int]:
-    if name in _MOTORS:
-        return _of_motor(arrays, axis, _MOTORS.index(name))
-    b = arrays["B"] @ np.linalg.inv(redefinition_matrix(TENDON_ANGLES))[:, _REDEFINED.index(name)]
-    return _of_column(arrays, axis, b)
-
-
-def _of_motor(arrays: Mapping[str, Matrix], axis: int, motor: int) -> tuple[Vector, Vector, int]:
-    """Return numerator, denominator and dead time of one output from one motor."""
-    return _of_column(arrays, axis, arrays["B"][:, motor])
-
-
-def _of_column(arrays: Mapping[str, Matrix], axis: int, b: Vector) -> tuple[Vector, Vector, int]:
-    A, _, C, _ = system_of(arrays)
-    # c (zI - A)^-1 b = (det(zI - A + b c) - det(zI - A)) / det(zI - A).
-    denominator = np.real(np.poly(A))
-    numerator = np.real(np.poly(A - np.outer(b, C[axis]))) - denominator
-    return numerator[1:], denominator, int(arrays["delay"][0])
-
-
 def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matrix, Matrix]:
     """Return the system with `delay` samples of its inputs as states."""
     n, m = B.shape
@@ -255,19 +273,14 @@ def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matri
     return F, G, H
 
 
-def _checked(model: Any, output: str, input: str | None, angle_unit: str) -> tuple[str, float]:
+def _checked(model: Any, output: str, input: str | None) -> str:
+    """Return the name of the input."""
     _require_linear(model.kind)
     robot = model.robot
     require_one_of("output", output, robot.outputs.names)
-    require_one_of("angle_unit", angle_unit, ("rad", "deg"))
-    if robot.is_neck:
-        name = _REDEFINED[_OUTPUTS.index(output)] if input is None else input
-        require_one_of("input", name, _REDEFINED + _MOTORS)
-    else:
-        name = redefined_input(robot, output) if input is None else robot.own(input)
-        require_one_of("input", name, (redefined_input(robot, output), *robot.set_points))
-    angle = to_si(robot.outputs.unit)[1] == "rad"
-    return name, 180.0 / np.pi if angle_unit == "deg" and angle else 1.0
+    name = redefined_input(robot, output) if input is None else robot.own(input)
+    require_one_of("input", name, (*robot.input_names, robot.cocontraction_name, *robot.set_points))
+    return name
 
 
 def _require_linear(kind: str) -> None:
@@ -317,10 +330,8 @@ def jacobian(model: Any, state: State, inputs: ArrayLike) -> Jacobian:
     return Jacobian(X[:, :n], X[:, n:], Y[:, :n], Y[:, n:])
 
 
-def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None) -> control.StateSpace:
+def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None, units: str) -> control.StateSpace:
     """Return the linear system that `model` is near a state; see `Model.linearize`."""
-    import control
-
     block = model.block()
     motors = _motor_count(block)
     load_tangent(block.runtime)  # a kind without derivatives need not come to rest first
@@ -339,11 +350,8 @@ def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None) -
     A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
     A, B, C = moved_through(A, B, C)
-    return control.StateSpace(
-        A, B, C, np.zeros((n_out, motors)), block.sample_time,
-        inputs=[port.name for port in block.inputs[:motors]], outputs=[port.name for port in block.outputs[:-1]],
-        name=model.kind,
-    )  # fmt: skip
+    names = [port.name for port in block.inputs[:motors]], [port.name for port in block.outputs[:-1]]
+    return shown_system(model, (A, B, C), names, model.kind, units)
 
 
 def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None) -> Vector:

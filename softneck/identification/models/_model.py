@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 #: A free run starts from this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
 _MOTORS = ("simulated", "measured")
+# A sample time of so many time constants is a slip: a neck's 10 s.
+_LONGEST_SAMPLE = 50.0
 # Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
 _SEARCHING = ("nlsm",)
 
@@ -156,7 +158,9 @@ class Model(Shown):
         """
         return _linear.jacobian(self, state, inputs)
 
-    def linearize(self, at: State | Mapping[str, float] | ArrayLike | None = None) -> control.StateSpace:
+    def linearize(
+        self, at: State | Mapping[str, float] | ArrayLike | None = None, *, units: str = "SI"
+    ) -> control.StateSpace:
         """Return the linear system from the motors' set-points to the outputs that the model is near a state.
 
         States that no input moves, or that no output shows, are left out. It has `dt` and the signals' names.
@@ -164,11 +168,12 @@ class Model(Shown):
         Args:
             at: the state, whose motors are told to stay where they are; or set-points [rad], (3,) or by name
                 (`motor_setpoint_1`, ..), under which the model has come to rest; None for zero.
+            units: as of `ss`.
 
         Raises:
             SettingsError: a kind without derivative, or a model that does not come to rest.
         """
-        return _linear.linearised(self, at)
+        return _linear.linearised(self, at, units)
 
     def simulate(self, recording: RecordingLike, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
         """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.
@@ -263,23 +268,31 @@ class Model(Shown):
         input: str | None = None,
         continuous: bool = False,
         pade: int = 3,
+        units: str = "SI",
     ) -> control.TransferFunction:
         """Return a transfer function to `output` (linear kinds); in discrete time its dead time is exact.
 
         Args:
-            output: "pitch" or "roll".
-            angle_unit: of the output, "rad" or "deg".
-            input: "theta_i", "phi_i", "delta_i" or "motor_setpoint_1".., the others held; None takes the redefined
-                input of `output` (Eq. 9, 10).
+            output: its name, of a neck "pitch" or "roll".
+            angle_unit: of the output in SI, "rad" or "deg".
+            input: a redefined input ("theta_i", "phi_i", "delta_i"; "flexion_input", "cocontraction") or a motor's
+                set-point, the others held; None takes the redefined input of `output` (Eq. 9, 10).
             continuous: return K/(s + p) and the like, the dead time as a Pade approximation.
             pade: its order; 0 leaves the dead time out.
+            units: as of `ss`.
         """
-        G = _linear.transfer_function(self, output, input, angle_unit)
-        return _linear.continuous_function(self, output, input, angle_unit, pade) if continuous else G
+        if continuous:
+            return _linear.continuous_function(self, output, input, angle_unit, pade, units)
+        return _linear.transfer_function(self, output, input, angle_unit, units)
 
-    def ss(self) -> control.StateSpace:
-        """Return the state space to (pitch, roll) [rad] from (theta_i, phi_i), or from the motors where it has them."""
-        return _linear.state_space(self)
+    def ss(self, *, units: str = "SI") -> control.StateSpace:
+        """Return the state space to the outputs from the redefined inputs, or from the motors where it has them.
+
+        Args:
+            units: "SI" (rad, Pa, m, V), with the signals' names; "robot": motors in the unit of the robot's files and
+                outputs in the one that people see, with names that say it: `pressure_setpoint [kPa]`, `flexion [deg]`.
+        """
+        return _linear.state_space(self, units)
 
     def casadi(self) -> casadi.Function:
         """Return one step in free run as a function of symbols, (x, u) -> (x_next, y), from the runtime's own text.
@@ -302,7 +315,7 @@ class Model(Shown):
     def summary(self) -> str:
         """Return a few lines on what the model is, in degrees."""
         lines = [f"{self.kind}: {KINDS[self.kind].summary}", f"sample time {1e3 * self.sample_time:g} ms"]
-        if not self.robot.is_neck:
+        if self.robot.in_header():
             lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs "
                          f"{', '.join(self.robot.outputs.names)}")  # fmt: skip
         known = _ports.payloads(self.arrays)
@@ -390,7 +403,7 @@ def _payload_of(run: Recording, block: Block) -> dict[str, float]:
 
 
 def _check_header(model: Model) -> None:
-    if not 0.0 < model.sample_time < (10.0 if model.robot.is_neck else np.inf):
+    if not 0.0 < model.sample_time < _LONGEST_SAMPLE * (model.robot.time_constant_s or np.inf):
         raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for {model.robot.name}.")
     if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
         raise FileFormatError("its settings and findings must be tables.")

@@ -22,32 +22,26 @@ _TRAINED = "set_points_rad"
 
 
 def _output(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
-    unit = to_si(robot.outputs.unit)[1]
-    port = Port(
-        name=name, unit=unit, description=description, missing=missing, display_unit=_shown(robot, outputs=True)
-    )
+    unit, shown = to_si(robot.outputs.unit)[1], robot.outputs.display_unit
+    # "": what is usual for the unit, as degrees are.
+    port = Port(name=name, unit=unit, description=description, missing=missing,
+                display_unit="" if shown == "deg" else shown)  # fmt: skip
     if unit != "rad" or missing:
         return port
     return replace(port, minimum=-np.pi, maximum=np.pi, nominal=0.2)
 
 
 def _motor(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
-    unit = to_si(robot.motors.unit)[1]
+    unit, shown = to_si(robot.motors.unit)[1], robot.motors.unit
     nominal = 1.0 if unit == "rad" else None
     return Port(name=name, unit=unit, description=description, nominal=nominal, missing=missing,
-                display_unit=_shown(robot, outputs=False))  # fmt: skip
-
-
-def _shown(robot: Robot, *, outputs: bool) -> str:
-    """Return the unit in which people see outputs or motors; that of a neck is the usual one."""
-    if robot.is_neck:
-        return ""
-    return robot.outputs.display_unit if outputs else robot.motors.unit
+                display_unit="" if shown == unit else shown)  # fmt: skip
 
 
 def _platform(robot: Robot, name: str) -> str:
     """Return what an output is of, for people."""
-    return f"{name.capitalize()} of the platform" if robot.is_neck else f"Output `{name}` of {robot.name}"
+    tendons = robot.tendon_angles is not None
+    return f"{name.capitalize()} of the platform" if tendons else f"Output `{name}` of {robot.name}"
 
 
 def parameters(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Port, ...]:
@@ -110,7 +104,11 @@ def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] 
 def inputs(findings: Mapping[str, Any], robot: Robot) -> tuple[Port, ...]:
     """Return the inputs; the set-points range over what the model was trained on."""
     low, high = _range(findings, len(robot.motors.names))
-    pulls = "; positive: the winch pulls" if robot.is_neck else f" ({robot.motors.unit} in the robot's files)"
+    pulls = (
+        "; positive: the winch pulls"
+        if robot.tendon_angles is not None
+        else f" ({robot.motors.unit} in the robot's files)"
+    )
     return (
         *(
             replace(_motor(robot, name, f"Set-point of motor {j}{pulls}"), minimum=float(a), maximum=float(b))
