@@ -19,7 +19,9 @@ from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import VERSION, Requirement, check_number, kept_back, metric_names, with_groups
 from softneck.verification._scale import Scale, digits
 
-_RISE = "sim.rise_s"
+_RISE, _OVERSHOOT = "sim.rise_s", "sim.overshoot_pct"
+# Three standard deviations of the default noise, 0.05 deg, of the default step, 15 deg [%].
+_NOISE_PCT = 1.0
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Least, largest and unit of the numbers of [track].
 _TRACK = {
@@ -122,6 +124,10 @@ def make_tune_requirements(
     usual = {
         name: scale.table(limits if name == "require" else defaults[name]) for name in defaults if name != "version"
     }
+    # What three standard deviations of the noise add to the largest output, beyond what they add to the neck's.
+    share = scale.factor("noise_deg") / scale.factor("size_deg") - 1.0
+    most = usual["require"][_OVERSHOOT]["max"] + max(0.0, _NOISE_PCT * share)
+    usual["require"][_OVERSHOOT] = {"max": digits(most)}
     if rise is not None:
         usual["require"][_RISE] = {"max": rise}
     if not stepping:
