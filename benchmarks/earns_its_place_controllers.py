@@ -31,7 +31,6 @@ from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, Model, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Part, StepReference, metrics, run_loop
 from softneck.loop._reference_parts import AheadReference
-from softneck.robot._neck_default import NeckDefault
 from softneck.signals import (
     Excitation,
     Recording,
@@ -96,7 +95,7 @@ def designed(cell: Cell) -> tuple[Any, NonlinearObserver | None]:
     where, ahead = (cell.robot, cell.seed), PREVIEW if preview else 0.0
     if kind == "mpc":
         # A wish, as the default is: a limit that cannot be kept would be given up with all others.
-        wish = MpcNumbers(preview=ahead, minimum_tautness=NeckDefault(TAUT[cell.robot]), payload_tautness=0.0)
+        wish = MpcNumbers(preview=ahead, wish=TAUT[cell.robot], payload_tautness=0.0)
         return wish.over(observed(*where)[1]).design(family(*where)), observed(*where)[1]
     if kind == "nmpc":
         settings = NmpcSettings(minimum_tautness=TAUT[cell.robot], preview=ahead)

@@ -202,11 +202,13 @@ def rms_deg(result: LoopResult, reference: Reference, since: float) -> float:
 
 def told(settings: MpcNumbers, payload: float) -> MpcNumbers:
     """Return the settings of a controller that knows its payload [kg] without an observer: to the bit the same."""
-    more, least = settings.payload_tautness * payload, settings.minimum_tautness
-    if least is None or settings.payload_tautness == 0.0:
+    more, least = (settings.payload_tautness or 0.0) * payload, settings.minimum_tautness
+    if least is None or more == 0.0:
         return settings
     # A wish stays one, a limit a limit.
-    return replace(settings, payload_tautness=0.0, minimum_tautness=type(least)(least + more))
+    if isinstance(least, str):
+        return replace(settings, payload_tautness=0.0, wish=settings.wish + more)
+    return replace(settings, payload_tautness=0.0, minimum_tautness=least + more)
 
 
 def inclined(on: Specimen, controller: MpcController, payload: float, seed: int = 0) -> list[tuple[float, float]]:

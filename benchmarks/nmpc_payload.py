@@ -43,7 +43,6 @@ from softneck.identification import GreyBox
 from softneck.loop import BlockPart, Loop, run_loop
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant import record as record_own
-from softneck.robot._neck_default import NeckDefault
 from softneck.signals import Recording, signal
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record
 
@@ -128,7 +127,7 @@ def rows_told(name: str, look: float = 0.0, seed: int = 0) -> Iterator[tuple[str
     if look > 0.0:
         on = replace(on, observer=KalmanSettings().design(several).block())
     for taut in (TAUT, 3.5):
-        wish = MpcNumbers(minimum_tautness=NeckDefault(taut), look_ahead=look)
+        wish = MpcNumbers(wish=taut, look_ahead=look)
         ahead = replace(wish, preview=PREVIEW).design(on.family)
         # With less dead time as quick as it was is not as quick as it could be.
         for bandwidth in (QUICK.bandwidth, *((20.0,) if look > 0.0 else ())):

@@ -68,7 +68,7 @@ def motor_ends(robot: Robot, what: str) -> tuple[Vector, Vector]:
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     if motors.setpoint_min is None or motors.setpoint_max is None:
         raise SettingsError(
-            f"robot {robot.label()} gives no `motors.setpoint_min` and `motors.setpoint_max`, which {what} needs to "
+            f"robot {robot.label()} gives no `motors.setpoint_min` and `setpoint_max`, which {what} needs to "
             "know how far its outputs go; add them."
         )
     return factor * np.array(motors.setpoint_min), factor * np.array(motors.setpoint_max)

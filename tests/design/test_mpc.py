@@ -13,8 +13,9 @@ from scipy.linalg import solve_discrete_are
 
 from softneck.core import DataError, FileFormatError
 from softneck.design import MpcController, MpcSettings
+from softneck.design.plants._uncertain import uncertain_plant
 from softneck.design.predictive import _mpc_state_runtime as rt
-from softneck.design.predictive._predicted import settings_for
+from softneck.design.predictive._scale import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.loop import BlockPart, Loop, RotationReference, run_loop
 from softneck.loop._reference_parts import AheadReference
@@ -85,9 +86,10 @@ def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureReque
 @pytest.mark.slow
 def test_without_limits_and_blocking_it_is_the_lqr(plain: MpcController) -> None:
     settings = MpcNumbers(bandwidth=8.0, moves=30)
-    problem = settings_for(settings, bake_off_neck()).problem(bake_off_neck(), 8.0)
-    controller = settings.design(bake_off_neck())
-    assert settings.starts == tuple(range(30))
+    plant = scaled_plant(uncertain_plant(bake_off_neck()))
+    resolved = settings.resolved(plant)
+    problem, controller = resolved.problem(plant, 8.0), settings.design(bake_off_neck())
+    assert resolved.starts == tuple(range(30))
     T, w = problem.T, problem.move_weight
     A, B, Q = np.eye(5), np.zeros((5, 3)), np.zeros((5, 5))
     A[:2, :2], A[:2, 2:] = POLE * np.eye(2), GAIN * (1.0 - POLE) * T[:2]

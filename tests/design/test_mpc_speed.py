@@ -9,7 +9,9 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.design import MpcSettings
-from softneck.design.predictive._predicted import predicted_plants, settings_for
+from softneck.design.plants._uncertain import uncertain_plant
+from softneck.design.predictive._predicted import predicted_plants
+from softneck.design.predictive._scale import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 
 from ..oracles.bake_off import bake_off_neck
@@ -52,26 +54,27 @@ def test_rises_that_cannot_be_are_refused() -> None:
 def test_an_identified_neck_is_taken_to_be_taut() -> None:
     """Its slowest pole and its gain are at least what is asked and what any sample has; one's own is as it is."""
     model = identified()
-    settings = settings_for(MpcNumbers(), model)
-    plants = predicted_plants(settings, model)
+    plant = scaled_plant(uncertain_plant(model), identified=True)
+    settings: Any = MpcNumbers().resolved(plant)
+    plants = predicted_plants(settings, plant)
     for plant, name in zip(plants, ("pitch", "roll"), strict=True):
         # Rounding of a root.
         assert np.abs(np.roots(plant.denominator)).max() <= np.exp(-settings.taut_pole * TS) + 1e-9
         largest = max(float(np.real(system.dcgain())) for system in model.samples(name))
         assert plant.static_gain == pytest.approx(largest, rel=1e-9)
         assert plant.delay * TS >= settings.least_delay - 1e-9
-    own = bake_off_neck()
-    assert settings_for(MpcNumbers(), own).minimum_tautness is None
-    believed = predicted_plants(settings_for(MpcNumbers(), own), own)
-    assert believed[0].static_gain == pytest.approx(float(np.real(own.pitch.dcgain())))
-    given = settings_for(MpcNumbers(taut_pole=7.0, minimum_tautness=0.1), own)
+    own = scaled_plant(uncertain_plant(bake_off_neck()))
+    assert MpcNumbers().resolved(own).minimum_tautness is None
+    believed = predicted_plants(MpcNumbers().resolved(own), own)
+    assert believed[0].static_gain == pytest.approx(float(np.real(bake_off_neck().pitch.dcgain())))
+    given = MpcNumbers(taut_pole=7.0, minimum_tautness=0.1).resolved(own)
     assert (given.taut_pole, given.minimum_tautness) == (7.0, 0.1)  # what is asked stays
 
 
 def test_the_default_tautness_is_a_wish_and_a_given_one_a_limit() -> None:
-    model, slackest = identified(), []
+    plant, slackest = scaled_plant(uncertain_plant(identified()), identified=True), []
     for settings in (MpcNumbers(bandwidth=6.0), MpcNumbers(bandwidth=6.0, minimum_tautness=0.5)):
-        problem = settings.problem(model, 6.0)
+        problem = settings.resolved(plant).problem(plant, 6.0)
         slackest.append(problem.tautness_weight / problem.slack_weight)
     assert slackest == [pytest.approx(3e-4), 1.0]
 

@@ -336,7 +336,7 @@ def test_the_loosest_tendon_gets_what_it_lacks(network: Model) -> None:
         ({"horizon": 2, "moves": 1}, "`horizon` 2 samples end within the model's dead time"),
         ({"horizon": 100, "moves": 50}, "150 unknowns, and the solver takes at most 120 within a sample"),
         ({"preview": 60.0}, "`preview` 60 s is more than the 100 samples that are remembered"),
-        ({"minimum_tautness": 20.0}, "`minimum_tautness` must be between -6 and 6"),
+        ({"minimum_tautness": 20.0}, "`minimum_tautness` 20 rad and `position_limit` 6 rad contradict"),
     ],
 )
 def test_horizons_beyond_what_is_solved_are_refused(network: Model, settings: dict[str, Any], match: str) -> None:

@@ -16,7 +16,7 @@ from softneck.core import Matrix, SettingsError
 from softneck.cosim import simulate
 from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.design import NmpcController, NmpcSettings
-from softneck.design.predictive._nmpc import NmpcNumbers
+from softneck.design.predictive._nmpc import NmpcNumbers, near_rest
 from softneck.fmu import build_fmu
 from softneck.identification import GreyBox, Model, Network, Play
 from softneck.plant import VirtualNeck
@@ -116,12 +116,14 @@ def test_a_length_of_two_chambers_in_bar_and_mm(tmp_path: Path) -> None:
 def test_it_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     """The same rows are the same problem, however long a sample takes."""
     found = {"pitch": {"static_gain": 0.16, "pole": 0.1 / sample_time, "delay": 3}}
-    asked = NmpcNumbers().of_robot(found, sample_time)
-    # 10 samples to the pole: a neck's at 20 ms, whose 20 samples hold a dead time of 4.
-    assert (asked.horizon, asked.moves, asked.window) == (19, 10, 8)
+    model: Any = replace(lag(Robot.preset("antagonist")), sample_time=sample_time)
+    plant = near_rest(model, found, np.array([[1.0, -1.0]]))
+    asked = NmpcNumbers().resolved(plant)
+    # 10 samples to the pole, as of a neck at 20 ms.
+    assert (asked.horizon, asked.moves, asked.window) == (20, 10, 8)
     assert asked.reference_time == pytest.approx(10.0 * sample_time)
     assert asked.bandwidth == pytest.approx(8.0 * 0.2 / (10.0 * sample_time))
-    given = NmpcNumbers(horizon=12, bandwidth=3.0).of_robot(found, sample_time)
+    given = NmpcNumbers(horizon=12, bandwidth=3.0).resolved(plant)
     assert (given.horizon, given.bandwidth) == (12, 3.0)
 
 

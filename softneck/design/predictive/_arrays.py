@@ -11,35 +11,32 @@ from softneck.core import Matrix, Vector
 
 from . import _mpc_state_runtime as rt
 from ._prediction import Matrices, Problem, disturbance_pole, padded, rest_states
-from ._scale import Scale
 
 # Radians: a motor resolves 1.3e-4 rad, a soft limit is judged at 1e-6.
 _TOLERANCE = 1e-10
 # Rows that the solver adds and drops in a sample; beyond them the plan of the sample before goes on.
 _BUDGET = 100
-# An estimated payload trembles: co-contraction follows it as slowly as nobody waits for [s].
-_SEEN = 0.5
+# An estimated payload trembles: co-contraction follows it slowly. Without a measurement the motors hold after a while.
+_SEEN = _COAST = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
-    """What the observer and the reference filters do.
+    """What the observer and the reference filters do, in scaled seconds.
 
     Attributes:
         trust: of the output-disturbance observer in what is measured, see `observer_gains`.
-        reference_time: time constant of the reference filters [s].
+        reference_time: time constant of the reference filters.
         preview: samples that the reference is known ahead.
-        coast: samples without measurement until the motors are held.
-        payload_tautness: that a kilogram wishes for [rad/kg]; 0: no payload is told.
-        scale: of another robot than the neck.
+        payload_tautness: that a kilogram wishes for [1/kg]; 0: no payload is told.
+        scale: what `scale_numbers` returns.
     """
 
     trust: float
     reference_time: float
     preview: int = 0
-    coast: int = 25
     payload_tautness: float = 0.0
-    scale: Scale | None = None
+    scale: tuple[float, ...] = ()
 
 
 def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix, ...]:
@@ -52,8 +49,7 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     constants = np.array([  # in the order of MPC_TS to MPC_NUMBERS
         Ts, p.rows, 1.0, n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
         min(round(tuning.reference_time / Ts), tuning.preview), float(told), _BUDGET, _TOLERANCE,
-        tuning.coast, angle_at, angle_at + float(p.angles), 0.0, 0.0,
-        *(() if tuning.scale is None else tuning.scale.numbers()),
+        max(1, round(_COAST / Ts)), angle_at, angle_at + float(p.angles), 0.0, 0.0, *tuning.scale,
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
     payload = [*[0.0] * p.outputs, *([math.exp(-Ts / _SEEN), tuning.payload_tautness] if told else [0.0])]
@@ -122,6 +118,13 @@ def with_filter(arrays: tuple[Matrix, ...], reference_time: float) -> tuple[Matr
     keep = math.exp(-Ts / reference_time) if reference_time > 0.0 else 0.0
     constants[rt.MPC_LEAD] = min(round(reference_time / Ts), constants[rt.MPC_AHEAD])
     return _with(arrays, constants=constants, filters=np.full_like(rt.MpcArrays(arrays).filters, keep))
+
+
+def with_sample_time(arrays: tuple[Matrix, ...], sample_time: float) -> tuple[Matrix, ...]:
+    """Return the arrays with a sample time [s] in place of the scaled one, as slew limits are a second's."""
+    constants = rt.MpcArrays(arrays).constants.copy()
+    constants[rt.MPC_TS] = sample_time
+    return _with(arrays, constants=constants)
 
 
 def _with(arrays: tuple[Matrix, ...], **changed: Matrix) -> tuple[Matrix, ...]:

@@ -22,7 +22,7 @@ from ..plants._uncertain import held_line
 from . import _mpc_state_runtime as rt
 from ._lti import lti
 from ._program import MpcInfo, MpcPart, explain
-from ._scale import runtime_of
+from ._scale import runtime_of, units_of
 
 if TYPE_CHECKING:
     import control
@@ -40,7 +40,7 @@ class MpcController(Shown):
         minimum_tautness: soft, of each tendon [rad], or None.
         order: of the loop it is for.
         design: JSON values: the settings and what was found.
-        robot: whose controller it is; of another than the neck all limits are in SI.
+        robot: whose controller it is; all limits are in SI.
     """
 
     sample_time: float
@@ -66,15 +66,15 @@ class MpcController(Shown):
         told = rt.MpcArrays(self.arrays).constants[rt.MPC_PAYLOAD] > 0.0
         measured = (Port(name="payload", unit="kg", description="measured disturbance"),) if told else ()
         starts = (self.position_limit, self.slew_limit, self.lead_limit, self.least_position, -MAX_MOTOR)
-        limits, neck = limit_ports(starts, self.robot)[:4], self.robot.is_neck
-        soft: tuple[Port, ...] = ()
-        if self.angle_limit is not None:
-            angle = Port(name="angle_limit", unit="rad", start=self.angle_limit, minimum=0.01, maximum=0.8)
-            unit = to_si(self.robot.outputs.unit)[1]
-            soft += (angle if neck else replace(angle, unit=unit, minimum=0.0, maximum=None),)
-        if self.minimum_tautness is not None:
-            taut = Port(name="minimum_tautness", unit="rad", start=self.minimum_tautness, minimum=-12.0, maximum=6.0)
-            soft += (taut if neck else replace(taut, unit=limits[0].unit, minimum=None, maximum=None),)
+        limits, robot = limit_ports(starts, self.robot)[:4], self.robot
+        soft = tuple(
+            Port(name=name, unit=to_si(unit)[1], start=start, minimum=least)
+            for name, unit, start, least in (
+                ("angle_limit", robot.outputs.unit, self.angle_limit, 0.0),
+                ("minimum_tautness", robot.motors.unit, self.minimum_tautness, None),
+            )
+            if start is not None
+        )
         return Block(
             kind="mpc",
             role="controller",
@@ -135,7 +135,7 @@ class MpcController(Shown):
             f"observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
             f"{d.get('reference_time_s', 0.0):.3g} s; Ms "
             + " and ".join(f"{value:.3g}" for value in d.get("sensitivity", []))
-            + (" (as identified, small moves)" if self.robot.is_neck else " (as identified)"),
+            + (" (as identified, small moves)" if len(d.get("sensitivity", [])) > 1 else " (as identified)"),
         ]
         lines += _observer_line(settings)
         if d.get("worst_sensitivity") is not None:
@@ -144,15 +144,9 @@ class MpcController(Shown):
         return "\n".join(lines + [f"  review: {line}" for line in self.review()])
 
     def _limits_line(self) -> str:
-        """Return a line on the limits, of another robot in the units of its file."""
-        if self.robot.is_neck:
-            line = (
-                f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s, "
-                f"lead {self.lead_limit:g} rad"
-            )
-        else:
-            given = {name: getattr(self, name) for name in _LIMITS[:4]}
-            (line,) = ControllerLimits(robot=self.robot, **given).lines(self.sample_time)
+        """Return a line on the limits, in the units of the robot's file."""
+        given = {name: getattr(self, name) for name in _LIMITS[:4]}
+        line = ControllerLimits(robot=self.robot, **given).lines(self.sample_time)[0]
         outputs, motors = self.robot.outputs.display_unit, self.robot.motors.unit
         if self.angle_limit is not None:
             line += f", |angle| <= {self.angle_limit / to_si(outputs)[0]:.3g} {outputs} (soft)"
@@ -242,24 +236,20 @@ def _limits(c: MpcController) -> list[str]:
             f"lead_limit {c.lead_limit / per:g} {c.robot.motors.unit} is less than one sample's slew "
             f"({c.slew_limit * c.sample_time / per:g} {c.robot.motors.unit}): the slew limit is never reached."
         )
-    if not c.robot.is_neck:
-        return lines
-    a = rt.MpcArrays(c.arrays)
+    a, (unit, outputs, _) = rt.MpcArrays(c.arrays), units_of(c.arrays)
     n = a.model_A.shape[1]
-    gains = [float(a.rest[axis, axis * n if a.rest.shape[1] > n else 0]) for axis in range(2)]
-    if c.angle_limit is not None:
-        T_inverse = np.linalg.inv(a.T)
-        for axis, name in enumerate(("pitch", "roll")):
-            needed = float(np.abs(T_inverse[:, axis]).max()) * c.angle_limit / abs(gains[axis])
-            if needed > c.position_limit:
-                reach = c.angle_limit * c.position_limit / needed
-                lines.append(
-                    f"{name}: its limit of {math.degrees(c.angle_limit):.3g} deg is beyond what the motors reach "
-                    f"({math.degrees(reach):.3g} deg): it limits nothing."
-                )
+    for axis, name in enumerate(c.robot.outputs.names if c.angle_limit is not None else ()):
+        gain = abs(float(a.rest[axis, axis * n if a.rest.shape[1] > n else 0])) * outputs[axis] / unit
+        reach = gain * c.position_limit / float(np.abs(np.linalg.pinv(a.T)[:, axis]).max())
+        if c.angle_limit is not None and c.angle_limit > reach:
+            lines.append(
+                f"{name}: its limit of {math.degrees(c.angle_limit):.3g} deg is beyond what the motors reach "
+                f"({math.degrees(reach):.3g} deg): it limits nothing."
+            )
     if c.minimum_tautness is not None and c.minimum_tautness > 0.0:
+        per = to_si(c.robot.motors.unit)[0]
         lines.append(
-            f"minimum_tautness {c.minimum_tautness:g} rad is above rest: the neck is compressed all the time, and a "
-            "co-contraction reference below that is never reached."
+            f"minimum_tautness {c.minimum_tautness / per:g} {c.robot.motors.unit} is above rest: {c.robot.name} is "
+            "compressed all the time, and a co-contraction reference below that is never reached."
         )
     return lines

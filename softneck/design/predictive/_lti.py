@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.identification.models._linear_systems import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import load_runtime
-from softneck.signals import redefinition_matrix
 
 from . import _mpc_state_runtime as rt
 from ._scale import runtime_of, unbound, units_of
@@ -26,32 +24,30 @@ _UNIT = 2.0**-10
 
 
 def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> control.StateSpace:
-    """Return it from (pitch_reference, roll_reference, pitch, roll) to (theta_i, phi_i).
+    """Return it from references and outputs to redefined inputs, of the neck theta_i and phi_i.
 
-    Its matrices are what the runtime's own `step` does to unit vectors. Another robot has its outputs and
-    redefined inputs in their place. With preview the reference counts as known only when it comes.
+    Its matrices are what the runtime's own `step` does to unit vectors. With preview the reference counts as known only
+    when it comes.
     """
     import control
 
     A, B, C, D = system(arrays)
     names = robot.outputs.names
-    if not robot.is_neck:
-        _, outputs, inputs = units_of(arrays)
-        B, C, D = B / np.tile(outputs, 2), C * inputs[:, None], D * inputs[:, None] / np.tile(outputs, 2)
+    _, outputs, inputs = units_of(arrays)
+    B, C, D = B / np.tile(outputs, 2), C * inputs[:, None], D * inputs[:, None] / np.tile(outputs, 2)
     turn = _to_own(arrays, robot)
     C, D = (C, D) if turn is None else (turn @ C, turn @ D)
     return control.StateSpace(
         A, B, C, D, float(rt.MpcArrays(arrays).constants[rt.MPC_TS]),
         inputs=[*(f"{output}_reference" for output in names), *names],
-        outputs=[redefined_input(robot, output) for output in names], name=name,
+        outputs=list(robot.input_names), name=name,
     )  # fmt: skip
 
 
 def _to_own(arrays: tuple[Matrix, ...], robot: Robot) -> Matrix | None:
     """Return what makes the redefined inputs of a coupled design those of its robot; None where they are."""
     a = rt.MpcArrays(arrays)
-    m = a.T.shape[0] - 1
-    weights = redefinition_matrix()[:m] if robot.is_neck else robot.weights()
+    m, weights = a.T.shape[0] - 1, robot.weights()
     if a.model_B.shape[1] == a.model_A.shape[1] or weights is None:
         return None
     motors, _, inputs = units_of(arrays)
@@ -59,7 +55,7 @@ def _to_own(arrays: tuple[Matrix, ...], robot: Robot) -> Matrix | None:
 
 
 def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return A, B, C, D of `lti`, of another robot than the neck in the units of its size."""
+    """Return A, B, C, D of `lti` in scaled quantities."""
     arrays = unbound(arrays)
     step = load_runtime(runtime_of(arrays)).step
     a = rt.MpcArrays(arrays)

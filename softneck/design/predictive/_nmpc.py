@@ -19,41 +19,40 @@ from softneck.core import (
     SettingsError,
     Vector,
     require_between,
+    require_finite,
     require_whole,
     to_si,
     write_archive,
 )
 from softneck.core._shown import Shown
-from softneck.estimation import AxisPlant
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._linear_systems import weights_of
 from softneck.identification.models._model import nested, nested_model
 from softneck.loop import BlockPart
 from softneck.robot import Robot
-from softneck.robot._neck_default import NeckCount, NeckDefault
-from softneck.robot._redefined import redefinition_of
 from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized_name
-from softneck.signals import TENDON_ANGLES, redefinition_matrix
+from softneck.signals import TENDON_ANGLES
 
-from ..linear._ports import LIMITS, MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs
+from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs
+from ..plants._coupled_axis import AnyAxes
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_prepared import BUDGET, SLACK_WEIGHT, NonlinearProblem, controller_arrays
 from ._nmpc_probe import plant_of, probed, require_horizon, risen
 from ._nmpc_state_runtime import NMPC_NUMBERS, NmpcArrays, NmpcState
 from ._predicted import over
-from ._scale import TAUTNESS_LEVER, SizedPlant, predictive_limits, sized_plant
+from ._scale import TAUTNESS_LEVER, ScaledPlant, predictive_limits, scale_numbers, scaled_plant
 from ._tuning import move_weight, require_given, require_solvable, samples_ahead, spaced_starts
 
 _STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
 NONLINEAR_KINDS = ("nn", "play", "greybox")
-# Of another robot, stretched by its slowest pole: the horizon behind the dead time, and the window [s], as a neck's 20
-# and 8 samples.
-_HORIZON, _WINDOW = 0.32, 0.16
-_LONGEST = 100
+# In scaled seconds: horizon and what of it is behind the dead time at least, in samples at most so many; window, time
+# constant of the reference filter; moves, and bandwidth.
+_HORIZON, _BEHIND, _LONGEST = 0.4, 0.2, 100
+_WINDOW, _REFERENCE_TIME, _MOVES, _BANDWIDTH = 0.16, 0.2, 10, 8.0
 # What earlier versions let set, and files of theirs may hold; none of it is another number here.
 _GONE = {
     "converged": False, "disturbance_time": None, "cocontraction_weight": 1.0, "slack_weight": SLACK_WEIGHT,
@@ -67,29 +66,30 @@ class NmpcSettings(Shown):
     """Nonlinear predictive control of all axes over `nn`, `play` or `greybox`, in sequential loops.
 
     One Gauss-Newton iteration for each sample, from the shifted plan of the sample before (real-time iteration, Diehl
-    et al. 2005). The defaults are the neck's; of another robot times are stretched by its slowest pole. Limits of the
-    motors are those of the robot's file; what is given is in the unit of its motors.
+    et al. 2005). Defaults are in ranges and time constants of the robot. Limits of the motors are those of its file;
+    what is given is in the unit of its motors.
 
     Attributes:
-        bandwidth: of the linear loop without dead time that has the same weights [rad/s].
+        bandwidth: of the linear loop without dead time that has the same weights [rad/s]; None: 1.6 over the time
+            constant, 8 of the neck.
         rise_s: time [s] in which a step rises from 10 to 90 %, as if bandwidth and reference filter were two lags;
-            where the bandwidth is too slow for it, that is raised. None: a filter of 0.2 s.
+            where the bandwidth is too slow for it, that is raised. None: a filter of the robot's time constant.
         preview: how far ahead the reference is known [s].
-        horizon: N, samples from now, the dead time among them.
-        moves: times at which the motors move.
-        lead_limit: how far a set-point may be from its motor [rad].
-        angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
-        minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], a wish that
+        horizon: N, samples from now, the dead time among them; None: two time constants, 20 samples of the neck.
+        moves: times at which the motors move; None: 10.
+        lead_limit: how far a set-point may be from its motor [rad]; None: as of `mpc`.
+        angle_limit: soft limit of outputs that are angles [rad]; None for none.
+        minimum_tautness: least motor position beyond that at which a tendon follows the outputs [rad], a wish that
             co-contraction is raised for, with its weight; None for none. Models that have not seen tendons hang are
-            wrong where they do. For necks.
+            wrong where they do. For tendons at known angles.
     """
 
-    bandwidth: float = NeckDefault(8.0)
+    bandwidth: float | None = None
     rise_s: float | None = None
     preview: float = 0.0
-    horizon: int = NeckCount(20)
-    moves: int = NeckCount(10)
-    lead_limit: float = NeckDefault(1.0)
+    horizon: int | None = None
+    moves: int | None = None
+    lead_limit: float | None = None
     angle_limit: float | None = None
     minimum_tautness: float | None = None
 
@@ -98,10 +98,12 @@ class NmpcSettings(Shown):
         if self.rise_s is not None:
             require_between("rise_s", self.rise_s, 0.001, 1e6, "s")
         require_between("preview", self.preview, 0.0, 1e6, "s")
-        require_whole("horizon", self.horizon, 2, 100)
-        require_whole("moves", self.moves, 1, self.horizon)
+        if self.horizon is not None:
+            require_whole("horizon", self.horizon, 2, _LONGEST)
+        if self.moves is not None:
+            require_whole("moves", self.moves, 1, self.horizon or _LONGEST)
         if self.minimum_tautness is not None:
-            require_between("minimum_tautness", self.minimum_tautness, -MAX_MOTOR, MAX_MOTOR, "rad")
+            require_finite("minimum_tautness", self.minimum_tautness)
 
     def over(self, observer: Any) -> NmpcNumbers:
         """Return the settings for a loop with this observer: how far it looks ahead."""
@@ -119,21 +121,19 @@ class NmpcSettings(Shown):
                 f"nonlinear predictive control is over {', '.join(NONLINEAR_KINDS)}; got {got}. "
                 "For a linear model use `softneck design mpc`."
             )
-        robot = model.robot
-        limits = predictive_limits(self, robot)
-        directions = None if robot.is_neck else weights_of(model)
-        pulled = max(0.0, self.minimum_tautness or 0.0)
-        found = probed(model, redefinition(directions, robot)[1], limits, pulled)
-        own = NmpcNumbers.of(self)
-        own = risen(own if robot.is_neck else own.of_robot(found, model.sample_time))
-        require_horizon(own, [plant_of(item, model.sample_time, robot.is_neck) for item in found.values()])
-        require_solvable(own.moves, len(robot.motors.names))
-        return NmpcController(settings=own, limits=limits, model=model, found=found, directions=directions)
+        robot, directions = model.robot, weights_of(model)
+        found = probed(model, directions, to_si(robot.motors.unit)[0] * max(0.0, self.minimum_tautness or 0.0))
+        plant = near_rest(model, found, directions)
+        limits = predictive_limits(self, plant)
+        own = risen(NmpcNumbers.of(self).resolved(plant))
+        require_horizon(own, [plant_of(item, model.sample_time) for item in found.values()])
+        require_solvable(own.moves or 1, len(robot.motors.names))
+        return NmpcController(settings=own, limits=limits, model=model, found=found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NmpcNumbers(NmpcSettings):
-    """Settings, and the numbers that follow from plant and observer.
+    """Settings, and the numbers that follow from plant and observer; None for what is usual.
 
     Attributes:
         window: samples over which the output disturbance is estimated.
@@ -141,38 +141,33 @@ class NmpcNumbers(NmpcSettings):
         look_ahead: by how much the observer of the loop runs ahead of its sensor [s]; whole samples of it count.
     """
 
-    window: int = NeckCount(8)
-    reference_time: float = NeckDefault(0.2)
-    look_ahead: float = NeckDefault(0.0)
+    window: int | None = None
+    reference_time: float | None = None
+    look_ahead: float | None = None
 
     @classmethod
     def of(cls, settings: NmpcSettings) -> Self:
         """Return the settings with these numbers."""
         return cls(**{field.name: getattr(settings, field.name) for field in fields(settings)})
 
-    def of_robot(self, found: Mapping[str, Mapping[str, float]], sample_time: float) -> Self:
-        """Return the settings for another robot, times stretched by its slowest plant near rest."""
-        plants = [plant_of(item, sample_time, neck=False) for item in found.values()]
-        stretch = max(plant.stretch for plant in plants)
-        horizon = max(plant.delay for plant in plants) + round(_HORIZON * stretch / sample_time)
-        others = {
-            "bandwidth": self.bandwidth / stretch,
-            "reference_time": self.reference_time * stretch,
-            "horizon": min(max(horizon, 3), _LONGEST),
-            "window": min(max(round(_WINDOW * stretch / sample_time), 2), _LONGEST),
-        }
-        changed = {k: v for k, v in others.items() if isinstance(getattr(self, k), NeckDefault | NeckCount)}
-        if isinstance(self.moves, NeckCount):
-            changed["moves"] = min(int(self.moves), int(changed.get("horizon", self.horizon)))
-        return replace(self, **changed)
+    def resolved(self, plant: ScaledPlant) -> Self:
+        """Return the settings with the numbers that are usual for a plant."""
+        second, Ts = plant.scaling.second, plant.axes[0].sample_time
+        delay = max(item.delay for item in plant.axes)
+        horizon = self.horizon or min(max(3, round(_HORIZON / Ts), delay + round(_BEHIND / Ts)), _LONGEST)
+        usual = {
+            "bandwidth": _BANDWIDTH / second, "reference_time": _REFERENCE_TIME * second, "look_ahead": 0.0,
+            "horizon": horizon, "moves": min(_MOVES, horizon),
+            "window": min(max(round(_WINDOW / Ts), 2), _LONGEST),
+        }  # fmt: skip
+        return replace(self, **{name: value for name, value in usual.items() if getattr(self, name) is None})
 
 
-def redefinition(directions: Matrix | None, robot: Robot) -> tuple[Matrix, Matrix]:
-    """Return T from motors to redefined inputs, and its inverse."""
-    if directions is not None:
-        return redefinition_of(directions, robot.outputs.names)
-    T = redefinition_matrix()
-    return T, np.linalg.inv(T)
+def near_rest(model: Model, found: Mapping[str, Mapping[str, float]], directions: Matrix) -> ScaledPlant:
+    """Return what a model is near rest, in scaled quantities."""
+    plants = {name: plant_of(found[name], model.sample_time) for name in model.robot.outputs.names}
+    axes = {name: UncertainAxis(plant, (plant,)) for name, plant in plants.items()}
+    return scaled_plant(UncertainPlant(axes, model.robot, directions), identified=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -184,7 +179,7 @@ class SampleSolution:
         iterations: of the QP solver, all Gauss-Newton steps together.
         residual: of the QP's KKT conditions.
         previous_plan, softened: samples so far on which those happened.
-        moves: (moves, motors) that are planned next [rad], of another robot in SI.
+        moves: (moves, motors) that are planned next [SI].
     """
 
     status: str
@@ -199,7 +194,7 @@ def explain(block: Block, values: Vector) -> SampleSolution:
     """Return what the sample decided that led a controller's `block` to the state `values`."""
     a = NmpcArrays(block.arrays)
     parts = NmpcState.parts(a)
-    # Of another robot the motors' unit, before those of the outputs.
+    # The motors' unit, before those of the outputs.
     unit = a.setup[-a.T.shape[0]] if a.setup.size > NMPC_NUMBERS else 1.0
     number = {name: float(values[place.start]) for name, place in parts.items()}
     return SampleSolution(
@@ -251,14 +246,12 @@ class NmpcController(Shown):
         limits: what its set-points may do.
         model: that it predicts with.
         found: static gain, pole and dead time of the model near rest, by axis.
-        directions: (outputs, motors) of the motors in each output of another robot than the neck.
     """
 
     settings: NmpcNumbers
     limits: ControllerLimits
     model: Model
     found: Mapping[str, Mapping[str, float]]
-    directions: Matrix | None = None
 
     kind = "nmpc"
 
@@ -297,37 +290,33 @@ class NmpcController(Shown):
         """The limits that can be changed at the start."""
         return self.limits.ports()[:4]
 
-    def plants(self) -> tuple[AxisPlant, ...]:
-        """Return the linear plants that the model is near rest, of another robot in the units of its size."""
-        if self._sized is None:
-            return self._near_rest
-        return tuple(axis.nominal for axis in self._sized.axes.values())
+    def plants(self) -> AnyAxes:
+        """Return the linear plants that the model is near rest, in scaled quantities."""
+        return self._near_rest.axes
 
     @property
-    def _near_rest(self) -> tuple[AxisPlant, ...]:
-        neck = self.robot.is_neck
-        return tuple(plant_of(self.found[axis], self.sample_time, neck) for axis in self.robot.outputs.names)
+    def directions(self) -> Matrix:
+        """Weights (outputs, motors) of the motors in each output's direction."""
+        return weights_of(self.model)
+
+    @property
+    def motor_factor(self) -> float:
+        """SI of the unit of the robot's motors."""
+        return to_si(self.robot.motors.unit)[0]
 
     @cached_property
-    def _sized(self) -> SizedPlant | None:
-        """Another robot's plants in the units of its size."""
-        if self.directions is None:
-            return None
-        names = self.robot.outputs.names
-        axes = {name: UncertainAxis(plant, (plant,)) for name, plant in zip(names, self._near_rest, strict=True)}
-        T = redefinition(self.directions, self.robot)
-        return sized_plant(UncertainPlant(axes, self.robot, self.directions), self.limits, T)
+    def _near_rest(self) -> ScaledPlant:
+        return near_rest(self.model, self.found, self.directions)
 
     def problem(self) -> NonlinearProblem:
         """Return what is asked, in numbers."""
-        s, plants, scale = self.settings, self.plants(), None
-        if self._sized is None:
-            T, inverse = redefinition(None, self.robot)
-        else:
-            (T, inverse), scale = self._sized.redefinition, self._sized.scale
-        weights = np.tile([1.0 / plant.static_gain**2 for plant in plants], (s.horizon, 1))
+        s: Any = self.settings
+        plant = self._near_rest
+        (T, inverse), scaling, plants = plant.redefinition, plant.scaling, plant.axes
+        weights = np.tile([1.0 / item.static_gain**2 for item in plants], (s.horizon, 1))
         # What follows the horizon: an error that dies out as fast as the loop.
         weights[-1] /= 1.0 - math.exp(-2.0 * s.bandwidth * self.sample_time)
+        numbers = scale_numbers(plant, self.limits)
         return NonlinearProblem(
             model=self.model,
             horizon=s.horizon,
@@ -335,9 +324,11 @@ class NmpcController(Shown):
             T=T,
             T_inverse=inverse,
             weights=weights,
-            move_weight=1.5 * max(move_weight(plant, s.bandwidth) for plant in plants),
+            move_weight=1.5 * max(move_weight(item, s.bandwidth * scaling.second) for item in plants),
             cocontraction_weight=1.0,
-            scale=scale,
+            # The redefined inputs' units are no numbers of this runtime.
+            scale=numbers[: len(numbers) - len(plants)] if numbers else (),
+            motor_unit=scaling.motor_unit,
             look=samples_ahead(s.look_ahead, self.sample_time),
         )
 
@@ -383,15 +374,15 @@ class NmpcController(Shown):
 
     def summary(self) -> str:
         """Return some lines for people."""
-        s, robot = self.settings, self.robot
+        s: Any = self.settings
+        robot = self.robot
         lines = [
             f"nmpc controller over {self.model.kind}, {1e3 * self.sample_time:g} ms, sequential order",
             f"  {len(robot.motors.names) * s.moves} unknowns, horizon {s.horizon} samples, bandwidth "
             f"{s.bandwidth:.4g} rad/s, disturbance over {s.window} samples, "
             "one iteration a sample",
         ]
-        if not robot.is_neck:
-            lines += self.limits.lines(self.sample_time)
+        lines += self.limits.lines(self.sample_time)
         shown, motor = to_si(robot.outputs.display_unit)[0], to_si(robot.motors.unit)[0]
         for axis in robot.outputs.names:
             f = self.found[axis]
@@ -411,7 +402,6 @@ class NmpcController(Shown):
             **self.limits.header(),
             "found": {axis: dict(values) for axis, values in self.found.items()},
             "model": model,
-            **({} if self.directions is None else {"directions": self.directions.tolist()}),
             **self.robot.in_header(),
         }
         write_archive(path, header, arrays, force=force)
@@ -429,8 +419,9 @@ class NmpcController(Shown):
         per_motor, given = to_si(robot.motors.unit)[0], header
         if "position_limit" in settings:  # of versions before 0.3, in the unit of the motors
             given = {name: per_motor * settings.pop(name) for name in LIMITS[:4]}
-        directions = np.array(header["directions"]) if "directions" in header else None
+        plant = near_rest(model, header["found"], weights_of(model))
         return cls(
-            settings=NmpcNumbers(**settings), limits=ControllerLimits.from_header(given, robot), model=model,
-            found=header["found"], directions=directions,
+            # A file of an earlier version may not say all.
+            settings=NmpcNumbers(**settings).resolved(plant), limits=ControllerLimits.from_header(given, robot),
+            model=model, found=header["found"],
         )  # fmt: skip

@@ -13,16 +13,12 @@ from softneck.identification import Model
 
 from ._nmpc_state_runtime import NMPC_NO_BOUND
 from ._prediction import idle_moves
-from ._scale import TAUTNESS_LEVER, Scale
+from ._scale import TAUTNESS_LEVER
 
-# Samples without measurement until the motors hold, and samples after which a model has settled; of another robot those
-# of a neck at 20 ms, stretched by its slowest pole.
-COAST = 25
-SETTLE = 200
+# Scaled seconds without measurement until the motors hold, and after which a model has settled.
+_COAST, _SETTLE = 0.5, 4.0
 # On violations of soft limits against errors of the angles, squared; iterations of the QP's solver.
 SLACK_WEIGHT, BUDGET = 1e3, 200
-# A neck's [s].
-NECK_SAMPLE = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -42,7 +38,8 @@ class NonlinearProblem:
         weights: (N, outputs) on angle errors [1/rad^2].
         move_weight: lambda.
         cocontraction_weight: rho.
-        scale: units of another robot than the neck, in which all these numbers are.
+        scale: what `scale_numbers` returns, without the units of the redefined inputs.
+        motor_unit: of the motors [SI].
         look: samples by which the observer is ahead of its sensor.
     """
 
@@ -54,7 +51,8 @@ class NonlinearProblem:
     weights: Matrix
     move_weight: float
     cocontraction_weight: float
-    scale: Scale | None = None
+    scale: tuple[float, ...] = ()
+    motor_unit: float = 1.0
     look: int = 0
 
     @property
@@ -141,16 +139,12 @@ def controller_arrays(controller: Any) -> tuple[Matrix, ...]:
     p, block = prepared.problem, controller.model.block()
     start = block.initial_state(use_measurement=0.0, noise_std=0.0)
     slack = 0.0 if s.angle_limit is None else SLACK_WEIGHT * float(p.weights[0].max())
-    scale, stretch = p.scale, max(plant.stretch for plant in prepared.plants)
-    coast, settle = COAST, SETTLE
-    if scale is not None:
-        coast, settle = (max(1, round(n * NECK_SAMPLE * stretch / controller.sample_time)) for n in (COAST, SETTLE))
+    coast, settle = (max(1, round(time / prepared.plants[0].sample_time)) for time in (_COAST, _SETTLE))
+    taut = -NMPC_NO_BOUND if s.minimum_tautness is None else controller.motor_factor * s.minimum_tautness / p.motor_unit
     constants = np.array([
         controller.sample_time, p.horizon, s.window, prepared.ahead, prepared.lead, prepared.keep, p.move_weight,
         p.cocontraction_weight, slack, s.angle_limit or 0.0, BUDGET, coast, settle,
-        len(block.outputs), -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness, TAUTNESS_LEVER,
-        p.look,
-        *(() if scale is None else (*scale.bounds, scale.motors, *scale.outputs)),
+        len(block.outputs), taut, TAUTNESS_LEVER, p.look, *p.scale,
     ])  # fmt: skip
     return (
         constants, np.array(p.starts, dtype=np.float64), p.T, p.levels, p.weights, prepared.gains, prepared.future,

@@ -12,21 +12,15 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 from softneck.identification import Model
-from softneck.identification.models._directions import NECK_SECONDS
+from softneck.robot._scaling import TIME_CONSTANT, Scaling
 
-from ..linear._ports import ControllerLimits
+from ..linear._ports import motor_ranges
 from ._tuning import samples_ahead
 
-# A neck's model is moved by this much of a redefined input to learn its gain and its time constant [rad]; another
-# robot's by as much of its motors' range: 2/3 rad of 6 rad to either side.
-_PROBE = 1.0
-_PROBE_SECONDS = 6.0
-_OF_RANGE = 1.0 / 9.0
-# Another robot is watched for as many samples as a neck at 20 ms, and twice as long until nothing but this part changes
-# in the last third.
-_ROWS, _MOST_ROWS = 300, 40_000
-_AT_REST = 1e-3
-# Of the largest answer: an output that moves less does not follow.
+# Scaled seconds after a step of one; where nobody says how fast a robot is, as many samples as that is of the neck, and
+# twice as many until nothing but this part changes in the last third.
+_PROBE_SECONDS, _ROWS, _MOST_ROWS, _AT_REST = 6.0, 300, 40_000, 1e-3
+# Of a scaled output: one that moves less does not follow.
 _LEAST = 1e-3
 # Samples of a reference ahead, each a cell of the state.
 _MOST_PREVIEW = 100
@@ -34,51 +28,50 @@ _MOST_PREVIEW = 100
 S = TypeVar("S", bound=Any)
 
 
-def probed(model: Model, inverse: Matrix, limits: ControllerLimits, pulled: float = 0.0) -> dict[str, dict[str, float]]:
+def probed(model: Model, weights: Matrix, pulled: float = 0.0) -> dict[str, dict[str, float]]:
     """Return static gain, pole [1/s] and dead time [samples] of each axis, as the model steps near rest.
 
     Args:
         model: of any robot.
-        inverse: from redefined inputs to motors.
-        limits: of its motors.
-        pulled: where all motors of a neck stand before a step [rad]: a payload may leave its tendons hanging at zero.
+        weights: (outputs, motors) of the motors in each output's direction.
+        pulled: where all motors stand before a step, above rest [SI]: a payload may leave tendons hanging at zero.
 
     Raises:
         SettingsError: an input that does not move its output.
     """
-    neck, found, answers = model.robot.is_neck, {}, {}
-    for axis, name in enumerate(model.robot.outputs.names):
-        direction = inverse[:, axis]
-        size = _PROBE if neck else _places(limits)[1] / float(np.abs(direction).max())
-        answers[name] = _answer(model, size * direction, limits, pulled)[:, axis] / size
-    largest = max(float(np.abs(y).max()) for y in answers.values())
-    for name, y in answers.items():
-        if not np.isfinite(y).all() or abs(y[-1]) < (_LEAST if neck else _LEAST * largest) or y[-1] == 0.0:
-            told = "its input (Eq. 9, 10)" if neck else "its direction"
-            hint = (
-                "identify it again, or ask for `minimum_tautness` if its tendons hang" if neck else "identify it again"
+    robot, inverse, ends = model.robot, model.robot.redefinition(weights)[1], motor_ranges(model.robot, None)
+    scaling = Scaling.of(robot, set_points=None if ends is None else np.array(ends))
+    sizes = scaling.input_units(weights)
+    moved = [_answer(model, step, scaling.motor_rest + pulled) for step in (sizes * inverse[:, : len(sizes)]).T]
+    answers = [y[:, axis] for axis, y in enumerate(moved)]
+    known = Scaling.of(robot, outputs=np.array([[min(0.0, *y), max(0.0, *y)] for y in answers]).T).output_unit
+    found = {}
+    for name, y, size, unit in zip(robot.outputs.names, answers, sizes.tolist(), known, strict=True):
+        if not np.isfinite(y).all() or abs(y[-1]) < _LEAST * unit or y[-1] == 0.0:
+            hint = " or ask for `minimum_tautness` if its tendons hang" if robot.tendon_angles is not None else ""
+            raise SettingsError(
+                f"the model's {name} does not follow its input `{robot.input_names[len(found)]}`; identify it "
+                f"again{',' + hint if hint else ''}."
             )
-            raise SettingsError(f"the model's {name} does not follow {told}; {hint}.")
         share = y / y[-1]
         dead, risen = (int(np.argmax(share > part)) for part in (0.05, 0.632))
         a = math.exp(-1.0 / max(1, risen - dead))
-        found[name] = {"static_gain": float(y[-1]), "pole": -math.log(a) / model.sample_time, "delay": dead}
+        gain = float(y[-1] / size)
+        found[name] = {"static_gain": gain, "pole": -math.log(a) / model.sample_time, "delay": dead}
     return found
 
 
-def plant_of(found: Mapping[str, float], sample_time: float, neck: bool) -> AxisPlant:
+def plant_of(found: Mapping[str, float], sample_time: float) -> AxisPlant:
     """Return the linear plant of what `probed` found."""
     a = math.exp(-found["pole"] * sample_time)
     numerator = np.array([found["static_gain"] * (1.0 - a)])
-    stretch = 1.0 if neck else max(1.0 / found["pole"], sample_time) / NECK_SECONDS
-    return AxisPlant(numerator, np.array([1.0, -a]), int(found["delay"]), sample_time, stretch)
+    return AxisPlant(numerator, np.array([1.0, -a]), int(found["delay"]), sample_time)
 
 
-def _answer(model: Model, step: Vector, limits: ControllerLimits, pulled: float) -> Matrix:
+def _answer(model: Model, step: Vector, middle: Vector) -> Matrix:
     """Return what a step (motors,) of the set-points changes of the outputs (time, outputs), until they rest."""
-    neck, block = model.robot.is_neck, model.block()
-    middle = np.full(step.size, pulled) if neck else _places(limits)[0]
-    rows = round(_PROBE_SECONDS / model.sample_time) if neck else _ROWS
+    block, seconds = model.block(), model.robot.time_constant_s
+    rows = _ROWS if seconds is None else round(_PROBE_SECONDS * (seconds / TIME_CONSTANT) / model.sample_time)
     while True:
         u = np.full((rows, len(block.inputs)), np.nan)
         ends = []
@@ -87,16 +80,9 @@ def _answer(model: Model, step: Vector, limits: ControllerLimits, pulled: float)
             ends.append(block.run(block.initial_state(use_measurement=0.0), u)[1][:, : len(model.robot.outputs.names)])
         y = ends[1] - ends[0]
         late = y[2 * rows // 3 :]
-        if neck or rows >= _MOST_ROWS or np.ptp(late, axis=0).max() <= _AT_REST * np.abs(y[-1]).max():
+        if seconds is not None or rows >= _MOST_ROWS or np.ptp(late, axis=0).max() <= _AT_REST * np.abs(y[-1]).max():
             return y
         rows *= 2
-
-
-def _places(limits: ControllerLimits) -> tuple[Vector, float]:
-    """Return where another robot's motors stand before a step (motors,), and by how much one is moved."""
-    motors = len(limits.robot.motors.names)
-    low, high = np.split(limits.constants(1.0)[1 : 2 * motors + 1], 2)
-    return 0.5 * (low + high), 0.5 * _OF_RANGE * float((high - low).min())
 
 
 def risen(settings: S) -> S:

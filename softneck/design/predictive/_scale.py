@@ -1,116 +1,129 @@
-"""Robots of other units, sizes and speeds than the neck's, as plants of a neck's size.
-
-The weights, tolerances and soft limits of predictive control are in rad of a neck. So another robot's motors are taken
-in a unit in which they have a neck's range, its redefined inputs in one in which they pull as theta_i does, and each
-output in one in which its static gain is a neck's: the QP is the same in all units of the robot.
-"""
+"""A robot's plant in scaled quantities (`softneck.robot._scaling`), and the limits of its predictive controller."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
+from softneck.estimation._scaling import plants_scaling
 from softneck.robot import Robot
 from softneck.robot._neck_default import NeckDefault
+from softneck.robot._scaling import MOTOR_RANGE, OUTPUT_RANGE, Scaling
 from softneck.runtime._bundle import sized_name
 
-from ..linear._ports import MAX_MOTOR, MAX_REFERENCE, ControllerLimits, limits_of
+from ..linear._ports import MAX_MOTOR, ControllerLimits, limits_of, motor_ranges, reference_ranges
 from ..plants._coupled import CoupledPlant
-from ..plants._coupled_axis import CoupledAxis
-from ..plants._uncertain import UncertainAxis, UncertainPlant
+from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis
+from ..plants._uncertain import Doubts, UncertainPlant, doubts_of
 from . import _mpc_state_runtime as rt
 
-if TYPE_CHECKING:
-    import control
-
-
-# The paper's static gain [rad/rad], 27.69 / 5.293 deg/rad (Eq. 31).
-_NECK_GAIN = math.radians(27.69 / 5.293)
-# Of theta_i = P_1 - P_2 / 2 - P_3 / 2 (Eq. 9).
-_NECK_WEIGHT = math.sqrt(1.5)
-# Motor that one radian of a neck takes up [rad/rad]: radius of the tendons' attachment over that of the winch,
-# 52 mm / 7.5 mm (lab code; paper, section 3.1).
+# Motor that one scaled output takes up: radius of the tendons' attachment over that of the winch, 52 mm / 7.5 mm (lab
+# code; paper, section 3.1).
 TAUTNESS_LEVER = 6.93
+# How far a set-point may be from its motor: more than the drives of the neck fall behind at the paper's fastest
+# signals, 0.4 rad; and what the slew makes in so many scaled seconds.
+_LEAD, _LEADING = 1.0, 0.08
 # Beyond all bounds.
 _FREE = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Scale:
-    """Another robot's units and bounds.
+class ScaledPlant:
+    """What a predictive design works on.
 
     Attributes:
-        motors: unit of the motors in SI.
-        outputs: (outputs,) units of the outputs in SI.
-        inputs: (outputs,) units of the redefined inputs in SI.
-        bounds: lowest and highest set-points, and references, in these units.
-    """
-
-    motors: float
-    outputs: Vector
-    inputs: Vector
-    bounds: Vector
-
-    def numbers(self) -> tuple[float, ...]:
-        """Return what the runtime reads behind its constants."""
-        return (*self.bounds.tolist(), self.motors, *self.outputs.tolist(), *self.inputs.tolist())
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class SizedPlant:
-    """Another robot's plant in such units, or a coupled one; what a predictive design works on.
-
-    Attributes:
-        axes: output -> what its axis may be.
+        axes: a nominal plant of each output, in scaled quantities and seconds.
+        samples: what else each of them may be.
         robot: whose plant it is.
-        redefinition: T (outputs + 1, motors) and its inverse.
-        scale: the units; None for a neck's own.
+        redefinition: T (outputs + 1, motors) to scaled redefined inputs, and its inverse.
+        scaling: of the robot.
+        inputs: (outputs,) units of the redefined inputs in SI.
+        doubts: what a design allows for besides.
+        identified: whether recordings told the plant.
+        sample_time: [s].
     """
 
-    axes: Mapping[str, UncertainAxis]
+    axes: AnyAxes
+    samples: tuple[AnyAxes, ...]
     robot: Robot
     redefinition: tuple[Matrix, Matrix]
-    scale: Scale | None
+    scaling: Scaling
+    inputs: Vector
+    doubts: Doubts
+    identified: bool
+    sample_time: float
 
     @property
-    def uncertain(self) -> bool:
-        """Whether there are samples beside the nominal plant."""
-        return all(len(axis.samples) > 1 for axis in self.axes.values())
-
-    def tf(self, output: str) -> control.TransferFunction:
-        """Return the nominal plant of an axis."""
-        return self.axes[output].nominal.tf()
-
-    def samples(self, output: str) -> list[control.TransferFunction]:
-        """Return the samples of an axis."""
-        return [plant.tf() for plant in self.axes[output].samples]
+    def has_tendons(self) -> bool:
+        """Whether tendons are to be kept taut, and co-contraction pulls them."""
+        return self.robot.tendon_angles is not None and bool(self.redefinition[1][:, -1].any())
 
 
-def predictive_limits(settings: Any, robot: Robot) -> ControllerLimits:
+def scaled_plant(plant: UncertainPlant | CoupledPlant, *, identified: bool = False) -> ScaledPlant:
+    """Return a plant in scaled quantities.
+
+    Raises:
+        SettingsError: the robot does not say where its set-points end.
+    """
+    robot, axes = plant.robot, list(plant.axes.values())
+    (T, inverse), m = (part.copy() for part in plant.redefinition), len(axes)
+    scaling = plants_scaling(robot, [axis.nominal for axis in axes], T[:m], "a controller")
+    inputs = scaling.input_units(T[:m])
+    T[:m] *= scaling.motor_unit / inputs[:, None]
+    inverse[:, :m] *= inputs / scaling.motor_unit
+    gains = inputs / scaling.output_unit[:, None]
+
+    def scaled(item: Any, axis: int) -> AnyAxis:
+        seconds = item.sample_time / scaling.second
+        if isinstance(item, CoupledAxis):
+            return replace(item, B=gains[axis] * item.B, sample_time=seconds)
+        return replace(item, numerator=float(gains[axis, axis]) * item.numerator, sample_time=seconds)
+
+    return ScaledPlant(
+        axes=tuple(scaled(axis.nominal, i) for i, axis in enumerate(axes)),
+        samples=tuple(tuple(scaled(item, i) for item in axis.samples[1:]) for i, axis in enumerate(axes)),
+        robot=robot,
+        redefinition=(T, inverse),
+        scaling=scaling,
+        inputs=inputs,
+        doubts=getattr(plant, "doubts", None) or doubts_of(robot),
+        identified=identified,
+        sample_time=plant.sample_time,
+    )
+
+
+def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
     """Return the limits of a predictive controller: what the robot's file says, and the lead of its settings.
 
     Raises:
         SettingsError: one that the robot does not have, that its file does not give, or that contradicts another.
     """
-    limits = limits_of(robot, lead_limit=settings.lead_limit, least_cocontraction=NeckDefault(-MAX_MOTOR))
-    unit, angle = robot.motors.unit, settings.angle_limit
-    if angle is not None:
-        if robot.is_neck:
-            require_between("angle_limit", angle, 0.01, MAX_REFERENCE, "rad")
-        elif to_si(robot.outputs.unit)[1] != "rad":
+    robot, scaling = plant.robot, plant.scaling
+    (factor, _), unit, lead = to_si(robot.motors.unit), robot.motors.unit, settings.lead_limit
+    limits = limits_of(robot, lead_limit=lead or 1.0, least_cocontraction=NeckDefault(-MAX_MOTOR))
+    if lead is None:
+        slew = limits.slew_limit * scaling.second / scaling.motor_unit
+        limits = replace(limits, lead_limit=max(_LEAD, _LEADING * slew) * scaling.motor_unit)
+    if settings.angle_limit is not None:
+        if to_si(robot.outputs.unit)[1] != "rad":
             raise SettingsError(
                 f"`angle_limit` is for outputs that are angles; those of {robot.label()} are in "
                 f"{robot.outputs.unit}. Leave it out."
             )
-    taut, most = settings.minimum_tautness, limits.position_limit / to_si(unit)[0]
-    if taut is not None and not robot.is_neck and not isinstance(taut, NeckDefault):
-        raise SettingsError(f"`minimum_tautness` is for necks; {robot.label()} is none. Leave it out.")
-    if taut is not None and taut >= most:
+        least, most = 0.01 * float(scaling.output_unit.min()), float(reference_ranges(robot)[1].max())
+        require_between("angle_limit", settings.angle_limit, least, most, "rad")
+    taut, most = settings.minimum_tautness, limits.position_limit / factor
+    if isinstance(taut, str) or taut is None:
+        return limits
+    if not plant.has_tendons:
+        raise SettingsError(
+            f"`minimum_tautness` is for tendons at known angles; {robot.label()} has none that co-contraction pulls. "
+            "Leave it out."
+        )
+    if taut >= most:
         raise SettingsError(
             f"`minimum_tautness` {taut:g} {unit} and `position_limit` {most:g} {unit} contradict each other: no motor "
             "could pull that far. Lower the first."
@@ -118,36 +131,16 @@ def predictive_limits(settings: Any, robot: Robot) -> ControllerLimits:
     return limits
 
 
-def sized_plant(
-    plant: UncertainPlant | CoupledPlant, limits: ControllerLimits, redefinition: tuple[Matrix, Matrix]
-) -> SizedPlant:
-    """Return another robot's plant as one of a neck's size; a coupled neck as it is."""
-    if plant.robot.is_neck:
-        return SizedPlant(axes=plant.axes, robot=plant.robot, redefinition=redefinition, scale=None)
-    T, inverse = (part.copy() for part in redefinition)
-    robot, m = plant.robot, len(plant.names)
-    numbers = limits.constants(plant.sample_time)[1:]
-    low, high = np.split(numbers[: 2 * T.shape[1]], 2)
-    unit = float((high - low).max()) / (2.0 * rt.MPC_MOTOR_LIMIT)
-    inputs = unit * np.linalg.norm(T[:m], axis=1) / _NECK_WEIGHT
-    outputs = np.array([abs(axis.nominal.static_gain) for axis in plant.axes.values()]) * inputs / _NECK_GAIN
-    T[:m] *= unit / inputs[:, None]
-    inverse[:, :m] *= inputs / unit
-    references = np.split(numbers[2 * T.shape[1] :], 2)
-    bounds = np.concatenate([low / unit, high / unit, *(part / np.append(outputs, unit) for part in references)])
-    axes = {
-        name: UncertainAxis(_scaled(axis.nominal, i, gains), tuple(_scaled(item, i, gains) for item in axis.samples))
-        for i, ((name, axis), gains) in enumerate(zip(plant.axes.items(), inputs / outputs[:, None], strict=True))
-    }
-    scale = Scale(motors=unit, outputs=outputs, inputs=inputs, bounds=bounds)
-    return SizedPlant(axes=axes, robot=robot, redefinition=(T, inverse), scale=scale)
-
-
-def _scaled(plant: Any, axis: int, gains: Vector) -> Any:
-    """Return an axis with its gains from the redefined inputs of all axes times `gains`."""
-    if isinstance(plant, CoupledAxis):
-        return replace(plant, B=gains * plant.B)
-    return replace(plant, numerator=float(gains[axis]) * plant.numerator)
+def scale_numbers(plant: ScaledPlant, limits: ControllerLimits) -> tuple[float, ...]:
+    """Return what the runtime reads behind its constants: scaled bounds, and units; nothing where they are its own."""
+    robot, unit, outputs = plant.robot, plant.scaling.motor_unit, plant.scaling.output_unit
+    ranges: Any = motor_ranges(robot, limits.position_limit)
+    motors, (low, high) = np.array(ranges) / unit, np.array(reference_ranges(robot)) / outputs
+    own = [MOTOR_RANGE] * motors.shape[1], [OUTPUT_RANGE] * len(outputs)
+    found = [*motors.ravel(), *low, motors[0].min(), *high, motors[1].max(), unit, *outputs, *plant.inputs]
+    usual = [*(-np.array(own[0])), *own[0], *(-np.array(own[1])), -MOTOR_RANGE, *own[1], MOTOR_RANGE,
+             *[1.0] * (2 * len(outputs) + 1)]  # fmt: skip
+    return () if found == usual else tuple(map(float, found))
 
 
 def runtime_of(arrays: tuple[Matrix, ...]) -> str:
@@ -157,7 +150,7 @@ def runtime_of(arrays: tuple[Matrix, ...]) -> str:
 
 
 def units_of(arrays: tuple[Matrix, ...]) -> tuple[float, Vector, Vector]:
-    """Return the units in SI of motors, outputs (outputs,) and redefined inputs (outputs,); ones for a neck."""
+    """Return the units in SI of motors, outputs (outputs,) and redefined inputs (outputs,)."""
     a = rt.MpcArrays(arrays)
     m = a.T.shape[0] - 1
     if a.constants.size == rt.MPC_NUMBERS:
@@ -166,7 +159,7 @@ def units_of(arrays: tuple[Matrix, ...]) -> tuple[float, Vector, Vector]:
 
 
 def unbound(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
-    """Return the arrays with all units one and no bounds: the controller in the units of its size."""
+    """Return the arrays with all units one and no bounds: the controller in scaled quantities."""
     a = rt.MpcArrays(arrays)
     if a.constants.size == rt.MPC_NUMBERS:
         return arrays

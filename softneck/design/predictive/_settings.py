@@ -10,37 +10,23 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_finite, require_one_of, to_si
 from softneck.core._shown import Shown
-from softneck.estimation._axis import HasTransferFunctions, robot_of
 from softneck.estimation._settings import ORDERS
 from softneck.robot import Robot
-from softneck.robot._neck_default import NeckCount, NeckDefault
 from softneck.robot._search import find_robot
-from softneck.signals import redefinition_matrix
 
 from ..linear._ports import LIMITS, ControllerLimits
-from ..plants._coupled import CoupledPlant
-from ..plants._coupled_axis import radius, sensitivity
+from ..plants._coupled import coupled_plant
+from ..plants._coupled_axis import AnyAxes, radius, sensitivity
 from ..plants._uncertain import USUAL_PERIOD, discrete, uncertain_plant
-from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains
+from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains, with_sample_time
 from ._controller import MpcController
 from ._lti import system
 from ._mpc_state_runtime import MpcArrays
-from ._predicted import (
-    families,
-    over,
-    plant_of,
-    predicted_plants,
-    sample_pairs,
-    settings_for,
-    settings_of_robot,
-    weighed,
-    with_taken,
-)  # fmt: skip
+from ._predicted import HIDDEN, families, over, predicted_plants, sample_pairs, taken
 from ._prediction import Problem, matrices
-from ._scale import TAUTNESS_LEVER, SizedPlant, predictive_limits, sized_plant
+from ._scale import TAUTNESS_LEVER, ScaledPlant, predictive_limits, scale_numbers, scaled_plant
 from ._tuning import (
     FULL_TRUST,
-    Pair,
     filter_for_rise,
     guard_samples,
     halved,
@@ -51,14 +37,18 @@ from ._tuning import (
     require_given,
     require_solvable,
     rise,
-    slowness,
     spaced_starts,
 )  # fmt: skip
 
-# Bandwidths that are tried [rad/s].
+# All in scaled seconds. Bandwidths that are tried.
 _BANDWIDTHS = (1.0, 40.0)
-# Of another robot, stretched by its slowest pole: without a measurement the motors hold then [s].
-_COAST = 0.5
+# Behind the dead time, in samples at most so many; moves in it.
+_HORIZON, _LONGEST, _MOVES = 0.6, 200, 10
+_PREVIEW = 4.0
+# Time constant of the reference filter: of what recordings told, and of a plant of one's own.
+_REFERENCE_TIMES = 0.05, 0.2
+# Of a robot with doubts on its small moves: its slowest pole where tendons are taut.
+_TAUT_POLE = 9.0
 # Bound on Ms on every sample of a family, where that on the nominal plant is not larger: samples are what a payload or
 # an inclination makes of it now and then.
 _WORST_SENSITIVITY = 2.5
@@ -77,21 +67,24 @@ class MpcSettings(Shown):
     """Model predictive control of all axes over an identified linear model, moves of the motors as unknowns.
 
     Weights follow from `bandwidth`, the observer from `max_sensitivity`, the reference filter from `rise_s`. Limits of
-    the motors are those of the robot's file. The defaults are the neck's; what is given is in the unit of the robot's
-    motors. A `control` system is predicted with all that each motor does to each output.
+    the motors are those of the robot's file. Defaults are in ranges and time constants of the robot; what is given is
+    in the unit of its motors. A `control` system is predicted with all that each motor does to each output.
 
     Attributes:
         bandwidth: of the slowest pole of the loop without dead time [rad/s]; None for the fastest that keeps the
             robustness while the observer believes all that is measured.
         max_sensitivity: bound on Ms, on the identified plant and on its faster form; on samples of a family 2.5.
         rise_s: time [s] in which a step rises from 10 to 90 % on the predicted plant, no limit acting: a faster loop is
-            filtered, a slower one gets more bandwidth, its observer less trust. None: a filter of 0.05 s.
+            filtered, a slower one gets more bandwidth, its observer less trust. None: a filter of a quarter of the
+            robot's time constant, 0.05 s of the neck.
         preview: how far ahead the reference is known [s]; the controller then has the inputs
             `pitch_reference_ahead` and `roll_reference_ahead`.
-        lead_limit: how far a set-point may be from its motor [rad].
-        angle_limit: soft limit of pitch and roll, or of another robot's angles [rad]; None for none.
-        minimum_tautness: least motor position beyond that at which a tendon follows the neck [rad], soft; None for no
-            limit. With pretension it is negative: rest counts as 0. The default is a wish of light weight.
+        lead_limit: how far a set-point may be from its motor [rad]; None: a twelfth of the range (1 rad of the neck),
+            and no less than what drives that are late by 0.4 time constants fall behind.
+        angle_limit: soft limit of outputs that are angles [rad]; None for none.
+        minimum_tautness: least motor position beyond that at which a tendon follows the outputs [rad], soft; None for
+            no limit. With pretension it is negative: rest counts as 0. "wish": 0.5 rad of a neck, a wish of light
+            weight, where tendons stand at known angles and recordings told the plant.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
     """
 
@@ -99,10 +92,9 @@ class MpcSettings(Shown):
     max_sensitivity: float = 1.5
     rise_s: float | None = None
     preview: float = 0.0
-    # More than the drives of the neck fall behind at the paper's fastest signals, 0.4 rad.
-    lead_limit: float = NeckDefault(1.0)
+    lead_limit: float | None = None
     angle_limit: float | None = None
-    minimum_tautness: float | None = NeckDefault(0.5)
+    minimum_tautness: float | str | None = "wish"
     order: str = "sequential"
 
     def __post_init__(self) -> None:
@@ -110,8 +102,9 @@ class MpcSettings(Shown):
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         if self.rise_s is not None:
             require_between("rise_s", self.rise_s, 0.001, 1e6, "s")
-        require_between("preview", self.preview, 0.0, 4.0, "s")
-        if self.minimum_tautness is not None:
+        if isinstance(self.minimum_tautness, str):
+            require_one_of("minimum_tautness", self.minimum_tautness, ("wish",))
+        elif self.minimum_tautness is not None:
             require_finite("minimum_tautness", self.minimum_tautness)
         require_one_of("order", self.order, ORDERS)
 
@@ -137,21 +130,15 @@ class MpcSettings(Shown):
         """
         given = None if robot is None else find_robot(robot)
         period, model = discrete(model, (given and given.sample_time_s) or USUAL_PERIOD)
-        plant = plant_of(model, given)
-        whose, settings = given or robot_of(plant), settings_for(MpcNumbers.of(self), plant)
-        limits = predictive_limits(settings, whose)
-        if whose.is_neck and not isinstance(plant, CoupledPlant):
-            made = with_taken(settings.designed(plant, limits), settings, plant)
-        else:
-            whole = plant if isinstance(plant, CoupledPlant) else uncertain_plant(plant, given)
-            settings = settings if whose.is_neck else settings_of_robot(settings, whole)
-            made = settings.designed(sized_plant(whole, limits, weighed(whole)), limits)
+        whole = coupled_plant(model, robot=given) or uncertain_plant(model, given)
+        plant = scaled_plant(whole, identified=hasattr(model, "findings"))
+        made = MpcNumbers.of(self).designed(plant, predictive_limits(self, plant))
         return made if period is None else replace(made, design={**made.design, "held_s": period})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MpcNumbers(MpcSettings):
-    """Settings, and the numbers that follow from plant and observer.
+    """Settings, and the numbers that follow from plant and observer; None for what is usual.
 
     Attributes:
         reference_time: time constant of the reference filter [s].
@@ -166,17 +153,18 @@ class MpcNumbers(MpcSettings):
         look_ahead: by how much the observer of the loop runs ahead of its sensor [s]: so much dead time is behind it.
         payload_tautness: what a kilogram that the observer tells adds to `minimum_tautness` [rad/kg]; beyond 0 the
             controller has an input `payload` [kg]. A payload slackens tendons.
+        wish: the tautness that is wished for, of scaled motors.
     """
 
-    reference_time: float = NeckDefault(0.05)
-    horizon: int = NeckCount(30)
-    moves: int = NeckCount(10)
-    # The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s).
-    least_delay: float = NeckDefault(0.1)
-    small_move_pole: float = NeckDefault(5.293)
-    taut_pole: float = NeckDefault(9.0)
-    look_ahead: float = NeckDefault(0.0)
-    payload_tautness: float = NeckDefault(0.0)
+    reference_time: float | None = None
+    horizon: int | None = None
+    moves: int | None = None
+    least_delay: float | None = None
+    small_move_pole: float | None = None
+    taut_pole: float | None = None
+    look_ahead: float | None = None
+    payload_tautness: float | None = None
+    wish: float = 0.5
 
     @classmethod
     def of(cls, settings: MpcSettings) -> Self:
@@ -186,85 +174,121 @@ class MpcNumbers(MpcSettings):
     @property
     def starts(self) -> tuple[int, ...]:
         """Samples of the horizon at which the motors move."""
-        return spaced_starts(self.horizon, self.moves)
+        return spaced_starts(self.horizon or 1, self.moves or 1)
 
-    def designed(self, model: HasTransferFunctions, limits: ControllerLimits) -> MpcController:
+    def resolved(self, plant: ScaledPlant) -> Self:
+        """Return the settings with the numbers that are usual for a plant."""
+        second, doubts, told = plant.scaling.second, plant.doubts, plant.identified
+        taut = self.minimum_tautness
+        require_between("preview", self.preview, 0.0, _PREVIEW * second, "s")
+        if taut == "wish" and not (told and plant.has_tendons):
+            taut = None
+        horizon = self.horizon or min(max(3, round(_HORIZON / plant.axes[0].sample_time)), _LONGEST)
+        usual = {
+            "horizon": horizon, "moves": min(_MOVES, horizon), "look_ahead": 0.0, "payload_tautness": 0.0,
+            "reference_time": second * _REFERENCE_TIMES[0 if told else 1],
+            "least_delay": (HIDDEN if told else 1.0) * doubts.least_delay, "small_move_pole": doubts.small_move_pole,
+            "taut_pole": _TAUT_POLE / second if told and doubts.small_move_pole > 0.0 else 0.0,
+        }  # fmt: skip
+        found = {name: value for name, value in usual.items() if getattr(self, name) is None}
+        # What a payload wants adds to a tautness that is wished for.
+        found |= {"payload_tautness": 0.0} if taut is None else {}
+        return replace(self, **found, minimum_tautness=taut)
+
+    def _scaled(self, second: float) -> Self:
+        """Return resolved settings in scaled seconds."""
+        times = {"rise_s", "preview", "reference_time", "least_delay", "look_ahead"}
+        rates = {"bandwidth", "small_move_pole", "taut_pole"}
+        given = {name: getattr(self, name) for name in (*times, *rates) if getattr(self, name) is not None}
+        return replace(self, **{name: v / second if name in times else v * second for name, v in given.items()})
+
+    def designed(self, plant: ScaledPlant, limits: ControllerLimits) -> MpcController:
         """Return the controller for what is predicted."""
-        nominal = predicted_plants(self, model)
-        samples = sample_pairs(model, self)
-        bandwidth = self._fastest(model, nominal, samples) if self.bandwidth is None else self.bandwidth
-        if self.rise_s is not None and self.bandwidth is None:
-            bandwidth = self._risen(model, nominal, bandwidth)
-        arrays, found = self._tuned(self._arrays(model, bandwidth), nominal, samples)
+        asked, second = self.resolved(plant), plant.scaling.second
+        work = asked._scaled(second)
+        nominal, samples = predicted_plants(work, plant), sample_pairs(plant, work)
+        bandwidth = work._fastest(plant, limits, nominal, samples) if work.bandwidth is None else work.bandwidth
+        if work.rise_s is not None and work.bandwidth is None:
+            bandwidth = work._risen(plant, limits, nominal, bandwidth)
+        arrays, found = work._tuned(work._arrays(plant, limits, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
-        unit, taut = to_si(limits.robot.motors.unit)[0], self.minimum_tautness
+        for name, value in found.items():
+            if name.endswith(("_rad_s", "_s")):
+                found[name] = value / second if name.endswith("_rad_s") else value * second
+        taut = asked.minimum_tautness
+        if taut is not None:
+            unit = plant.scaling.motor_unit
+            taut = self.wish * unit if isinstance(taut, str) else to_si(plant.robot.motors.unit)[0] * taut
+        found["dead_time_s"] = [(item.delay + self.extra_delay) * plant.sample_time for item in nominal]
         return MpcController(
-            sample_time=nominal[0].sample_time,
-            arrays=arrays,
+            sample_time=plant.sample_time,
+            arrays=with_sample_time(arrays, plant.sample_time),
             **{name: getattr(limits, name) for name in LIMITS[:4]},
             robot=limits.robot,
             angle_limit=self.angle_limit,
-            minimum_tautness=None if taut is None else unit * taut,
+            minimum_tautness=taut,
             order=self.order,
-            design={"settings": asdict(self), "extra_delay": self.extra_delay, **found},
-        )
+            design={"settings": asdict(asked), "extra_delay": self.extra_delay, **found,
+                    "assumed": taken(asked, self, plant)},
+        )  # fmt: skip
 
-    def _fastest(self, model: HasTransferFunctions, nominal: Pair, samples: list[Pair]) -> float:
+    def _fastest(self, plant: ScaledPlant, limits: ControllerLimits, nominal: AnyAxes, samples: list[AnyAxes]) -> float:
         bounds, w = self._bounds(nominal, samples), judged_frequencies(nominal)
 
         def keeps(bandwidth: float) -> bool:
-            return keeps_bounds(self._arrays(model, bandwidth), bounds, self.extra_delay, w)
+            return keeps_bounds(self._arrays(plant, limits, bandwidth), bounds, self.extra_delay, w)
 
-        low, high = (speed / slowness(nominal) for speed in _BANDWIDTHS)
+        low, high = _BANDWIDTHS
         if not keeps(low):
             raise SettingsError(
-                f"not even a bandwidth of {low:g} rad/s keeps Ms <= {self.max_sensitivity:g} "
+                f"not even a bandwidth of {low / plant.scaling.second:g} rad/s keeps Ms <= {self.max_sensitivity:g} "
                 f"({max(_WORST_SENSITIVITY, self.max_sensitivity):g} on the samples of a family); raise "
                 "`max_sensitivity`, or give `bandwidth`, with which less of what is measured is believed."
             )
         return halved(keeps, low, high)[0]
 
-    def _risen(self, model: HasTransferFunctions, nominal: Pair, least: float) -> float:
+    def _risen(self, plant: ScaledPlant, limits: ControllerLimits, nominal: AnyAxes, least: float) -> float:
         """Return the least bandwidth from `least` on with which a step rises as fast as asked without a filter.
 
         Beyond `least` the observer believes less of what is measured, so that the loop stays as robust.
         """
 
         def rises(bandwidth: float) -> bool:
-            unfiltered = with_filter(self._arrays(model, bandwidth), 0.0)
+            unfiltered = with_filter(self._arrays(plant, limits, bandwidth), 0.0)
             return rise(unfiltered, nominal, self.extra_delay) <= self.rise_s  # type: ignore[operator]
 
-        low, high = least, _BANDWIDTHS[1] / slowness(nominal)
+        low, high = least, _BANDWIDTHS[1]
         if rises(low):
             return low
         if not rises(high):
-            raise SettingsError(f"`rise_s` {self.rise_s:g} is faster than any plan of this plant rises; ask for more.")
+            asked = (self.rise_s or 0.0) * plant.scaling.second
+            raise SettingsError(f"`rise_s` {asked:g} is faster than any plan of this plant rises; ask for more.")
         return halved(lambda bandwidth: not rises(bandwidth), low, high)[1]
 
-    def _arrays(self, model: HasTransferFunctions, bandwidth: float) -> tuple[Any, ...]:
-        problem = self.problem(model, bandwidth)
-        Ts = problem.axes[0].sample_time
+    def _arrays(self, plant: ScaledPlant, limits: ControllerLimits, bandwidth: float) -> tuple[Any, ...]:
+        problem = self.problem(plant, bandwidth)
         tuning = Tuning(
-            trust=FULL_TRUST, reference_time=self.reference_time, preview=round(self.preview / Ts),
-            payload_tautness=self.payload_tautness,
+            trust=FULL_TRUST, reference_time=self.reference_time or 0.0,
+            preview=round(self.preview / problem.axes[0].sample_time),
+            payload_tautness=(self.payload_tautness or 0.0) / plant.scaling.motor_unit,
+            scale=scale_numbers(plant, limits),
         )  # fmt: skip
-        if isinstance(model, SizedPlant) and model.scale is not None:
-            tuning = replace(tuning, scale=model.scale, coast=max(1, round(_COAST * slowness(problem.axes) / Ts)))
         return assemble(problem, matrices(problem), tuning)
 
-    def problem(self, model: HasTransferFunctions, bandwidth: float) -> Problem:
-        """Return what is asked with that bandwidth [rad/s], in numbers, before observer and filter are tuned."""
-        nominal = predicted_plants(self, model)
-        lever = redefinition_matrix()
-        T, inverse = model.redefinition if isinstance(model, SizedPlant) else (lever, np.linalg.inv(lever))
-        require_solvable(self.moves, T.shape[1])
+    def problem(self, plant: ScaledPlant, bandwidth: float) -> Problem:
+        """Return what is asked with that scaled bandwidth, in numbers, before observer and filter are tuned.
+
+        Of resolved settings in scaled seconds.
+        """
+        nominal, (T, inverse), m = predicted_plants(self, plant), plant.redefinition, len(plant.axes)
+        require_solvable(len(self.starts), T.shape[1])
         weights: Vector = np.array([1.0 / plant.static_gain**2 for plant in nominal])
         # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
         on_input = max(move_weight(plant, bandwidth) for plant in nominal)
-        wish = _WISH if isinstance(self.minimum_tautness, NeckDefault) else _SLACK
+        wish = _WISH if isinstance(self.minimum_tautness, str) else _SLACK
         return Problem(
             axes=tuple(replace(plant, delay=plant.delay + self.extra_delay) for plant in nominal),
-            horizon=self.horizon,
+            horizon=self.horizon or 1,
             starts=self.starts,
             T=T,
             T_inverse=inverse,
@@ -274,22 +298,22 @@ class MpcNumbers(MpcSettings):
             slack_weight=_SLACK * float(weights.max()),
             tautness_weight=wish * float(weights.max()),
             angles=self.angle_limit is not None,
-            tautness=None if self.minimum_tautness is None else TAUTNESS_LEVER * lever[:2].T,
+            tautness=None if self.minimum_tautness is None else TAUTNESS_LEVER * T[:m].T,
             guard=guard_samples(bandwidth, nominal[0].sample_time),
         )
 
-    def _bounds(self, nominal: Pair, samples: list[Pair]) -> list[tuple[Pair, float]]:
+    def _bounds(self, nominal: AnyAxes, samples: list[AnyAxes]) -> list[tuple[AnyAxes, float]]:
         worst = max(_WORST_SENSITIVITY, self.max_sensitivity)
-        bounds = [(pair, self.max_sensitivity) for pair in families(nominal, self.small_move_pole)]
+        bounds = [(pair, self.max_sensitivity) for pair in families(nominal, self.small_move_pole or 0.0)]
         return bounds + [(pair, worst) for pair in samples]
 
     def _tuned(
-        self, arrays: tuple[Matrix, ...], nominal: Pair, samples: list[Pair]
+        self, arrays: tuple[Matrix, ...], nominal: AnyAxes, samples: list[AnyAxes]
     ) -> tuple[tuple[Matrix, ...], dict[str, Any]]:
         """Return the arrays with observer and filter, and what was found."""
-        moved, w = families(nominal, self.small_move_pole), judged_frequencies(nominal)
+        moved, w = families(nominal, self.small_move_pole or 0.0), judged_frequencies(nominal)
         arrays = with_gains(arrays, observer_trust(arrays, self._bounds(nominal, samples), self.extra_delay, w))
-        time = self.reference_time
+        time = self.reference_time or 0.0
         if self.rise_s is not None:
             time = filter_for_rise(arrays, nominal, self.extra_delay, self.rise_s)
         arrays = with_filter(arrays, time)
@@ -302,7 +326,6 @@ class MpcNumbers(MpcSettings):
                 (sensitivity(parts, pair, self.extra_delay, w) for pair in samples), default=None
             ),
             "spectral_radius": max(radius(parts, pair, self.extra_delay) for pair in moved),
-            "dead_time_s": [(plant.delay + self.extra_delay) * plant.sample_time for plant in nominal],
             "starts": list(self.starts),
         }  # fmt: skip
         return arrays, found

@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.estimation import AxisPlant
 
-from ..linear._axis_loop import LOWEST, frequencies
+from ..linear._axis_loop import frequencies
 from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
 from ._arrays import with_filter, with_gains
 from ._lti import system
@@ -27,7 +27,7 @@ _HALVINGS = 18
 _THINNING = 5
 # Of a range of 40: to 2 %.
 _NARROWED = 7
-# A step response is judged over this long [s].
+# A step response is judged over this long.
 _HORIZON = 4.0
 # With 180 a sample of 20 ms was over before half of the answers came, with 90 none of them took a tenth of it.
 _MOST_UNKNOWNS = 120
@@ -37,7 +37,7 @@ _SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 
 def judged_frequencies(nominal: Pair) -> Vector:
     """Return the frequencies [rad/s] of Ms: 5 % apart, so that a peak is missed by less than 1 %."""
-    return frequencies(nominal[0].sample_time, lowest=LOWEST / slowness(nominal))[::_THINNING]
+    return frequencies(nominal[0].sample_time)[::_THINNING]
 
 
 def halved(keeps: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
@@ -140,7 +140,7 @@ def rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int) -> float:
     axis, infinite where one does not rise."""
     parts, m, Ts = system(arrays), len(pair), pair[0].sample_time
     A, B, C = closed(parts, pair, extra_delay)
-    rows = math.ceil(_HORIZON * slowness(pair) / Ts)
+    rows = math.ceil(_HORIZON / Ts)
     x, y = np.zeros((A.shape[0], m)), np.zeros((rows, m))
     for k in range(rows):
         x = A @ x + B
@@ -170,11 +170,6 @@ def filter_for_rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int, as
         quick = rise(with_filter(arrays, middle), pair, extra_delay) < asked
         low, high = (middle, high) if quick else (low, middle)
     return low
-
-
-def slowness(pair: Pair) -> float:
-    """Return by how much the slowest axis is slower than a neck's."""
-    return max(plant.stretch for plant in pair)
 
 
 def guard_samples(bandwidth: float, sample_time: float) -> int:
