@@ -1,7 +1,7 @@
-"""FMUs out of blocks: FMI 2.0 through pythonfmu, FMI 2.0 and 3.0 without Python.
+"""FMUs of blocks: FMI 2.0 through pythonfmu, FMI 2.0 and 3.0 without Python.
 
-What an importer sees is written once, in `fmu.describe`.
-May import `design` and below; no loop over FMUs is closed here.
+The model description is generated once, in `fmu.describe`.
+May import `design` and below; simulation of FMUs is in `cosim`.
 """
 
 import lazy_loader

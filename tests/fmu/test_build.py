@@ -186,7 +186,7 @@ def test_what_is_told_of_a_model_escapes_what_it_was_told(toys: Any) -> None:
 
     info = fmu_info(Thing(), scores="fit < 90 %", stop_time=4.0)
     assert (info.description, info.stop_time) == ("a lag & more", 4.0)
-    for text in ("a lag &amp; more", "&lt;b&gt;", "fit &lt; 90 %", "What it is not good for"):
+    for text in ("a lag &amp; more", "&lt;b&gt;", "fit &lt; 90 %", "Limits of use"):
         assert text in info.documentation
 
 

@@ -50,7 +50,7 @@ def test_zig_is_asked_for_the_platform_and_named_where_it_is_missing(
         commands.append(command)
         return suffix.encode()
 
-    monkeypatch.setattr(_compilers, "_compiled", compiled)
+    monkeypatch.setattr(_compilers, "_compile", compiled)
     platform = PLATFORMS[name]
     monkeypatch.setattr(_compilers, "have_zig", lambda: False)
     with pytest.raises(SettingsError, match="zig is not installed; install it with `pip install ziglang`"):

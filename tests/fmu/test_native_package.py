@@ -26,7 +26,7 @@ from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
 from softneck.fmu.compiled.translate._kinds import LIBRARIES, RUNTIMES, ranks_of
 from softneck.fmu.compiled.translate._translate import only_kinds
 from softneck.fmu.describe._description import described_block
-from softneck.fmu.python._zip import deflated, write_zip
+from softneck.fmu.python._zip import deflate, write_zip
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
 
@@ -97,7 +97,7 @@ def test_a_wheel_knows_its_libraries_in_its_own_folders(tmp_path: Path) -> None:
 def test_a_stream_deflated_before_gives_the_same_file(tmp_path: Path) -> None:
     members = {"b/é.txt": b"one" * 1000, "a.bin": bytes(5), "empty": b""}
     write_zip(tmp_path / "plain.zip", members)
-    write_zip(tmp_path / "given.zip", members, {members["b/é.txt"]: deflated(members["b/é.txt"])})
+    write_zip(tmp_path / "given.zip", members, {members["b/é.txt"]: deflate(members["b/é.txt"])})
     assert (tmp_path / "plain.zip").read_bytes() == (tmp_path / "given.zip").read_bytes()
     with zipfile.ZipFile(tmp_path / "plain.zip") as archive:
         assert archive.testzip() is None

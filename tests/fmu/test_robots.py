@@ -230,7 +230,7 @@ def test_a_controller_of_two_motors_has_the_drives_of_two() -> None:
     assert [array.tolist()[2:] for array in neck.arrays[:1]] == [[]]
     two = with_modelled_drives(_controller(2, 1))
     assert two.arrays[0].tolist()[2:] == [3.0, 2.0]
-    assert two.parameters[-1].description.startswith("true: the motors are where motor_position_1..2 say")
+    assert two.parameters[-1].description.startswith("true: use the inputs motor_position_1..2;")
     bar = _controller(2, 1)
     bar = replace(bar, inputs=tuple(replace(port, unit="Pa") for port in bar.inputs))
     assert with_modelled_drives(bar) is bar

@@ -43,7 +43,7 @@ def test_members_that_reach_out_are_refused(name: str, tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", "<x/>")
         archive.writestr(name, "evil")
-    with pytest.raises(FileFormatError, match="reaches out of it"):
+    with pytest.raises(FileFormatError, match="would be outside the folder"):
         unpack(path)
 
 

@@ -1,4 +1,4 @@
-"""A block as an FMU without Python: FMI 2.0 or 3.0, the library of each platform, the model as a resource."""
+"""Export of a block as an FMU without Python: FMI 2.0 or 3.0, a library for each platform, the model as a resource."""
 
 from __future__ import annotations
 
@@ -28,12 +28,11 @@ from ._sources import FLAGS, GENERATED, MAIN, PROBE, Sources
 from .translate._translate import only_kinds
 
 FMI_VERSIONS = (2, 3)
-_HOST = (
-    "Nothing: no Python, no compiler, no library beyond those of the operating system. "
-    "Set non-finite inputs and the FMU answers with an error status and a message; NaN means `not measured` where the "
-    "table says so."
+_HOST_NOTE = (
+    "No requirements: no Python, no compiler, no library beyond those of the operating system. "
+    "Setting a non-finite input is an error with a message, except NaN (`not measured`) where the table allows it."
 )
-_REBUILD = """Rebuild the library of this FMU for any platform with a C99 compiler, for instance
+_REBUILD_README = """Rebuild the library of this FMU for any platform with a C99 compiler, for instance
 
     cc {flags} -fPIC -shared -o {name}.so {main} -lm
 
@@ -47,17 +46,17 @@ def build_compiled_fmu(
     thing: Buildable | Block | str | Path, path: str | Path, *, info: FmuInfo | None = None, force: bool = False,
     fmi: int = 2, platforms: Sequence[str] = (), sensitivities: bool = False,
 ) -> str:  # fmt: skip
-    """Write `thing` as a Co-Simulation FMU that needs no Python, and return one line on where its libraries come from.
+    """Write `thing` as a Co-Simulation FMU that needs no Python; return one line on the origin of its libraries.
 
     Variables, timing and state are those of `build_fmu`. The same block, info and libraries give the same bytes.
 
     Args:
-        thing: what to package, as `build_fmu` takes it.
+        thing: as for `build_fmu`.
         path: `NAME.fmu`; NAME becomes the model name.
-        info: what the FMU says about itself.
+        info: texts of the FMU; those of `fmu_info` if not given.
         force: replace an existing file.
         fmi: 2 or 3.
-        platforms: that the FMU must run on, e.g. "x86_64-windows"; none: all whose library is here.
+        platforms: on which the FMU must run, e.g. "x86_64-windows"; none: all with a library on this machine.
         sensitivities: add outputs of the next sample (`pitch_next`, ..) and their directional derivatives.
 
     Raises:
@@ -88,9 +87,9 @@ def build_compiled_fmu(
 
 
 def next_outputs(block: Block) -> tuple[Port, ...]:
-    """Return the outputs that an FMU with sensitivities has beside its own: what a step makes of the inputs of now.
+    """Return the additional outputs of an FMU with sensitivities: its outputs at the next sample.
 
-    Of an identified plant those of the robot, of all others the first that are numbers.
+    These are the robot's outputs for an identified plant, and the leading numeric outputs for other blocks.
 
     Raises:
         SettingsError: a kind that has no derivative, or no such outputs.
@@ -99,12 +98,12 @@ def next_outputs(block: Block) -> tuple[Port, ...]:
         with_tangent(bundle(block.runtime, loops=False))
     except TangentError as error:
         raise SettingsError(f"{block.kind} has no sensitivities: {error}") from None
-    # Those tell of the block itself, not of the robot or what it is asked to do.
+    # Motor positions and innovations are internal to the block.
     aside = (*motor_positions(block), "innovation")
     own = takewhile(lambda p: not (p.boolean or p.integer or p.missing or p.name in aside), block.outputs)
-    what = "at the next sample, if the inputs are held"
+    note = "at the next sample, if the inputs are held"
     found = tuple(
-        replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {what}") for port in own
+        replace(port, name=f"{port.name}_next", description=f"{port.description or port.name} {note}") for port in own
     )
     if not found:
         raise SettingsError(f"{block.kind} ({block.role}) has no sensitivities: none of its outputs is a number.")
@@ -119,7 +118,7 @@ def _check_kinds(modules: set[str], sources: Sources) -> None:
 
 
 def _folders(library: Library, wanted: Sequence[str], fmi: int) -> list[tuple[str, str, bytes]]:
-    """Return (folder, suffix, bytes) of each library that goes into the FMU."""
+    """Return (folder, suffix, bytes) of each library for the FMU."""
     for name in wanted:
         if name not in PLATFORMS:
             raise SettingsError(f"unknown platform `{name}`; use one of {', '.join(PLATFORMS)}.")
@@ -155,9 +154,9 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources,
     members = {
         "modelDescription.xml": model_description(block, info, identity, fmi=fmi),
         "resources/model.bin": model_bytes(block, name, guid, ahead=ahead),
-        "documentation/index.html": documentation_page(name, block, info, _HOST).encode(),
+        "documentation/index.html": documentation_page(name, block, info, _HOST_NOTE).encode(),
         "documentation/licenses/license.txt": license_text("softneck", info.license).encode(),
-        "sources/README.txt": _REBUILD.format(
+        "sources/README.txt": _REBUILD_README.format(
             flags=" ".join(FLAGS), name=name, main=MAIN, version=__version__
         ).encode(),
     }
@@ -169,7 +168,7 @@ def _members(block: Block, info: FmuInfo, name: str, fmi: int, sources: Sources,
 
 
 def _needed_sources(sources: Sources, modules: set[str], fmi: int) -> dict[str, str]:
-    """Return the sources of this model's kinds and version of FMI alone: 40 kB less than those of the whole library."""
+    """Return only the sources for this model's kinds and FMI version: 40 kB less than the whole library."""
     other = f"fmi{5 - fmi}.h"
     files = {name: text for name, text in sources.files.items() if name not in (other, PROBE)}
     files[GENERATED] = only_kinds(files[GENERATED], modules)
@@ -178,11 +177,11 @@ def _needed_sources(sources: Sources, modules: set[str], fmi: int) -> dict[str, 
 
 
 def _build_description(name: str) -> bytes:
-    """Return how FMI 3 wants to be told to compile (section 2.5.2.1)."""
+    """Return the build description of FMI 3 (section 2.5.2.1)."""
     root = Element("fmiBuildDescription", fmiVersion="3.0")
     options = " ".join(flag for flag in FLAGS if flag.startswith("-f"))
     configuration = SubElement(root, "BuildConfiguration", modelIdentifier=name)
-    # Options of a compiler stand beside its name alone (table of SourceFileSet); clang takes those of gcc.
+    # `compilerOptions` requires `compiler` (table of SourceFileSet); clang accepts the options of gcc.
     head = {"language": "C99", "compiler": "gcc", "compilerOptions": options}
     files = SubElement(configuration, "SourceFileSet", head)
     SubElement(files, "SourceFile", name=MAIN)

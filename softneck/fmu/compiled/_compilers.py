@@ -1,4 +1,4 @@
-"""Platforms and C compilers: the one of this machine, and zig, which compiles for all platforms."""
+"""Platforms and C compilers: the compiler of this machine, and zig, which compiles for all platforms."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ._sources import FLAGS, MAIN, Sources
 
 @dataclass(frozen=True, slots=True)
 class Platform:
-    """One kind of machine.
+    """A platform: operating system and processor.
 
     Attributes:
-        name: what users type, and FMI 3's name of the folder.
-        fmi2: FMI 2's name of the folder; "" where that version has none.
+        name: as users type it; also FMI 3's folder name.
+        fmi2: FMI 2's folder name; "" if FMI 2 has none.
         suffix: of the library.
         target: zig's name; glibc 2.17 is of 2012, macOS 11 of 2020, the first for Apple's own processors.
-        system, machines: what Python calls it.
+        system, machines: Python's names.
     """
 
     name: str
@@ -59,7 +59,7 @@ def here() -> Platform | None:
     return None
 
 
-# Of processor time: a busy machine may take its time. A library takes one minute.
+# Limit of processor time, which a busy machine does not lengthen. A library takes one minute.
 _MOST_SECONDS = 600
 
 
@@ -73,52 +73,52 @@ def local_compiler() -> list[str] | None:
 
 
 def have_zig() -> bool:
-    """Return whether the package `ziglang` is here."""
+    """Return whether the package `ziglang` is installed."""
     return find_spec("ziglang") is not None
 
 
 def compile_here(sources: Sources, compiler: list[str]) -> bytes:
-    """Return the library of this machine, made by its own compiler."""
+    """Compile the library for this machine with its own compiler."""
     suffix = {"win32": ".dll", "darwin": ".dylib"}.get(sys.platform, ".so")
     extra = [] if sys.platform == "win32" else ["-fPIC"]
     strip = [] if sys.platform == "darwin" else ["-s", "-Wl,--gc-sections"]
-    # Larger and faster: one library weighs little where five are too many.
-    return _compiled(sources, [*compiler, *FLAGS, "-O3", *extra, *strip], suffix)
+    # -O3 makes the library larger and faster; with one platform the size does not matter.
+    return _compile(sources, [*compiler, *FLAGS, "-O3", *extra, *strip], suffix)
 
 
 def compile_for(sources: Sources, platform: Platform) -> bytes:
-    """Return the library of any platform, made by zig.
+    """Cross-compile the library for any platform with zig.
 
     Raises:
-        SettingsError: zig is not here, or refused the sources.
+        SettingsError: zig is not installed, or rejects the sources.
     """
     if not have_zig():
         raise SettingsError("zig is not installed; install it with `pip install ziglang`.")
     extra = [] if platform.system == "win32" else ["-fPIC"]
-    # Names of what nobody calls from outside: zig's linker for macOS would keep them.
+    # Remove local symbols, which zig's linker for macOS would keep.
     gather = ["-Wl,-x"] if platform.system == "darwin" else ["-Wl,--gc-sections"]
     gather += ["-Wl,--hash-style=gnu"] if platform.system == "linux" else []
-    # -O2, where `SN_SMALL` does not ask for short code. Two numbers side by side wait for what was stored one by one,
-    # and the neck's step takes 5 % longer. Code that aarch64's outliner has shortened deflates worse.
+    # -O2, except for functions marked `SN_SMALL`. Vectorised pairs (SLP) wait for numbers that were stored one by one,
+    # and the neck's step takes 5 % longer. Code shortened by aarch64's outliner compresses worse.
     small = ["-fno-slp-vectorize", "-fno-sanitize=undefined", "-w", "-s", "-mllvm", "-enable-machine-outliner=never"]
-    # Macs with Intel processors: 5 kB less; a step of predictive control or the observer takes half as long again.
+    # Intel Macs: 5 kB less, but a step of predictive control or the observer takes 1.5 times as long.
     hint = 10 if platform.name == "x86_64-darwin" else 60
     small += ["-mllvm", "-inline-threshold=0", "-mllvm", f"-inlinehint-threshold={hint}"]
-    # Nothing is thrown through C. Windows asks for the tables, and zig's own parts there need them.
+    # No exceptions pass through C, so unwind tables are left out; on Windows zig's own code needs them.
     windows = ["-rtlib=none", "-DSN_OWN_PROBE"]
     small += windows if platform.system == "win32" else ["-fno-asynchronous-unwind-tables", "-fno-unwind-tables"]
     command = [sys.executable, "-m", "ziglang", "cc", "-target", platform.target, *FLAGS, *small, *extra, *gather]
-    return _compiled(sources, command, platform.suffix)
+    return _compile(sources, command, platform.suffix)
 
 
-def _compiled(sources: Sources, command: list[str], suffix: str) -> bytes:
+def _compile(sources: Sources, command: list[str], suffix: str) -> bytes:
     with tempfile.TemporaryDirectory(prefix="softneck-native-") as name:
         folder = Path(name)
         for file, text in sources.files.items():
             (folder / file).write_text(text, encoding="utf-8")
         library = folder / f"softneck{suffix}"
         full = [*command, "-shared", "-o", library.name, MAIN]
-        # A library that names the temporary folder would have other bytes each time.
+        # A library that contains the temporary folder's name would have other bytes each time.
         full += [] if suffix == ".dll" else ["-lm"]
         environment = os.environ | {"SOURCE_DATE_EPOCH": "315532800"}
         try:

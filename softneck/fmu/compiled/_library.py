@@ -1,8 +1,7 @@
-"""Where the libraries of the platforms come from: those that `make native` built, else this machine's compiler.
+"""Compiled libraries of the platforms: built by `make native`, else compiled on this machine.
 
 `make native` writes `binaries/`: for each platform a library of all kinds and one of each part of them, the generated
-source, and a manifest with the digest of all that they were made of. A wheel carries that folder, so that exporting
-needs no compiler.
+source, and a manifest with the digest of all inputs. A wheel contains that folder, so that exporting needs no compiler.
 """
 
 from __future__ import annotations
@@ -19,28 +18,28 @@ import platformdirs
 
 from softneck.core import FileFormatError, SettingsError, atomic_write
 
-from ..python._zip import deflated
+from ..python._zip import deflate
 from ._compilers import PLATFORMS, compile_for, compile_here, have_zig, here, local_compiler
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
 from .translate._kinds import LIBRARIES, RUNTIMES
 from .translate._translate import only_kinds
 
 BINARIES = HERE / "binaries"
-# With the derivatives of the kinds' steps: half as large again, and no business of other FMUs.
+# With the derivatives of the kinds' steps: 1.5 times as large, so only for FMUs with sensitivities.
 SENSITIVE = BINARIES / "sensitivities"
-_MANIFEST = "manifest.json"
-_BEGUN = "begun.json"  # of a `make native` that has not ended
+_MANIFEST_FILE = "manifest.json"
+_PROGRESS_FILE = "begun.json"  # state of an interrupted `make native`
 
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """Libraries and what they were made of.
+    """Libraries with their sources.
 
     Attributes:
         binaries: platform -> bytes.
         sources: all C sources.
-        origin: one line for people: who compiled them.
-        streams: bytes -> the same deflated, where that was done already.
+        origin: one line on how they were compiled.
+        streams: bytes -> the deflated bytes, if already known.
     """
 
     binaries: dict[str, bytes]
@@ -50,15 +49,15 @@ class Library:
 
 
 def find_library(modules: set[str] | None = None, *, sensitivities: bool = False) -> Library:
-    """Return the libraries that are here, compiling for this machine only where none are.
+    """Return the available libraries; if there are none, compile one for this machine.
 
     Args:
-        modules: that it must hold; those of robots of other sizes than the neck's are compiled, for this machine only.
+        modules: that it must contain; modules for robots of other sizes than the neck are compiled for this machine.
         sensitivities: with the derivatives of the kinds' steps.
 
     Raises:
         FileFormatError: a library is damaged.
-        SettingsError: there is none, and neither a C compiler nor zig.
+        SettingsError: there is no library, no C compiler and no zig.
     """
     if modules and not modules <= set(RUNTIMES):
         return _local_library(tuple(sorted(modules)), sensitivities=sensitivities)
@@ -69,11 +68,11 @@ def find_library(modules: set[str] | None = None, *, sensitivities: bool = False
 
 
 def packaged_library(folder: Path = BINARIES, modules: set[str] | None = None) -> Library | None:
-    """Return what `make native` built, if it is there and was made of the sources of now.
+    """Return the libraries that `make native` built, or None if there are none for the present sources.
 
     Args:
-        folder: where.
-        modules: that it must hold: the first part that has them all; None, or where no part has, the whole.
+        folder: of the libraries.
+        modules: that it must contain: the first part with all of them is returned; the whole if None or no part has.
 
     Raises:
         FileFormatError: a file is damaged.
@@ -85,7 +84,7 @@ def packaged_library(folder: Path = BINARIES, modules: set[str] | None = None) -
 
 
 def _part(modules: set[str] | None) -> str:
-    """Return the name of the part that holds these modules; "" for the whole."""
+    """Return the name of the part with these modules; "" for the whole."""
     return next((part for part, held in LIBRARIES.items() if modules and modules <= held), "")
 
 
@@ -112,7 +111,7 @@ def _file_name(platform: str, part: str = "") -> str:
 
 
 def platforms_built() -> tuple[list[str], str]:
-    """Return the platforms that an FMU would be made for now, and how; nothing is compiled."""
+    """Return the platforms for which an FMU can be exported now, and their origin, without compiling."""
     manifest = _manifest(BINARIES)
     if manifest is not None and manifest["key"] == sources_key():
         return list(manifest["platforms"]), "built with this softneck"
@@ -126,21 +125,21 @@ def platforms_built() -> tuple[list[str], str]:
 def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Library:
     """Cross-compile for all platforms with zig and write them to `folder`: `make native`.
 
-    Each library is kept as it comes: a call after one that was interrupted or failed takes up what is there.
+    Each library is saved when it is done: after an interruption the next call continues with the missing ones.
     """
     sources, key = c_sources(sensitivities=sensitivities), sources_key(sensitivities=sensitivities)
     folder.mkdir(parents=True, exist_ok=True)
-    digests = _begun(folder, key)
+    digests = _finished_files(folder, key)
     for part, name in product(("", *LIBRARIES), PLATFORMS):
         if (file := _file_name(name, part)) not in digests:
-            _keep(folder, file, _packed(compile_for(_of_part(sources, part), PLATFORMS[name])), digests)
-            (folder / _BEGUN).write_text(json.dumps({"key": key, "files": digests}), encoding="utf-8")
+            _keep(folder, file, _deflate(compile_for(_of_part(sources, part), PLATFORMS[name])), digests)
+            (folder / _PROGRESS_FILE).write_text(json.dumps({"key": key, "files": digests}), encoding="utf-8")
     _keep(folder, GENERATED, sources.files[GENERATED].encode(), digests)
     manifest = {"key": key, "platforms": list(PLATFORMS), "files": digests, "refused": sources.refused}
     for path in folder.iterdir():  # of another version
         if path.name not in digests and path.is_file():
             path.unlink()
-    (folder / _MANIFEST).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    (folder / _MANIFEST_FILE).write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
     return _read(folder, manifest)
 
 
@@ -156,20 +155,20 @@ def _keep(folder: Path, name: str, data: bytes, digests: dict[str, str]) -> None
     digests[name] = hashlib.sha256(data).hexdigest()
 
 
-def _begun(folder: Path, key: str) -> dict[str, str]:
-    """Return the files, with their digests, that an earlier call left behind whole and for the same sources."""
+def _finished_files(folder: Path, key: str) -> dict[str, str]:
+    """Return the files with their digests that an interrupted call completed for the same sources."""
     try:
-        begun = json.loads((folder / _BEGUN).read_text(encoding="utf-8"))
+        begun = json.loads((folder / _PROGRESS_FILE).read_text(encoding="utf-8"))
         files = begun["files"] if begun["key"] == key else {}
         return {n: d for n, d in files.items() if hashlib.sha256((folder / n).read_bytes()).hexdigest() == d}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 
-def _packed(data: bytes) -> bytes:
-    """Return a deflate stream: zopfli needs a second for a library and saves 4 % of every FMU that is ever made."""
+def _deflate(data: bytes) -> bytes:
+    """Return a deflate stream; zopfli takes a second for a library and makes every FMU 4 % smaller."""
     if find_spec("zopfli") is None:
-        return deflated(data)
+        return deflate(data)
     from zopfli import zlib as zopfli  # pyright: ignore[reportMissingImports]  (of the group native alone)
 
     return zopfli.compress(data)[2:-4]  # without zlib's head and checksum
@@ -188,7 +187,7 @@ def _local_library(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool =
     if not refused.is_file():
         sources = c_sources(modules, sensitivities=sensitivities)
         folder.mkdir(parents=True, exist_ok=True)
-        # The last one is the sign that all are there.
+        # The last file marks that all are complete.
         for path, data in (
             (library, compile_here(sources, compiler) if compiler else compile_for(sources, machine)),
             (generated, sources.files[GENERATED].encode()),
@@ -210,7 +209,7 @@ def _cache_folder() -> Path:
 
 
 def _manifest(folder: Path) -> dict | None:
-    path = folder / _MANIFEST
+    path = folder / _MANIFEST_FILE
     if not path.is_file():
         return None
     try:

@@ -1,6 +1,6 @@
-"""`resources/model.bin`: what the library reads; `c/sn_model.h` is the other side of it, and checks every length.
+"""`resources/model.bin`: the model file of the compiled library; `c/sn_model.h` reads it and checks every length.
 
-Little-endian as all five platforms are. Head (32 bytes): magic, format, byte-order mark, length, CRC-32 of the rest.
+Little-endian, as are all five platforms. Head (32 bytes): magic, format, byte-order mark, length, CRC-32 of the rest.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from softneck.runtime._own import PREFIX
 
 from .translate._kinds import is_known, module_of, ranks_of
 
-_MAGIC = b"SNMODEL\0"
+_MAGIC_BYTES = b"SNMODEL\0"
 FORMAT = 2
-_MARK = 0x01020304
-_HEAD = 32
+_BYTE_ORDER_MARK = 0x01020304
+_HEAD_BYTES = 32
 _BOOLEAN, _MISSING, _INTEGER = 1, 2, 4
 
 
@@ -35,15 +35,15 @@ class Node:
 
     @property
     def modules(self) -> set[str]:
-        """The modules of this node and all below."""
+        """The modules of this node and its members."""
         return {self.module}.union(*(member.modules for member in self.members))
 
 
 def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
-    """Return the tree that runtime name `outer(inner:11,other:13)` and its arrays stand for.
+    """Return the tree for the runtime name `outer(inner:11,other:13)` and its arrays.
 
     Raises:
-        SettingsError: a runtime that is not in the table, or arrays of other ranks than those there.
+        SettingsError: a runtime that is not in the table, or arrays of other ranks than declared.
     """
     outer, _, inner = runtime.partition("(")
     pairs = [part.rpartition(":") for part in split_members(inner[:-1])] if inner else []
@@ -73,32 +73,32 @@ def node_of(runtime: str, arrays: tuple[Matrix, ...]) -> Node:
 
 
 def model_bytes(block: Block, name: str, guid: str, *, ahead: int = 0) -> bytes:
-    """Return the file of `block`; `guid` is what hosts hand over to show that description and model belong together.
+    """Return the model file of `block`; by `guid` the library checks that it belongs to the model description.
 
-    The last `ahead` outputs are the first ones as they will be at the next sample.
+    The last `ahead` outputs are the first outputs at the next sample.
 
     Raises:
-        SettingsError: the library does not know the block's kind.
+        SettingsError: the block's kind is not in the library.
     """
     writer = _Writer()
     writer.text(name)
     writer.text(guid)
     writer.plain("<d", float(block.sample_time))
     ports = (block.inputs, block.outputs, block.parameters)
-    # A reference steps like a plant: sample k gives what is read at k + 1.
+    # A reference steps like a plant: sample k gives the outputs at k + 1.
     writer.plain("<5I", block.role in ("plant", "reference"), *map(len, ports), ahead)
     for port in (port for group in ports for port in group):
         writer.port(port)
     writer.node(node_of(block.runtime, block.arrays))
     body = b"".join(writer.parts)
-    head = _MAGIC + struct.pack("<IIQII", FORMAT, _MARK, _HEAD + len(body), zlib.crc32(body), 0)
+    head = _MAGIC_BYTES + struct.pack("<IIQII", FORMAT, _BYTE_ORDER_MARK, _HEAD_BYTES + len(body), zlib.crc32(body), 0)
     return head + body
 
 
 class _Writer:
     def __init__(self) -> None:
         self.parts: list[bytes] = []
-        self._size = _HEAD
+        self._size = _HEAD_BYTES
 
     def add(self, data: bytes) -> None:
         """Append bytes."""

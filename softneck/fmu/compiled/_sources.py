@@ -1,4 +1,4 @@
-"""The C sources: those written by hand in `c/`, and `sn_kinds.h`, translated from the runtimes."""
+"""C sources of the library: written by hand in `c/`, and `sn_kinds.h`, translated from the runtimes."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from .translate._scope import TranslationError
 from .translate._translate import Unit
 
 HERE = Path(__file__).parent
-# Floating point as it stands there, on every platform: no fused multiply-add, no errno, no traps.
+# Floating point exactly as written, on every platform: no fused multiply-add, no errno, no traps.
 FLAGS = (
     "-std=c99", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-fvisibility=hidden",
     "-ffunction-sections", "-fdata-sections",
 )  # fmt: skip
 MAIN = "softneck.c"
 GENERATED = "sn_kinds.h"
-PROBE = "sn_probe.h"  # for zig and Windows alone
+PROBE = "sn_probe.h"  # only for zig and Windows
 
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Everything that a C compiler needs.
+    """Input of a C compiler.
 
     Attributes:
         files: name -> text, `softneck.c` includes all others.
-        refused: runtime module -> why it is not in there.
+        refused: runtime module that could not be translated -> the reason.
     """
 
     files: dict[str, str]
@@ -38,9 +38,9 @@ class Sources:
 
 
 def c_sources(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> Sources:
-    """Return the C sources of the library, or of one of other runtime `modules`, translated now.
+    """Translate the runtime `modules` and return the C sources of their library.
 
-    With `sensitivities` the kinds hold the derivatives of their steps; those that have none are refused.
+    With `sensitivities` the derivatives of the steps are included; kinds without derivative are refused.
     """
     unit, refused = Unit(), {}
     for module in modules:
@@ -55,13 +55,13 @@ def c_sources(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = Fals
 
 @cache
 def sources_key(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> str:
-    """Return a digest of all that the library is made of: runtimes, translator, sources written by hand, flags.
+    """Return a digest of all inputs of the library: runtimes, translator, sources written by hand, flags.
 
-    Far faster than translating: it tells whether a library that is there is still the right one.
+    Much faster than translating; a library with another digest is out of date.
     """
     texts = [bundle(module, loops=False) for module in modules]
     digest = hashlib.sha256(repr((FLAGS, [ranks_of(module) for module in modules], texts)).encode())
-    # By name: a wheel has the packages in other folders than a checkout. By content where a name is there twice.
+    # Sorted by name, as a wheel has other folders than a checkout; equal names are sorted by content.
     paths = [*HERE.rglob("*.py"), *(HERE / "c").glob("*.[ch]")]
     if sensitivities:
         paths += Path(_tangent.__file__).parent.glob("_tangent*.py")

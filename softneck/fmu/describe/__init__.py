@@ -1,5 +1,5 @@
-"""What an FMU tells tools and people: model description, documentation, icon, response.
+"""Model description, documentation and terminals of an FMU.
 
 The same for both backends.
-May import what makes blocks; knows no backend.
+May import the subpackages that make blocks, but no backend.
 """

@@ -1,4 +1,4 @@
-"""What an FMU tells people about the model, observer, controller or neck inside it."""
+"""Documentation of an FMU: texts on the model, observer, controller or neck inside it."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class FmuInfo:
         license: SPDX name, "" for none.
         version: of the model, "" for none.
         copyright: one line, "" for none.
-        documentation: HTML that goes into the body of `documentation/index.html`: how the model was
-            identified, its scores, what it is not good for.
+        documentation: HTML for the body of `documentation/index.html`: how the model was identified, its scores, its
+            limits.
         stop_time: of the default experiment [s].
-        robot: name and hash of another robot than the neck, for loops to refuse parts of two.
+        robot: name and hash of the robot unless it is the neck; loops refuse parts of different robots.
     """
 
     description: str = ""
@@ -44,29 +44,29 @@ class FmuInfo:
     copyright: str = ""
     documentation: str = ""
     stop_time: float = 10.0
-    robot: tuple[str, str] | None = field(default=None, repr=False)  # which an FMU's GUID is made of
+    robot: tuple[str, str] | None = field(default=None, repr=False)  # `repr` is part of the GUID
 
 
-# What the slave's syntax needs.
+# Required by the slave's syntax.
 MINIMUM_PYTHON = (3, 11)
 HOST_NEEDS = (
-    f"The host needs Python {'.'.join(map(str, MINIMUM_PYTHON))} or newer with numpy (nothing of softneck); "
-    "a host that is not a Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH, and is better "
-    "served by an FMU of `softneck fmu --backend compiled`, which needs no Python."
+    f"The host needs Python {'.'.join(map(str, MINIMUM_PYTHON))} or newer with numpy (not softneck). A host that is "
+    "not a Python program finds it through LD_PRELOAD=libpython3.x.so and PYTHONPATH; better use an FMU of "
+    "`softneck fmu --backend compiled`, which needs no Python."
 )
-_NUMBA = (
+_NUMBA_NOTE = (
     "Where the host has numba too, a runtime that is slow in plain Python is compiled or taken from softneck's cache; "
-    "the environment variable SOFTNECK_FMU_NUMBA=0 leaves that out, =1 always does it."
+    "the environment variable SOFTNECK_FMU_NUMBA=0 disables this, =1 enforces it."
 )
-_PATHS = (
+_PATHS_NOTE = (
     "pythonfmu's binary decodes only %20 in the path it is unpacked to: keep +, #, %, parentheses and "
     "letters beyond ASCII out of it (softneck's own tools do)."
 )
 _TIMING = {
-    "plant": "Inputs are read at the sample instants and held; the outputs they cause show one sample later.",
-    "other": "Inputs are read at the sample instants; the outputs show at once and are held.",
+    "plant": "Inputs are read at the sample instants and held; outputs change one sample later.",
+    "other": "Inputs are read at the sample instants; outputs change at once and are held.",
 }
-_STYLE = (
+_PAGE_STYLE = (
     "body{font:15px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
     "pre{overflow:auto}"
     "table{border-collapse:collapse}td,th{border:1px solid #bbb;padding:.2em .6em;text-align:left}"
@@ -79,21 +79,21 @@ def documentation_page(name: str, block: Block, info: FmuInfo, host: str = "") -
     Args:
         name: of the model.
         block: with its outputs of the next sample.
-        info: what the FMU says about itself.
-        host: what the host needs; "" for Python.
+        info: texts of the FMU.
+        host: requirements of the host; "" for Python.
     """
     title = escape(info.description or f"{block.kind} ({block.role})")
     timing = _TIMING["plant" if block.role == "plant" else "other"]
     parts = [
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(name)}</title>',
-        f"<style>{_STYLE}</style></head><body>",
+        f"<style>{_PAGE_STYLE}</style></head><body>",
         f"<h1>{escape(name)}</h1><p>{title}</p>",
         info.documentation,
         "<h2>Variables</h2>",
         _table(block),
         f"<h2>Timing</h2><p>Internal sample time {block.sample_time:g} s; any communication step is legal.",
         f"{timing}</p>",
-        f"<h2>Host</h2><p>{escape(host or f'{HOST_NEEDS} {_NUMBA} {_PATHS}')}</p>",
+        f"<h2>Host</h2><p>{escape(host or f'{HOST_NEEDS} {_NUMBA_NOTE} {_PATHS_NOTE}')}</p>",
         '<p>Licences: <a href="licenses/">licenses/</a>. '
         f"{escape(' · '.join(text for text in (info.author, info.copyright, info.license) if text))}</p>",
         "</body></html>\n",
@@ -126,30 +126,30 @@ _HEADINGS = {
     "plant": "How it was identified",
     "observer": "How it was designed",
     "controller": "How it was designed",
-    "reference": "What it gives",
+    "reference": "The reference",
 }
 
 _LIMITS = {
     "plant": (
-        "An identified plant is good where its training data were: other payloads, other tendons and slower or wilder "
-        "motions than those recorded are guesses. In free run an error stays; nothing pulls it back."
+        "An identified plant is valid within its training data: other payloads, other tendons and slower or faster "
+        "motions are extrapolation. In simulation (free run) its errors are not corrected by measurements."
     ),
-    "observer": "It assumes the linear plant it was designed on; far from there its innovation says so.",
-    "controller": "It was designed on a linear plant; verify the loop on the virtual neck before it moves hardware.",
+    "observer": "It assumes the linear plant of its design; far from there its innovation is large.",
+    "controller": "It was designed on a linear plant; verify the loop on the virtual neck before using it on hardware.",
 }
 _KIND_LIMITS = {
     "virtual_neck": (
-        "It stands in for a neck that was never weighed: its parameters are the paper's or yours, its friction and its "
-        "link are simple. What holds on it has yet to hold on hardware."
+        "It is a simple model: its parameters are the paper's or yours and were not measured, its friction and its "
+        "link are simplified. Results on it must be confirmed on hardware."
     ),
 }
 
 
 class Buildable(Protocol):
-    """Anything an FMU is made of."""
+    """An object that can be exported as an FMU."""
 
     def block(self) -> Block:
-        """Return the block that steps."""
+        """Return the block to export."""
         ...
 
     def summary(self) -> str:
@@ -158,11 +158,11 @@ class Buildable(Protocol):
 
 
 def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot | None = None) -> Any:
-    """Return what has a block, or what its file or preset stands for: a softneck file, a neck or a robot.
+    """Return the object with a block: itself, or read from a softneck file, a neck or robot file, or a preset.
 
     Raises:
-        FileFormatError: a file of which nothing is stepped.
-        SettingsError: no file, no preset and nothing with a block.
+        FileFormatError: a file without a block.
+        SettingsError: not a file, a preset or an object with a block.
     """
     thing = own_controller(thing)
     if not isinstance(thing, str | Path):
@@ -175,7 +175,7 @@ def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot |
     if path.suffix == ".npz":
         found = opened(path, robot=robot)
         if not hasattr(found, "block"):
-            raise FileFormatError(f"{path}: is not a model, observer or controller: nothing in it can be stepped.")
+            raise FileFormatError(f"{path}: is not a model, observer or controller.")
         return found
     if path.suffix not in ("", ".toml"):
         raise FileFormatError(
@@ -200,23 +200,23 @@ def has_keys(path: Path, keys: set[str]) -> bool:
 
 
 def block_and_info(thing: Buildable | Block | str | Path, info: FmuInfo | None) -> tuple[Block, FmuInfo]:
-    """Return what is packaged, and what its FMU says of it where nobody says otherwise."""
+    """Return the block to export and the texts of its FMU: `info`, or those of `fmu_info`."""
     found = buildable(thing)
     if isinstance(found, Block):
         return found, info or FmuInfo()
-    # A block alone has no summary, and says nothing.
+    # A block alone has no summary.
     return found.block(), info or (fmu_info(found) if hasattr(found, "summary") else FmuInfo())
 
 
 def fmu_info(
     thing: Buildable, *, scores: str = "", validation: Validation | None = None, stop_time: float = 10.0
 ) -> FmuInfo:
-    """Return the texts of an FMU of `thing`: how it was made, its scores and what it is not good for.
+    """Return the texts of an FMU of `thing`: its origin, scores and limits.
 
     Args:
         thing: model, observer, controller or neck.
-        scores: what was scored, as plain text.
-        validation: of a model on data it was not trained on; its fits are shown.
+        scores: as plain text.
+        validation: of a model on data that it was not trained on; its fits are included.
         stop_time: of the default experiment [s].
     """
     block = thing.block()
@@ -236,7 +236,7 @@ def fmu_info(
     robot: Any = getattr(thing, "robot", None)
     limits = _KIND_LIMITS.get(block.kind, _LIMITS.get(block.role, ""))
     if limits:
-        parts.append(f"<h2>What it is not good for</h2><p>{limits}</p>")
+        parts.append(f"<h2>Limits of use</h2><p>{limits}</p>")
     return FmuInfo(
         description=summary.splitlines()[0] if summary else block.kind,
         author="softneck",
@@ -252,12 +252,12 @@ def _fits(validation: Validation) -> str:
     for name, scores in (("persistence", validation.persistence), ("this model", validation.fits)):
         for horizon, fit in scores.items():
             cells = "".join(f"<td>{_percent(fit.get(axis))}</td>" for axis in validation.robot.outputs.names)
-            ahead = {"inf": "free run", "1": "one sample ahead"}.get(horizon, f"{horizon} samples ahead")
+            ahead = {"inf": "simulation (free run)", "1": "one sample ahead"}.get(horizon, f"{horizon} samples ahead")
             rows.append(f"<tr><td>{name}</td><td>{ahead}</td>{cells}</tr>")
     head = (
         f"<tr><th></th><th></th>{''.join(f'<th>{escape(axis)}</th>' for axis in validation.robot.outputs.names)}</tr>"
     )
-    diverged = "" if validation.diverged is None else f" Its free run diverged at t = {validation.diverged:g} s."
+    diverged = "" if validation.diverged is None else f" Its simulation diverged at t = {validation.diverged:g} s."
     return (
         f"<p>NRMSE fit in %, on {validation.rows_scored} rows of {escape(validation.data)}; "
         f"{validation.rows_left_out} rows that it was trained on are left out.{diverged}</p>"

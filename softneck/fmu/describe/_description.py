@@ -1,6 +1,6 @@
 """`modelDescription.xml` (FMI 2.0.4, section 2.2; FMI 3.0, section 2.4) and terminals of a block.
 
-Value references count inputs, outputs, parameters, as the slave does; FMI 3.0 has `time` behind them. The members of
+Value references count inputs, outputs, parameters, as in the slave; FMI 3.0 adds `time` at the end. The members of
 terminals have the same names in plants, observers, controllers and references, so that tools connect them by name.
 """
 
@@ -24,80 +24,80 @@ from softneck.runtime import Block, Port
 
 from ._describe import FmuInfo
 
-_RUNTIME = "softneck.fmu.describe._modelled_drives_runtime"
-# Where a neck's controller has its motor positions, and how many; the runtime takes them where nothing else is said.
-_NECK = (5, 3)
+_DRIVES_RUNTIME = "softneck.fmu.describe._modelled_drives_runtime"
+# Index of the first motor position in a neck's controller, and number of motors: the defaults of the runtime.
+_DEFAULT_PORTS = (5, 3)
 
 
 def with_modelled_drives(block: Block) -> Block:
-    """Return a controller with the drives inside and the parameter that says which positions hold; others as they are.
+    """Add a model of the drives to a controller, with a parameter that selects measured or modelled positions.
 
-    No file of a controller knows its drives: they are those of the paper's neck.
+    Other blocks are returned unchanged. A controller's file has no drives, so those of the paper's neck are used.
     """
     inputs, positions = [port.name for port in block.inputs], list(motor_positions(block))
     motors = len(positions)
     first = inputs.index(positions[0]) if positions and positions[0] in inputs else len(inputs)
     if block.role != "controller" or inputs[first : first + motors] != positions or motors != len(block.outputs):
         return block
-    # Drives of another quantity are not the paper's; and a block out of an FMU has them.
+    # Only drives in rad are the paper's; and a block read from an FMU already has them.
     if block.inputs[first].unit != "rad" or USE_MOTOR_POSITIONS in {port.name for port in block.parameters}:
         return block
     neck, Ts = NeckParameters.paper(), block.sample_time
-    # A set-point that is `drive_latency` late acts from the first sample on that is no earlier, and shows one later.
+    # A set-point delayed by `drive_latency` acts from the next sample instant on, and is visible one sample later.
     delay = 1 + math.ceil(neck.drive_latency / Ts - 1e-9)
     drive = [math.exp(-neck.position_gain * Ts), delay, first, motors]
     return replace(
         block,
-        runtime=f"{_RUNTIME}({block.runtime}:{len(block.arrays)})",
-        arrays=(np.array(drive[:2] if (first, motors) == _NECK else drive), *block.arrays),
+        runtime=f"{_DRIVES_RUNTIME}({block.runtime}:{len(block.arrays)})",
+        arrays=(np.array(drive[:2] if (first, motors) == _DEFAULT_PORTS else drive), *block.arrays),
         parameters=(*block.parameters, _parameter(positions)),
     )
 
 
 def motor_positions(block: Block) -> tuple[str, ...]:
-    """Return what the positions of the motors are called that a block moves, or that move it."""
+    """Return the names of the motor positions among the ports of a block."""
     return motor_positions_among([port.name for port in (*block.inputs, *block.outputs)])
 
 
 def _parameter(positions: Sequence[str]) -> Port:
     numbered = positions[0] == "motor_position_1"
-    told = f"motor_position_1..{len(positions)}" if numbered else ", ".join(positions)
+    inputs = f"motor_position_1..{len(positions)}" if numbered else ", ".join(positions)
     return Port(
         name=USE_MOTOR_POSITIONS,
-        description=f"true: the motors are where {told} say; false: a model of the drives inside says it",
+        description=f"true: use the inputs {inputs}; false: use the model of the drives inside",
         boolean=True,
         minimum=0.0,
         maximum=1.0,
     )
 
 
-# Paper, section 3: the neck tilts up to 0.7 rad or so; more in a reference is nearly always degrees.
+# Paper, section 3: the neck tilts up to about 0.7 rad; a larger reference is probably in degrees.
 REFERENCE_LIMIT = 0.8
-_NONE = ("", "1")
-_TIME = "time"
+_NO_UNIT = ("", "1")
+_TIME_NAME = "time"
 # SI unit -> usual display unit, factor to it.
 _SHOWN = {"rad": ("deg", 180.0 / math.pi), "rad/s": ("deg/s", 180.0 / math.pi), "m": ("mm", 1e3)}
 TERMINALS = "terminalsAndIcons/terminalsAndIcons.xml"
 _TERMINALS = {
     "motors": "Set-points and positions of the motors",
-    "angles": "Angles of the platform, and what an observer says of them",
-    "outputs": "Outputs of the robot, and what an observer says of them",
-    "measurement": "What the sensors say",
-    "reference": "Where the platform shall be",
+    "angles": "Angles of the platform and their estimates",
+    "outputs": "Outputs of the robot and their estimates",
+    "measurement": "Measurements of the sensors",
+    "reference": "Reference of the platform",
 }
-# Behind an output's name: what tells that there is one.
-_TOLD = ("_measured", "_reference")
+# Endings of ports by which outputs are recognised.
+_OUTPUT_ENDINGS = ("_measured", "_reference")
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Name, GUID and generation date of one FMU, and what runs in it.
+    """Name, GUID, generation date and build of one FMU.
 
     Attributes:
-        name, guid, date: as FMI means them.
-        tool: what built it; None for pythonfmu.
-        sources: files that a compiler takes to rebuild it; none where Python runs in it.
-        ahead: how many of the last outputs are the first ones at the next sample, with their derivatives.
+        name, guid, date: as in FMI.
+        tool: that built it; None for pythonfmu.
+        sources: files to compile it from; empty for FMUs with Python.
+        ahead: number of outputs at the next sample, with derivatives; they are the last outputs.
     """
 
     name: str
@@ -109,13 +109,13 @@ class Identity:
 
 
 def described_block(block: Block) -> Block:
-    """Return `block` as its FMU holds it: a controller with the drives inside, references with a range."""
+    """Return `block` as in its FMU: controllers with a model of the drives, references with a range."""
     whole = with_modelled_drives(block)
     return replace(whole, inputs=tuple(_with_reference_range(port) for port in whole.inputs))
 
 
 def generation_tool() -> str:
-    """Return the name and version of what builds the FMU."""
+    """Return the names and versions of the tools that build the FMU."""
     return f"softneck {__version__} (PythonFMU {version('pythonfmu')})"
 
 
@@ -123,9 +123,9 @@ def model_description(block: Block, info: FmuInfo, identity: Identity, *, fmi: i
     """Return the XML text of the model description of FMI 2.0 or 3.0.
 
     Raises:
-        SettingsError: two ports of one name, or in FMI 3.0 one that is called `time`.
+        SettingsError: two ports with one name, or in FMI 3.0 a port called `time`.
     """
-    _check_names(block, _TIME if fmi == 3 else "")
+    _check_names(block, _TIME_NAME if fmi == 3 else "")
     root = Element("fmiModelDescription", _head(block, info, identity, fmi))
     _co_simulation(root, block, identity, fmi)
     _unit_definitions(root, block)
@@ -207,7 +207,9 @@ def _unit_definitions(root: Element, block: Block) -> None:
     definitions = SubElement(root, "UnitDefinitions")
     for name in used:
         unit = SubElement(definitions, "Unit", name=name)
-        base = {key: str(power) for key, power in SI_BASES.get(name, {}).items()}  # none of a unit that has only a name
+        base = {
+            key: str(power) for key, power in SI_BASES.get(name, {}).items()
+        }  # empty for a unit without SI base units
         if base:
             SubElement(unit, "BaseUnit", base)
         shown = {_display_unit(port) for port in ports if port.unit == name}
@@ -216,7 +218,7 @@ def _unit_definitions(root: Element, block: Block) -> None:
 
 
 def _annotation(parent: Element, block: Block, info: FmuInfo) -> None:
-    # For our own tools: FMI has no place for the role, nor for "NaN means not measured".
+    # For softneck itself: FMI has no attribute for the role, nor for "NaN means not measured".
     missing = [port.name for port in (*block.inputs, *block.outputs, *block.parameters) if port.missing]
     facts = {"kind": block.kind, "role": block.role, "sampleTime": repr(float(block.sample_time))}
     if info.robot is not None:
@@ -232,7 +234,7 @@ def _variables(root: Element, block: Block, fmi: int) -> None:
             _variable(table, port, causality, reference, fmi)
             reference += 1
     if fmi == 3:
-        head = {"name": _TIME, "valueReference": str(reference), "causality": "independent"}
+        head = {"name": _TIME_NAME, "valueReference": str(reference), "causality": "independent"}
         SubElement(table, "Float64", head | {"variability": "continuous", "description": "Simulation time"})
 
 
@@ -263,9 +265,9 @@ def _structure(root: Element, block: Block, ahead: int, fmi: int) -> None:
     first = 1 if fmi == 2 else 0  # FMI 2.0 counts variables from one, FMI 3.0 has their references
     parameters = [str(n_in + n_out + i + first) for i in range(len(block.parameters))]
     inputs = [str(i + first) for i in range(n_in)]
-    # Outputs change in a communication step alone: an input that is set shows in none before. A master that were told
-    # otherwise would find an algebraic loop between observer and controller. At the start they follow the parameters.
-    # Those of the next sample follow the inputs at once.
+    # Outputs only change in a communication step, so they do not depend on inputs directly. Otherwise a master would
+    # find an algebraic loop between observer and controller. Initial outputs depend on the parameters. Only the outputs
+    # of the next sample depend on the inputs directly.
     for tag, known in (("Output", []), ("InitialUnknown", parameters)):
         group = SubElement(structure, f"{tag}s") if fmi == 2 and n_out else structure
         for i in range(n_out):
@@ -278,7 +280,7 @@ def _structure(root: Element, block: Block, ahead: int, fmi: int) -> None:
 
 
 def _has_unit(port: Port) -> bool:
-    return port.unit not in _NONE and not port.boolean
+    return port.unit not in _NO_UNIT and not port.boolean
 
 
 def _unit_attributes(port: Port) -> dict[str, str]:
@@ -300,7 +302,7 @@ def _start_attribute(port: Port) -> str:
 
 
 def _display_unit(port: Port) -> tuple[str, float]:
-    """Return the unit in which people see a port, and what its values are multiplied by for that."""
+    """Return the display unit of a port and the factor from SI."""
     if port.display_unit:
         return port.display_unit, 1.0 / to_si(port.display_unit)[0]
     return _SHOWN.get(port.unit, (port.unit, 1.0))
@@ -309,7 +311,7 @@ def _display_unit(port: Port) -> tuple[str, float]:
 def terminals(block: Block) -> dict[str, list[str]]:
     """Return terminal -> names of its inputs and outputs, without empty terminals."""
     ports = (*block.inputs, *block.outputs)
-    outputs = {port.name.removesuffix(end) for port in ports for end in _TOLD if port.name.endswith(end)}
+    outputs = {port.name.removesuffix(end) for port in ports for end in _OUTPUT_ENDINGS if port.name.endswith(end)}
     motors = motor_positions(block)
     found = {title: [p.name for p in ports if _terminal_of(p, outputs, motors) == title] for title in _TERMINALS}
     return {title: members for title, members in found.items() if members}
@@ -329,14 +331,14 @@ def _terminal_of(port: Port, outputs: set[str], positions: Collection[str]) -> s
 
 
 def terminals_file(block: Block) -> dict[str, bytes]:
-    """Return the file's name in the FMU and its XML; nothing for a block without terminals."""
+    """Return the terminals' file name in the FMU and its XML; empty for a block without terminals."""
     found = terminals(block)
     if not found:
         return {}
     root = Element("fmiTerminalsAndIcons", fmiVersion="3.0")
     group = SubElement(root, "Terminals")
     for title, members in found.items():
-        # A bus: an observer takes the set-points and leaves the positions.
+        # A bus: an observer may connect the set-points and not the positions.
         head = {"name": title, "matchingRule": "bus", "description": _TERMINALS[title]}
         terminal = SubElement(group, "Terminal", head)
         for name in members:

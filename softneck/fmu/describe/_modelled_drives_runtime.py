@@ -1,12 +1,12 @@
-"""A controller beside a model of its drives, for simulators that do not connect motor positions.
+"""A controller with a model of its drives, for simulators that do not connect motor positions.
 
-Member 0 is the controller. It limits how far its set-points u are ahead of the motors, and its anti-windup follows
-from what that takes away; so it must know where the motors are. Unless the last parameter says that the inputs tell
-it, each is
+Member 0 is the controller. It limits the distance of its set-points u from the motor positions, and its anti-windup
+uses this limit, so it needs the motor positions. If the last parameter does not select the inputs, each position is
+modelled by
 
     m(k+1) = a m(k) + (1 - a) u(k+1-d):
 
-the position loop and the latency of a drive that carries nothing.
+the position loop and the latency of a drive without load.
 """
 
 import numpy as np
@@ -18,17 +18,17 @@ from softneck.runtime._rest_runtime import REST
 
 
 def drives_first(drive: np.ndarray) -> int:
-    """Return where motor positions begin among the inputs: behind a neck's references, angles where none is said."""
+    """Return the index of the first motor position among the inputs; 5, as for a neck, if not given."""
     return int(drive[2]) if drive.shape[0] > 2 else 5
 
 
 def drives_motors(drive: np.ndarray) -> int:
-    """Return the number of motors: a neck's three where none is said."""
+    """Return the number of motors; 3, as for a neck, if not given."""
     return int(drive[3]) if drive.shape[0] > 2 else 3
 
 
 class DrivesArrays(Arrays):
-    """The drives, all alike; the arrays of the controller follow."""
+    """Parameters of the drives, equal for all; the arrays of the controller follow."""
 
     drive = array(
         "numbers", "a, d of m(k+1) = a m(k) + (1 - a) u(k+1-d), d at least 1; first input and motors, if not 5, 3"
@@ -39,7 +39,7 @@ class DrivesArrays(Arrays):
 
 
 class DrivesState(StateVector):
-    """Where the modelled motors are; the controller's state follows."""
+    """State of the modelled drives; the controller's state follows."""
 
     started = cells("", "1 from the first step on")
     m = cells("motors", "modelled motor positions of now [rad]")
@@ -62,10 +62,10 @@ def initialise(p: DrivesArrays, parameters: np.ndarray, x: DrivesState, outputs:
 def step(p: DrivesArrays, parameters: np.ndarray, x: DrivesState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Step the controller, then the drives; ports as of the controller.
 
-    parameters: those of the controller, and whether its motor positions are the inputs (0 or 1).
+    parameters: those of the controller, and whether to use the inputs as motor positions (0 or 1).
     """
     if x.started == 0.0:
-        # Connected positions say where the motors begin; without them it is at rest, 0.
+        # Start at the connected positions; unconnected ones are 0, at rest.
         x.m[:] = inputs[p.first : p.first + p.motors]
         for i in range(p.d):
             x.u[i] = inputs[p.first : p.first + p.motors]

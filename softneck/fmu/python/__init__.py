@@ -1,5 +1,5 @@
-"""FMI 2.0 Co-Simulation FMUs through pythonfmu, and FMUs unpacked where they are safe to run.
+"""FMI 2.0 Co-Simulation FMUs through pythonfmu, and unpacking of FMUs into folders with plain paths.
 
-The slave's text runs inside the host and imports nothing of ours.
+The slave's text runs inside the host and imports no softneck module.
 May import `fmu.describe`.
 """

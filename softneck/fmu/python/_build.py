@@ -1,4 +1,4 @@
-"""A block becomes an FMI 2.0 Co-Simulation FMU through pythonfmu."""
+"""Export of a block as an FMI 2.0 Co-Simulation FMU through pythonfmu."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from ..describe._description import Identity, described_block, generation_tool, 
 from ._module import slave_module
 from ._zip import read_zip, write_zip
 
-_BINARIES = ("binaries/linux64/", "binaries/win64/")
-_ROLES = ("plant", "observer", "controller", "reference")
+_BINARY_FOLDERS = ("binaries/linux64/", "binaries/win64/")
+_KNOWN_ROLES = ("plant", "observer", "controller", "reference")
 
 
 def build_fmu(
@@ -41,13 +41,13 @@ def build_fmu(
 ) -> Path:
     """Write a model, observer, controller or neck as an FMI 2.0 Co-Simulation FMU and return its path.
 
-    The FMU carries the runtime of the block's kind, its arrays and pythonfmu's binaries; it needs Python
+    The FMU contains the runtime of the block's kind, its arrays and pythonfmu's binaries; it needs Python
     and numpy on the host, not softneck. The same block and info give the same bytes.
 
     Args:
-        thing: what to package: itself, its block, its file, or a preset of a neck or robot.
+        thing: a model, observer, controller or neck, its block, its file, or a preset of a neck or robot.
         path: `NAME.fmu`; NAME becomes the model name.
-        info: what the FMU says about itself; what `fmu_info` makes of `thing` if not given.
+        info: texts of the FMU; those of `fmu_info` if not given.
         force: replace an existing file.
 
     Raises:
@@ -76,7 +76,7 @@ def build_fmu(
 
 
 def model_name(path: Path) -> str:
-    """Return the model name that an FMU file's name gives."""
+    """Return the model name from the name of an FMU file."""
     name = path.stem
     if path.suffix != ".fmu":
         raise SettingsError(f"{path}: an FMU's file name must end in `.fmu`.")
@@ -89,9 +89,9 @@ def model_name(path: Path) -> str:
 
 
 def check_block(block: Block) -> None:
-    """Refuse a block that no FMU can be made of."""
-    if block.role not in _ROLES:
-        raise SettingsError(f"{block.kind}: role `{block.role}` must be one of {', '.join(_ROLES)}.")
+    """Raise SettingsError if a block cannot be exported as an FMU."""
+    if block.role not in _KNOWN_ROLES:
+        raise SettingsError(f"{block.kind}: role `{block.role}` must be one of {', '.join(_KNOWN_ROLES)}.")
     for port in (*block.inputs, *block.outputs, *block.parameters):
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", port.name):
             raise SettingsError(f"{block.kind}: `{port.name}` cannot be the name of an FMU variable.")
@@ -116,7 +116,7 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
         **own,
     }
     members = _through_pythonfmu(module.script_name, module.script, resources)
-    missing = [folder for folder in _BINARIES if not any(member.startswith(folder) for member in members)]
+    missing = [folder for folder in _BINARY_FOLDERS if not any(member.startswith(folder) for member in members)]
     if missing:
         raise SettingsError(f"the installed pythonfmu lacks {', '.join(missing)}; install pythonfmu 0.6.9 or newer.")
     members["modelDescription.xml"] = model_description(block, info, Identity(name, guid, generation_date()))
@@ -128,7 +128,7 @@ def _members(block: Block, info: FmuInfo, name: str) -> dict[str, bytes]:
 
 
 def _facts(block: Block, name: str) -> dict[str, Any]:
-    """Return what the slave reads: all of the block but its arrays."""
+    """Return the JSON values that the slave reads: the block without its arrays."""
     return {
         "name": name,
         "kind": block.kind,
@@ -137,7 +137,7 @@ def _facts(block: Block, name: str) -> dict[str, Any]:
         "cost": "own" if PREFIX in block.runtime else plain_cost(block),
         "module_of_runtime": ""
         if PREFIX in block.runtime
-        else block.runtime,  # nothing the slave reads: a compiled FMU can be made of this one
+        else block.runtime,  # not for the slave: by this a compiled FMU can be made of this one
         "shapes": [list(array.shape) for array in block.arrays],
         "inputs": [_port_facts(port) for port in block.inputs],
         "outputs": [_port_facts(port) for port in block.outputs],
@@ -157,7 +157,7 @@ def _port_facts(port: Port) -> dict[str, Any]:
 
 
 def _flat(arrays: tuple[np.ndarray, ...]) -> bytes:
-    """Return all arrays behind each other as one `.npy`: an instance starts ten times as fast as from an `.npz`."""
+    """Return all arrays concatenated in one `.npy`: an instance starts ten times as fast as from an `.npz`."""
     buffer = io.BytesIO()
     flat = np.concatenate([array.ravel() for array in arrays]) if arrays else np.zeros(0)
     np.save(buffer, flat.astype("<f8"), allow_pickle=False)
@@ -172,8 +172,8 @@ def _through_pythonfmu(module: str, source: str, resources: Mapping[str, bytes])
         files = [Path(folder) / name for name in resources]
         for file in files:
             file.write_bytes(resources[file.name])
-        # pythonfmu imports the slave's class and makes it a name in sys.modules; an instance then reads its
-        # resources from pythonfmu's own folder.
+        # pythonfmu imports the slave's class and leaves it in sys.modules; an instance would then read its resources
+        # from pythonfmu's folder.
         with _imports_restored():
             from pythonfmu import FmuBuilder
 
@@ -188,7 +188,7 @@ def _through_pythonfmu(module: str, source: str, resources: Mapping[str, bytes])
 def _imports_restored() -> Iterator[None]:
     path, bytecode, modules = list(sys.path), sys.dont_write_bytecode, set(sys.modules)
     sys.dont_write_bytecode = True
-    # An FMU that ran in this process brought its own pythonfmu, without binaries, and modules that stand on it.
+    # An FMU that ran in this process loaded its own pythonfmu, without binaries, and modules that use it.
     installed, loaded, from_fmus = str(distribution("pythonfmu").locate_file("")), sys.modules.get("pythonfmu"), {}
     if loaded is not None and not str(loaded.__file__).startswith(installed):
         from_fmus = {name: sys.modules.pop(name) for name in modules if name.startswith(("pythonfmu", "softneck_"))}
@@ -207,14 +207,14 @@ def _imports_restored() -> Iterator[None]:
 
 
 def generation_date() -> str:
-    """Return SOURCE_DATE_EPOCH, or the first moment that a zip archive can carry: equal blocks, equal bytes."""
+    """Return SOURCE_DATE_EPOCH, or else the earliest date of a zip archive, so that equal blocks give equal bytes."""
     seconds = os.environ.get("SOURCE_DATE_EPOCH", "")
     moment = datetime.fromtimestamp(int(seconds), UTC) if seconds.isdigit() else datetime(1980, 1, 1, tzinfo=UTC)
     return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def license_text(package: str, stated: str) -> str:
-    """Return what the licence is said to be, and the text of the package's own, which covers its code in the FMU."""
+    """Return the stated licence and the licence text of the package, which covers its code in the FMU."""
     for file in distribution(package).files or []:
         if file.name == "LICENSE":
             text = file.read_text(encoding="utf-8")
@@ -222,12 +222,12 @@ def license_text(package: str, stated: str) -> str:
     return f"{stated}\n\nThe code of {package} in this FMU is under the licence that {package} states.\n".lstrip()
 
 
-# 0.1 us a line and 1 ns a number, about: 15 us and more are middling, 100 us and more are heavy.
+# About 0.1 us for a line and 1 ns for a number: 15 us and more are "middling", 100 us and more are "heavy".
 _MIDDLING_LINES, _HEAVY_LINES, _HEAVY_NUMBERS = 150, 1000, 20_000
 
 
 def plain_cost(block: Block) -> str:
-    """Return "light", "middling" or "heavy": what an FMU of `block` costs where its runtime is not compiled."""
+    """Return "light", "middling" or "heavy": the cost of a step of `block` in plain Python."""
     if sum(array.size for array in block.arrays) > _HEAVY_NUMBERS:
         return "heavy"
     lines = _lines(block)
@@ -235,7 +235,7 @@ def plain_cost(block: Block) -> str:
 
 
 def _lines(block: Block) -> int:
-    """Return the number of lines that one plain step runs through."""
+    """Return the number of lines that one step in plain Python executes."""
     runtime = load_runtime(block.runtime, compiled=False)
     parameters = np.array([port.start for port in block.parameters])
     inputs = np.array([np.nan if port.missing else port.start for port in block.inputs])

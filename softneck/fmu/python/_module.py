@@ -1,7 +1,7 @@
-"""One module out of a kind's runtime and the slave, under a name that its content decides, and a loader for it.
+"""One module of a kind's runtime and the slave, named by a hash of its content, and a script that loads it.
 
-pythonfmu's binary compiles and runs the slave's script anew for every instance and never lets go of its
-names: what it finds there is therefore short, and takes the module from where Python keeps modules.
+pythonfmu's binary compiles and runs the slave's script again for every instance and never releases its names. The
+script is therefore short and imports the module, which Python keeps in `sys.modules`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from softneck.runtime._compile import COMPILE_OPTIONS, compiled_name
 
 from ..describe._describe import MINIMUM_PYTHON
 
-# Stated in the FMU and checked before anything else: old hosts must get past the syntax of this part.
+# Written to the FMU and checked first; its syntax must be valid for old versions of Python.
 _CHECK = f'''"""A softneck FMU: generated, do not edit."""
 import sys
 
@@ -38,25 +38,25 @@ try:
 except ImportError:
     _fmu_refuse("it needs numpy in the Python of this host (" + sys.executable + "); install it there.")
 '''  # noqa: E501
-# The binary (pythonfmu 0.7) gives up a reference to the script's names for every instance that it never took.
-_TAKE = """import ctypes
+# The binary (pythonfmu 0.7) releases, for every instance, a reference to the script's names that it never acquired.
+_SCRIPT_TEMPLATE = """import ctypes
 
 from {name} import SoftneckSlave
 
 ctypes.pythonapi.Py_IncRef(ctypes.py_object(globals()))
 """
-_SLAVE = ("_slave_compiled.py", "_slave_exit.py", "_slave.py")
+_SLAVE_FILES = ("_slave_compiled.py", "_slave_exit.py", "_slave.py")
 
 
 @dataclass(frozen=True, slots=True)
 class SlaveModule:
-    """What an FMU runs.
+    """The Python code of an FMU.
 
     Attributes:
         name, source: of the module with runtime and slave.
-        script_name, script: of what pythonfmu's binary loads for each instance.
-        runtime: name under which softneck and the FMUs keep the compiled runtime.
-        options: numba's, for that.
+        script_name, script: of the script that pythonfmu's binary loads for each instance.
+        runtime: name under which softneck and the FMUs cache the compiled runtime.
+        options: of numba, to compile it.
     """
 
     name: str
@@ -74,7 +74,7 @@ def slave_module(runtime: str) -> SlaveModule:
         SettingsError: the runtime defines a name that the slave uses.
     """
     text = bundle(runtime)
-    files = [Path(_numba_cache.__file__), *(Path(__file__).with_name(name) for name in _SLAVE)]
+    files = [Path(_numba_cache.__file__), *(Path(__file__).with_name(name) for name in _SLAVE_FILES)]
     parts = [file.read_text(encoding="utf-8") for file in files]
     clash = _names(text) & set[str]().union(*map(_names, parts))
     if clash:
@@ -82,7 +82,7 @@ def slave_module(runtime: str) -> SlaveModule:
     border = _constant(parts[1], "_FMU_BORDER")
     source = border + text + border + "\n".join(map(_without_own_imports, parts))
     name = content_name(source)
-    script = f"{_CHECK}{_TAKE.format(name=name)}"
+    script = f"{_CHECK}{_SCRIPT_TEMPLATE.format(name=name)}"
     return SlaveModule(name, source, content_name(script, "softneck_fmu"), script, compiled_name(text), COMPILE_OPTIONS)
 
 
@@ -111,4 +111,4 @@ def _constant(source: str, name: str) -> str:
     for node in ast.parse(source).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == name:
             return str(ast.literal_eval(node.value))
-    raise SettingsError(f"the slave does not say {name}.")
+    raise SettingsError(f"the slave does not define {name}.")

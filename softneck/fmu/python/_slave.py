@@ -1,12 +1,10 @@
-"""The one FMI 2.0 slave: every FMU carries this text behind the runtime of its kind (`_module.py`).
+"""The FMI 2.0 slave of all kinds: every FMU contains this text after the runtime of its kind (`_module.py`).
 
-It knows nothing of kinds: ports, sample time and arrays come from `resources/block.json` and
-`resources/arrays.npy`, the three functions of the runtime from the module it stands in. It must run
-where softneck is not: standard library, numpy and pythonfmu's base class only.
+Ports, sample time and arrays come from `resources/block.json` and `resources/arrays.npy`, the three functions of the
+runtime from the same module. It must run without softneck: standard library, numpy and pythonfmu's base class only.
 
-Timing: sample n is at t_0 + n T_s. It is taken in the communication step that begins at or before it,
-with the inputs held then. A plant's new outputs show when communication reaches sample n + 1, those of
-everything else at once.
+Timing: sample n is at t_0 + n T_s. It is taken in the communication step that begins at or before it, with the inputs
+held then. A plant's new outputs are visible when communication reaches sample n + 1, those of other blocks at once.
 """
 
 import contextvars
@@ -27,7 +25,7 @@ from ._runtime_names import initialise, state_size, step
 from ._slave_compiled import _FMU_SWITCH, _fmu_compiled_step, _fmu_print
 from ._slave_exit import _fmu_release_at_exit
 
-# Share of a sample time: hosts add up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
+# Tolerance as a share of the sample time: hosts sum up their time, and 1e6 steps of 2 ms are off by 1e-7 s at most.
 _FMU_SAME_TIME = 1e-4
 _FMU_MOST_SAMPLES = 1e9
 _FMU_WARNING = 1
@@ -47,7 +45,7 @@ class _FmuMessage:
 
 
 def _fmu_guarded(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Say why a call failed, on stderr and in the FMI log, before the binary turns it into a status."""
+    """Report the reason of a failed call on stderr and in the FMI log; the binary then returns an error status."""
 
     @wraps(method)
     def call(self: "SoftneckSlave", *arguments: Any) -> Any:
@@ -61,14 +59,14 @@ def _fmu_guarded(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _fmu_keep_alive(*things: object) -> None:
-    # On an exception pythonfmu 0.7 releases instance, class and log queue, and releases them again at the
-    # next reset or free: without these references the second call after an error runs on freed memory.
+    # On an exception pythonfmu 0.7 releases instance, class and log queue, and releases them again at the next reset or
+    # free: without these references the second call after an error would use freed memory.
     for thing in things:
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(thing))
 
 
 def _fmu_arrays(path: Path, shapes: list[list[int]]) -> tuple[np.ndarray, ...]:
-    """Return the arrays that stand behind each other in one file."""
+    """Return the arrays that are concatenated in one file."""
     flat = np.load(path, allow_pickle=False).astype(np.float64, copy=False)
     arrays, first = [], 0
     for shape in shapes:
@@ -79,7 +77,7 @@ def _fmu_arrays(path: Path, shapes: list[list[int]]) -> tuple[np.ndarray, ...]:
 
 
 def _fmu_quiet() -> Callable[..., Any]:
-    """Return a way to call plain numpy without its warnings, which are the host's to switch."""
+    """Return a function that calls others with numpy's warnings off, leaving the host's setting alone."""
     if int(np.__version__.split(".")[0]) >= 2:
         # numpy 2 keeps its error state in the context: entering one costs a tenth of `errstate`.
         context = contextvars.copy_context()
@@ -113,7 +111,7 @@ class SoftneckSlave(Fmi2Slave):
         self.start, self.count, self.running, self.stale = 0.0, 0, False, True
         self.stop = math.inf
         self.variables = np.array([port["start"] for port in self.ports], dtype=np.float64)
-        # What nobody connects or sets was not measured.
+        # An input that is neither connected nor set was not measured.
         self.variables[:n_in][[port["missing"] for port in self.facts["inputs"]]] = np.nan
         self.pending = np.zeros(n_out)
         self.memory = np.zeros(state_size(self.arrays))
@@ -131,7 +129,7 @@ class SoftneckSlave(Fmi2Slave):
         return self.queue
 
     def tell(self, status: int, text: str) -> None:
-        """Put `text` into the FMI log and on stderr: hosts show the log only when asked to."""
+        """Write `text` to the FMI log and to stderr, as hosts only show the log on request."""
         self.queue.append(_FmuMessage(status, text))
         _fmu_print(text)
 
@@ -155,7 +153,7 @@ class SoftneckSlave(Fmi2Slave):
 
     @_fmu_guarded
     def enter_initialization_mode(self) -> None:
-        """Nothing to do: outputs follow the parameters until the mode is left."""
+        """Enter the mode in which outputs follow the parameters; no action needed."""
 
     @_fmu_guarded
     def exit_initialization_mode(self) -> None:
@@ -173,14 +171,14 @@ class SoftneckSlave(Fmi2Slave):
             self.stale = False
 
     def _choose(self, *, always: bool) -> None:
-        """Take `step` from numba where that pays, or where it must be (`always`), else as it stands here."""
-        # What numba takes its time for is done now, on copies.
+        """Select the step function: compiled by numba if that is faster overall or `always`, else plain Python."""
+        # Compile now, by a call on copies.
         copies = (self.arrays, self.parameters, self.memory.copy(), np.zeros(self.n_in), self.pending.copy())
         found = _fmu_compiled_step(self.facts, self.folder, copies, always=always)
         self.compiled, self.advance = found is not None, found or step
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Take all samples in [current_time, current_time + step_size); False refuses the step and changes nothing."""
+        """Take all samples in [current_time, current_time + step_size); on False the state is unchanged."""
         try:
             end = current_time + step_size
             refusal = self._refusal(current_time, step_size, end)
@@ -192,18 +190,18 @@ class SoftneckSlave(Fmi2Slave):
             slack = _FMU_SAME_TIME * self.sample_time
             while self.start + self.count * self.sample_time < end - slack:
                 self._take_sample()
-            # A plant's next outputs belong to the next sample: they show when that is reached.
+            # A plant's next outputs are visible when the next sample is reached.
             if self.plant and self.start + self.count * self.sample_time <= end + slack:
                 self.outputs[:] = self.pending
         except BaseException as error:
-            # Not False: that is "discard", the only status of pythonfmu's binary besides "fatal", and hosts cut the
-            # result off there without a word. What was half done must not pass for a step refused.
+            # Not False: pythonfmu's binary returns "discard" then, and hosts end the result there without a message. A
+            # step that failed halfway must not count as refused.
             self._fail(error)
             raise
         return True
 
     def _refusal(self, time: float, size: float, end: float) -> str:
-        """Return why a step to `end` cannot be taken, "" for one that can."""
+        """Return the reason why a step to `end` is not possible; "" if it is."""
         if not self.running:
             return "a step before the initialisation has ended."
         samples = (end - self.start) / self.sample_time - self.count
@@ -251,10 +249,10 @@ class SoftneckSlave(Fmi2Slave):
         """Return values of any variables."""
         self._initialise()
         values = self.variables.tolist()
-        return [self._shown(values[reference], reference) for reference in references]
+        return [self._readable(values[reference], reference) for reference in references]
 
-    def _shown(self, value: float, reference: int) -> float:
-        """Return an input that was never set as its start value: hosts expect a number."""
+    def _readable(self, value: float, reference: int) -> float:
+        """Return the start value for an input that was never set, as hosts expect a number."""
         return self.ports[reference]["start"] if value != value and reference < self.n_in else value
 
     @_fmu_guarded
@@ -267,7 +265,7 @@ class SoftneckSlave(Fmi2Slave):
         port = self.ports[reference]
         if value - value != 0.0 and not (port["missing"] and value != value):
             raise ValueError(f"{port['name']} was set to {value}; it must be finite.")
-        # A limit that a saturating controller works out may miss the stated one by rounding.
+        # The limit that a saturating controller computes may differ from the stated one by rounding.
         slack = 1e-9 * (1.0 + abs(value))
         outside = not port["low"] - slack <= value <= port["high"] + slack and value == value
         if reference < self.n_in:
@@ -286,7 +284,7 @@ class SoftneckSlave(Fmi2Slave):
 
     def _warn_outside(self, port: dict[str, Any], value: float) -> None:
         self.warned.add(port["name"])
-        # A set-point just outside of what was trained is in rad all the same.
+        # A set-point slightly outside the training range is probably in rad all the same.
         far = abs(value) > 2.0 * max(-port["low"], port["high"])
         asked = port["name"].endswith("_reference") or ("_setpoint" in port["name"] and far)
         hint = " Is it in degrees?" if asked and port["unit"] == "rad" else ""
@@ -311,7 +309,7 @@ class SoftneckSlave(Fmi2Slave):
             getattr(self, name)[:] = np.frombuffer(state[name], dtype="<f8")
         self.start, self.count, self.running = state["start"], state["count"], state["running"]
         self.stale = False
-        # Compiled and plain steps differ in the last digit, and a replay must not.
+        # Compiled and plain steps differ in the last digit, but a replay must be equal.
         if self.advance is None or state["compiled"] != self.compiled:
             self._resume(state["compiled"])
 
@@ -338,4 +336,4 @@ class SoftneckSlave(Fmi2Slave):
             plain = json.loads(state.decode())
             return {name: bytes.fromhex(value) if name in _FMU_VECTORS else value for name, value in plain.items()}
         except (ValueError, AttributeError, TypeError):
-            return {}  # refused by name when it is set: there is an instance then that can tell
+            return {}  # `_set_fmu_state` refuses it with a message

@@ -1,8 +1,8 @@
-"""The part of every FMU that takes its `step` from numba where the host has it (docs, how-to, FMUs).
+"""The part of every FMU that compiles its `step` with numba if the host has it (docs, how-to, FMUs).
 
-Where softneck is installed too, it writes the runtime's text to the folder, under the name and with the options, that
-softneck itself uses (`runtime._compile`): what either has compiled, the other finds. Elsewhere FMUs have a folder of
-their own: code that softneck compiled may need its modules. Standard library, numpy and numba only.
+If softneck is installed too, it uses the same cache folder, module names and options as softneck itself
+(`runtime._compile`), so that each finds the code that the other has compiled. Otherwise FMUs have a folder of their
+own, as code that softneck compiled may need its modules. Standard library, numpy and numba only.
 """
 
 import importlib.util
@@ -15,21 +15,20 @@ from typing import Any
 
 from softneck.runtime._numba_cache import compile_without_failing_cache, numba_cache_name
 
-# In the environment of the host: "0" never, "1" always, else by the cost that the FMU states.
+# Environment variable of the host: "0" never, "1" always, else by the cost in the FMU.
 _FMU_SWITCH = "SOFTNECK_FMU_NUMBA"
-# The line before and behind the runtime in the module's text.
+# The line before and after the runtime in the module's text.
 _FMU_BORDER = "# --- runtime ---\n"
 
 
 def _fmu_compiled_step(
     facts: dict[str, Any], folder: str, arguments: tuple[Any, ...], *, always: bool = False
 ) -> Callable[..., None] | None:
-    """Return the compiled `step` of the FMU unpacked in `folder`, or None where plain Python is to run.
+    """Return the compiled `step` of the FMU unpacked in `folder`, or None to run plain Python.
 
-    numba takes its time at the first call, which is made here, with `arguments`.
-
-    A light runtime is not worth numba's start of half a second; a middling one is where it is compiled already;
-    a heavy one is compiled here, once for all FMUs of its kind on this machine.
+    numba compiles at the first call, which is made here, with `arguments`. A light runtime does not justify numba's
+    start of half a second. A middling one does if it is compiled already. A heavy one is compiled here, once for all
+    FMUs of its kind on this machine.
     """
     switch = os.environ.get(_FMU_SWITCH, "")
     wanted = always or switch == "1"
@@ -47,11 +46,11 @@ def _fmu_compiled_step(
                 return None
             if not ready:
                 _fmu_print(
-                    f"{facts['name']}: compiling its runtime, once on this machine; {_FMU_SWITCH}=0 leaves that out."
+                    f"{facts['name']}: compiling its runtime, once on this machine; {_FMU_SWITCH}=0 disables this."
                 )
             found = _fmu_compile(alias, _fmu_cached_text(facts, folder, cache), facts["options"])
         found(*arguments)
-    except Exception as error:  # whatever is wrong with this numba or this disk, plain Python still runs
+    except Exception as error:  # any problem with numba or the disk: plain Python still runs
         _fmu_print(f"{facts['name']}: runs without numba, which failed: {error}")
         return None
     return found
@@ -70,7 +69,7 @@ def _fmu_have(package: str) -> bool:
 
 
 def _fmu_cache_folder() -> Path:
-    """Return where softneck keeps compiled runtimes (the user's cache folder as platformdirs names it)."""
+    """Return softneck's folder of compiled runtimes (in the user's cache folder, as in platformdirs)."""
     if sys.platform == "win32":
         cache = Path(os.environ.get("LOCALAPPDATA") or Path.home(), "softneck", "Cache")
     elif sys.platform == "darwin":

@@ -1,10 +1,9 @@
-"""The part of every FMU that lets go of pythonfmu's binary before the process ends.
+"""The part of every FMU that finalises pythonfmu's binary before the process ends.
 
-The binary (pythonfmu 0.7, Linux) ends twice: at the exit of the process a static destructor frees what it shares
-between instances (where it started Python itself, that ends Python), and its finaliser then counts down in the memory
-that was freed. A host whose heap is busy enough, as it is with numpy, dies of it with SIGABRT ("corrupted unsorted
-chunks"), after all its work is done. Calling the finaliser before that leaves both with nothing to do.
-Standard library only.
+The binary (pythonfmu 0.7, Linux) cleans up twice: at the exit of the process a static destructor frees the data shared
+between instances (and ends Python if the binary started it), and its finaliser then decrements a counter in the freed
+memory. A host with a busy heap, as with numpy, then aborts with SIGABRT ("corrupted unsorted chunks") after all its
+work is done. Calling the finaliser earlier prevents this. Standard library only.
 """
 
 import atexit
@@ -17,14 +16,14 @@ _FMU_RELEASED: set[str] = set()
 
 
 def _fmu_release_at_exit(resources: str) -> None:
-    """Have the binary of the FMU unpacked around `resources` finalised when this process ends."""
+    """Register the finaliser of the FMU's binary beside `resources` to run when this process ends."""
     if sys.platform != "linux":
         return
     for path in Path(resources).parent.glob("binaries/linux64/*.so"):
         if str(path) in _FMU_RELEASED:
             continue
         try:
-            # Never closed: the binary stays loaded until the exit, whatever the host does.
+            # Never closed: the binary stays loaded until the exit.
             finalise = ctypes.CDLL(str(path), mode=os.RTLD_NOLOAD | os.RTLD_NOW).finalizePythonInterpreter
             register = ctypes.CDLL(None).__cxa_atexit
         except (OSError, AttributeError):  # not loaded from here, another pythonfmu, another C library
@@ -33,5 +32,5 @@ def _fmu_release_at_exit(resources: str) -> None:
         _FMU_RELEASED.add(str(path))
         if sys.orig_argv:  # the host is Python itself
             atexit.register(finalise)
-        else:  # The finaliser ends Python: C must call it. C's exit goes backwards, and the destructor came before.
+        else:  # The finaliser ends Python, so C must call it: before the destructor, which was registered earlier.
             register(finalise, None, None)

@@ -1,4 +1,4 @@
-"""FMUs as ZIP archives: bytes that follow from the content alone, and unpacking where they are safe to run.
+"""FMUs as ZIP archives: reproducible writing, and unpacking into folders with plain paths.
 
 pythonfmu's binary decodes only `%20` in the path it gets and crashes the process on `+`, `#`, `%`,
 parentheses or accents in it, so the folder's own path must be plain, whatever the FMU's path is.
@@ -23,14 +23,14 @@ from softneck.core._files import require_file
 # PKWARE's APPNOTE 6.3: local header, entry of the directory, end of the directory.
 _LOCAL, _ENTRY, _END = "<4s5H3L2H", "<4s6H3L5H2L", "<4s4H2LH"
 _VERSION, _UNIX, _UTF8, _STORED, _DEFLATED = 20, 3 << 8, 1 << 11, 0, 8
-# 1980-01-01, the first moment that an entry can carry; rw-r--r-- of a plain file.
+# 1980-01-01, the earliest date of an entry; rights rw-r--r-- of a plain file.
 _TIME, _DATE, _RIGHTS = 0, 33, 0o100644 << 16
-# Measured numbers hardly deflate: a tree of 1,000,000 points loses 11 % in 20 s. Beyond this many bytes they stay as
-# they are; what is beyond the other one needs the 64-bit headers that not every host reads.
-_LARGE, _MOST = 1 << 24, (1 << 32) - 2  # a size of 2^32 - 1 says: see the 64-bit header
+# Measured numbers hardly compress: a tree of 1,000,000 points by 11 % in 20 s. Members beyond the first size [bytes]
+# are stored; beyond the second an archive needs 64-bit headers, which not every host reads.
+_LARGE, _MOST = 1 << 24, (1 << 32) - 2  # a size of 2^32 - 1 refers to the 64-bit header
 
 
-def deflated(data: bytes) -> bytes:
+def deflate(data: bytes) -> bytes:
     """Return `data` as a raw deflate stream."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
     return packer.compress(data) + packer.flush()
@@ -39,19 +39,19 @@ def deflated(data: bytes) -> bytes:
 def write_zip(path: Path, members: Mapping[str, bytes], streams: Mapping[bytes, bytes] | None = None) -> None:
     """Write `members` (archive name -> content) to `path`: sorted, deflated, with fixed times and rights.
 
-    `streams` holds content that was deflated before (by a slower, better packer); zipfile would not take it.
+    `streams` has content that is already deflated (by a slower, better compressor), which zipfile does not accept.
 
     Raises:
         SettingsError: more than 4 GB.
     """
     if sum(map(len, members.values())) > _MOST:
-        raise SettingsError(f"{path.name}: would hold more than 4 GB, which not every host reads; fit fewer points.")
+        raise SettingsError(f"{path.name}: would have more than 4 GB, which not every host reads; fit fewer points.")
     directory, offset = [], 0
     with path.open("wb") as file:
         for name in sorted(members):
             data, title = members[name], name.encode()
             large = len(data) > _LARGE
-            packed = data if large else (streams or {}).get(data) or deflated(data)
+            packed = data if large else (streams or {}).get(data) or deflate(data)
             sizes = (zlib.crc32(data), len(packed), len(data), len(title), 0)
             common = (_VERSION, _UTF8, _STORED if large else _DEFLATED, _TIME, _DATE, *sizes)
             file.write(struct.pack(_LOCAL, b"PK\3\4", *common) + title)
@@ -64,7 +64,7 @@ def write_zip(path: Path, members: Mapping[str, bytes], streams: Mapping[bytes, 
 
 
 def read_zip(path: Path) -> dict[str, bytes]:
-    """Return the files of an archive that we have just written ourselves."""
+    """Return the files of an archive written by softneck itself."""
     with zipfile.ZipFile(path) as archive:
         return {entry.filename: archive.read(entry) for entry in archive.infolist() if not entry.is_dir()}
 
@@ -78,7 +78,7 @@ def unpack(path: str | Path, *, main: str = "modelDescription.xml", what: str = 
     The caller removes the folder.
 
     Raises:
-        FileFormatError: no FMU, or one with members that reach out of the folder or are too large.
+        FileFormatError: not an FMU, or one with members outside the folder or too large.
     """
     source = Path(path)
     require_file(source)
@@ -95,7 +95,7 @@ def unpack(path: str | Path, *, main: str = "modelDescription.xml", what: str = 
         raise
     except OSError as error:
         raise OutputFileError(f"{source}: cannot be unpacked: {error.strerror or error}.") from error
-    except Exception as error:  # zipfile and its decompressors raise whatever damaged bytes lead to
+    except Exception as error:  # damaged bytes raise all kinds of errors in zipfile and its decompressors
         raise FileFormatError(f"{source}: is not {what} or is damaged ({error}).") from error
     return folder
 
@@ -115,7 +115,9 @@ def _check_members(source: Path, archive: zipfile.ZipFile, main: str, what: str)
     for entry in entries:
         name = PurePosixPath(entry.orig_filename)
         if name.is_absolute() or ".." in name.parts or "\\" in entry.orig_filename or ":" in entry.orig_filename:
-            raise FileFormatError(f"{source}: its member `{entry.orig_filename}` reaches out of it; not unpacked.")
+            raise FileFormatError(
+                f"{source}: its member `{entry.orig_filename}` would be outside the folder; not unpacked."
+            )
     if main not in archive.namelist():
         raise FileFormatError(f"{source}: is not {what}: it has no {main}.")
 

@@ -1,5 +1,5 @@
-"""Runtimes to C: types, expressions, statements, calls, and the functions that a kind needs.
+"""Translation of runtimes to C: types, expressions, statements, calls, and the functions of a kind.
 
-An error, never a guess, where the runtime's Python has no C.
+Python without a translation is an error.
 Imports `core` and `runtime` only.
 """

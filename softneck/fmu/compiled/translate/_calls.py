@@ -1,4 +1,4 @@
-"""Calls of numpy, math and Python's own functions in C."""
+"""Translation of calls of numpy, math and Python's built-in functions to C."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Protocol
 
 from ._scope import BOOL, FLOAT, INT, MATRIX, VECTOR, Scalar, Scope, Type, Value, View, length
 
-# numpy's and math's name -> C, of one number.
+# Function of one number in numpy or math -> its name in C.
 _EACH = {
     "sqrt": "sqrt", "sin": "sn_sin", "cos": "sn_cos", "tan": "sn_tan", "tanh": "sn_tanh", "exp": "sn_exp",
     "log": "sn_log", "atan": "sn_atan", "arctan": "sn_atan", "asin": "sn_asin", "arcsin": "sn_asin",
@@ -25,21 +25,21 @@ _MADE = {"empty": 0.0, "zeros": 0.0, "ones": 1.0}
 
 
 class CallContext(Protocol):
-    """What the translation of a call needs of `_expressions.Expressions`."""
+    """The part of `_expressions.Expressions` that the translation of calls uses."""
 
     scope: Scope
 
-    def ordered(self, nodes: list[ast.expr]) -> list[Value]: ...
+    def evaluate_all(self, nodes: list[ast.expr]) -> list[Value]: ...
     def scalar(self, node: ast.expr, kind: Scalar) -> str: ...
     def elementwise(self, node: ast.AST, name: str, left: Value, right: Value) -> Value: ...
     def truth(self, value: Value, node: ast.AST) -> str: ...
-    def room(self, code: str, kind: Type) -> Value: ...
+    def allocate(self, code: str, kind: Type) -> Value: ...
 
 
 def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -> Value:
     """Return the C of `np.NAME(...)` or `math.NAME(...)`."""
     if name in _MADE:
-        return _made(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
+        return _new_array(ex, node, values, whole=_whole(ex, node), value=_MADE[name])
     if isinstance(node, ast.Call) and node.keywords:
         raise ex.scope.fail(node, "keyword arguments are not supported here.")
     kinds = [value.type for value in values]
@@ -55,15 +55,15 @@ def numpy_call(ex: CallContext, node: ast.AST, name: str, values: list[Value]) -
             return _extreme(ex, node, name[:3], values)
         return ex.elementwise(node, f"sn_{name}", *values)
     if name in ("min", "max", "sum") and kinds == [MATRIX]:
-        return Value(_REDUCTIONS[name].format(f"sn_flat(w, {ex.scope.given(values[0])})"), FLOAT)
+        return Value(_REDUCTIONS[name].format(f"sn_flat(w, {ex.scope.argument(values[0])})"), FLOAT)
     if kinds == [VECTOR] and name in _REDUCTIONS:
         return Value(_REDUCTIONS[name].format(values[0].code), FLOAT)
     if kinds == [VECTOR] and name in _ENTRYWISE:
-        return ex.room(f"{_ENTRYWISE[name]}(w, {values[0].code})", VECTOR)
+        return ex.allocate(f"{_ENTRYWISE[name]}(w, {values[0].code})", VECTOR)
     if kinds == [VECTOR] and name == "argsort":
-        return ex.room(f"sn_order(w, {values[0].code})", View(1, True))
+        return ex.allocate(f"sn_order(w, {values[0].code})", View(1, True))
     if kinds == [VECTOR] and name in _LIKE:
-        made = ex.room(f"sn_zeros1(w, {values[0].code}.n)", VECTOR)
+        made = ex.allocate(f"sn_zeros1(w, {values[0].code}.n)", VECTOR)
         if _LIKE[name] == "ones":
             ex.scope.emit(f"sn_fill1({made.code}, 1.0);")
         return made
@@ -78,7 +78,7 @@ def _of_numbers(name: str, codes: list[str], whole: bool) -> Value | None:
     if name in _TESTS:
         return Value("1" if whole else f"{_TESTS[name]}({codes[0]})", BOOL)
     if name in ("floor", "ceil"):
-        # A whole number as math gives it; numpy's floats of them hold the same.
+        # A whole number, as in math; numpy's float has the same value.
         return Value(f"sn_int(w, {name}({codes[0]}))", INT)
     return None
 
@@ -93,24 +93,24 @@ def _whole(ex: CallContext, node: ast.AST) -> bool:
     return whole
 
 
-def _made(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
-    """Return a new array; one that numpy leaves unset is zero here."""
+def _new_array(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, value: float) -> Value:
+    """Return a new array; `np.empty` is filled with zeros."""
     if not isinstance(node, ast.Call) or len(node.args) != 1:
         raise ex.scope.fail(node, "one shape is needed.")
     shape = node.args[0]
     if isinstance(shape, ast.Tuple) and len(shape.elts) == 2 and not whole:
         sizes = [ex.scalar(size, INT) for size in shape.elts]
-        made = ex.room(f"sn_zeros2(w, {sizes[0]}, {sizes[1]})", MATRIX)
+        made = ex.allocate(f"sn_zeros2(w, {sizes[0]}, {sizes[1]})", MATRIX)
         if value:
             ex.scope.emit(f"sn_fill2(&{made.code}, {value});")
         return made
     if isinstance(shape, ast.Tuple) and len(shape.elts) == 3 and not whole and not value:
         sizes = [ex.scalar(size, INT) for size in shape.elts]
-        return ex.room(f"sn_zeros3(w, {', '.join(sizes)})", View(3))
+        return ex.allocate(f"sn_zeros3(w, {', '.join(sizes)})", View(3))
     size = values[0]
     if size.type != INT:
         raise ex.scope.fail(node, "arrays are made with one to three dimensions.")
-    made = ex.room(f"sn_zeros{'_i' if whole else '1'}(w, {size.code})", View(1, whole))
+    made = ex.allocate(f"sn_zeros{'_i' if whole else '1'}(w, {size.code})", View(1, whole))
     if value and whole:
         raise ex.scope.fail(node, "whole numbers are made as zeros.")
     if value:
@@ -120,25 +120,25 @@ def _made(ex: CallContext, node: ast.AST, values: list[Value], *, whole: bool, v
 
 def _dot(ex: CallContext, node: ast.AST, values: list[Value]) -> Value:
     a, b = values
-    codes = f"(w, {ex.scope.given(a)}, {ex.scope.given(b)})"
+    codes = f"(w, {ex.scope.argument(a)}, {ex.scope.argument(b)})"
     if a.type == b.type == VECTOR:
         return Value(f"sn_dot{codes}", FLOAT)
     if a.type == MATRIX and b.type == VECTOR:
-        return ex.room(f"sn_dot_mv{codes}", VECTOR)
+        return ex.allocate(f"sn_dot_mv{codes}", VECTOR)
     if a.type == VECTOR and b.type == MATRIX:
-        return ex.room(f"sn_dot_vm{codes}", VECTOR)
+        return ex.allocate(f"sn_dot_vm{codes}", VECTOR)
     if a.type == b.type == MATRIX:
-        return ex.room(f"sn_dot_mm{codes}", MATRIX)
+        return ex.allocate(f"sn_dot_mm{codes}", MATRIX)
     raise ex.scope.fail(node, "products are supported for vectors and matrices.")
 
 
 def array_of(ex: CallContext, node: ast.Call) -> Value:
     """Return `np.array([a, b, ...])` of numbers."""
     items = node.args[0].elts if len(node.args) == 1 and isinstance(node.args[0], ast.List | ast.Tuple) else []
-    values = ex.ordered(items)
+    values = ex.evaluate_all(items)
     if not items or node.keywords or not all(isinstance(value.type, Scalar) for value in values):
         raise ex.scope.fail(node, "`np.array` is supported for a list of numbers.")
-    made = ex.room(f"sn_zeros1(w, {len(values)})", VECTOR)
+    made = ex.allocate(f"sn_zeros1(w, {len(values)})", VECTOR)
     for i, value in enumerate(values):
         ex.scope.emit(f"*sn_at1(w, {made.code}, {i}) = {ex.scope.cast(value, FLOAT)};")
     return made
@@ -151,18 +151,18 @@ def method(ex: CallContext, node: ast.Call, name: str, base: Value) -> Value:
     if name in ("max", "min", "sum") and not node.args:
         return numpy_call(ex, node, name, [base])
     if name == "copy" and not node.args and base.type.rank < 3:
-        return ex.room(f"sn_copied{base.type.rank}(w, {ex.scope.given(base)})", base.type)
+        return ex.allocate(f"sn_copied{base.type.rank}(w, {ex.scope.argument(base)})", base.type)
     if name in ("ravel", "flatten") and not node.args:
-        return base if base.type == VECTOR else ex.room(f"sn_flat(w, {ex.scope.given(base)})", VECTOR)
+        return base if base.type == VECTOR else ex.allocate(f"sn_flat(w, {ex.scope.argument(base)})", VECTOR)
     if name == "reshape":
         shape = node.args[0] if len(node.args) == 1 else ast.Tuple(node.args)
         sizes = shape.elts if isinstance(shape, ast.Tuple) else [shape]
         codes = [ex.scalar(size, INT) for size in sizes]
-        flat = base.code if base.type == VECTOR else f"sn_flat(w, {ex.scope.given(base)})"
+        flat = base.code if base.type == VECTOR else f"sn_flat(w, {ex.scope.argument(base)})"
         if len(codes) == 2 and base.type.rank < 3:
-            return ex.room(f"sn_shaped(w, {flat}, {codes[0]}, {codes[1]})", MATRIX)
+            return ex.allocate(f"sn_shaped(w, {flat}, {codes[0]}, {codes[1]})", MATRIX)
         if len(codes) == 1 and base.type == MATRIX:
-            return ex.room(flat, VECTOR)
+            return ex.allocate(flat, VECTOR)
     raise ex.scope.fail(node, "this method is not supported.")
 
 
@@ -170,7 +170,7 @@ def plain_call(ex: CallContext, node: ast.Call, name: str) -> Value:
     """Return the C of a call of one of Python's own functions."""
     if node.keywords:
         raise ex.scope.fail(node, "keyword arguments are not supported here.")
-    values = ex.ordered(node.args)
+    values = ex.evaluate_all(node.args)
     kinds = [value.type for value in values]
     if len(values) == 1 and isinstance(kinds[0], Scalar):
         value = values[0]

@@ -1,7 +1,7 @@
-"""Expressions to C.
+"""Translation of expressions to C.
 
-Every result is one term of C or stands in brackets. Python evaluates from left to right and C in no order: whatever
-an operand has to write as statements of its own comes after the operands before it are kept in variables.
+Every result is one term of C or in brackets. Python evaluates from left to right, C in no fixed order: before an
+operand writes statements of its own, the operands before it are stored in variables.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from ._scope import (
     Type,
     Value,
     View,
+    common_type,
     length,
-    unified,
     uniform,
 )
 
@@ -34,38 +34,38 @@ _SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _BITS = {ast.BitXor: "^", ast.BitAnd: "&", ast.BitOr: "|"}
 _CONSTANTS = {"pi": "SN_PI", "inf": "HUGE_VAL", "nan": "sn_from_bits(0x7ff8000000000000u)", "e": "2.718281828459045"}
-# A product of whole numbers up to this factor cannot leave int64: `sn_int` lets none beyond 2^53 in.
+# A product with a factor up to this cannot overflow int64, as `sn_int` limits whole numbers to 2^53.
 _SMALL_FACTOR = 512
 _LARGEST_POWER = 16
 
 
 class Expressions:
-    """Turns expressions of one function into C; `own` translates calls of the runtime's own functions."""
+    """Translator of the expressions of one function; `own` translates calls of the runtime's own functions."""
 
     def __init__(self, scope: Scope, constants: dict[str, ast.expr], own: Callable[..., Value | None]) -> None:
         self.scope, self.constants, self._own = scope, constants, own
 
     def value(self, node: ast.expr) -> Value:
-        """Return the C of an expression; statements that it needs are written before."""
+        """Return the C of an expression, after writing the statements that it needs."""
         handler: Callable[[Any], Value] | None = getattr(self, f"_{type(node).__name__.lower()}", None)
         if handler is None:
             raise self.scope.fail(node, "there is no translation to C for this.")
         return handler(node)
 
-    def ordered(self, nodes: list[ast.expr]) -> list[Value]:
-        """Return several, evaluated from left to right."""
+    def evaluate_all(self, nodes: list[ast.expr]) -> list[Value]:
+        """Return the C of several expressions, evaluated from left to right."""
         values: list[Value] = []
         for node in nodes:
             before = len(self.scope.lines)
             value = self.value(node)
             if len(self.scope.lines) > before and values:
                 written = self.scope.taken_back(before)
-                values = [v if self._fixed(v) else self.scope.kept(v) for v in values]
+                values = [v if self._is_fixed(v) else self.scope.store(v) for v in values]
                 self.scope.lines += written
             values.append(value)
         return values
 
-    def _fixed(self, value: Value) -> bool:
+    def _is_fixed(self, value: Value) -> bool:
         """Return whether later statements of the same expression cannot change a value."""
         return value.known is not None or value.code.isidentifier() or value.code in self.scope.lent.values()
 
@@ -102,13 +102,13 @@ class Expressions:
         if node.attr == "size" and isinstance(base.type, View):
             return Value("(" + " * ".join(length(base.code, base.type, i) for i in range(base.type.rank)) + ")", INT)
         if node.attr == "T" and base.type in (VECTOR, MATRIX):
-            return base if base.type == VECTOR else Value(f"sn_turned({self.scope.given(base)})", MATRIX)
+            return base if base.type == VECTOR else Value(f"sn_turned({self.scope.argument(base)})", MATRIX)
         raise self.scope.fail(node, "this attribute is not supported.")
 
     def _tuple(self, node: ast.Tuple) -> Value:
-        values = self.ordered(node.elts)
+        values = self.evaluate_all(node.elts)
         kind = Bundle(tuple(value.type for value in values))
-        return Value(self.scope.bundled([value.code for value in values], kind), kind)
+        return Value(self.scope.make_tuple([value.code for value in values], kind), kind)
 
     # Operators
 
@@ -118,7 +118,7 @@ class Expressions:
             known = None if value.known is None else not value.known
             return Value(f"(!{self.truth(value, node)})", BOOL, known)
         if isinstance(node.op, ast.USub) and value.type == VECTOR:
-            return self.room(f"sn_negative_v(w, {value.code})", VECTOR)
+            return self.allocate(f"sn_negative_v(w, {value.code})", VECTOR)
         if not isinstance(value.type, Scalar) or isinstance(node.op, ast.Invert):
             raise self.scope.fail(node, "this operator is not supported here.")
         kind = INT if value.type == BOOL else value.type
@@ -129,7 +129,7 @@ class Expressions:
     def _binop(self, node: ast.BinOp) -> Value:
         if isinstance(node.op, ast.Pow):
             return self._power(node)
-        left, right = self.ordered([node.left, node.right])
+        left, right = self.evaluate_all([node.left, node.right])
         return self.binary(node, left, right)
 
     def binary(self, node: ast.AST, left: Value, right: Value) -> Value:
@@ -165,7 +165,7 @@ class Expressions:
         raise self.scope.fail(node, "`//` is supported between whole numbers only.")
 
     def elementwise(self, node: ast.AST, name: str, left: Value, right: Value) -> Value:
-        """Return an operation on each entry of arrays of one shape, or of an array and a number."""
+        """Return an elementwise operation on arrays of one shape, or on an array and a number."""
         letters = ""
         for value in (left, right):
             if value.type not in (VECTOR, MATRIX) and not isinstance(value.type, Scalar):
@@ -173,11 +173,13 @@ class Expressions:
             letters += {VECTOR: "v", MATRIX: "m"}.get(value.type, "s")  # type: ignore[arg-type]
         if letters in ("vm", "mv"):
             raise self.scope.fail(node, "a vector and a matrix cannot have one shape.")
-        a, b = (self.scope.cast(v, FLOAT) if isinstance(v.type, Scalar) else self.scope.given(v) for v in (left, right))
-        return self.room(f"{name}_{letters}(w, {a}, {b})", MATRIX if "m" in letters else VECTOR)
+        a, b = (
+            self.scope.cast(v, FLOAT) if isinstance(v.type, Scalar) else self.scope.argument(v) for v in (left, right)
+        )
+        return self.allocate(f"{name}_{letters}(w, {a}, {b})", MATRIX if "m" in letters else VECTOR)
 
     def _power(self, node: ast.BinOp) -> Value:
-        base, exponent = self.ordered([node.left, node.right])
+        base, exponent = self.evaluate_all([node.left, node.right])
         n = exponent.known
         if not isinstance(base.type, Scalar) or n is None:
             raise self.scope.fail(node, "powers are supported for numbers, with a constant exponent.")
@@ -192,7 +194,7 @@ class Expressions:
     # Truth
 
     def truth(self, value: Value, node: ast.AST) -> str:
-        """Return C that is true where Python takes `value` for true."""
+        """Return C for the truth value of `value` in Python."""
         if value.type == BOOL:
             return value.code
         if not isinstance(value.type, Scalar):
@@ -200,8 +202,8 @@ class Expressions:
         return f"({value.code} != 0)"
 
     def _compare(self, node: ast.Compare) -> Value:
-        values = self.ordered([node.left, *node.comparators])
-        values = [values[0], *(self.scope.kept(v) for v in values[1:-1]), values[-1]]
+        values = self.evaluate_all([node.left, *node.comparators])
+        values = [values[0], *(self.scope.store(v) for v in values[1:-1]), values[-1]]
         parts = []
         for op, left, right in zip(node.ops, values, values[1:], strict=False):
             if type(op) not in _COMPARISONS or not all(isinstance(v.type, Scalar) for v in (left, right)):
@@ -214,7 +216,7 @@ class Expressions:
         sign = "&&" if isinstance(node.op, ast.And) else "||"
         result = self._booleans(node, node.values[0])
         for part in node.values[1:]:
-            with self.scope.captured() as lines:
+            with self.scope.capture() as lines:
                 value = self._booleans(node, part)
             if not lines:
                 result = Value(f"({result.code} {sign} {value.code})", BOOL)
@@ -234,11 +236,11 @@ class Expressions:
 
     def _ifexp(self, node: ast.IfExp) -> Value:
         test = self.truth(self.value(node.test), node)
-        with self.scope.captured() as yes_lines:
+        with self.scope.capture() as yes_lines:
             yes = self.value(node.body)
-        with self.scope.captured() as no_lines:
+        with self.scope.capture() as no_lines:
             no = self.value(node.orelse)
-        kind = unified(yes.type, no.type, self.scope.function)
+        kind = common_type(yes.type, no.type, self.scope.function)
         if not yes_lines and not no_lines and isinstance(kind, Scalar):
             return Value(f"({test} ? {self.scope.cast(yes, kind)} : {self.scope.cast(no, kind)})", kind)
         name = self.scope.temporary(kind)
@@ -282,28 +284,28 @@ class Expressions:
             return Value(base.code + self.scope.types.field(kind, i), kind.items[i])
         if index.type != INT or not uniform(kind) or index.known is not None:
             raise self.scope.fail(node, "this entry of a tuple is not supported.")
-        held = self.scope.kept(base)
-        place = self.scope.kept(index)
+        held = self.scope.store(base)
+        place = self.scope.store(index)
         self.scope.emit(f"if ((uint64_t){place.code} >= {len(kind.items)}u) sn_outside(w);")
         return Value(f"{held.code}.f[{place.code}]", kind.items[0])
 
     def part(self, node: ast.Subscript, base: Value, kind: View) -> Value:
-        """Return an entry, a row or a stretch of an array."""
+        """Return an entry, a row or a slice of an array."""
         places = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if len(places) > kind.rank:
             raise self.scope.fail(node, f"the array has {kind.rank} dimensions.")
         if not any(isinstance(place, ast.Slice) for place in places):
             return self._at(base, kind, places)
         if len(places) == 1 and isinstance(places[0], ast.Slice) and not kind.whole and kind.rank < 3:
-            return self._stretch(node, base, kind, places[0])
+            return self._slice_of(node, base, kind, places[0])
         if len(places) == 2 and kind == MATRIX:
             first, second = places
             if isinstance(first, ast.Slice) and not isinstance(second, ast.Slice):
                 column = Value(f"sn_column2(w, {self.scope.place(base)}, {self.place(second, base, kind, 1)})", VECTOR)
-                return column if _all(first) else self._stretch(node, self.scope.kept(column), VECTOR, first)
+                return column if _all(first) else self._slice_of(node, self.scope.store(column), VECTOR, first)
             if isinstance(second, ast.Slice) and not isinstance(first, ast.Slice):
                 row = Value(f"sn_row2(w, {self.scope.place(base)}, {self.place(first, base, kind, 0)})", VECTOR)
-                return row if _all(second) else self._stretch(node, self.scope.kept(row), VECTOR, second)
+                return row if _all(second) else self._slice_of(node, self.scope.store(row), VECTOR, second)
         raise self.scope.fail(node, "this part of an array is not supported.")
 
     def _at(self, base: Value, kind: View, places: list[ast.expr]) -> Value:
@@ -311,12 +313,12 @@ class Expressions:
             return Value(f"(*sn_at_i(w, {base.code}, {self.place(places[0], base, kind, 0)}))", INT)
         if len(places) == kind.rank:
             indices = ", ".join(self.place(place, base, kind, i) for i, place in enumerate(places))
-            return Value(f"(*sn_at{kind.rank}(w, {self.scope.given(base)}, {indices}))", FLOAT)
+            return Value(f"(*sn_at{kind.rank}(w, {self.scope.argument(base)}, {indices}))", FLOAT)
         rows = base
         for i, place in enumerate(places):
             rank = kind.rank - i
             rows = Value(
-                f"sn_row{rank}(w, {self.scope.given(rows)}, {self.place(place, base, kind, i)})", View(rank - 1)
+                f"sn_row{rank}(w, {self.scope.argument(rows)}, {self.place(place, base, kind, i)})", View(rank - 1)
             )
         return rows
 
@@ -329,16 +331,16 @@ class Expressions:
             return f"({length(base.code, kind, dimension)} - {-index.known})"
         return index.code
 
-    def _stretch(self, node: ast.AST, base: Value, kind: View, cut: ast.Slice) -> Value:
+    def _slice_of(self, node: ast.AST, base: Value, kind: View, cut: ast.Slice) -> Value:
         if cut.step is not None:
             raise self.scope.fail(node, "a slice with a step is not supported.")
         if _all(cut):
             return base
         if not base.code.isidentifier():
-            base = self.scope.kept(base)
+            base = self.scope.store(base)
         low = "0" if cut.lower is None else self.place(cut.lower, base, kind, 0)
         high = length(base.code, kind, 0) if cut.upper is None else self.place(cut.upper, base, kind, 0)
-        return Value(f"sn_cut{'2' if kind.rank == 2 else ''}(w, {self.scope.given(base)}, {low}, {high})", kind)
+        return Value(f"sn_cut{'2' if kind.rank == 2 else ''}(w, {self.scope.argument(base)}, {low}, {high})", kind)
 
     # Calls
 
@@ -348,17 +350,17 @@ class Expressions:
             if isinstance(function.value, ast.Name) and function.value.id in ("np", "math"):
                 if function.attr == "array":
                     return array_of(self, node)
-                return numpy_call(self, node, function.attr, self.ordered(node.args))
+                return numpy_call(self, node, function.attr, self.evaluate_all(node.args))
             return method(self, node, function.attr, self.value(function.value))
         if not isinstance(function, ast.Name):
             raise self.scope.fail(node, "this call is not supported.")
         result = self._own(node, self)
         return plain_call(self, node, function.id) if result is None else result
 
-    def room(self, code: str, kind: Type) -> Value:
-        """Return a new array in a variable of its own: made once, in its turn."""
+    def allocate(self, code: str, kind: Type) -> Value:
+        """Return a new array in a new variable, so that it is made once and in order."""
         self.scope.allocates = True
-        return self.scope.kept(Value(code, kind))
+        return self.scope.store(Value(code, kind))
 
 
 def _all(cut: ast.Slice) -> bool:

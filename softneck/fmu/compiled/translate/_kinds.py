@@ -1,8 +1,7 @@
-"""The runtimes that the library holds.
+"""The runtimes in the compiled library.
 
-The types of a runtime's arrays decide all other types in it; their ranks are those that its module declares. A runtime
-that is not here, or that the translator does not know how to write in C, cannot be in a compiled FMU; `refused` says
-why.
+The types of a runtime's arrays determine all other types in it; their ranks are declared by its module. A runtime that
+is not listed here, or that cannot be translated to C, cannot be in a compiled FMU; `Sources.refused` has the reason.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import re
 from softneck.runtime._bundle import ANY_SIZE, layout_of
 from softneck.runtime._layout import Arrays
 
-_NECKS = (
+_NECK_RUNTIMES = (
     "softneck.identification.linear._rls_runtime",
     "softneck.identification.linear._oe_runtime",
     "softneck.identification.linear._state_space_runtime",
@@ -32,8 +31,8 @@ _NECKS = (
     "softneck.fmu.describe._modelled_drives_runtime",
     "softneck.loop._reference_runtime",
 )
-# Those that robots of other sizes have; once more for all of these, so that the neck's know their sizes beforehand.
-_ROBOTS = (
+# Runtimes for robots of any size, in addition to those above, whose sizes are the neck's and known at compile time.
+_ROBOT_RUNTIMES = (
     "softneck.identification.set_membership._nlsm_runtime",
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.structured._loaded_greybox_runtime",
@@ -48,8 +47,9 @@ _ROBOTS = (
     "softneck.design.predictive._mpc_runtime",
     "softneck.loop._reference_runtime",
 )
-RUNTIMES = (*_NECKS, *(f"{module}@{ANY_SIZE}" for module in _ROBOTS))
-# Its tuples have the robot's sizes: one text for all there is none, and whoever wants one compiles it (see `_library`).
+RUNTIMES = (*_NECK_RUNTIMES, *(f"{module}@{ANY_SIZE}" for module in _ROBOT_RUNTIMES))
+# Its tuples have the robot's sizes, so there is no text for all sizes: each size is compiled on demand (see
+# `_library`).
 _EACH_SIZE = "softneck.plant._neck_runtime"
 _SIZE = re.compile(r"[1-8]x[1-4]")
 
@@ -57,9 +57,9 @@ _SIZE = re.compile(r"[1-8]x[1-4]")
 _SIZED = frozenset(module for module in RUNTIMES if module.endswith(f"@{ANY_SIZE}"))
 _DRIVES = frozenset({"softneck.fmu.describe._modelled_drives_runtime"})
 _CONTROL = _DRIVES | {m for m in RUNTIMES if ".design." in m or "kalman" in m or ".loop." in m}
-# An observer has a model of either size, modelled drives a controller.
+# Observers are in both parts for models, the modelled drives in both parts for controllers.
 _OBSERVERS = frozenset(module for module in RUNTIMES if ".estimation." in module) - _CONTROL
-# Parts of the library: an FMU carries one that holds all its kinds, which weighs half as much as the whole.
+# Parts of the library: an FMU contains the part with all its kinds, half as large as the whole.
 LIBRARIES = {
     "models": frozenset(RUNTIMES) - _CONTROL - _SIZED,
     "control": _CONTROL - _SIZED,
@@ -67,8 +67,8 @@ LIBRARIES = {
     "robot_control": _CONTROL & _SIZED | _DRIVES,
 }
 
-# Which of a step's functions are compiled for speed, all others for size: those with so many loops within each other, 0
-# for all. A search among thousands of points and a quadratic program spend their time in every loop.
+# Functions with at least this many nested loops (0: all functions) are compiled for speed, all others for size. A
+# search among thousands of points and a quadratic program spend their time in every loop.
 FAST = {
     "softneck.identification.linear._rls_runtime": 0,
     "softneck.identification.set_membership._nlsm_runtime": 1,
@@ -80,14 +80,14 @@ FAST = {
 
 
 def module_of(runtime: str) -> str:
-    """Return the module in the library that runs a runtime: its own, or that of all sizes."""
+    """Return the library's module for a runtime: its own, or the one for all sizes."""
     plain, _, size = runtime.partition("@")
     sized = not size or _SIZE.fullmatch(size) is not None  # the name may come from a file
     return f"{plain}@{ANY_SIZE}" if sized and runtime not in RUNTIMES and plain != _EACH_SIZE else runtime
 
 
 def is_known(module: str) -> bool:
-    """Return whether a module is in the library, or can be compiled beside it for a robot of its sizes."""
+    """Return whether a module is in the library, or can be compiled on demand for a robot's sizes."""
     plain, _, size = module.partition("@")
     return module in RUNTIMES or (plain == _EACH_SIZE and _SIZE.fullmatch(size) is not None)
 

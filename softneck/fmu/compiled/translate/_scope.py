@@ -1,4 +1,4 @@
-"""One function on its way to C: types and how C spells them, its variables, and the lines written so far."""
+"""Translation state of one function: types and their C names, variables, and the lines written so far."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from softneck.core import SettingsError
 
 
 class TranslationError(SettingsError):
-    """A runtime uses something that the translator to C does not know."""
+    """A runtime uses a construct without a translation to C."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class Scalar:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """An array of `rank` dimensions; `whole` for one of whole numbers."""
+    """An array of `rank` dimensions; `whole` if of whole numbers."""
 
     rank: int
     whole: bool = False
@@ -46,7 +46,7 @@ class Arrays:
 
 @dataclass(frozen=True, slots=True)
 class Nothing:
-    """What a function without `return` gives."""
+    """The result of a function without `return`."""
 
 
 Type = Scalar | View | Bundle | Arrays | Nothing
@@ -57,7 +57,7 @@ _SCALARS = {"int": "int64_t", "float": "double", "bool": "int"}
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """An expression: its C text and type, and its value where the translator knows that already."""
+    """An expression: its C text and type, and its value if constant."""
 
     code: str
     type: Type
@@ -65,29 +65,29 @@ class Value:
 
 
 def lends(kind: Type) -> bool:
-    """Return whether a parameter is read where the caller keeps it: it is more than two registers hold."""
+    """Return whether a parameter is passed by pointer: it does not fit two registers."""
     return isinstance(kind, Bundle) or (isinstance(kind, View) and kind.rank > 1)
 
 
 def length(code: str, kind: View, dimension: int) -> str:
-    """Return C of the length of an array along one dimension; arrays hold it in 32 bits, all counting is in 64."""
+    """Return C of the length of an array along one dimension; stored in 32 bits, converted to 64."""
     return f"(int64_t){code}.n{'' if kind.rank == 1 else dimension}"
 
 
-def unified(first: Type, second: Type, where: str) -> Type:
-    """Return the type that holds both: whole numbers become floats, all else must be equal."""
+def common_type(first: Type, second: Type, where: str) -> Type:
+    """Return the common type of two: whole numbers become floats, other types must be equal."""
     if first == second:
         return first
     if isinstance(first, Scalar) and isinstance(second, Scalar):
         return FLOAT if FLOAT in (first, second) else INT
     if isinstance(first, Bundle) and isinstance(second, Bundle) and len(first.items) == len(second.items):
         pairs = zip(first.items, second.items, strict=True)
-        return Bundle(tuple(unified(a, b, where) for a, b in pairs))
-    raise TranslationError(f"{where}: one name stands for {first} and for {second}.")
+        return Bundle(tuple(common_type(a, b, where) for a, b in pairs))
+    raise TranslationError(f"{where}: one name has the types {first} and {second}.")
 
 
 class CTypes:
-    """Names of C types; tuples become structs, which are declared on the way."""
+    """Names of C types; tuples become structs, which are declared when first used."""
 
     def __init__(self) -> None:
         self.declarations: list[str] = []
@@ -104,7 +104,7 @@ class CTypes:
         return "void" if isinstance(kind, Nothing) else self._struct(kind)
 
     def field(self, kind: Bundle, index: int) -> str:
-        """Return how entry `index` of a tuple is reached."""
+        """Return the C access to entry `index` of a tuple."""
         return f".f[{index}]" if uniform(kind) else f".f{index}"
 
     def _struct(self, kind: Bundle) -> str:
@@ -121,22 +121,22 @@ class CTypes:
 
 
 def uniform(kind: Bundle) -> bool:
-    """Return whether all entries are of one type, so that a variable may choose among them."""
+    """Return whether all entries have one type, so that a variable index is possible."""
     return len(set(kind.items)) == 1
 
 
-# A variable, an array of the model, or what a parameter points to; and an entry of a tuple in one.
+# A variable, an array of the model, or the target of a pointer parameter; or an entry of a tuple in one of these.
 _PLACE = re.compile(r"(?:[a-z]\w*|\(\*\w+\)|v_\w+->arrays\[\d+\]\.v\d)(?:\.f\d+|\.f\[\d+\])*")
 
 
 class Scope:
-    """What a function translator writes into.
+    """Variables and lines of a function under translation.
 
     Attributes:
         lines: of C.
         variables: name -> type, widened from pass to pass.
-        allocates: whether the function takes room in the workspace.
-        lent: parameter, or a part of one under its own name -> C, for those that are read where the caller keeps them.
+        allocates: whether the function allocates workspace.
+        lent: parameter passed by pointer, or a named part of one -> C.
     """
 
     def __init__(self, function: str, types: CTypes, variables: dict[str, Type]) -> None:
@@ -152,14 +152,14 @@ class Scope:
         self.lines.append(line)
 
     def fail(self, node: ast.AST, text: str) -> TranslationError:
-        """Return the error that says which part of the function cannot be translated."""
+        """Return the error that names the part of the function without translation."""
         shown = ast.unparse(node) if isinstance(node, ast.expr | ast.stmt) else type(node).__name__
         return TranslationError(f"{self.function}: `{shown.splitlines()[0][:80]}`: {text}")
 
     def bind(self, name: str, kind: Type) -> Type:
-        """Give a variable a type that holds `kind` beside what it held before, and return that."""
+        """Widen the type of a variable to include `kind` and return it."""
         before = self.variables.get(name)
-        after = kind if before is None else unified(before, kind, f"{self.function}: `{name}`")
+        after = kind if before is None else common_type(before, kind, f"{self.function}: `{name}`")
         if after != before:
             self.variables[name] = after
             self.widened = True
@@ -171,22 +171,22 @@ class Scope:
         self.temporaries.append((name, kind))
         return name
 
-    def stands(self, value: Value) -> bool:
-        """Return whether `value` has a place that no variable chooses."""
+    def has_place(self, value: Value) -> bool:
+        """Return whether `value` has an address that does not depend on a variable index."""
         return _PLACE.fullmatch(value.code) is not None
 
     def place(self, value: Value) -> str:
-        """Return C of the place where `value` stands."""
-        if self.stands(value):
+        """Return C of the address of `value`; values without one are stored first."""
+        if self.has_place(value):
             return value.code[2:-1] if value.code.startswith("(*") and value.code.endswith(")") else f"&{value.code}"
-        return f"&{self.kept(value).code}"
+        return f"&{self.store(value).code}"
 
-    def given(self, value: Value) -> str:
-        """Return C of an argument: matrices, cubes and tuples are read where they stand, all else is handed over."""
+    def argument(self, value: Value) -> str:
+        """Return C of an argument: matrices, cubes and tuples by address, others by value."""
         return self.place(value) if lends(value.type) else value.code
 
-    def kept(self, value: Value) -> Value:
-        """Return `value` in a variable of its own, evaluated here."""
+    def store(self, value: Value) -> Value:
+        """Evaluate `value` into a new variable and return that; constants stay as they are."""
         if value.known is not None:
             return value
         name = self.temporary(value.type)
@@ -194,8 +194,8 @@ class Scope:
         return Value(name, value.type)
 
     @contextmanager
-    def captured(self) -> Iterator[list[str]]:
-        """Collect lines apart from those written so far."""
+    def capture(self) -> Iterator[list[str]]:
+        """Collect the lines written inside the context separately."""
         outside, self.lines = self.lines, []
         try:
             yield self.lines
@@ -203,13 +203,13 @@ class Scope:
             self.lines = outside
 
     def taken_back(self, before: int) -> list[str]:
-        """Take back the lines written since there were `before` of them, and return them."""
+        """Remove the lines after the first `before` and return them."""
         written = self.lines[before:]
         del self.lines[before:]
         return written
 
     def cast(self, value: Value, kind: Type) -> str:
-        """Return C that turns `value` into `kind`, which holds it."""
+        """Return C that converts `value` to the wider type `kind`."""
         if value.type == kind:
             return value.code
         if isinstance(value.type, Scalar) and isinstance(kind, Scalar):
@@ -220,16 +220,16 @@ class Scope:
             if kind == INT and value.type == BOOL:
                 return f"((int64_t)({value.code}))"
         if isinstance(value.type, Bundle) and isinstance(kind, Bundle):
-            held = self.kept(value)
+            held = self.store(value)
             items = [
                 self.cast(Value(held.code + self.types.field(value.type, i), item), kind.items[i])
                 for i, item in enumerate(value.type.items)
             ]
-            return self.bundled(items, kind)
+            return self.make_tuple(items, kind)
         raise TranslationError(f"{self.function}: {value.type} cannot become {kind}.")
 
-    def bundled(self, items: list[str], kind: Bundle) -> str:
-        """Return C of a tuple, in a variable of its own."""
+    def make_tuple(self, items: list[str], kind: Bundle) -> str:
+        """Return C of a tuple, in a new variable."""
         name = self.temporary(kind)
         for i, item in enumerate(items):
             self.emit(f"{name}{self.types.field(kind, i)} = {item};")

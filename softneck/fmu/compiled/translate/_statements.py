@@ -1,4 +1,4 @@
-"""Statements to C."""
+"""Translation of statements to C."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 from ._expressions import Expressions
-from ._scope import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Scope, Type, Value, View, unified
+from ._scope import FLOAT, INT, MATRIX, NONE, VECTOR, Bundle, Scalar, Scope, Type, Value, View, common_type
 
 
 class Statements:
-    """Writes the statements of one function into its scope.
+    """Translator of the statements of one function into its scope.
 
     Attributes:
-        result: type of what it returns, widened from pass to pass; None before the first `return`.
+        result: type of the result, widened from pass to pass; None before the first `return`.
     """
 
     def __init__(self, function: ast.FunctionDef, scope: Scope, expressions: Expressions, result: Type | None) -> None:
@@ -25,7 +25,7 @@ class Statements:
         self._bound = Counter([name.id for name in names] + [argument.arg for argument in function.args.args])
 
     def block(self, statements: list[ast.stmt]) -> None:
-        """Write statements one after the other."""
+        """Write statements in order."""
         for node in statements:
             handler: Callable[[Any], None] | None = getattr(self, f"_{type(node).__name__.lower()}", None)
             if handler is None:
@@ -58,20 +58,20 @@ class Statements:
     def _return(self, node: ast.Return) -> None:
         constant = isinstance(node.value, ast.Constant) and node.value.value is None
         if node.value is None or constant:
-            self._returned(NONE, node)
+            self._set_result(NONE, node)
             self.scope.emit("goto leave;")
             return
         value = self.ex.value(node.value)
-        kind = self._returned(value.type, node)
+        kind = self._set_result(value.type, node)
         if kind != NONE:
             self.scope.emit(f"result = {self.scope.cast(value, kind)};")
         self.scope.emit("goto leave;")
 
-    def _returned(self, kind: Type, node: ast.AST) -> Type:
+    def _set_result(self, kind: Type, node: ast.AST) -> Type:
         before = self.result
         if before is not None and NONE in (kind, before) and kind != before:
-            raise self.scope.fail(node, "either every `return` gives something or none.")
-        self.result = kind if before is None else unified(before, kind, self.scope.function)
+            raise self.scope.fail(node, "either all `return` statements have a value or none.")
+        self.result = kind if before is None else common_type(before, kind, self.scope.function)
         self.scope.widened |= before is not None and self.result != before
         return self.result
 
@@ -79,8 +79,8 @@ class Statements:
 
     def _assign(self, node: ast.Assign) -> None:
         if len(node.targets) == 1 and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple):
-            # All right sides before any left one; no tuple is made.
-            values = self.ex.ordered(node.value.elts)
+            # All right sides are evaluated before any assignment; no tuple is made.
+            values = self.ex.evaluate_all(node.value.elts)
             if len(values) == len(node.targets[0].elts):
                 held = values if len(values) == 1 else [self._own_copy(value) for value in values]
                 for target, value in zip(node.targets[0].elts, held, strict=True):
@@ -88,12 +88,12 @@ class Statements:
                 return
         value = self.ex.value(_not_copied(node))
         if len(node.targets) > 1:
-            value = self.scope.kept(value)
+            value = self.scope.store(value)
         for target in node.targets:
             self.assign(target, value)
 
     def _own_copy(self, value: Value) -> Value:
-        return value if value.known is not None else self.scope.kept(value)
+        return value if value.known is not None else self.scope.store(value)
 
     def _annassign(self, node: ast.AnnAssign) -> None:
         if node.value is not None:
@@ -102,9 +102,9 @@ class Statements:
     def assign(self, target: ast.expr, value: Value) -> None:
         """Write `target = value`."""
         if value.type == NONE:
-            raise self.scope.fail(target, "there is no value to keep.")
+            raise self.scope.fail(target, "there is no value to assign.")
         if isinstance(target, ast.Name):
-            if isinstance(value.type, Bundle) and self._bound[target.id] == 1 and self._lent(value):
+            if isinstance(value.type, Bundle) and self._bound[target.id] == 1 and self._is_lent(value):
                 self.scope.variables.setdefault(target.id, value.type)
                 self.scope.lent[target.id] = value.code
             elif target.id != "_":
@@ -113,8 +113,8 @@ class Statements:
         elif isinstance(target, ast.Tuple):
             if not isinstance(value.type, Bundle) or len(value.type.items) != len(target.elts):
                 raise self.scope.fail(target, "the tuple has another length.")
-            # What a parameter points to nobody changes meanwhile: it is read where it stands.
-            held = value if self._lent(value) else self.scope.kept(value)
+            # The target of a pointer parameter does not change meanwhile: it is read in place.
+            held = value if self._is_lent(value) else self.scope.store(value)
             for i, (part, kind) in enumerate(zip(target.elts, value.type.items, strict=True)):
                 self.assign(part, Value(held.code + self.scope.types.field(value.type, i), kind))
         elif isinstance(target, ast.Subscript):
@@ -122,17 +122,17 @@ class Statements:
         else:
             raise self.scope.fail(target, "nothing can be assigned to this.")
 
-    def _lent(self, value: Value) -> bool:
-        """Return whether `value` stands in what a parameter points to."""
-        return self.scope.stands(value) and any(value.code.startswith(place) for place in self.scope.lent.values())
+    def _is_lent(self, value: Value) -> bool:
+        """Return whether `value` is in the target of a pointer parameter."""
+        return self.scope.has_place(value) and any(value.code.startswith(place) for place in self.scope.lent.values())
 
     def _store(self, target: ast.Subscript, value: Value) -> None:
-        # Python takes the value before it looks for the place.
+        # Python evaluates the value before the target.
         before = len(self.scope.lines)
         place = self.ex.value(target)
         if len(self.scope.lines) > before and value.known is None:
             written = self.scope.taken_back(before)
-            value = self.scope.kept(value)
+            value = self.scope.store(value)
             self.scope.lines += written
         self.put(target, place, value)
 
@@ -144,11 +144,10 @@ class Statements:
             self.scope.emit(f"{place.code} = {self.scope.cast(value, place.type)};")
         elif place.type in (VECTOR, MATRIX) and isinstance(value.type, Scalar):
             rank = 1 if place.type == VECTOR else 2
-            self.scope.emit(f"sn_fill{rank}({self.scope.given(place)}, {self.scope.cast(value, FLOAT)});")
+            self.scope.emit(f"sn_fill{rank}({self.scope.argument(place)}, {self.scope.cast(value, FLOAT)});")
         elif place.type in (VECTOR, MATRIX) and value.type == place.type:
-            self.scope.emit(
-                f"sn_set{1 if place.type == VECTOR else 2}(w, {self.scope.given(place)}, {self.scope.given(value)});"
-            )
+            rank = 1 if place.type == VECTOR else 2
+            self.scope.emit(f"sn_set{rank}(w, {self.scope.argument(place)}, {self.scope.argument(value)});")
         else:
             raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
 
@@ -157,8 +156,8 @@ class Statements:
         if isinstance(place.type, View):
             self._in_place(node, place)
         elif isinstance(node.target, ast.Subscript):
-            # Python reads the entry before it works out what to add.
-            old = self.scope.kept(place)
+            # Python reads the entry before it evaluates the right side.
+            old = self.scope.store(place)
             self.put(node, place, self.ex.binary(node, old, self.ex.value(node.value)))
         else:
             self.assign(node.target, self.ex.binary(node, place, self.ex.value(node.value)))
@@ -173,14 +172,14 @@ class Statements:
         if not number and value.type != place.type:
             raise self.scope.fail(node, f"{value.type} does not go into {place.type}.")
         letters = {(VECTOR, False): "iv", (VECTOR, True): "is", (MATRIX, False): "im", (MATRIX, True): "ims"}
-        code = self.scope.cast(value, FLOAT) if number else self.scope.given(value)
-        self.scope.emit(f"sn_{name}_{letters[(place.type, number)]}(w, {self.scope.given(place)}, {code});")
+        code = self.scope.cast(value, FLOAT) if number else self.scope.argument(value)
+        self.scope.emit(f"sn_{name}_{letters[(place.type, number)]}(w, {self.scope.argument(place)}, {code});")
 
     # Control
 
     def _if(self, node: ast.If) -> None:
         test = self.ex.value(node.test)
-        if test.known is not None:  # what is left out need not be known in C
+        if test.known is not None:  # the other branch need not have a translation
             self.block(node.body if test.known else node.orelse)
             return
         self.scope.emit(f"if ({self.ex.truth(test, node)}) {{")
@@ -202,14 +201,14 @@ class Statements:
                 self.scope.emit("break;")
             self.scope.emit("sn_rounds(w, 1);")
 
-        self._rounds(node, "for (;;) {", head)
+        self._loop(node, "for (;;) {", head)
 
     def _for(self, node: ast.For) -> None:
         call, target = node.iter, node.target
         plain = isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range"
         if not plain or node.orelse or not isinstance(target, ast.Name) or not isinstance(call, ast.Call):
             raise self.scope.fail(node, "`for NAME in range(...)` is the only loop supported.")
-        borders = self.ex.ordered(call.args)
+        borders = self.ex.evaluate_all(call.args)
         step = borders[2].known if len(borders) == 3 else 1
         if any(border.type != INT for border in borders) or not isinstance(step, int) or step == 0:
             raise self.scope.fail(node, "`range` takes whole numbers, its step a constant.")
@@ -226,12 +225,12 @@ class Statements:
                 kind = self.scope.bind(target.id, INT)
                 self.scope.emit(f"v_{target.id} = {self.scope.cast(Value(counter, INT), kind)};")
 
-        self._rounds(node, f"for (; {counter} {sign} {end}; {counter} += {step}) {{", head)
+        self._loop(node, f"for (; {counter} {sign} {end}; {counter} += {step}) {{", head)
 
-    def _rounds(self, node: ast.For | ast.While, opening: str, head: Callable[[], None]) -> None:
-        """Write a loop; what a round takes of the workspace the next one gets back, unless a name carries it on."""
+    def _loop(self, node: ast.For | ast.While, opening: str, head: Callable[[], None]) -> None:
+        """Write a loop; each iteration releases its workspace, unless a variable carries it on."""
         before, self.scope.allocates = self.scope.allocates, False
-        with self.scope.captured() as lines:
+        with self.scope.capture() as lines:
             head()
             self.block(node.body)
         if self.scope.allocates and not self._carries(node):
@@ -242,7 +241,7 @@ class Statements:
         self.scope.lines += [opening, *lines, "}"]
 
     def _carries(self, node: ast.For | ast.While) -> bool:
-        """Return whether an array bound in the loop may be read in a later round or behind it: not told apart."""
+        """Return whether an array assigned in the loop may be read in a later iteration or after the loop."""
         bound = {
             name.id for part in ast.walk(node) if isinstance(part, ast.Assign | ast.AnnAssign)
             for target in ([part.target] if isinstance(part, ast.AnnAssign) else part.targets)
@@ -261,7 +260,7 @@ def holds_view(kind: Type | None) -> bool:
 
 
 def _not_copied(node: ast.Assign) -> ast.expr:
-    """Return what is assigned; of `a[i:j] = b.copy()` it is `b`, as what writes into a part lets the two overlap."""
+    """Return the assigned expression; `b` for `a[i:j] = b.copy()`, as writing into a slice allows overlap."""
     call, into_part = node.value, len(node.targets) == 1 and isinstance(node.targets[0], ast.Subscript)
     method = call.func if isinstance(call, ast.Call) and not call.args else None
     return method.value if into_part and isinstance(method, ast.Attribute) and method.attr == "copy" else call

@@ -1,7 +1,7 @@
-"""Runtimes in C: each function of a runtime once for each combination of types that it is called with.
+"""Translation of runtimes to C: each function once for each combination of argument types.
 
-numba does the same when it compiles: the types of the arrays decide all others. What is written here is plain C99
-over `sn_base.h` and `sn_vector.h`; whatever is not known there is an error that names function and line, never a guess.
+numba does the same when it compiles: the types of the arrays determine all others. The output is plain C99 that uses
+`sn_base.h` and `sn_vector.h`; a construct without translation is an error that names function and line.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ _MEMBERS = {
     "member_step": (6, NONE, "sn_member_step(w, {})"),
     "member_tangent": (10, NONE, "sn_member_tangent(w, {})"),
 }
-# Functions that C has by hand, several numbers side by side or moved at once: types and result as in Python, bits too.
+# Functions with vectorised C written by hand: types and results as in Python, to the bit.
 _BY_HAND: dict[str, tuple[tuple[Type, ...], Type]] = {
     "slant_descend": ((MATRIX, VECTOR, MATRIX, VECTOR, VECTOR, FLOAT, VECTOR, VECTOR), NONE),
     "narx_push": ((VECTOR, VECTOR), NONE),
 }
-_PASSES = 20
+_MOST_PASSES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class _TranslatedFunction:
-    """A function in C: its name there and what it returns."""
+    """A function in C: its name, the type of its result, and the parameters passed by pointer."""
 
     name: str
     result: Type
@@ -61,7 +61,7 @@ class _TranslatedFunction:
 
 @dataclass(slots=True)
 class Unit:
-    """C of several runtimes; functions that come out equal are written once."""
+    """C of several runtimes; equal functions are written once."""
 
     types: CTypes = field(default_factory=CTypes)
     functions: list[str] = field(default_factory=list)
@@ -74,7 +74,7 @@ class Unit:
         """Add runtime `module`, whose arrays have `ranks`, and with `tangent` the derivative of its step.
 
         Raises:
-            TranslationError: it uses what is not known in C; the unit is as it was before.
+            TranslationError: it has a construct without translation; the unit is unchanged.
         """
         before = (list(self.types.declarations), list(self.functions), dict(self._bodies))
         arrays = Arrays(ranks)
@@ -85,7 +85,9 @@ class Unit:
             start = runtime.function("initialise", (arrays, VECTOR, VECTOR, VECTOR))
             step = runtime.function("step", (arrays, VECTOR, VECTOR, VECTOR, VECTOR))
             if size.result != INT or start.result != NONE or step.result != NONE:
-                raise TranslationError(f"{module}: `state_size` returns a whole number, the others nothing.")
+                raise TranslationError(
+                    f"{module}: `state_size` must return a whole number, the other functions must return None."
+                )
             moved = _tangent_of(runtime, arrays) if tangent else "NULL"
         except (TranslationError, TangentError) as error:
             self.functions, self._bodies = before[1], before[2]
@@ -104,7 +106,7 @@ class Unit:
         """Add the derivative of a runtime's step (see `softneck.runtime._tangent`), and return its name in C.
 
         Raises:
-            TranslationError: it uses what is not known in C.
+            TranslationError: it has a construct without translation.
         """
         runtime = _Runtime(self, with_tangent(bundle(module, loops=False)))
         return _tangent_of(runtime, Arrays(ranks))
@@ -116,21 +118,21 @@ class Unit:
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
-        functions = [_fast(text) if defined(text) in fast else _small(text) for text in self.functions]
+        functions = [_fast(text) if defined_name(text) in fast else _small(text) for text in self.functions]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
 
     def _fast(self) -> set[str]:
-        """Return the functions that are worth their room: loops of the steps that `FAST` names."""
-        pieces = {defined(text): text for text in self.functions}
+        """Return the functions to compile for speed: loops of the steps in `FAST`."""
+        pieces = {defined_name(text): text for text in self.functions}
         depths = {name: nested_loops(text) for name, text in pieces.items()}
         return {
             name
             for module, step in zip(self.names, self.steps, strict=True) if module in FAST
-            for name in reached(pieces, step) if depths[name] >= FAST[module]
+            for name in reachable(pieces, step) if depths[name] >= FAST[module]
         }  # fmt: skip
 
     def keep(self, name: str, text: str) -> str:
-        """Keep a function written under the placeholder @, and return its C name."""
+        """Add a function whose name is the placeholder @, and return its C name."""
         if text not in self._bodies:
             unique = f"{name}_{len(self._bodies)}"
             self._bodies[text] = unique
@@ -139,14 +141,14 @@ class Unit:
 
 
 class _Runtime:
-    """One runtime module on its way to C."""
+    """One runtime module under translation."""
 
     def __init__(self, unit: Unit, text: str) -> None:
         tree = ast.parse(text)
         self.unit = unit
         self.definitions = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
         self.constants = _constants(tree)
-        # C is compiled: loops over branches beat whole arrays.
+        # In compiled code, loops with branches are faster than operations on whole arrays.
         self.constants |= {"COMPILED": ast.Constant(True)} if "COMPILED" in self.constants else {}
         self.has_members = "member_step" in self.definitions
         self._done: dict[tuple[str, tuple[Type, ...]], _TranslatedFunction | None] = {}
@@ -158,22 +160,22 @@ class _Runtime:
             if name not in self.definitions:
                 raise TranslationError(f"there is no function `{name}`.")
             self._done[key] = None
-            self._done[key] = self._written(self.definitions[name], arguments)
+            self._done[key] = self._translate(self.definitions[name], arguments)
         done = self._done[key]
         if done is None:
             raise TranslationError(f"`{name}` calls itself.")
         return done
 
-    def _written(self, node: ast.FunctionDef, arguments: tuple[Type, ...]) -> _TranslatedFunction:
+    def _translate(self, node: ast.FunctionDef, arguments: tuple[Type, ...]) -> _TranslatedFunction:
         names = [argument.arg for argument in node.args.args]
         plain = not (node.args.kwonlyargs or node.args.vararg or node.args.kwarg or node.args.defaults)
         if not plain or len(names) != len(arguments):
-            raise TranslationError(f"`{node.name}` takes plain arguments, all of them given.")
+            raise TranslationError(f"`{node.name}` must be called with all arguments, by position.")
         variables: dict[str, Type] = dict(zip(names, arguments, strict=True))
         bound = {part.id for part in ast.walk(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
         lent = {name: f"(*v_{name})" for name, kind in variables.items() if lends(kind) and name not in bound}
         result: Type | None = None
-        for _ in range(_PASSES):
+        for _ in range(_MOST_PASSES):
             scope = Scope(node.name, self.unit.types, variables)
             scope.lent = lent
             statements = Statements(node, scope, Expressions(scope, self.constants, self._call), result)
@@ -183,7 +185,7 @@ class _Runtime:
             if settled:
                 break
         else:
-            raise TranslationError(f"`{node.name}`: the types of its variables do not settle.")
+            raise TranslationError(f"`{node.name}`: the types of its variables do not converge.")
         result = NONE if result is None else result
         text = self._text(node, names, arguments, scope, result)
         made = self.unit.keep(re.sub(r"\W", "_", node.name), text)
@@ -201,7 +203,7 @@ class _Runtime:
             else f"{spell(kind)} {'a' if name in widened else 'v'}_{name}"
             for name, kind in given.items()
         ]
-        # An array that is returned may lie in the workspace: then the caller gives the room back.
+        # A returned array may be in the workspace: then the caller releases it.
         releases = scope.allocates and not holds_view(result)
         own = [
             (f"v_{name}", kind)
@@ -220,10 +222,10 @@ class _Runtime:
         lines += ["w->top = top;"] if releases else []
         lines += ["return result;"] if result != NONE else []
         head = f"static SN_INSIDE {spell(result)} @({', '.join(['sn_work *w', *declared])})"
-        return f"/* {node.name} */\n{head}\n{{\n{indented(lines)}\n}}\n"
+        return f"/* {node.name} */\n{head}\n{{\n{indent(lines)}\n}}\n"
 
     def _call(self, node: ast.Call, ex: Expressions) -> Value | None:
-        """Return the C of a call of a function of this runtime; None for what is none of its own."""
+        """Return the C of a call of a function of this runtime; None for other functions."""
         name = node.func.id if isinstance(node.func, ast.Name) else ""
         if name == "member_count" and self.has_members:
             arrays = next(key for key, kind in ex.scope.variables.items() if isinstance(kind, Arrays))
@@ -232,20 +234,20 @@ class _Runtime:
             return None
         if node.keywords:
             raise ex.scope.fail(node, "keyword arguments are not supported here.")
-        values = ex.ordered(node.args)
+        values = ex.evaluate_all(node.args)
         if name in _MEMBERS:
             count, kind, code = _MEMBERS[name]
             if len(values) != count:
                 raise ex.scope.fail(node, f"`{name}` takes {count} arguments.")
-            value = Value(code.format(", ".join(map(ex.scope.given, values))), kind)
+            value = Value(code.format(", ".join(map(ex.scope.argument, values))), kind)
         elif name == "tanh_each":
             filled = ex.scope.temporary(values[0].type)
             count = len(values[0].type.items) if isinstance(values[0].type, Bundle) else 0
-            ex.scope.emit(f"sn_tanh_each(w, {count}, ({ex.scope.given(values[0])})->f, {filled}.f);")
+            ex.scope.emit(f"sn_tanh_each(w, {count}, ({ex.scope.argument(values[0])})->f, {filled}.f);")
             return Value(filled, values[0].type)
         elif _BY_HAND.get(name, ((), NONE))[0] == tuple(value.type for value in values):
             kind = _BY_HAND[name][1]
-            arguments = "".join(f", {ex.scope.given(value)}" for value in values)
+            arguments = "".join(f", {ex.scope.argument(value)}" for value in values)
             value = Value(f"sn_{name}(w{arguments})", kind)
         else:
             done = self.function(name, tuple(value.type for value in values))
@@ -258,7 +260,7 @@ class _Runtime:
             ex.scope.emit(f"{value.code};")
             return Value("", NONE)
         ex.scope.allocates |= holds_view(value.type)
-        return ex.scope.kept(value)
+        return ex.scope.store(value)
 
 
 def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
@@ -267,7 +269,7 @@ def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
 
 
 def _fast(text: str) -> str:
-    """Return a function that may stand where it is called, and checks whole numbers where they stand."""
+    """Return a function as inline, with inline checks of whole numbers."""
     return text.replace("sn_int(", "sn_int_here(").replace("\nstatic ", "\nstatic inline ", 1)
 
 
@@ -290,8 +292,8 @@ def _constants(tree: ast.Module) -> dict[str, ast.expr]:
     return found
 
 
-def indented(lines: list[str]) -> str:
-    """Return C statements, each as deep as the brackets that are open before it."""
+def indent(lines: list[str]) -> str:
+    """Return C statements indented by their open brackets."""
     depth, shown = 1, []
     for line in lines:
         shown.append("    " * (depth - line.startswith("}")) + line)
@@ -307,20 +309,20 @@ def _zero(kind: Type) -> str:
 
 @cache
 def along_one(text: str) -> str:
-    """Return the bundle `text` with its `step_tangent` (see `softneck.runtime._tangent`) for one direction alone.
+    """Return the bundle `text` with its `step_tangent` (see `softneck.runtime._tangent`) for a single direction.
 
     Raises:
         TangentError: the step has no derivative.
     """
-    return ast.unparse(ast.fix_missing_locations(_One().visit(ast.parse(with_tangent(text)))))
+    return ast.unparse(ast.fix_missing_locations(_OneDirection().visit(ast.parse(with_tangent(text)))))
 
 
-class _One(ast.NodeTransformer):
+class _OneDirection(ast.NodeTransformer):
     def __init__(self) -> None:
         self._direction = ""
 
     def visit_For(self, node: ast.For) -> ast.AST | list[ast.stmt]:
-        """Return what stands in a loop over directions, and any other loop as it is."""
+        """Return the body of a loop over directions; other loops stay."""
         if ast.unparse(node.iter) != "range(moved)":
             return self.generic_visit(node)
         self._direction = ast.unparse(node.target)
@@ -329,7 +331,7 @@ class _One(ast.NodeTransformer):
         return body
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        """Return the first direction for the one of a loop."""
+        """Replace the loop variable of the directions by 0."""
         return ast.Constant(0) if node.id == self._direction else node
 
 
@@ -339,14 +341,14 @@ _ENTRY = re.compile(r'^    \{"([^"]+)", .*\},\n', re.MULTILINE)
 _COUNT = re.compile(r"(sn_kind_count = )\d+")
 
 
-def defined(piece: str) -> str:
+def defined_name(piece: str) -> str:
     """Return the name of the function or table that a piece of generated C defines; "" for none."""
     found = _DEFINED.search(piece)
     return found[1] if found else ""
 
 
-def reached(pieces: Mapping[str, str], roots: Iterable[str]) -> set[str]:
-    """Return the names of the pieces that `roots` use, directly or through others; all are numbered."""
+def reachable(pieces: Mapping[str, str], roots: Iterable[str]) -> set[str]:
+    """Return the names of the pieces that `roots` use, directly or indirectly; all names are numbered."""
     found: set[str] = set()
     waiting = [name for name in roots if name in pieces]
     while waiting:
@@ -358,7 +360,7 @@ def reached(pieces: Mapping[str, str], roots: Iterable[str]) -> set[str]:
 
 
 def nested_loops(piece: str) -> int:
-    """Return how many loops of a function stand within each other at most; 0 for none."""
+    """Return the depth of nested loops of a function; 0 without loops."""
     depth, most = 0, 0
     open_loops: list[int] = []
     for line in piece.splitlines():
@@ -372,18 +374,18 @@ def nested_loops(piece: str) -> int:
 
 
 def only_kinds(text: str, modules: Set[str]) -> str:
-    """Return `sn_kinds.h` with the runtimes `modules` alone."""
+    """Return `sn_kinds.h` with only the runtimes `modules`."""
     left_out = [entry[0] for entry in _ENTRY.finditer(text) if entry[1] not in modules]
     for entry in left_out:
         text = text.replace(entry, "")
     text = _COUNT.sub(rf"\g<1>{len(_ENTRY.findall(text))}", text)
-    # An empty line stands between two functions, none within one.
+    # Functions are separated by empty lines and contain none.
     pieces = text.split("\n\n")
-    functions = {defined(piece): piece for piece in pieces if _is_function(piece)}
+    functions = {defined_name(piece): piece for piece in pieces if _is_function(piece)}
     roots = [word for entry in _ENTRY.finditer(text) for word in _NUMBERED.findall(entry[0])]
-    needed = reached(functions, roots)
-    return "\n\n".join(piece for piece in pieces if not _is_function(piece) or defined(piece) in needed)
+    needed = reachable(functions, roots)
+    return "\n\n".join(piece for piece in pieces if not _is_function(piece) or defined_name(piece) in needed)
 
 
 def _is_function(piece: str) -> bool:
-    return bool(re.search(r"\d$", defined(piece)))
+    return bool(re.search(r"\d$", defined_name(piece)))
