@@ -8,7 +8,7 @@ import click
 
 from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve
 from softneck.core._kinds import kinds_of
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 
 from .shared._console import note, print_json, progress
 from .shared._groups import kinds_complete
@@ -58,7 +58,7 @@ def command(
     if observer is not None:
         if not hasattr(asked, "over"):
             raise SettingsError(f"`--observer` is for mpc and nmpc, and {kind} does not ask for it; leave it out.")
-        asked = asked.over(opened(observer, "observer", robot))
+        asked = asked.over(load_for_robot(observer, "observer", robot))
     with progress(f"design {kind}", quiet=as_json):
         controller = asked.design(plants[0] if len(plants) == 1 else plants)
     controller.save(path, force=replace)

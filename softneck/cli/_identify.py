@@ -11,7 +11,7 @@ import click
 
 from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, require_positive, resolve
 from softneck.core._kinds import kinds_of
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 
 from ._auto import identify_auto
 from .shared._console import left_out, percent, print_json, progress, useless
@@ -151,7 +151,7 @@ def adapt(
 
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    old = opened(model, "model", robot)
+    old = load_for_robot(model, "model", robot)
     if kind not in (old.kind, "auto"):
         raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; what is refitted stays what it is.")
     window = float(apply_settings(_Adaptation, settings).window)

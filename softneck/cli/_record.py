@@ -11,7 +11,7 @@ import click
 
 from softneck.core import SettingsError, refuse_existing, require_between, require_finite, to_si
 from softneck.robot import Robot, find_robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.signals import (
     Excitation,
     SetPointLimits,
@@ -209,7 +209,7 @@ def _known(source: Path, robot: str | None) -> Known:
     from softneck.identification import Model
     from softneck.identification.selection._experiment_design import Known
 
-    model = opened(source, robot=robot)
+    model = load_for_robot(source, robot=robot)
     if not isinstance(model, Model):
         raise SettingsError(f"{source}: is no model; give one of kind `guarded`.")
     return Known.of_model(model)

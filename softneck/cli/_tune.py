@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import CheckFailedError, file_hash
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, requirements_option
@@ -79,7 +79,7 @@ def command(
     asked = task_of(things, requirements, seed).asked
     if not as_json:
         note("requirements: " + "; ".join(asked.lines()))
-    eyes = None if observer is None else opened(observer, "observer", robot)
+    eyes = None if observer is None else load_for_robot(observer, "observer", robot)
     files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}
     with progress("tune", quiet=as_json) as report:
         found = tune(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 
 from .shared._console import print_json, print_table, progress, useless
 from .shared._options import common_options, tolerance_option
@@ -70,7 +70,7 @@ def command(
     models = tuple(path for path in models if path not in data)
     if not models:
         raise SettingsError("recordings only; expected a model before them: softneck validate MODEL --data REC...")
-    loaded = {str(path): opened(path, "model", robot) for path in models}
+    loaded = {str(path): load_for_robot(path, "model", robot) for path in models}
     recordings = {str(path): read_recording(path, robot=robot) for path in data}
     rules = Rules(horizons, motors, include_training, tolerance=tolerance)
     with progress("validate", quiet=as_json) as report:

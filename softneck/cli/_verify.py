@@ -10,7 +10,7 @@ import click
 from softneck.core import CheckFailedError, file_hash, refuse_existing, write_certificate
 from softneck.core._certificate import CERTIFICATE_ENDING
 from softneck.loop._loop import ORDERS
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, output_option, requirements_option, target
@@ -68,12 +68,15 @@ def command(
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    judged = opened(controller, "controller", robot)
+    judged = load_for_robot(controller, "controller", robot)
     whose = robot_of(judged)
     asked = read_requirements(requirements, robot=whose)
     if left := left_to_tune(asked.own):
         note(f"{requirements}: {', '.join(left)} not looked at; `softneck tune` alone closes those loops.")
-    things, eyes = named_plants(list(plants), robot), None if observer is None else opened(observer, "observer", robot)
+    things, eyes = (
+        named_plants(list(plants), robot),
+        None if observer is None else load_for_robot(observer, "observer", robot),
+    )
     files = {
         "controller": controller,
         **{f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()},

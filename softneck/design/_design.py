@@ -9,7 +9,7 @@ from softneck.core import SettingsError, find_kind, resolve
 from softneck.core._kinds import fitting, make_settings
 from softneck.core._shown import percent
 from softneck.robot import Robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 
 if TYPE_CHECKING:
     from .linear._controller import LinearController
@@ -92,10 +92,10 @@ def linear_plant(thing: Any, *, any_fit: bool, robot: Robot | str | Path | None 
     Raises:
         SettingsError: neither, or a model that does not fit the rows held out (and not `any_fit`).
     """
-    plant = opened(thing, robot=robot)
+    plant = load_for_robot(thing, robot=robot)
     path = str(thing) if isinstance(thing, str | Path) else ""
     if not hasattr(plant, "tf") and not hasattr(plant, "axes"):
-        plant = opened(thing, "model")  # which says what it is
+        plant = load_for_robot(thing, "model")  # which says what it is
     with fitting(path or "the model"):
         held_out = getattr(plant, "findings", {}).get("hold_out", {})
         diverged = held_out.get("diverged") is not None

@@ -9,7 +9,7 @@ from typing import Any
 from softneck.core._kinds import make_settings
 from softneck.identification import Model
 from softneck.robot import Robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.signals import Recording
 from softneck.signals.recording._files import RecordingLike, opened_recording
 
@@ -55,7 +55,7 @@ def observer(
 
 def designed(settings: KalmanSettings, model: Any, robot: Robot | str | Path | None) -> AnyObserver:
     """Return the observer with the levels that its settings, sensor and robot say."""
-    return settings.design(opened(model, None if hasattr(model, "tf") else "model", robot))
+    return settings.design(load_for_robot(model, None if hasattr(model, "tf") else "model", robot))
 
 
 def fitted(made: AnyObserver, recordings: list[Recording], named: Collection[str]) -> FittedObserver:

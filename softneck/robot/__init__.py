@@ -1,6 +1,6 @@
 """The robot: its motors, outputs, directions and limits, read from a `robot.toml`, and the presets.
 
-Names the channels of files; assumes nothing that is not given.
+Defines the names of channels; values that are not given stay None.
 May import `core`.
 """
 

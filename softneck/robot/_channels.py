@@ -1,4 +1,4 @@
-"""Motors and outputs of a robot: what they are called, their units and their limits."""
+"""Motors and outputs of a robot: names, units and limits."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from softneck.core import SettingsError, to_si
 MOST_MOTORS, MOST_OUTPUTS = 8, 4
 _NUMBERED = re.compile(r"motor_(?P<what>setpoint|position|velocity|position_measured)_(?P<motor>[1-8])")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-# What recordings call other things: an output of that name, or one that ends so, could not be told from them.
+# Names and endings of other channels in recordings, which outputs must not have.
 _TAKEN = re.compile(r"(time|run|motor_.*|payload|compression|push_.*|base_tilt_.*|innovation|healthy|enabled|"
                     r"validity|.*_(rate|measured|estimate|reference|lower|upper|start|valid))")  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motors:
-    """The 1 to 8 motors, tendons or chambers that a robot is moved by; limits in `unit`, None where not given.
+    """The 1 to 8 motors, tendons or chambers of a robot; limits in `unit`, None if not given.
 
     Attributes:
         names: `pressure` has the channels `pressure_setpoint`, `pressure_position`, ..; `motor_1` `motor_setpoint_1`.
@@ -26,9 +26,9 @@ class Motors:
         setpoint_min: (motors,) lowest set-points.
         setpoint_max: (motors,) highest set-points.
         rate_limit: (motors,) largest changes of the set-points [`unit`/s].
-        sign: (motors,) -1 where the hardware counts against softneck, whose motors pull where they are positive.
-        nominal: (motors,) a typical set-point, as in FMI, by which motors are scaled; by their range where not given.
-        rest: (motors,) set-points at rest; learned from data where not given.
+        sign: (motors,) -1 if the hardware counts in the opposite direction: in softneck positive motors pull.
+        nominal: (motors,) typical set-points, as in FMI, which scale the motors; if not given, their range does.
+        rest: (motors,) set-points at rest; learned from data if not given.
     """
 
     names: tuple[str, ...]
@@ -61,16 +61,16 @@ class Motors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outputs:
-    """The 1 to 4 measured outputs; limits in `unit`, None where not given.
+    """The 1 to 4 measured outputs; limits in `unit`, None if not given.
 
     Attributes:
-        names: as their channels are called.
+        names: of their channels.
         unit: of `min` and `max`, such as "rad".
-        display_unit: in which files, reports and plots show them, such as "deg".
+        display_unit: unit in files, reports and plots, such as "deg".
         min: (outputs,) lowest values.
         max: (outputs,) highest values.
-        nominal: (outputs,) a typical value, as in FMI, by which outputs are scaled; by their range where not given.
-        rest: (outputs,) values at rest; learned from data where not given.
+        nominal: (outputs,) typical values, as in FMI, which scale the outputs; if not given, their range does.
+        rest: (outputs,) values at rest; learned from data if not given.
     """
 
     names: tuple[str, ...]
@@ -85,7 +85,9 @@ class Outputs:
         _check_names("outputs", self.names, MOST_OUTPUTS)
         for name in self.names:
             if _TAKEN.fullmatch(name):
-                raise SettingsError(f"`outputs.names` holds `{name}`, which recordings call something else; rename it.")
+                raise SettingsError(
+                    f"`outputs.names` holds `{name}`, the name of another channel of recordings; rename it."
+                )
         quantity = _unit("outputs.unit", self.unit)
         if not self.display_unit:
             object.__setattr__(self, "display_unit", self.unit)
@@ -102,7 +104,7 @@ class Outputs:
 
 
 def motor_channels(motors: Sequence[str], outputs: Sequence[str], what: str) -> tuple[str, ...]:
-    """Return the channels of `what` ("setpoint", "position", "velocity", "position_measured") of each motor.
+    """Return the channel of each motor for a quantity, such as "setpoint", "position" or "position_measured".
 
     `pressure` has `pressure_setpoint`; `motor_1`, or one whose channel would be another's, has `motor_setpoint_1`.
     """
@@ -118,19 +120,19 @@ def _with_number(what: str, motor: int) -> str:
     return f"motor_{what}_{motor}"
 
 
-def numbered(channel: str) -> tuple[str, int] | None:
-    """Return what of which motor, from 0, `motor_setpoint_1` and the like are; None for other channels."""
+def parse_numbered(channel: str) -> tuple[str, int] | None:
+    """Return quantity and motor index (from 0) of `motor_setpoint_1` and the like; None for other channels."""
     match = _NUMBERED.fullmatch(channel)
     return None if match is None else (match["what"], int(match["motor"]) - 1)
 
 
 def is_set_point(channel: str) -> bool:
-    """Return whether a variable is called like the set-point of a motor, of any robot."""
+    """Return whether a variable has the name of a motor's set-point, of any robot."""
     return channel.startswith("motor_setpoint_") or channel.endswith("_setpoint")
 
 
 def motor_positions_among(names: Collection[str]) -> tuple[str, ...]:
-    """Return what the positions of the motors are called whose set-points are among `names`, of any robot."""
+    """Return the names of the positions of the motors with set-points among `names`, of any robot."""
     found = []
     for j, name in enumerate(filter(is_set_point, dict.fromkeys(names)), start=1):
         with_number = _with_number("position", j)
@@ -142,7 +144,7 @@ def motor_positions_among(names: Collection[str]) -> tuple[str, ...]:
 def check_range(
     table: str, low: str, high: str, lowest: Sequence[float] | None, highest: Sequence[float] | None
 ) -> None:
-    """Raise SettingsError where a lowest value is not below its highest."""
+    """Raise SettingsError if a lowest value is not below its highest value."""
     for a, b in zip(lowest or (), highest or (), strict=False):
         if a >= b:
             raise SettingsError(f"`{table}.{low}` must be below `{table}.{high}`; got {a:g} and {b:g}.")
@@ -155,7 +157,7 @@ def _check_names(table: str, names: Sequence[str], most: int) -> None:
         if not _NAME.fullmatch(name):
             raise SettingsError(f"`{table}.names` holds `{name}`; a name has letters, digits and _, a letter first.")
         if list(names).count(name) > 1:
-            raise SettingsError(f"`{table}.names` holds `{name}` twice; each name stands for one channel.")
+            raise SettingsError(f"`{table}.names` holds `{name}` twice; names must differ.")
 
 
 def _unit(key: str, unit: str) -> str:

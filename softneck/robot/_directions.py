@@ -9,17 +9,17 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, require_one_of
 
 KINDS = ("tendons", "identified", "matrix")
-# Below this two tendons all but coincide, and moving along the axis would ask for huge motor angles.
-_LEAST = 1e-3
+# Below this two tendons nearly coincide, and moving along the axis would need huge motor angles.
+_MIN_SINGULAR_VALUE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Directions:
-    """How motors move outputs: each output follows its direction, a weighted sum of the motors.
+    """Directions in which motors move outputs: each output follows a weighted sum of the motors.
 
     Attributes:
-        kind: "tendons" (from where they stand around the axis), "matrix" (as given), "identified" (learned from data).
-        angles_deg: (motors,) where the tendons stand [deg]; 0 bends the first output, 90 the second.
+        kind: "tendons" (by their angles around the axis), "matrix" (as given), "identified" (learned from data).
+        angles_deg: (motors,) angles of the tendons [deg]; 0 bends the first output, 90 the second.
         matrix: (outputs, motors) weights.
         names: of the redefined inputs, one for each output and one for co-contraction; `{output}_input` if not given.
     """
@@ -52,7 +52,7 @@ class Directions:
         return rows
 
     def check(self, motors: int, outputs: int) -> None:
-        """Raise SettingsError unless the directions are those of so many motors, and span so many outputs."""
+        """Raise SettingsError unless the directions have these numbers of motors and outputs, and span the outputs."""
         self._check_weights(motors, outputs)
         if self.names and len(self.names) != outputs + 1:
             raise SettingsError(
@@ -70,10 +70,13 @@ class Directions:
         weights = self.weights()
         if weights is None:
             return
-        if np.linalg.svd(weights[:outputs], compute_uv=False)[min(outputs, motors) - 1] < _LEAST or motors < outputs:
+        if (
+            np.linalg.svd(weights[:outputs], compute_uv=False)[min(outputs, motors) - 1] < _MIN_SINGULAR_VALUE
+            or motors < outputs
+        ):
             what = f"tendons at {', '.join(f'{a:g}' for a in self.angles_deg)} deg" if self.angles_deg else "the matrix"
             raise SettingsError(
-                f'`directions`: {what} cannot span {outputs} output(s); mend them, or write kind = "identified".'
+                f'`directions`: {what} cannot span {outputs} output(s); fix them, or write kind = "identified".'
             )
 
     def _check_angles(self, motors: int, outputs: int) -> None:

@@ -1,4 +1,4 @@
-"""`robot.toml`: its tables and keys, what `extends` takes over, and presets."""
+"""`robot.toml`: its tables and keys, inheritance by `extends`, and presets."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ._channels import Motors, Outputs
 from ._directions import Directions
 
 PRESETS = ("neck", "arm", "antagonist", "finger", "trunk4")
-#: Table -> its keys and what they hold; "" is the top of the file. A number of "each" stands for all channels, or one
-# for each of them.
+#: Table -> its keys and their types; "" is the top of the file. "each" is one number for all channels, or a list of one
+# for each channel.
 KEYS: dict[str, dict[str, str]] = {
     "": {"name": "text", "extends": "text", "sample_time_s": "number", "time_constant_s": "number"},
     "motors": {"names": "texts", "unit": "text", "setpoint_min": "each", "setpoint_max": "each", "rate_limit": "each",
@@ -44,9 +44,9 @@ KEY_OF = {
     "neck": "plant.neck",
     "drives": "drives.file",
 }
-#: What is learned from data where a robot does not give it, or is 1.
+#: Keys that may be absent: learned from data, or 1 (`sign`).
 OPTIONAL = ("time_constant_s", "nominal", "rest", "sign")
-_SAID = {
+_TYPE_TEXTS = {
     "text": "a text",
     "texts": "a list of texts",
     "number": "a number",
@@ -54,7 +54,7 @@ _SAID = {
     "rows": "a list of rows of numbers",
     "each": "a number, or a list of one for each",
 }
-# What is in a unit goes with it: table -> the keys, also of other tables, that a new `unit` there makes void.
+# Table -> the keys, also of other tables, whose inherited values a new `unit` there makes invalid.
 _IN_UNIT = {
     "motors": tuple(("motors", key) for key in ("setpoint_min", "setpoint_max", "rate_limit", "nominal", "rest")),
     "outputs": (
@@ -64,7 +64,7 @@ _IN_UNIT = {
 }
 
 
-# What tells how large and how fast a robot moves goes with its directions: another robot's own is not the preset's.
+# Keys for the size and speed of motions: a robot with directions of its own does not inherit them.
 _OF_DIRECTIONS = (("", "time_constant_s"), *((table, key) for table in ("motors", "outputs")
                                              for key in ("nominal", "rest")))  # fmt: skip
 
@@ -73,13 +73,13 @@ def read_table(path: Path) -> dict[str, Any]:
     """Return the tables of a TOML file.
 
     Raises:
-        FileFormatError: no such file, or no TOML.
+        FileFormatError: no such file, or not TOML.
     """
     try:
         return tomllib.loads(settings_text(path))
     except FileNotFoundError as error:
         raise FileFormatError(f"{path}: no such robot file; `softneck robot new {path}` writes one.") from error
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits or brackets
+    except (ValueError, RecursionError) as error:  # not TOML, not UTF-8, thousands of digits or brackets
         raise FileFormatError(f"{path}: is not a TOML file ({error}).") from error
 
 
@@ -99,13 +99,13 @@ def preset_table(name: str) -> dict[str, Any]:
 
 
 def fields(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `Robot` that the tables of a file give, with those of the preset that it extends.
+    """Return the arguments of `Robot` for the tables of a file, with the values of the preset that it extends.
 
     Raises:
-        SettingsError: a key that no robot has, or a value of another type than its key's.
+        SettingsError: an unknown key, or a value of the wrong type.
     """
     _check(table)
-    whole = _extended(table)
+    whole = _extend(table)
     for name in ("motors", "outputs", "directions"):
         if name not in whole:
             raise SettingsError(f"there is no table `[{name}]`; write it, or `extends` one of {', '.join(PRESETS)}.")
@@ -122,21 +122,21 @@ def fields(table: Mapping[str, Any]) -> dict[str, Any]:
         "motors": Motors(**_for_each(motors)),
         "outputs": Outputs(**_for_each(outputs)),
         "directions": Directions(**directions),
-        **{name: _looked_up(whole, key) for name, key in KEY_OF.items()},
+        **{name: _look_up(whole, key) for name, key in KEY_OF.items()},
     }
 
 
 @contextlib.contextmanager
-def named(path: str | Path) -> Iterator[None]:
-    """Put the name of the file before what is wrong in it."""
+def prefix_errors(path: str | Path) -> Iterator[None]:
+    """Prefix the errors inside the context with the path of the file."""
     try:
         yield
     except SoftneckError as error:
         raise SettingsError(f"{path}: {error}") from error
 
 
-def shown(path: Path) -> str:
-    """Return a path as people read it: from the working folder, or whole where that is shorter."""
+def shortest_path(path: Path) -> str:
+    """Return the shorter of the relative and the absolute path, for messages."""
     return min(os.path.relpath(path), str(path.resolve()), key=len)
 
 
@@ -178,14 +178,14 @@ def _check_value(key: str, value: Any, what: str) -> None:
         "each": number(value) or all_of(value, number),
     }
     if not fits[what]:
-        raise SettingsError(f"`{key}` must be {_SAID[what]}; got {value!r}.")
+        raise SettingsError(f"`{key}` must be {_TYPE_TEXTS[what]}; got {value!r}.")
 
 
-def _extended(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the tables with what stands in the preset that they extend, key by key."""
+def _extend(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tables merged key by key with those of the preset that they extend."""
     if "extends" not in table:
         return dict(table)
-    base = _extended(preset_table(table["extends"]))
+    base = _extend(preset_table(table["extends"]))
     for name, others in _IN_UNIT.items():
         new = table.get(name, {})
         if new.get("unit", base[name]["unit"]) != base[name]["unit"]:
@@ -196,14 +196,14 @@ def _extended(table: Mapping[str, Any]) -> dict[str, Any]:
             (base[where] if where else base).pop(key, None)
     found = {key: value for key, value in {**base, **table}.items() if key != "extends"}
     for name in KEYS:
-        # Directions go together: angles of the one and a matrix of the other would be none.
+        # Directions are replaced as a whole: angles of one and a matrix of the other would not fit.
         if isinstance(base.get(name), Mapping) and isinstance(table.get(name), Mapping) and name != "directions":
             found[name] = {**base[name], **table[name]}
     return found
 
 
 def _for_each(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of motors or outputs as their class takes them: one number for all becomes one for each."""
+    """Return the keys of motors or outputs for their class: one number for all becomes one for each."""
     count = len(part["names"])
     found = {}
     for key, value in part.items():
@@ -219,7 +219,7 @@ def _tuple(value: Any) -> Any:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
-def _looked_up(table: Mapping[str, Any], key: str) -> Any:
+def _look_up(table: Mapping[str, Any], key: str) -> Any:
     where, _, last = key.rpartition(".")
     value = (table.get(where, {}) if where else table).get(last)
     return float(value) if isinstance(value, int | float) else value

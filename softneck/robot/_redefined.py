@@ -1,9 +1,9 @@
-"""Redefined inputs of any robot: one for each output, co-contraction behind them, and the motors that give them.
+"""Redefined inputs of any robot, one for each output, and co-contraction, with their map to the motors.
 
-Of the neck these are Eq. 9 to 11. In general v = W P with the weights W of the robot's directions, and of all motors
-that give v the nearest to zero are taken, W^+ v. Co-contraction moves along what tilts nothing: the vector of W's null
-space nearest to (1, .., 1), scaled so that its mean is 1 and co-contraction is the mean that it adds to the motors (for
-the neck Eq. 11). What else the null space has is held at zero; where it has nothing, there is no co-contraction.
+For the neck these are Eq. 9 to 11. In general v = W P with the weights W of the robot's directions; the motors for v
+are the ones of smallest norm, W^+ v. Co-contraction does not move the outputs: it is along the vector of W's null space
+nearest to (1, .., 1), scaled to mean 1, so that co-contraction is the mean that it adds to the motors (for the neck Eq.
+11). The other directions of the null space are held at zero; without a null space there is no co-contraction.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError
 
-# Below this part of the largest singular value a direction is one that the motors cannot move.
-_LEAST = 1e-6
-# A null space further than this from (1, .., 1) has no vector that all motors share.
-_SHARED = 1e-9
+# Below this share of the largest singular value the motors cannot move a direction.
+_MIN_SINGULAR_RATIO = 1e-6
+# Tolerance for the part of (1, .., 1) in the null space.
+_NULL_SPACE_TOLERANCE = 1e-9
 
 
 def redefinition_of(weights: Matrix, names: tuple[str, ...]) -> tuple[Matrix, Matrix]:
@@ -32,23 +32,23 @@ def redefinition_of(weights: Matrix, names: tuple[str, ...]) -> tuple[Matrix, Ma
     """
     _, s, Vh = np.linalg.svd(weights / np.linalg.norm(weights, axis=1, keepdims=True))
     outputs, motors = weights.shape
-    if motors < outputs or s[outputs - 1] < _LEAST * s[0]:
+    if motors < outputs or s[outputs - 1] < _MIN_SINGULAR_RATIO * s[0]:
         raise SettingsError(
             f"{motors} motor(s) cannot move {', '.join(names)} independently; a controller needs directions that span "
             "all outputs."
         )
     ones = np.ones(motors)
     shared = Vh[outputs:].T @ (Vh[outputs:] @ ones)
-    if np.linalg.norm(shared) > _SHARED * np.linalg.norm(ones):
+    if np.linalg.norm(shared) > _NULL_SPACE_TOLERANCE * np.linalg.norm(ones):
         shared *= motors / shared.sum()
         back = shared / (shared @ shared)
     else:
         shared, back = np.zeros(motors), np.zeros(motors)
-    if motors == outputs + 1 and np.abs(shared - 1.0).max() < _SHARED:
-        # As the paper writes them, Eq. 9 to 11: exact means, and an inverse without the rounding of a decomposition.
+    if motors == outputs + 1 and np.abs(shared - 1.0).max() < _NULL_SPACE_TOLERANCE:
+        # As in the paper, Eq. 9 to 11: exact means, and an inverse without the rounding of a decomposition.
         T = np.vstack([weights, np.full(motors, 1.0 / motors)])
         return T, np.linalg.inv(T)
     inverse = np.column_stack([np.linalg.pinv(weights), shared])
-    # What rounding leaves of a motor that takes no part.
+    # Rounding errors of motors that do not contribute.
     inverse[np.abs(inverse) < 1e-14 * np.abs(inverse).max(axis=0, initial=0.0)] = 0.0
     return np.vstack([weights, back]), inverse

@@ -1,4 +1,4 @@
-"""The robot that recordings, models and controllers belong to."""
+"""The robot of recordings, models and controllers."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.core._shown import Shown
 
 from . import _file
-from ._channels import Motors, Outputs, motor_channels, numbered
+from ._channels import Motors, Outputs, motor_channels, parse_numbered
 from ._directions import Directions
 from ._redefined import redefinition_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Robot(Shown):
-    """A robot that motors move: what it is, and what is known of it; None where it is not given.
+    """A robot with its motors, outputs, directions and properties; None if not given.
 
     Attributes:
         name: for people.
@@ -31,14 +31,14 @@ class Robot(Shown):
         outputs: the 1 to 4 measured outputs.
         directions: which motors move which outputs.
         sample_time_s: [s].
-        time_constant_s: [s] in which outputs follow motors, by which seconds are scaled; learned from data where None.
+        time_constant_s: [s] of the outputs after a step of the motors, which scales time; learned from data if None.
         winch_radius_m: [m], of tendons on winches.
         noise_std: standard deviation of the sensor's noise, in the unit of the outputs.
         delay_s: of the sensor [s].
         rate_hz: samples of the sensor per second [1/s].
-        neck: the virtual plant that stands for the robot: "paper", "lab" or a neck file.
+        neck: the virtual plant of the robot: "paper", "lab" or a neck file.
         drives: file of the drives.
-        file: from which it was read; None for a preset.
+        file: that it was read from; None for a preset.
 
     Example:
         >>> import softneck
@@ -83,7 +83,7 @@ class Robot(Shown):
         self._complete()
 
     def _complete(self) -> None:
-        """Take what a file leaves out from the preset `neck` where channels and directions are that preset's."""
+        """Complete missing values from the preset `neck` if channels and directions are those of the preset."""
         if self.time_constant_s is None and self.is_neck:
             neck = Robot.preset("neck")
             object.__setattr__(self, "time_constant_s", neck.time_constant_s)
@@ -96,7 +96,7 @@ class Robot(Shown):
 
     @classmethod
     def preset(cls, name: str = "neck") -> Robot:
-        """Return one of ours: `neck` (the paper's), `arm`, `antagonist`, `finger` or `trunk4`.
+        """Return a built-in robot: `neck` (the paper's), `arm`, `antagonist`, `finger` or `trunk4`.
 
         Raises:
             SettingsError: no such preset.
@@ -108,11 +108,11 @@ class Robot(Shown):
         """Read a `robot.toml`.
 
         Raises:
-            FileFormatError: no such file, or no TOML.
-            SettingsError: a key or a value that is not one of a robot; the line says which.
+            FileFormatError: no such file, or not TOML.
+            SettingsError: a wrong key or value; the message names it.
         """
         table = _file.read_table(Path(path))
-        with _file.named(path):
+        with _file.prefix_errors(path):
             return cls(**_file.fields(table), file=Path(path))
 
     @classmethod
@@ -120,17 +120,17 @@ class Robot(Shown):
         """Return the robot that `as_dict` wrote, or the tables of a `robot.toml`.
 
         Raises:
-            SettingsError: a key or a value that is not one of a robot.
+            SettingsError: a wrong key or value.
         """
         return cls(**_file.fields(content))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the tables of its `robot.toml`, without `extends`; what is not given is left out."""
+        """Return the tables of its `robot.toml`, without `extends` and without values that are not given."""
         return _table(self)
 
     @property
     def folder(self) -> Path | None:
-        """Where the files that it names are; None for a preset."""
+        """The folder of the files that it names; None for a preset."""
         return None if self.file is None else self.file.parent
 
     @property
@@ -150,12 +150,12 @@ class Robot(Shown):
 
     @property
     def measured_positions(self) -> tuple[str, ...]:
-        """What a model's inputs for the motors' measured positions are called."""
+        """The names of a model's inputs for the motors' measured positions."""
         return self._motor_channels("position_measured")
 
     def own(self, channel: str) -> str:
-        """Return what the robot calls a channel: `motor_setpoint_1` stands for the first motor's, whatever its name."""
-        what, motor = numbered(channel) or ("", 0)
+        """Return the robot's own name of a channel: `motor_setpoint_1` is always the first motor's set-point."""
+        what, motor = parse_numbered(channel) or ("", 0)
         return self._motor_channels(what)[motor] if what and motor < len(self.motors.names) else channel
 
     def _motor_channels(self, what: str) -> tuple[str, ...]:
@@ -163,9 +163,9 @@ class Robot(Shown):
 
     @property
     def hash(self) -> str:
-        """SHA-256 of what a number in a file means: channels, units and directions.
+        """SHA-256 of channels, units and directions, which give the numbers in files their meaning.
 
-        Names of motors, limits, rates, sensor, drives and virtual plant may change and files still fit each other.
+        Names of motors, limits, rates, sensor, drives and virtual plant may change without making files incompatible.
         """
         return _hash(self)
 
@@ -186,22 +186,22 @@ class Robot(Shown):
 
     @property
     def cocontraction_name(self) -> str:
-        """What moves no output: of the neck delta_i (Eq. 11)."""
+        """The name of the co-contraction, which moves no output: of the neck delta_i (Eq. 11)."""
         return self.directions.names[-1] if self.directions.names else "cocontraction"
 
     @property
     def tendon_angles(self) -> Vector | None:
-        """(motors,) where the tendons stand [rad]; None for a robot without tendons at known angles."""
+        """(motors,) angles of the tendons [rad]; None for a robot without tendons at known angles."""
         return np.radians(self.directions.angles_deg) if self.directions.kind == "tendons" else None
 
     def redefinition(self, weights: Matrix | None = None) -> tuple[Matrix, Matrix]:
         """Return T (outputs + 1, motors) to redefined inputs and co-contraction, and its inverse (motors, outputs + 1).
 
         Args:
-            weights: (outputs, motors) where the robot does not give its own.
+            weights: (outputs, motors), if the robot does not give its own.
 
         Raises:
-            SettingsError: directions that are to be identified, or that do not span the outputs.
+            SettingsError: directions still to be identified, or that do not span the outputs.
         """
         own = self.weights() if weights is None else weights
         if own is None:
@@ -209,12 +209,12 @@ class Robot(Shown):
         return redefinition_of(own, self.outputs.names)
 
     def in_header(self) -> dict[str, Any]:
-        """Return what the header of a model's file says of its robot: nothing where it is the neck as we know it."""
+        """Return the robot's entry in the header of a model's file; empty for the preset `neck`."""
         table = self.as_dict()
         return {} if table == Robot.preset("neck").as_dict() else {"robot": table}
 
     def require(self, key: str, what: str) -> Any:
-        """Return a value that `what` (such as "softneck record") needs.
+        """Return the value of an attribute; the error names the caller, such as "softneck record".
 
         Raises:
             SettingsError: the robot does not give it.
@@ -225,13 +225,15 @@ class Robot(Shown):
         return value
 
     def require_neck(self, what: str) -> None:
-        """Raise SettingsError where `what`, which takes necks alone, is given another robot."""
+        """Raise SettingsError unless this is a neck, for functions that support necks only."""
         if not self.is_neck:
             raise SettingsError(f"{what} takes necks only so far, not robot {self.label()}.")
 
     def label(self) -> str:
-        """Return name, short hash and file, by which messages tell robots apart."""
-        return f"`{self.name}` ({self.hash[:8]}{'' if self.file is None else f', from {_file.shown(self.file)}'})"
+        """Return name, short hash and file, to identify a robot in messages."""
+        return (
+            f"`{self.name}` ({self.hash[:8]}{'' if self.file is None else f', from {_file.shortest_path(self.file)}'})"
+        )
 
     def summary(self) -> str:
         """Return a few lines on the robot, for people."""
@@ -243,8 +245,8 @@ def _hash(robot: Robot) -> str:
     table = robot.as_dict()
     outputs = {key: table["outputs"][key] for key in ("names", "unit", "display_unit")}
     directions = {key: value for key, value in table["directions"].items() if key != "names"}
-    told = [len(robot.motors.names), robot.motors.unit, outputs, directions]
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    content = [len(robot.motors.names), robot.motors.unit, outputs, directions]
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 @cache
@@ -253,7 +255,7 @@ def _preset(name: str) -> Robot:
 
 
 def _table(robot: Robot) -> dict[str, Any]:
-    """Return the tables of a robot's file; what is not given is left out."""
+    """Return the tables of a robot's file, without values that are not given."""
     table: dict[str, Any] = {"name": robot.name}
     for name in ("motors", "outputs", "directions"):
         part = getattr(robot, name)
@@ -291,7 +293,7 @@ def _summary(robot: Robot) -> str:
 
 
 def _short(key: str, value: Any) -> Any:
-    """Return a value as a file says it: one number where all are the same."""
+    """Return a value as in a file: one number if all are equal."""
     if isinstance(value, tuple):
         if key in ("names", "angles_deg", "matrix"):
             return [list(item) if isinstance(item, tuple) else item for item in value]

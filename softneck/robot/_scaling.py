@@ -1,8 +1,8 @@
-"""The door between a robot's SI quantities and the scaled ones that estimators, designs and verification work on.
+"""Scaling between a robot's SI quantities and the scaled ones that estimators, designs and verification use.
 
 Scaled quantities have the size of the preset `neck`: set-points run over about +-6, outputs over about +-0.8, and
-outputs follow set-points with a time constant of 0.2. Numbers chosen there hold for every robot, and the maps of the
-neck itself are the identity. Nothing else in softneck multiplies by a unit or by a pace.
+outputs follow set-points with a time constant of 0.2. Constants chosen for the neck hold for every robot, and the
+maps of the neck itself are the identity. No other code in softneck multiplies by a unit or a time scale.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from ._robot import Robot
 MOTOR_RANGE, OUTPUT_RANGE, TIME_CONSTANT = 6.0, 0.8, 0.2
 # Of theta_i = P_1 - P_2 / 2 - P_3 / 2 (Eq. 9): the norm of its weights.
 _INPUT_WEIGHT = math.sqrt(1.5)
-# Scaled data are rounded to this, so that iterative fits see the same numbers whatever the unit of the file was.
-_RESOLUTION = 2.0**-40
+# Scaled data are rounded to this, so that iterative fits get the same numbers for any unit of the file.
+_SCALED_RESOLUTION = 2.0**-40
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -35,7 +35,7 @@ class Scaling:
         motor_rest: (motors,) set-points that are zero when scaled [SI].
         output_unit: (outputs,) of the outputs [SI].
         output_rest: (outputs,) outputs that are zero when scaled [SI].
-        second: how many seconds one scaled second is [s].
+        second: length of one scaled second [s].
     """
 
     motor_unit: float
@@ -52,10 +52,10 @@ class Scaling:
         """Return the scaling of a robot: by its nominal values, else by its ranges, else by data.
 
         Args:
-            robot: what it gives of `nominal`, `rest`, `setpoint_min`, `min` and so on counts first.
-            set_points: (time, motors) data in SI, for what the robot does not give; zero and one without.
+            robot: its `nominal`, `rest`, `setpoint_min`, `min` and so on take precedence over data.
+            set_points: (time, motors) data in SI, for values that the robot does not give; without data 0 and 1.
             outputs: (time, outputs) data in SI, likewise.
-            time_constant: of the data [s]; the robot's own counts first.
+            time_constant: of the data [s]; the robot's own takes precedence.
         """
         motors, measured = robot.motors, robot.outputs
         inputs = to_si(motors.unit)[0], motors.nominal, motors.rest, motors.setpoint_min, motors.setpoint_max
@@ -91,14 +91,14 @@ class Scaling:
         return np.asarray(self.output_rest + self.output_unit * values)
 
     def input_units(self, weights: Matrix) -> Vector:
-        """Return the units (outputs,) of redefined inputs in SI: in these each direction pulls as theta_i does.
+        """Return the units (outputs,) of redefined inputs in SI, in which every direction has the norm of theta_i.
 
         Args:
             weights: (outputs, motors) of the motors in each output's direction.
         """
         pull = np.linalg.norm(weights, axis=1) / _INPUT_WEIGHT
-        # Rounded by their ratio, so that a norm's own rounding leaves the neck's at one.
-        return self.motor_unit * np.exp2(rounded(np.log2(pull)))
+        # The ratio is rounded, so that the rounding of the norm leaves the neck's at exactly one.
+        return self.motor_unit * np.exp2(round_scaled(np.log2(pull)))
 
     def scale_seconds(self, seconds: float) -> float:
         """Return a time [s] in scaled seconds."""
@@ -110,11 +110,11 @@ class Scaling:
 
 
 def scaled_robot(robot: Robot, scaling: Scaling) -> Robot:
-    """Return the robot in scaled quantities: without units, of the size and the pace of the preset `neck`."""
+    """Return the robot in scaled quantities: dimensionless, with the size and time constant of the preset `neck`."""
     motors, outputs = robot.motors, robot.outputs
     per, out = to_si(motors.unit)[0] / scaling.motor_unit, to_si(outputs.unit)[0]
 
-    def moved(values: tuple[float, ...] | None, scale: Callable[[Vector], Matrix], factor: float) -> Any:
+    def convert(values: tuple[float, ...] | None, scale: Callable[[Vector], Matrix], factor: float) -> Any:
         return None if values is None else tuple(scale(factor * np.array(values)).tolist())
 
     return replace(
@@ -124,12 +124,12 @@ def scaled_robot(robot: Robot, scaling: Scaling) -> Robot:
             rest=(0.0,) * len(motors.names),
             rate_limit=None if motors.rate_limit is None else tuple(
                 rate * per * scaling.second for rate in motors.rate_limit),
-            setpoint_min=moved(motors.setpoint_min, scaling.scale_motors, to_si(motors.unit)[0]),
-            setpoint_max=moved(motors.setpoint_max, scaling.scale_motors, to_si(motors.unit)[0]),
+            setpoint_min=convert(motors.setpoint_min, scaling.scale_motors, to_si(motors.unit)[0]),
+            setpoint_max=convert(motors.setpoint_max, scaling.scale_motors, to_si(motors.unit)[0]),
         ),
         outputs=replace(
             outputs, unit="1", display_unit="1", nominal=(1.0,) * len(outputs.names), rest=(0.0,) * len(outputs.names),
-            min=moved(outputs.min, scaling.scale_outputs, out), max=moved(outputs.max, scaling.scale_outputs, out),
+            min=convert(outputs.min, scaling.scale_outputs, out), max=convert(outputs.max, scaling.scale_outputs, out),
         ),
         sample_time_s=None if robot.sample_time_s is None else scaling.scale_seconds(robot.sample_time_s),
         time_constant_s=TIME_CONSTANT,
@@ -139,9 +139,9 @@ def scaled_robot(robot: Robot, scaling: Scaling) -> Robot:
     )  # fmt: skip
 
 
-def rounded(values: Matrix) -> Matrix:
+def round_scaled(values: Matrix) -> Matrix:
     """Return scaled data rounded to 2^-40: far below any sensor's resolution, far above the rounding of a unit."""
-    return np.round(values / _RESOLUTION) * _RESOLUTION
+    return np.round(values / _SCALED_RESOLUTION) * _SCALED_RESOLUTION
 
 
 def _sizes(

@@ -16,7 +16,7 @@ from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import directions_of, robot_of
 from softneck.identification.models._ports import payloads
 from softneck.robot import Robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.robot._scaling import Scaling
 from softneck.signals.recording._recording import require_same_robot
 from softneck.verification import Verification, verify
@@ -151,7 +151,7 @@ def tune(
     task = task_of(plants, requirements, seed)
     dropped = {} if kinds or not task.tested else dict.fromkeys(UNCERTIFIED, _UNCERTIFIED)
     chosen = tuple(kind for kind in dict.fromkeys(kinds or KINDS_SEARCHED) if kind not in dropped)
-    observer = None if observer is None else opened(observer, "observer")
+    observer = None if observer is None else load_for_robot(observer, "observer")
     if observer is not None:
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
     refuse_impossible(task.asked, task.plant)

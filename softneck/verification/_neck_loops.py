@@ -20,7 +20,7 @@ from softneck.loop._references import RobotReference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._presets import PRESETS
 from softneck.robot import Robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.robot._scaling import Scaling
 from softneck.runtime import Block
 
@@ -97,7 +97,7 @@ def _opened_plant(item: Any, robot: str | Path | Robot | None) -> Any:
     path = Path(item) if isinstance(item, str | Path) else None
     if path is not None and (path.suffix == ".toml" or (str(item) in PRESETS and not path.exists())):
         return NeckParameters.preset(str(item))
-    thing = opened(item, robot=robot)
+    thing = load_for_robot(item, robot=robot)
     if not hasattr(thing, "tf") and (path is not None or not is_own_plant(thing)):
         raise SettingsError(f"{item}: a MODEL, FAMILY, NECK or FMU is needed; this is a {type(thing).__name__}.")
     return thing

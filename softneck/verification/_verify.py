@@ -20,7 +20,7 @@ from softneck.design.linear._own import own_controller
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.signals.recording._recording import require_same_robot
 
 from ._evidence import Evidence, gather, worst_row
@@ -250,8 +250,8 @@ def verify(
         >>> len(softneck.verify(softneck.design_controller("pi", model), {"rls": model}, asked).verdicts) > 10
         True
     """
-    begin, controller = time.perf_counter(), opened(own_controller(controller), "controller")
-    observer = None if observer is None else opened(observer, "observer")
+    begin, controller = time.perf_counter(), load_for_robot(own_controller(controller), "controller")
+    observer = None if observer is None else load_for_robot(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
         # Physics and functions of one's own say nothing of a robot: their ports have to be its own.

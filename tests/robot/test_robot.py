@@ -126,7 +126,7 @@ def test_the_hash_is_of_what_numbers_in_a_file_mean() -> None:
         ("[motors]\nnames = []", r"`motors.names` must be a list of texts"),
         (f"[motors]\nnames = {[f'm{i}' for i in range(9)]}", r"`motors.names` must hold 1 to 8 names; got 9"),
         ('[outputs]\nnames = ["a", "b", "c", "d", "e"]', r"`outputs.names` must hold 1 to 4 names; got 5"),
-        ('[outputs]\nnames = ["pitch", "time"]', r"`outputs.names` holds `time`, which recordings call something else"),
+        ('[outputs]\nnames = ["pitch", "time"]', r"`outputs.names` holds `time`, the name of another channel"),
         ('[motors]\nunit = "furlong"', r"`motors.unit`: unknown unit `furlong`; use one of rad"),
         ('[outputs]\ndisplay_unit = "mm"', r"`outputs.display_unit` cannot be mm where `unit` is rad"),
         ("[motors]\nsetpoint_min = 7", r"`motors.setpoint_min` must be below `motors.setpoint_max`; got 7 and 6"),

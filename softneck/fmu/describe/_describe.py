@@ -17,7 +17,7 @@ from softneck.identification import Validation
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.robot._file import PRESETS
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.runtime import Block, Port
 
 
@@ -173,7 +173,7 @@ def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot |
         raise SettingsError(f"a model, observer, controller, neck or its file is needed; got a {type(thing).__name__}.")
     name, path = str(thing), Path(thing)
     if path.suffix == ".npz":
-        found = opened(path, robot=robot)
+        found = load_for_robot(path, robot=robot)
         if not hasattr(found, "block"):
             raise FileFormatError(f"{path}: is not a model, observer or controller.")
         return found

@@ -13,7 +13,7 @@ from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, re
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.robot import Robot
-from softneck.robot._opened import opened
+from softneck.robot._loading import load_for_robot
 from softneck.signals import Recording
 from softneck.signals.recording._files import RecordingLike, opened_recording
 
@@ -248,7 +248,7 @@ def validate(
     if names is None:
         model_name, data_name = (str(of) if isinstance(of, str | Path) else None for of in (model, recording))
         names = (model_name or "model", data_name or "data")
-    judged: Model = opened(model, "model")
+    judged: Model = load_for_robot(model, "model")
     parts = judged_parts(judged, opened_recording(recording), rules)
     return judge(judged, parts, rules, names=names)
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softneck.robot._scaling import Scaling, rounded, scaled_robot
+from softneck.robot._scaling import Scaling, round_scaled, scaled_robot
 
 from ._recording import Recording
 
@@ -29,7 +29,7 @@ def scaled_recording(recording: Recording, scaling: Scaling) -> Recording:
         (robot.outputs.names, scaling.scale_outputs),
     ):
         if all(name in recording.channels for name in names):
-            values = rounded(scale(np.column_stack([recording.channels[name] for name in names])))
+            values = round_scaled(scale(np.column_stack([recording.channels[name] for name in names])))
             channels |= dict(zip(names, values.T, strict=True))
     return replace(
         recording,
