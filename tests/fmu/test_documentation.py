@@ -44,7 +44,7 @@ def test_scores_of_a_validation_are_shown(tmp_path: Path) -> None:
     page = _page(build_fmu(model.block(), tmp_path / "Rls.fmu", info=fmu_info(model, validation=judged)))
     fit = judged.fits["inf"]["pitch"]
     assert fit is not None
-    assert f"<td>this model</td><td>free run</td><td>{fit:.2f}</td>" in page
+    assert f"<td>this model</td><td>simulation (free run)</td><td>{fit:.2f}</td>" in page
     assert f"on {judged.rows_scored} rows of my &lt;data&gt;; {judged.rows_left_out} rows" in page
     for text in ("How it was identified", "Limits of use", "trained on 500 rows", "<td>forgetting</td>"):
         assert text in page
