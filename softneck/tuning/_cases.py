@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Vector, to_si
-from softneck.loop import BlockPart, Loop, LoopResult, SensorFault, run_loop
+from softneck.loop import Loop, LoopResult, SensorFault, run_loop
 from softneck.loop._references import Reference, RobotReference
 from softneck.robot import Robot
 from softneck.runtime import Block
-from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at
+from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at, step_loop
 
 from ._requirements import Task, TuneRequirements, circles
 
@@ -108,16 +108,9 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, o
         led, inclination = _LED * time, (asked.si(track["circle_deg"]),)
         reference = RobotReference(kind="rotation", values=inclination, frequency=frequency, at=at, rise=led)
         duration = at + led + _TURNS / frequency
-    return Loop(
-        plant=plant.quiet(Ts), controller=BlockPart(block), observer=None if observer is None else BlockPart(observer),
-        reference=_Together(reference, together),
-        duration=duration, order=order,
-        robot=robot, **plant.carrying(case.payload), faults=tuple(faults),
-        # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
-        connections={
-            f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
-            for port in block.inputs if port.name.endswith("_reference_ahead")
-        },
+    return step_loop(
+        block, plant.quiet(Ts), plant, case.payload, _Together(reference, together), asked, duration=duration,
+        order=order, observer=observer, faults=faults,
     )  # fmt: skip
 
 

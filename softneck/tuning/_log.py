@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 import math
@@ -17,7 +16,6 @@ import numpy as np
 from softneck.core import FileFormatError, OutputFileError, atomic_write
 from softneck.core._budget import MOST_JSON, settings_text
 from softneck.design.plants._uncertain import uncertain_plant
-from softneck.plant import NeckParameters
 
 from ._judge import Judgement
 from ._requirements import Task, has_observer
@@ -158,9 +156,7 @@ def _plants(task: Task) -> Iterator[bytes]:
         tested = getattr(thing, "findings", {}).get("tested")
         yield json.dumps(tested, sort_keys=True, default=str).encode()
     for thing in task.own.values():
-        if isinstance(thing, NeckParameters):
-            yield repr(dataclasses.astuple(thing)).encode()
-        elif hasattr(thing, "block"):
+        if hasattr(thing, "block"):
             yield from _of_block(thing.block())
         elif hasattr(thing, "arrays"):
             yield from _of_block(thing)

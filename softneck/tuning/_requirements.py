@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-import math
 import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from softneck.core import KINDS, FileFormatError, SettingsError, resolve, to_si
-from softneck.core._budget import settings_text
+from softneck.core import KINDS, SettingsError, resolve, to_si
 from softneck.identification import Model
 from softneck.loop import default_limits
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
-from softneck.verification._requirements import VERSION, Requirement, check_number, kept_back, metric_names, with_groups
+from softneck.verification._requirements import (
+    VERSION,
+    Requirement,
+    bounds_of,
+    check_number,
+    kept_back,
+    metric_names,
+    of_file,
+    with_groups,
+)
 from softneck.verification._scale import Scale, digits
 
 _RISE, _OVERSHOOT = "sim.rise_s", "sim.overshoot_pct"
@@ -88,25 +96,7 @@ def read_tune_requirements(
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
-    given: Any = {"robot": robot, "scale": scale, "stepping": stepping, "rise": rise}
-    if path is None:
-        return make_tune_requirements({}, **given)
-    if not isinstance(path, str | Path):
-        raise SettingsError(f"requirements are a file or a table; got a {type(path).__name__}.")
-    try:
-        table = tomllib.loads(settings_text(path))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(f"{path}: is not valid TOML ({error}).") from error
-    except OSError as error:
-        raise FileFormatError(
-            f"{path}: cannot be read ({error.strerror}); name a requirements file (.toml)."
-        ) from error
-    if table.get("version") != VERSION:
-        raise FileFormatError(f"{path}: must say `version = {VERSION}`; it says {table.get('version')}.")
-    try:
-        return make_tune_requirements(table, **given)
-    except SettingsError as error:
-        raise SettingsError(f"{path}: {error}") from error
+    return of_file(path, partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise))
 
 
 def make_tune_requirements(
@@ -137,14 +127,12 @@ def make_tune_requirements(
         and isinstance(table.get(key, {}), Mapping) else table[key]
         for key in dict.fromkeys((*usual, *table)) if key != "version"
     }  # fmt: skip
-    track = _numbers(merged.get("track", {}), defaults["track"], scale)
+    track = _numbers(merged["track"], defaults["track"], scale)
     require, reserve = kept_back(merged.get("require", {}), merged.get("reserve", {}))
-    extra = tuple(
-        bound
-        for metric, entry in require.items()
-        if metric.startswith("track.")
-        for bound in _bounds(metric, entry, whose)
-    )
+    tracked = {metric: entry for metric, entry in require.items() if metric.startswith("track.")}
+    extra = bounds_of(tracked, metric_names(whose, track=True), tracked)
+    if wrong := [item.metric for item in extra if item.bound != "max" or item.limit <= 0.0]:
+        raise SettingsError(f"`{wrong[0]}` must say {{ max = NUMBER }} of a positive number, or false.")
     certificate = make_requirements(merged, scale=scale)
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
@@ -189,8 +177,6 @@ def _for_linear(usual: dict[str, Any]) -> dict[str, Any]:
 
 def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[str, float]:
     """Return the table [track] by the neck's names of its keys, which files up to 0.2 have of every robot."""
-    if not isinstance(given, Mapping):
-        raise SettingsError("`track` must be a table: [track].")
     inside = {key: key for key in defaults} | {scale.name_of(key): key for key in defaults}
     found = dict(zip(defaults, scale.table(defaults).values(), strict=True))
     for key, value in given.items():
@@ -199,20 +185,6 @@ def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[st
         check_number(f"[track] {key}", value, inside[key], _TRACK[inside[key]], scale)
         found[inside[key]] = float(value)
     return found
-
-
-def _bounds(metric: str, entry: Any, robot: Robot) -> list[Requirement]:
-    known = [name for name in metric_names(robot, track=True) if name.startswith("track.")]
-    if metric not in known:
-        raise SettingsError(f"unknown metric `{metric}`; of [track] there are {', '.join(known)}.")
-    if entry is False:
-        return []
-    if not isinstance(entry, Mapping) or list(entry) != ["max"]:
-        raise SettingsError(f"`{metric}` must say {{ max = NUMBER }}, or false; got {entry!r}.")
-    limit = entry["max"]
-    if isinstance(limit, bool) or not isinstance(limit, int | float) or not math.isfinite(limit) or limit <= 0.0:
-        raise SettingsError(f"the limit of `{metric}` must be a positive number; got {limit!r}.")
-    return [Requirement(metric, "max", float(limit), True)]
 
 
 def has_observer(kind: str) -> bool:

@@ -319,11 +319,16 @@ def run_necks(
         (plant, payload, angle) for plant in plants
         for payload in plant.payloads(table["payloads_kg"]) for angle in angles
     ]  # fmt: skip
-    runs = []
+    runs, size, at = [], asked.si(float(table["size_deg"])), step_at(controller, asked)
     for number, (plant, payload, angle) in enumerate(cases):
         name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
         progress(number / len(cases), name)
-        loop = _loop(controller, plant, float(payload), math.radians(angle), asked, order, observer, seed + number)
+        ends = tuple(size * share for share in direction(math.radians(angle), robot))
+        loop = step_loop(
+            controller, plant.make(seed + number, controller.sample_time), plant, float(payload),
+            RobotReference(kind="step", values=ends, at=at), asked, duration=at + float(table["duration_s"]),
+            order=order, observer=observer,
+        )  # fmt: skip
         values, result = judge_loop(loop)
         runs.append(NeckRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
     return runs
@@ -354,34 +359,21 @@ def _near(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckPa
     raise SettingsError(f"no plausible neck within a spread of {spread:g} holds its tendons; lower `spread_pct`.")
 
 
-def _loop(
-    controller: Block,
-    plant: OwnPlant,
-    payload: float,
-    orientation: float,
-    asked: Requirements,
-    order: str,
-    observer: Block | None,
-    seed: int,
-) -> Loop:
-    size, robot, at = asked.si(float(asked.sim["size_deg"])), asked.robot, step_at(controller, asked)
-    ends = tuple(size * share for share in direction(orientation, robot))
+def step_loop(
+    controller: Block, part: Part, plant: OwnPlant, payload: float, reference: Callable[[float], tuple[float, ...]],
+    asked: Requirements, *, duration: float, order: str, observer: Block | None, faults: Sequence[Any] = (),
+) -> Loop:  # fmt: skip
+    """Return a loop over a part that a plant makes."""
     return Loop(
-        plant=plant.make(seed, controller.sample_time),
-        controller=BlockPart(controller),
-        observer=None if observer is None else BlockPart(observer),
-        reference=RobotReference(kind="step", values=ends, at=at),
-        duration=at + float(asked.sim["duration_s"]),
-        order=order,
-        robot=robot,
-        **plant.carrying(payload),
+        plant=part, controller=BlockPart(controller), observer=None if observer is None else BlockPart(observer),
+        reference=reference, duration=duration, order=order, robot=asked.robot, **plant.carrying(payload),
+        faults=tuple(faults),
         # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
         connections={
             f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
-            for port in controller.inputs
-            if port.name.endswith("_reference_ahead")
+            for port in controller.inputs if port.name.endswith("_reference_ahead")
         },
-    )
+    )  # fmt: skip
 
 
 def judge_loop(

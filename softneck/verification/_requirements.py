@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
 from softneck.core._budget import settings_text
@@ -72,6 +73,7 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
     return less, kept
 
 
+_T = TypeVar("_T")
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
 _AXIS_METRICS = (*LARGE, *SMALL)
@@ -249,13 +251,18 @@ def read_requirements(
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
+    return of_file(path, partial(make_requirements, robot=robot, scale=scale))
+
+
+def of_file(path: str | Path | None, make: Callable[[Mapping[str, Any]], _T]) -> _T:
+    """Return what `make` makes of the tables of a file, of none where there is no file; its errors name the file."""
     if path is None:
-        return make_requirements({}, robot=robot, scale=scale)
+        return make({})
     if not isinstance(path, str | Path):
         raise SettingsError(f"requirements are a file or a table; got a {type(path).__name__}.")
     table = _read(Path(path))
     try:
-        return make_requirements(table, robot=robot, scale=scale)
+        return make(table)
     except SettingsError as error:
         raise SettingsError(f"{path}: {error}") from error
 
@@ -271,6 +278,8 @@ def make_requirements(
         if key not in ("version", *_NUMBERS, "require"):
             raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(_NUMBERS)}, require.")
     tables: Any = {name: _table(name, defaults[name], own.get(name, {}), scale) for name in _NUMBERS}
+    if not isinstance(own.get("require", {}), Mapping):
+        raise SettingsError("`require` must be a table: [require].")
     bounds = _bounds(scale.table(defaults["require"]), own.get("require", {}), scale.robot)
     _refuse_contradictions(bounds, scale.robot)
     _refuse_weak(bounds, tables, scale)
@@ -338,15 +347,21 @@ def check_number(name: str, value: Any, key: str, ends: tuple[float, float, str]
 
 
 def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requirement, ...]:
-    if not isinstance(own, Mapping):
-        raise SettingsError("`require` must be a table: [require].")
-    names = metric_names(robot)
-    for metric in own:
+    require = {metric: entry for metric, entry in {**defaults, **own}.items()
+               if metric != "sim.slack_s" or metric in own or robot.tendon_angles is not None}  # fmt: skip
+    found = bounds_of(require, metric_names(robot), own)
+    if not found:
+        raise SettingsError("nothing is required; a certificate needs at least one requirement.")
+    return found
+
+
+def bounds_of(require: Mapping[str, Any], names: tuple[str, ...], own: Any) -> tuple[Requirement, ...]:
+    """Return the requirements of a table; `names`: of all metrics, `own`: those that a user states."""
+    found = []
+    for metric, entry in require.items():
         if metric not in names:
             raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(names)}.")
-    found = []
-    for metric, entry in {**defaults, **own}.items():
-        if entry is False or (metric == "sim.slack_s" and metric not in own and robot.tendon_angles is None):
+        if entry is False:
             continue
         if not isinstance(entry, Mapping) or not entry or any(key not in _BOUNDS for key in entry):
             raise SettingsError(
@@ -356,8 +371,6 @@ def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requir
             if isinstance(limit, bool) or not isinstance(limit, int | float) or not math.isfinite(limit):
                 raise SettingsError(f"the limit of `{metric}` must be a finite number; got {limit!r}.")
             found.append(Requirement(metric, bound, float(limit), metric in own))
-    if not found:
-        raise SettingsError("nothing is required; a certificate needs at least one requirement.")
     return tuple(found)
 
 

@@ -98,7 +98,7 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"track": {"noise_deg": True}}, "must be a number"),
         ({"require": {"track.lap_s": {"max": 1.0}}}, r"unknown metric `track.lap_s`"),
         ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must say"),
-        ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "must be a positive number"),
+        ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "of a positive number"),
         ({"reserve": {"axes.gain_margin": 0.1}}, "is for loops over simulation models"),
         ({"reserve": {"sim.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
         ({"reserve": {"sim.rise_s": 0.49}}, "<= 0.49 leaves nothing beside its reserve of 0.49"),
