@@ -1,5 +1,5 @@
 """The pytest plugin: a `closed_loop` fixture for users' own tests.
 
-Nothing heavy is imported until a test asks.
+Heavy modules are imported when a test uses the fixture.
 May import `cosim` and below.
 """

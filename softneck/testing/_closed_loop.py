@@ -1,4 +1,4 @@
-"""A closed loop in a user's test: run it, hold it to limits, and show what failed."""
+"""The fixture `closed_loop`: run a closed loop in a user's test and check its limits."""
 
 from __future__ import annotations
 
@@ -14,24 +14,33 @@ from softneck.loop import check_limits
 from softneck.plots import chart_figure
 from softneck.plots._charts import loop_chart
 
-# Settings of the test that are no part of a loop file, and those of its [reference].
-_PARTS = ("plant", "observer", "controller")
-_REFERENCE = ("kind", "pitch_deg", "roll_deg", "cocontraction_rad", "at_s", "rise_s", "frequency_hz", "inclination_deg")
+# Settings that are parts of the loop, and those of its [reference].
+_PART_KEYS = ("plant", "observer", "controller")
+_REFERENCE_KEYS = (
+    "kind",
+    "pitch_deg",
+    "roll_deg",
+    "cocontraction_rad",
+    "at_s",
+    "rise_s",
+    "frequency_hz",
+    "inclination_deg",
+)
 
 
 class LimitsExceeded(AssertionError):
-    """A limit did not hold; the message names metric, limit, value and the plot."""
+    """A limit does not hold; the message names metric, limit, value and the plot."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClosedLoop:
-    """What the fixture `closed_loop` gives to a test.
+    """The value of the fixture `closed_loop`: call it to run a loop.
 
     Attributes:
-        folder: where relative paths start.
-        plot: file of the plot that a failure leaves.
-        file, settings: the defaults of the markers.
-        limits: those of the markers; every loop must hold them.
+        folder: of relative paths.
+        plot: file of the plot of a failure.
+        file, settings: defaults from the markers.
+        limits: from the markers; every loop must hold them.
     """
 
     folder: Path
@@ -41,19 +50,19 @@ class ClosedLoop:
     limits: Mapping[str, float] = field(default_factory=dict)
 
     def __call__(self, loop_file: str | Path | None = None, **settings: Any) -> Outcome:
-        """Run a loop and hold it to the limits of the markers.
+        """Run a loop and check the limits of the markers.
 
         Args:
-            loop_file: of a loop; its own limits are held too.
-            settings: without a loop file, `plant`, `controller` and, if there is one, `observer` (an FMU, a file of
-                ours, or a table as in a loop file), the keys of [reference] such as `pitch_deg` or `at_s` (0.5 s
+            loop_file: of a loop; its own limits are checked too.
+            settings: without a loop file, `plant`, `controller` and, if there is one, `observer` (an FMU, a softneck
+                file, or a table as in a loop file), the keys of [reference] such as `pitch_deg` or `at_s` (0.5 s
                 unless given), and the other keys of a loop file, such as `duration_s` (6 s) or `fault`.
 
         Raises:
             LimitsExceeded: a limit of a marker or of the loop file does not hold.
-            SettingsError: no such setting.
+            SettingsError: an unknown setting.
         """
-        # A file that the test names itself stands for all that the markers say.
+        # A file given by the test replaces file and settings of the markers.
         chosen = settings if loop_file is not None else {**self.settings, **settings}
         file = loop_file if loop_file is not None else self.file
         if file is not None and chosen:
@@ -70,8 +79,8 @@ class Outcome:
 
     Attributes:
         result: signals, metrics.
-        plot: file of the plot that a failure leaves.
-        axis: "pitch" or "roll", which a limit without an axis is about.
+        plot: file of the plot of a failure.
+        axis: "pitch" or "roll": the axis of limits without one.
     """
 
     result: Result
@@ -79,14 +88,14 @@ class Outcome:
     axis: str
 
     def holds(self, limits: Mapping[str, float] | None = None, **named: float) -> Outcome:
-        """Hold the loop to upper limits and return it again.
+        """Check upper limits and return the outcome itself.
 
         Args:
             limits: as in a loop file, such as {"pitch.overshoot_pct": 10.0}.
             named: metrics of the stepped axis, such as overshoot_pct=10.0, or of the motors.
 
         Raises:
-            LimitsExceeded: one does not hold; the plot is saved.
+            LimitsExceeded: a limit does not hold; the plot is saved.
         """
         table = self.result.metrics
         wanted = {self._full(name, table): limit for name, limit in {**(limits or {}), **named}.items()}
@@ -115,15 +124,15 @@ def _table(settings: Mapping[str, Any]) -> dict[str, Any]:
     table: dict[str, Any] = {"duration_s": 6.0}
     reference: dict[str, Any] = {"kind": "step", "at_s": 0.5}
     for key, value in settings.items():
-        if key in _PARTS:
+        if key in _PART_KEYS:
             table[key] = value if isinstance(value, Mapping) else _source(key, str(value))
-        elif key in _REFERENCE:
+        elif key in _REFERENCE_KEYS:
             reference[key] = value
-        elif key.partition("_")[0] in _PARTS and key.endswith("_parameters"):
+        elif key.partition("_")[0] in _PART_KEYS and key.endswith("_parameters"):
             continue
         else:
             table[key] = value
-    for part in _PARTS:
+    for part in _PART_KEYS:
         if f"{part}_parameters" in settings and part in table:
             table[part] = {**table[part], "parameters": settings[f"{part}_parameters"]}
     return {"reference": reference, **table}

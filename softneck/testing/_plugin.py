@@ -1,4 +1,4 @@
-"""What pytest loads through the entry point `softneck`; it must cost nothing where no test closes a loop."""
+"""The pytest plugin, loaded through the entry point `softneck`; it is cheap when no test uses the fixture."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import pytest
 if TYPE_CHECKING:
     from ._closed_loop import ClosedLoop
 
-_MARKERS = (
-    "closed_loop(loop_file=None, **settings): what the `closed_loop` fixture runs unless the test says otherwise",
+_MARKER_LINES = (
+    "closed_loop(loop_file=None, **settings): defaults of the `closed_loop` fixture",
     "limits(metric=limit, ...): upper limits that every loop of the test must hold, such as overshoot_pct=10",
 )
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Register the markers."""
-    for marker in _MARKERS:
+    for marker in _MARKER_LINES:
         config.addinivalue_line("markers", marker)
 
 
 @pytest.fixture
 def closed_loop(request: pytest.FixtureRequest) -> ClosedLoop:
-    """Run closed loops over FMUs and say what did not hold; see `softneck.testing._closed_loop.ClosedLoop`."""
+    """Run closed loops over FMUs and check their limits; see `softneck.testing._closed_loop.ClosedLoop`."""
     from ._closed_loop import ClosedLoop
 
     file: object = None
     settings: dict[str, object] = {}
     limits: dict[str, float] = {}
-    # The closest marker comes first: what stands at the test goes before what stands at its module.
+    # The closest marker comes first: a marker of the test overrides one of its module.
     for marker in reversed(list(request.node.iter_markers("closed_loop"))):
         file = marker.args[0] if marker.args else file
         settings |= marker.kwargs
