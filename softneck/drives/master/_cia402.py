@@ -1,6 +1,6 @@
 """The power state machine of a drive as the master sees it (CiA 402-2): status word in, control word out.
 
-Tables and look-ups; nothing here remembers anything.
+Tables and look-ups without state.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from enum import IntEnum
 
 
 class DriveState(IntEnum):
-    """States by their bits of the status word."""
+    """Drive states, coded by their bits of the status word."""
 
     NOT_READY = 0x00
     DISABLED = 0x40
@@ -22,14 +22,14 @@ class DriveState(IntEnum):
     UNKNOWN = 0xFF
 
 
-# Without power, and not by a fault: what a drive has to say before a run counts as done.
+# States without power and without a fault: each drive must report one of them before a run is done.
 OFF = frozenset({DriveState.NOT_READY, DriveState.DISABLED, DriveState.READY, DriveState.SWITCHED_ON})
-# With power: a drive that quick-stops or reacts to a fault still brakes.
+# States with power: during a quick stop or a fault reaction a drive still brakes.
 POWERED = frozenset({DriveState.ENABLED, DriveState.QUICK_STOP, DriveState.REACTION})
 
 
 class Goal(IntEnum):
-    """What the master wants of a drive."""
+    """The state that the master requests of a drive."""
 
     OFF = 0
     READY = 1
@@ -55,8 +55,8 @@ _STATES = tuple(
 
 _SHUTDOWN, _SWITCH_ON, _ENABLE, _QUICK_STOP, _NOTHING, _FAULT_RESET = 0x06, 0x07, 0x0F, 0x02, 0x00, 0x80
 S, G = DriveState, Goal
-# (state, goal) -> control word; what is not listed gets "disable voltage". Quick stop never leads back to enabled,
-# and no goal but RESET leaves a fault: nothing restarts by itself.
+# (state, goal) -> control word; pairs that are not listed get "disable voltage". Quick stop never leads back to
+# enabled, and only the goal RESET leaves a fault, so that no drive restarts by itself.
 _WORDS = {
     (S.DISABLED, G.READY): _SHUTDOWN,
     (S.READY, G.READY): _SHUTDOWN,
@@ -80,5 +80,5 @@ def state_of(word: int) -> DriveState:
 
 
 def control_word(state: DriveState, goal: Goal) -> int:
-    """Return the control word that brings a drive in `state` nearer to `goal`."""
+    """Return the control word for the next transition of a drive in `state` towards `goal`."""
     return _WORDS.get((state, goal), _NOTHING)

@@ -1,6 +1,6 @@
-"""What may go wrong, as a table: for each event who reacts, how, and until when at the latest.
+"""The fault table: for each event the reaction of the master and its deadline.
 
-The table is the requirement list of the project's fault table; the tests name each row.
+The tests name each row.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from enum import StrEnum
 
 
 class Reaction(StrEnum):
-    """What the master does."""
+    """Reactions of the master."""
 
     COUNT = "count"
     HOLD = "hold"
@@ -20,14 +20,14 @@ class Reaction(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One row.
+    """One row of the fault table.
 
     Attributes:
-        reaction: what happens.
-        cycles: deadline in cycles; 0 where `seconds` counts.
+        reaction: of the master.
+        cycles: deadline in cycles; 0 if `seconds` is the deadline.
         seconds: deadline [s].
-        text: for people.
-        rehome: the drives' zero is lost: `softneck drives commission --only zero` is due.
+        text: one line on the event.
+        rehome: whether the drives' zero is lost and `softneck drives commission --only zero` must be run.
     """
 
     reaction: Reaction
@@ -89,19 +89,19 @@ RULES: dict[str, Rule] = {
 }
 
 
-# Told also while no drive has power: what says that somebody else drives, or that a zero is lost.
+# Events that count also while no drive has power: another master is active, or a zero is lost.
 IDLE_TOO = frozenset({"second_master", "bus_off", "boot_up", "operator", "emergency"})
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened in a run: when, what, and at which drive.
+    """An event in a run: its time, its kind and the drive.
 
     Attributes:
         time: [s] of the master's clock.
         name: key of `RULES`.
         node: of the drive, 0 for none.
-        detail: for people.
+        detail: further text.
     """
 
     time: float
@@ -111,11 +111,11 @@ class Event:
 
     @property
     def rule(self) -> Rule:
-        """Its row of the table."""
+        """The row of the fault table for this event."""
         return RULES[self.name]
 
     def __str__(self) -> str:
-        """One line for people."""
+        """Return one line on the event."""
         where = f" (node {self.node})" if self.node else ""
         more = f": {self.detail}" if self.detail else ""
         return f"{self.rule.text}{where}{more}"

@@ -1,4 +1,4 @@
-"""The cyclic traffic with the drives, without I/O: frames in become axis states and events, targets become frames."""
+"""Cyclic traffic with the drives, without I/O: received frames to drive states and events, targets to frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Frame(NamedTuple):
         identifier: COB-ID.
         data: at most 8 bytes.
         remote: a remote request (RTR).
-        error: not from the bus but about it: the adapter reports an error; data is b"off" for bus-off.
+        error: an error reported by the adapter, not a frame on the bus; data is b"off" for bus-off.
     """
 
     identifier: int
@@ -31,11 +31,11 @@ class Frame(NamedTuple):
 
 
 BUS_OFF = Frame(0, b"off", error=True)
-"""What the edge puts in when the adapter went bus-off or is gone."""
+"""Frame that the I/O layer inserts when the adapter is bus-off or gone."""
 
 
 class NodeState(IntEnum):
-    """NMT states as heartbeat and guarding code them."""
+    """NMT states, coded as in heartbeat and guarding messages."""
 
     BOOT_UP = 0x00
     STOPPED = 0x04
@@ -60,7 +60,7 @@ def nmt_frame(command: Command, node: int) -> Frame:
 
 
 def node_state(code: int) -> NodeState:
-    """Return the state that a heartbeat or guarding byte says, without its toggle bit."""
+    """Return the NMT state in a heartbeat or guarding byte; the toggle bit is ignored."""
     try:
         return NodeState(code & 0x7F)
     except ValueError:
@@ -71,28 +71,28 @@ _TPDO = struct.Struct("<Hih")
 _RPDO = struct.Struct("<Hi")
 _EMERGENCY = struct.Struct("<HB")
 SYNC = Frame(0x080)
-# SDO request to write 8 to 6060h, and how a drive begins its answer that it did (CiA 301, 7.2.4.3.3).
+# SDO request to write 8 to 6060h, and the start of the answer that confirms it (CiA 301, 7.2.4.3.3).
 _LATE_MODE, _MODE_TAKEN = b"\x2f\x60\x60\0\x08\0\0\0", b"\x60\x60\x60\0"
-# Not faults: a drive at its own software limit decelerates and says so (FF06h, FF07h).
+# Not faults: a drive at its own software limit decelerates and reports it (FF06h, FF07h).
 _LIMIT_CODES = (0xFF06, 0xFF07)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusSettings:
-    """The cyclic traffic.
+    """Settings of the cyclic traffic.
 
     Attributes:
         nodes: node numbers of the motors, in their order.
         cycle: [s].
         guarding: "life" (guarding by RTR) or "heartbeat".
-        guard_cycles: cycles between two guarding requests, or two heartbeats of ours.
-        master: our node number, for the heartbeat.
-        silent_cycles: without any drive's answer until the bus counts as dead.
-        missing_cycles: without a drive's TPDO until it counts as lost.
-        answer_time: without its guarding answer or heartbeat [s], the same.
-        stalled_cycles: between two steps until the loop counts as stalled.
-        late_modes: nodes whose drive takes its mode in Operation Enabled alone: it is written there.
-        off: names of guards that are switched off; for the tests that prove each one to be needed.
+        guard_cycles: cycles between two guarding requests, or two heartbeats of the master.
+        master: node number of the master, for the heartbeat.
+        silent_cycles: cycles without any drive's answer after which the bus counts as dead.
+        missing_cycles: cycles without a drive's TPDO after which the drive counts as lost.
+        answer_time: time without a drive's guarding answer or heartbeat after which it counts as lost [s].
+        stalled_cycles: cycles between two steps after which the loop counts as stalled.
+        late_modes: nodes whose drive only accepts its mode in Operation Enabled, so that it is written there.
+        off: names of disabled guards, for the tests that show that each guard is needed.
     """
 
     nodes: tuple[int, ...] = (1, 2, 3)
@@ -114,7 +114,7 @@ class BusSettings:
 
 
 class DriveView:
-    """What the master knows of one drive.
+    """The master's view of one drive.
 
     Attributes:
         node: its number.
@@ -123,9 +123,9 @@ class DriveView:
         fresh: whether a TPDO came since the last step.
         silent: cycles without a TPDO.
         answered: when guarding or heartbeat last came [s]; None before the first.
-        nmt: state that it said there.
-        emergencies: (time, code, register) of all so far, the last 20.
-        mode: whether the drive has the cyclic mode; "asked" while it was told to and did not answer.
+        nmt: NMT state in the last guarding answer or heartbeat.
+        emergencies: (time, code, register) of the last 20.
+        mode: "taken" if the drive has the cyclic mode, "asked" while its answer is pending, else "missing".
     """
 
     __slots__ = (
@@ -134,7 +134,7 @@ class DriveView:
     )  # fmt: skip
 
     def __init__(self, node: int, *, late_mode: bool = False) -> None:
-        """Know nothing yet."""
+        """Start with unknown states."""
         self.mode = "missing" if late_mode else "taken"
         self.node = node
         self.word, self.state = 0, DriveState.UNKNOWN
@@ -146,21 +146,21 @@ class DriveView:
 
     @property
     def follows(self) -> bool:
-        """Whether the drive is in Operation Enabled, in the cyclic mode, and said so in this cycle."""
+        """Whether the drive reported Operation Enabled in this cycle and has the cyclic mode."""
         return self.state is DriveState.ENABLED and self.fresh and self.mode == "taken"
 
 
 class Fieldbus:
-    """Reads and writes the cyclic frames of all drives.
+    """Reader and writer of the cyclic frames of all drives.
 
     Attributes:
         settings: as given.
         drives: the views.
-        malformed: frames that were none of CANopen's, so far.
+        malformed: number of frames with a wrong length so far.
     """
 
     def __init__(self, settings: BusSettings) -> None:
-        """Prepare the look-up of identifiers."""
+        """Build the table of identifiers."""
         self.settings = settings
         self.drives = tuple(DriveView(node, late_mode=node in settings.late_modes) for node in settings.nodes)
         self.malformed = 0
@@ -179,7 +179,7 @@ class Fieldbus:
         self._beat = Frame(0x700 + settings.master, bytes([NodeState.OPERATIONAL]))
 
     def receive(self, now: float, frames: Sequence[Frame]) -> list[Event]:
-        """Take in all frames since the last step; return what happened."""
+        """Process all frames since the last step and return the events."""
         events: list[Event] = []
         for view in self.drives:
             view.fresh = False
@@ -239,7 +239,7 @@ class Fieldbus:
             events.append(Event(now, "node_left", view.node, f"it says {state.name}"))
 
     def _answer(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
-        """Take the answer to `_LATE_MODE`; to one that refuses it the wait for Operation Enabled does not end."""
+        """Process the answer to `_LATE_MODE`; after a refusal the wait for Operation Enabled times out."""
         del now, events
         if view.mode == "asked" and data[:4] == _MODE_TAKEN:
             view.mode = "taken"
@@ -263,7 +263,7 @@ class Fieldbus:
             events.append(Event(now, "bus_silent"))
 
     def send(self, goals: Sequence[Goal], targets: Sequence[int], *, guard: bool = True) -> list[Frame]:
-        """Return the frames of this cycle: set-points, SYNC, and guarding when it is due and `guard`."""
+        """Return the frames of this cycle: set-points, SYNC, and guarding if it is due and `guard` is set."""
         frames = []
         for view, goal, target in zip(self.drives, goals, targets, strict=True):
             word = control_word(view.state, goal)
@@ -278,7 +278,7 @@ class Fieldbus:
         return frames
 
     def signs_of_life(self) -> tuple[Frame, ...]:
-        """Return what the drives' guarding waits for: a request to each, or our heartbeat."""
+        """Return the frames that keep the drives' guarding alive: a request to each, or the master's heartbeat."""
         return self._guards if self.settings.guarding == "life" else (self._beat,)
 
     def start(self) -> list[Frame]:

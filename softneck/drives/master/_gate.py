@@ -1,4 +1,4 @@
-"""What of the inclinometer's samples may be believed: those of a robot's outputs."""
+"""Validation of the samples of a robot's outputs, such as those of an inclinometer."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import NamedTuple
 
 from ._events import Event
 
-# Without a valid sample for this long the sensor counts as lost [s]: the fault table allows 100 ms. So many identical
-# raw samples in a row are of a frozen one, and so many in a row that are no angles stop.
+# Time without a valid sample after which the sensor counts as lost [s] (the fault table allows 100 ms); number of equal
+# raw samples in a row after which it counts as frozen; number of invalid samples in a row that stop the run.
 DROPOUT, FROZEN, BAD = 0.08, 20, 3
-# No neck turns faster than this [rad/s], beside what noise may add [rad].
+# Largest speed of a neck [rad/s], and margin for noise [rad].
 _RATE, _MARGIN = 8.0, math.radians(3.0)
 
 
 class Reading(NamedTuple):
-    """One sample of what measures a robot's outputs, as it came.
+    """One raw sample of a robot's outputs.
 
     Attributes:
         values: of the outputs [rad].
         rates: [rad/s]; NaN without a gyro.
-        valid: False while the sensor itself says that it has nothing.
+        valid: False while the sensor itself reports no measurement.
     """
 
     values: tuple[float, ...]
@@ -37,24 +37,24 @@ class Tilt(Reading):
     def __new__(
         cls, pitch: float, roll: float, pitch_rate: float = math.nan, roll_rate: float = math.nan, valid: bool = True
     ) -> Tilt:
-        """Take both angles."""
+        """Make a sample of two angles."""
         return super().__new__(cls, (pitch, roll), (pitch_rate, roll_rate), valid)
 
 
 def sample_of(values: Sequence[float], rates: Sequence[float] = (), *, valid: bool = True) -> Reading:
-    """Return the sample of so many outputs; `rates` are NaN where none are given."""
+    """Return a sample; `rates` are NaN if not given."""
     return Reading(tuple(values), tuple(rates) or (math.nan,) * len(values), valid)
 
 
 class Gate:
-    """Passes samples on, counts what is wrong with them, and says when the sensor is lost.
+    """Validator of samples: discards invalid ones, and reports a lost or frozen sensor.
 
     Attributes:
-        last: last believed sample.
+        last: last accepted sample.
     """
 
     def __init__(self, angle: float) -> None:
-        """Believe nothing yet, and never what is beyond `angle` [rad]."""
+        """Start without a sample; values beyond `angle` [rad] are always discarded."""
         self._angle = angle
         self.last: Reading | None = None
         self._raw: tuple[float, ...] | None = None
@@ -63,7 +63,7 @@ class Gate:
         self._first: float | None = None
 
     def step(self, now: float, sample: Reading | None, events: list[Event]) -> bool:
-        """Take the sample that is due, None if none came; return whether it is believed."""
+        """Check the sample that is due (None if it is missing); return whether it is accepted."""
         if self._first is None:
             self._first = now
         good = sample is not None and sample.valid
@@ -90,7 +90,7 @@ class Gate:
         return good
 
     def _reason(self, now: float, sample: Reading) -> str:
-        """Return why `sample` is not valid, "" if it may be."""
+        """Return the reason why `sample` is invalid; "" if it is valid."""
         values = sample.values
         if not all(map(math.isfinite, values)):
             return "not finite"

@@ -1,4 +1,4 @@
-"""The master: `step(now, frames_in)` returns the frames to send. No clock, no bus, no thread: time is an argument."""
+"""The master of the drives: `step(now, frames_in)` returns the frames to send; no clock, no bus, no thread."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Motors = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """What the pilot gets at a sample.
+    """Measurements for the pilot at one sample.
 
     Attributes:
-        index: of the sample, from 0 where the phase `running` begins.
-        tilt: last believed sample.
-        fresh: whether it is of now.
+        index: of the sample, from 0 at the start of the phase `running`.
+        tilt: last accepted sample.
+        fresh: whether it is the present one.
         positions: of the motors [rad].
     """
 
@@ -39,14 +39,14 @@ class Measurement:
 
 
 class Pilot(Protocol):
-    """Observer and controller: what turns measurements into set-points."""
+    """Observer and controller: the map from measurements to set-points."""
 
     def start(self) -> None:
-        """Begin anew."""
+        """Start a new run."""
         ...
 
     def step(self, measured: Measurement) -> Motors | None:
-        """Return the set-points [rad], one for each motor; None if there are none in time."""
+        """Return the set-points [rad], one for each motor; None if they are not ready in time."""
         ...
 
     def finished(self, index: int) -> bool:
@@ -55,43 +55,43 @@ class Pilot(Protocol):
 
 
 def reference_of(pilot: Pilot) -> tuple[float, ...]:
-    """Return what a pilot that closes a loop wanted its outputs to be at its last step [rad]; () of any other."""
+    """Return the reference of a closed-loop pilot at its last step [rad]; () for other pilots."""
     return tuple(getattr(pilot, "reference", ()))
 
 
-# Clamped for longer than this stops [s]; time without a clamp takes a tenth of itself off.
+# Accumulated clamped time that stops the run [s]; time without clamping subtracts a tenth of itself.
 _PERSISTENT = 0.3
-# For each drive to be enabled, and for a ramp [s]: half of what the fault table allows.
+# Time-outs for enabling each drive and for a ramp [s]: half of the fault table's.
 _ENABLE_TIME, _RAMP_TIME = 1.0, 30.0
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
 _LOST = 5
-# Drives get this long for their stop ramp before they lose their voltage [s].
+# Time for the drives' stop ramp before their voltage is disabled [s].
 _STOP_TIME = 1.0
-# A drive that has not stopped this long after it was told to gets no more sign of life [s].
+# Time after a stop command after which guarding ends if a drive has not stopped [s].
 _OBEY_TIME = 0.25
 _NEVER = -math.inf
 _MOVED = frozenset({Phase.RAMP_IN, Phase.RUNNING, Phase.RAMP_OUT, Phase.RETREAT})
 
 
 class Master:
-    """All drives and what they move, from enabling to switched off, and every fault between.
+    """Master of all drives: enables them, runs the pilot, reacts to faults and switches the drives off.
 
     Attributes:
         settings: as given.
-        bus: the drives as they report themselves.
-        supervisor: the phase, and what ended the run.
-        positions, tensions: of the motors [rad] and tendons [N], as measured and estimated.
+        bus: the reported states of the drives.
+        supervisor: the phase, and the event that ended the run.
+        positions, tensions: of the motors [rad] and tendons [N], measured and estimated.
         setpoints: as sent [rad].
-        wanted: what the pilot asked for last [rad]; reference: what it wants the outputs to be [rad], () for nothing.
-        counts: event name -> how often.
+        wanted: last set-points of the pilot [rad]; reference: of its outputs [rad], () without one.
+        counts: event name -> number of occurrences.
         events: the last 1000.
         cycle: number of steps so far.
-        requests: (what, why) that came from outside since the last step: start, finish, stop.
-        taken: those that the last step took in.
+        requests: (request, reason) from outside since the last step: start, finish, leave, stop.
+        taken: the requests that the last step processed.
     """
 
     def __init__(self, settings: MasterSettings, pilot: Pilot) -> None:
-        """Be idle; `start` begins the run."""
+        """Start idle; `start` begins the run."""
         self.settings, self.pilot = settings, pilot
         self.bus = Fieldbus(settings.bus)
         self.supervisor = Supervisor(settings.bus.off)
@@ -126,17 +126,17 @@ class Master:
         return self.supervisor.phase in FINAL
 
     def start(self) -> None:
-        """Ask for the run to begin with the next step."""
+        """Request the start of the run with the next step."""
         self.requests.append(("start", ""))
         self._asked.append(Signal.START)
 
     def finish(self) -> None:
-        """Ask for the ramp out."""
+        """Request the ramp out."""
         self.requests.append(("finish", ""))
         self._asked.append(Signal.FINISH)
 
     def leave(self, reason: str = "") -> None:
-        """Ask for the ramp to rest and the end from wherever the run is; before anything moved, for a stop."""
+        """Request the ramp to rest and the end of the run in any phase; before the first motion, a stop."""
         self.requests.append(("leave", reason))
         now = self._now or 0.0
         if self.supervisor.phase in (Phase.RAMP_IN, Phase.RUNNING):
@@ -146,7 +146,7 @@ class Master:
             self._told(Event(now, "operator", 0, reason))
 
     def stop(self, reason: str = "") -> None:
-        """Ask for an immediate stop of all drives."""
+        """Request an immediate stop of all drives."""
         self.requests.append(("stop", reason))
         self._told(Event(self._now or 0.0, "operator", 0, reason))
 
@@ -155,8 +155,8 @@ class Master:
 
         Args:
             now: of this cycle.
-            frames: all that came since the last one; not our own.
-            tilt: the inclinometer's sample if one is due and came; due are the steps with `sample_due`.
+            frames: received since the last step, without those of the master.
+            tilt: the inclinometer's sample if one is due (`sample_due`) and has arrived.
         """
         self.taken = tuple(self.requests)
         self.requests.clear()
@@ -185,12 +185,12 @@ class Master:
 
     @property
     def ran(self) -> bool:
-        """Whether the pilot was asked in the last step and answered."""
+        """Whether the pilot ran in the last step and returned set-points."""
         return self._index >= 0 and self._part == 1 and self.supervisor.phase is Phase.RUNNING
 
     @property
     def tilt(self) -> Reading | None:
-        """The last believed sample of the inclinometer."""
+        """The last accepted sample of the inclinometer."""
         return self._gate.last
 
     @property
@@ -198,7 +198,7 @@ class Master:
         """Whether the next step is one at which observer and controller run."""
         return self.cycle % self.settings.sample_cycles == 0
 
-    # -- what came in -------------------------------------------------------------------------------------------
+    # -- input --------------------------------------------------------------------------------------------------
 
     def _timing(self, now: float) -> list[Event]:
         before, self._now = self._now, now
@@ -215,7 +215,7 @@ class Master:
         if not events:
             return
         supervisor, active = self.supervisor, self.supervisor.phase in ACTIVE
-        # While nothing has power only what could move or mislead counts.
+        # Without power only the events of `IDLE_TOO` count.
         for event in supervisor.react(now, events if active else [e for e in events if e.name in IDLE_TOO]):
             self._told(event, judged=True)
 
@@ -223,11 +223,11 @@ class Master:
         if not judged:
             self.supervisor.react(event.time, [event])
         self.counts[event.name] += 1
-        # What is only counted is kept once: it must not push out what stopped the run.
+        # Events that are only counted are stored once, so that they do not displace the one that stopped the run.
         if event.rule.reaction is not Reaction.COUNT or self.counts[event.name] == 1:
             self.events.append(event)
 
-    # -- what is wrong ------------------------------------------------------------------------------------------
+    # -- monitoring --------------------------------------------------------------------------------------------
 
     def _watch(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
         phase = self.supervisor.phase
@@ -255,7 +255,7 @@ class Master:
             self._judge(now, events)
             events.clear()
 
-    # -- what to do ---------------------------------------------------------------------------------------------
+    # -- phases -------------------------------------------------------------------------------------------------
 
     def _act(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
         phase = self.supervisor.phase
@@ -271,7 +271,7 @@ class Master:
             self._track()
 
     def _enable(self, now: float, events: list[Event]) -> None:
-        """One drive at a time; its set-point is where it is until it is enabled."""
+        """Enable one drive at a time; its set-point is its position until it is enabled."""
         if self._enabling_since == _NEVER:
             self._enabling_since = now
         view = self.bus.drives[self._enabling]
@@ -287,7 +287,7 @@ class Master:
             events.append(Event(now, "enable_timeout", view.node, f"it is {view.state.name}{why}"))
 
     def _ramp(self, now: float, events: list[Event]) -> None:
-        """Straight to rest, where P is zero, and a while there."""
+        """Ramp all motors to rest, P = 0, and wait there."""
         ramps = self.settings.ramps
         step = ramps.speed * self.settings.bus.cycle
         wanted = [value - min(max(value, -step), step) for value in self.setpoints]
@@ -300,14 +300,14 @@ class Master:
             self._arrived_at = _NEVER
             most = _RAMP_TIME
             if self.supervisor.phase is Phase.RETREAT:
-                # Without a sensor no longer than the way from the farthest set-point takes.
+                # Without a sensor at most the time from the farthest set-point.
                 most = min(most, self.settings.limits.position / ramps.speed + ramps.settle + 1.0)
             if now - self.supervisor.since > most:
                 events.append(Event(now, "ramp_timeout", 0, "the motors do not reach their rest"))
             return
         if self._arrived_at == _NEVER:
             self._arrived_at = now
-        # The run begins at a sample, so that its first row is one.
+        # The run starts at a sample.
         last = (self.cycle + 1) % self.settings.sample_cycles == 0
         if now - self._arrived_at >= ramps.settle - 1e-9 and last:
             self._change(now, Signal.ARRIVED)
@@ -343,7 +343,7 @@ class Master:
         self._limit(now, wanted, events, count=True)
 
     def _consult(self, now: float, fresh: bool, events: list[Event]) -> None:
-        """Ask the pilot; whatever goes wrong in it stops the drives in this cycle."""
+        """Run the pilot; any error in it stops the drives in this cycle."""
         tilt = self._gate.last
         if tilt is None:
             return
@@ -386,7 +386,7 @@ class Master:
             events.append(Event(now, "clamp_persistent", 0, why))
 
     def _switch_off(self, now: float, events: list[Event]) -> None:
-        """A run is done when each drive has said in this cycle that it is off; after a stop silence is enough."""
+        """End the run when every drive reported in this cycle that it is off; after a stop, silence is enough."""
         stopping, late = self.supervisor.phase is Phase.STOPPING, now - self.supervisor.since > _STOP_TIME
         powered = [view for view in self.bus.drives if view.state not in OFF or not view.fresh]
         if stopping:
@@ -398,7 +398,7 @@ class Master:
 
     @property
     def starved(self) -> bool:
-        """Whether guarding ends because a drive does not stop: one that hears no PDO still notices our silence."""
+        """Whether guarding ends because a drive does not stop; a drive without PDOs still notices the silence."""
         phase = self.supervisor.phase
         if phase is Phase.STOPPING:
             return (self._now or 0.0) - self.supervisor.since > _OBEY_TIME
@@ -410,7 +410,7 @@ class Master:
             self._arrived_at = _NEVER
 
     def _track(self) -> None:
-        """Without power a set-point is where its motor is; one that is enabled already holds."""
+        """Set the set-points of drives without power to the motor positions; enabled drives hold theirs."""
         values = []
         for view, limiter, position in zip(self.bus.drives, self._limiters, self.positions, strict=True):
             if view.state is not DriveState.ENABLED:
@@ -418,7 +418,7 @@ class Master:
             values.append(limiter.value)
         self.setpoints = tuple(values)
 
-    # -- what goes out ------------------------------------------------------------------------------------------
+    # -- output ------------------------------------------------------------------------------------------------
 
     def _goals(self) -> list[Goal]:
         goal = GOALS[self.supervisor.phase]

@@ -14,17 +14,17 @@ from ._fieldbus import BusSettings
 
 
 def setting(key: str, default: float, least: float, most: float) -> Any:
-    """Return the field of a number that the drives file calls `key`; default and range are in SI."""
+    """Return the dataclass field of a number with name `key` in the drives file; default and range are in SI."""
     return field(default=default, metadata={"key": key, "range": (least, most)})
 
 
 def factor_of(key: str) -> float:
-    """Return what turns a number of the drives file into SI."""
+    """Return the factor from a number in the drives file to SI."""
     return math.radians(1.0) if key.endswith("_deg") else 1.0
 
 
 class Ranged:
-    """Settings whose numbers are within their ranges."""
+    """Base of settings that checks the ranges of their numbers."""
 
     __slots__ = ()
 
@@ -38,16 +38,16 @@ class Ranged:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LimitSettings(Ranged):
-    """What set-points may be; beyond it they are clamped and counted.
+    """Limits of set-points, beyond which they are clamped.
 
     Attributes:
         position: |P| of each motor [rad].
         speed: [rad/s].
         acceleration: [rad/s^2].
-        tension: of a tendon, as estimated from the motor's current [N]; nearer than a fifth it may not be pulled
-            further, above it for 150 ms stops.
-        slack: a tendon below this hangs [N].
-        slack_unwind: how far a hanging tendon may still be let out, beyond what the outputs lean away from it [rad].
+        tension: of a tendon, estimated from the motor's current [N]; above 80 % of it the tendon may not be pulled
+            further, above it for 150 ms the run stops.
+        slack: tension below which a tendon is slack [N].
+        slack_unwind: how far a slack tendon may still be let out, in addition to the motion of the outputs [rad].
     """
 
     position: float = setting("position_rad", 6.0, 0.01, 100.0)
@@ -60,15 +60,15 @@ class LimitSettings(Ranged):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WatchSettings(Ranged):
-    """Model against measurement; both watches stop after 150 ms beyond their tolerance.
+    """Tolerances between model and measurement; beyond one for 150 ms the run stops.
 
     Attributes:
         following: motor against set-point [rad].
-        tilt: measured angle against the one that the motors' positions give [rad].
+        tilt: measured angle against the one computed from the motors' positions [rad].
         gain: static tilt for one radian of theta_i or phi_i (Eq. 31: 0.483/5.293).
         pole: of that first-order model [1/s] (Eq. 31).
-        pushed: a tendon that seems to push with more than this on the way in is one whose motor has the wrong sign
-            [N]; friction of gear and sheaths does not reach it at the ramp's speed.
+        pushed: pushing force of a tendon during the ramp in, above which its motor has the wrong sign [N]; friction of
+            gear and sheaths does not reach it at the ramp's speed.
         tendon_angles: gamma_1..3 of Eq. 5 and 7 [rad].
     """
 
@@ -88,11 +88,11 @@ class WatchSettings(Ranged):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RampSettings(Ranged):
-    """How a run begins and ends.
+    """Settings of the ramps at the start and the end of a run.
 
     Attributes:
         speed: of ramps [rad/s].
-        settle: time at the end of a ramp before what follows [s].
+        settle: waiting time at the end of a ramp [s].
         tolerance: of the motors to their rest there [rad].
     """
 
@@ -103,12 +103,12 @@ class RampSettings(Ranged):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChannelSettings:
-    """What the master must know of a robot that is given.
+    """Properties of the robot for the master.
 
     Attributes:
-        outputs: names of what is measured.
-        weights: (outputs, motors), each output's direction; () where they are to be identified, and nothing watches
-            then whether motors and outputs fit each other; None: of the neck, by its tendons' angles.
+        outputs: names of the measured outputs.
+        weights: (outputs, motors), each output's direction; () if still to be identified, in which case motors and
+            outputs are not compared; None: those of the neck, by its tendons' angles.
         ranges: of each motor: lowest and highest set-point [rad], largest speed [rad/s].
     """
 
@@ -127,10 +127,10 @@ class MasterSettings(Shown):
             drives commission --only zero`).
         newton_per_unit: tension for one unit of each drive's current, with sign.
         sample_cycles: bus cycles for one sample of the controller.
-        angle: what is measured beyond it is none of what the motors move [rad].
-        bus, limits, watch, ramps: as their classes say.
-        channels: of the robot; None: the neck, with no limits beside `limits`.
-        baseline: undisturbed motion, which plausibility is judged by; None: it is not.
+        angle: largest plausible measurement [rad].
+        bus, limits, watch, ramps: see their classes.
+        channels: of the robot; None: the neck, with no limits but `limits`.
+        baseline: of undisturbed motion, for the plausibility checks; None: no such checks.
     """
 
     counts_per_radian: tuple[float, ...]
@@ -157,5 +157,5 @@ class MasterSettings(Shown):
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of what is measured."""
+        """Names of the measured outputs."""
         return ("pitch", "roll") if self.channels is None else self.channels.outputs

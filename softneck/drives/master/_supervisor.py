@@ -1,4 +1,4 @@
-"""Phases of a run and what leads from one to the next: a table, one look-up, and no way back from a stop."""
+"""Phases of a run and their transitions: a table and one look-up; a stop is final."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Phase(StrEnum):
 
 
 class Signal(StrEnum):
-    """What moves it on."""
+    """Signals that trigger a transition."""
 
     START = "start"
     ENABLED = "enabled"
@@ -48,11 +48,11 @@ NEXT = {
     (_P.RETREAT, _S.ARRIVED): _P.DISABLING,
     (_P.DISABLING, _S.OFF): _P.DONE,
     (_P.STOPPING, _S.OFF): _P.STOPPED,
-    # A lost sensor: back to where no sensor is needed; before anything moved there is nothing to go back from.
+    # A lost sensor: retreat to rest, which needs no sensor; before the first motion, stop.
     (_P.ENABLING, _S.RETREAT): _P.STOPPING,
     (_P.RAMP_IN, _S.RETREAT): _P.RETREAT,
     (_P.RUNNING, _S.RETREAT): _P.RETREAT,
-    # A stop from wherever drives may have power.
+    # A stop from every phase in which drives may have power.
     (_P.ENABLING, _S.STOP): _P.STOPPING,
     (_P.RAMP_IN, _S.STOP): _P.STOPPING,
     (_P.RUNNING, _S.STOP): _P.STOPPING,
@@ -60,10 +60,10 @@ NEXT = {
     (_P.RETREAT, _S.STOP): _P.STOPPING,
     (_P.DISABLING, _S.STOP): _P.STOPPING,
 }
-# Phases in which drives may have power, and those with nothing after them.
+# Phases in which drives may have power, and final phases.
 ACTIVE = frozenset({_P.ENABLING, _P.RAMP_IN, _P.RUNNING, _P.RAMP_OUT, _P.RETREAT, _P.DISABLING})
 FINAL = frozenset({_P.DONE, _P.STOPPED})
-# What is asked of every drive; while enabling it goes one by one.
+# Goal for every drive in each phase; enabling goes one drive at a time.
 GOALS = {
     _P.IDLE: Goal.OFF,
     _P.ENABLING: Goal.ENABLED,
@@ -80,25 +80,25 @@ _SIGNALS = {Reaction.STOP: Signal.STOP, Reaction.RETREAT: Signal.RETREAT}
 
 
 class Supervisor:
-    """Keeps the phase, and the first event that ended the run.
+    """State machine of the run: its phase, and the first event that ended it.
 
     Attributes:
-        phase: where the run is.
-        since: when the phase began [s].
-        fault: what ended the run early; it stays, nothing clears it.
+        phase: of the run.
+        since: start of the phase [s].
+        fault: the event that ended the run early; it is never cleared.
         rehome: whether a drive lost its zero.
-        off: names of guards that are switched off, for the tests that prove each one to be needed.
+        off: names of disabled guards, for the tests that show that each guard is needed.
     """
 
     def __init__(self, off: frozenset[str] = frozenset()) -> None:
-        """Be idle."""
+        """Start idle."""
         self.phase, self.since = Phase.IDLE, 0.0
         self.fault: Event | None = None
         self.rehome = False
         self.off = off
 
     def signal(self, now: float, signal: Signal) -> bool:
-        """Move on if the table knows a way; return whether it does."""
+        """Make the transition for `signal` if the table has one; return whether it has."""
         following = NEXT.get((self.phase, signal))
         if following is None:
             return False
@@ -106,18 +106,18 @@ class Supervisor:
         return True
 
     def revoke(self, event: Event) -> None:
-        """Take a good end back: what showed after it says that it was none."""
+        """Change a successful end to a stop, because of an event after it."""
         self.phase = Phase.STOPPED
         self.fault = self.fault or event
 
     def react(self, now: float, events: Sequence[Event]) -> list[Event]:
-        """Take `events` of this cycle in their order; return those that count."""
+        """Process the events of this cycle in order; return those that are not disabled."""
         kept = [event for event in events if event.name not in self.off] if self.off else list(events)
         for event in kept:
             rule = event.rule
             self.rehome = self.rehome or rule.rehome
             signal = _SIGNALS.get(rule.reaction)
-            # The first fault is told; a stop goes over a retreat.
+            # The first fault is kept; a stop overrides a retreat.
             if signal is not None and self.phase not in FINAL and self.signal(now, signal) and self.fault is None:
                 self.fault = event
         return kept

@@ -1,4 +1,4 @@
-"""Model against measurement: does the neck tilt as its motors turn, do motors follow, do tendons bear it, and pull."""
+"""Monitoring of model against measurement: tilt, following error of the motors, and tension of the tendons."""
 
 from __future__ import annotations
 
@@ -14,23 +14,22 @@ from ._fieldbus import BusSettings
 from ._gate import Reading
 from ._settings import LimitSettings, WatchSettings
 
-# Both watches speak after this time beyond their tolerance [s]; the fault table allows 200 ms, and what is told
-# in one cycle acts in the same.
+# Time beyond a tolerance before an event [s]; the fault table allows 200 ms, and an event acts in the same cycle.
 PATIENCE = 0.15
 
 
 class Patience:
-    """Says once that something lasted too long."""
+    """Timer that reports a condition lasting for too long."""
 
     __slots__ = ("_limit", "_since")
 
     def __init__(self, limit: float = PATIENCE) -> None:
-        """Wait `limit` [s]."""
+        """Set the time limit [s]."""
         self._limit = limit
         self._since: float | None = None
 
     def over(self, now: float, beyond: bool) -> bool:
-        """Return whether `beyond` has held for the limit."""
+        """Return whether `beyond` has been true for the time limit."""
         if not beyond:
             self._since = None
             return False
@@ -40,23 +39,23 @@ class Patience:
 
 
 class Leaky:
-    """Adds up the time in which something holds and forgets it ten times as slowly."""
+    """Integrator of the time in which a condition holds, which leaks at a tenth of that rate."""
 
     __slots__ = ("_cycle", "_level", "_limit")
 
     def __init__(self, limit: float, cycle: float) -> None:
-        """Be full at `limit` [s]; asked each `cycle` [s]."""
+        """Set the limit [s]; `over` is called every `cycle` [s]."""
         self._limit, self._cycle, self._level = limit, cycle, 0.0
 
     def over(self, beyond: bool) -> bool:
-        """Return whether it is full."""
+        """Return whether the accumulated time has reached the limit."""
         step = self._cycle if beyond else -0.1 * self._cycle
         self._level = max(0.0, self._level + step)
         return self._level >= self._limit - 1e-9
 
 
 def timing(now: float, before: float | None, bus: BusSettings) -> list[Event]:
-    """Return what is wrong with the time between two steps [s]."""
+    """Return the events for a wrong time between two steps [s]."""
     if before is None:
         return []
     gap = (now - before) / bus.cycle
@@ -68,11 +67,11 @@ def timing(now: float, before: float | None, bus: BusSettings) -> list[Event]:
 
 
 class Watches:
-    """All of them, over one run.
+    """All monitors over one run.
 
     Attributes:
-        angles: that the model gives [rad].
-        led: motors that belong to the angles measured last, but for what all tendons do together [rad].
+        angles: of the model [rad].
+        led: motor positions that fit the last measured angles, without co-contraction [rad].
     """
 
     def __init__(
@@ -83,13 +82,13 @@ class Watches:
         motors: int = 3,
         baseline: Baseline | None = None,
     ) -> None:
-        """Begin upright; `weights` (outputs, motors) are directions, () where nobody knows them, None: the neck's."""
+        """Start upright; `weights` (outputs, motors) are the directions, () if not identified, None for the neck's."""
         self._plausible = None if baseline is None else Plausibility(baseline)
         self._settings, self._limits = settings, limits
         self._rows = settings.weights if weights is None else weights
         self.angles = [0.0] * len(self._rows)
         self.led: tuple[float, ...] = (0.0,) * motors
-        # The smallest motion that gives the angles (Penrose): nothing of it where directions are to be identified.
+        # The smallest motor motion for the angles (pseudo-inverse); None if directions are still to be identified.
         self._back = np.linalg.pinv(settings.gain * np.array(self._rows)).tolist() if self._rows else None
         self._offset = self.angles
         self._started = False
@@ -99,7 +98,7 @@ class Watches:
         self._pushes = tuple(Patience() for _ in range(motors))
 
     def align(self, measured: Sequence[float], positions: Sequence[float]) -> None:
-        """Take the angles before the motors move as those that belong to `positions`: a bias of sensor or link."""
+        """Take the offset between angles and model before the motors move as a bias of sensor or link."""
         if self._plausible is not None:
             self._plausible.begin()
         if not self._rows:
@@ -110,7 +109,7 @@ class Watches:
 
     def motors(self, now: float, setpoints: Sequence[float], positions: Sequence[float], nodes: Sequence[int],
                tensions: Sequence[float], events: list[Event]) -> None:  # fmt: skip
-        """Compare motors with their set-points, tendons with what they bear; each cycle while enabled."""
+        """Check following errors and tensions; each cycle while enabled."""
         for i in range(len(nodes)):
             gap = abs(setpoints[i] - positions[i])
             if self._behind[i].over(now, gap > self._settings.following):
@@ -119,7 +118,7 @@ class Watches:
                 events.append(Event(now, "tension", nodes[i], f"about {tensions[i]:.1f} N"))
 
     def signs(self, now: float, nodes: Sequence[int], tensions: Sequence[float], events: list[Event]) -> None:
-        """Look whether tendons pull; each cycle of the ramp in, in which every motor tightens its own."""
+        """Check that tendons pull; each cycle of the ramp in, during which every motor tightens its tendon."""
         for i in range(len(nodes)):
             if self._pushes[i].over(now, tensions[i] < -self._settings.pushed):
                 text = f"motor {i + 1}, about {tensions[i]:.1f} N: is `reversed` of its drive right?"
@@ -140,7 +139,7 @@ class Watches:
         ends = self._static(positions)
         self.angles = [angle + share * (end - angle) for angle, end in zip(self.angles, ends, strict=True)]
         if measured is None:
-            # What was not measured cannot diverge; the gate watches missing samples.
+            # Missing samples are monitored by the gate.
             return
         gap = max(
             abs(there - offset - here) for there, offset, here in zip(measured, self._offset, self.angles, strict=True)
@@ -151,7 +150,7 @@ class Watches:
     def plausible(self, now: float, nodes: Sequence[int], setpoints: Sequence[float], positions: Sequence[float],
                   tensions: Sequence[float], events: list[Event], *, due: bool,
                   sample: Reading | None, reference: Sequence[float]) -> None:  # fmt: skip
-        """Ask the charts; each cycle while enabled, with the sample that came where one is due."""
+        """Run the plausibility charts; each cycle while enabled, with the sample if one is due."""
         if self._plausible is None:
             return
         found = self._plausible.cycle(setpoints, positions, tensions)
@@ -164,7 +163,7 @@ class Watches:
             events.append(Event(now, found.name, 0 if found.motor < 0 else nodes[found.motor], found.detail))
 
     def _static(self, P: Sequence[float]) -> list[float]:
-        """Return the tilt that motors at `P` end at: Eq. 9, 10 for tendons in any direction, and the gain."""
+        """Return the static tilt for motors at `P`: Eq. 9, 10 for tendons in any direction, and the gain."""
         return [self._settings.gain * _product(row, P) for row in self._rows]
 
 

@@ -1,5 +1,5 @@
-"""Inclinometers: on the bus, on a serial port, or one's own.
+"""Inclinometers: on the bus, on a serial port, or the user's own.
 
-What a sensor says is checked by the master, not here.
+Their samples are checked by the master.
 May import `drives.bus` and `drives.master`.
 """

@@ -21,18 +21,18 @@ from softneck.signals.importing._clocks import pitch_roll
 from ..bus._link import reason
 from ..master import Frame, Tilt
 
-# Two decimals or more: a number that was torn within its decimals is none.
+# Two decimals or more: a number cut within its decimals is invalid.
 _LINE = re.compile(rb"i(\d{1,3}\.\d{2,}),\s?o(\d{1,3}\.\d{2,}|nan)")
 _LONGEST = 64
 _REQUEST = b"i"
 
 
 class SensorError(SoftneckError):
-    """An inclinometer cannot be opened, or speaks another protocol; the line says which and why."""
+    """An inclinometer cannot be opened, or uses another protocol."""
 
 
 def tilt_of_line(line: bytes) -> Tilt | None:
-    """Return the tilt that one line says, None if it says none; `line` without its end.
+    """Return the tilt in one line (without its end); None for other lines.
 
     At exactly no inclination the sensor's orientation is 0/0 and reads `nan`: the neck is upright then.
     """
@@ -50,22 +50,22 @@ def tilt_of_line(line: bytes) -> Tilt | None:
 
 
 class TiltLines:
-    """Makes samples of bytes as they come; torn, broken and binary ones cost their own line only.
+    """Parser of samples in a stream of bytes; damaged data only affects its own line.
 
     Attributes:
-        good, bad: lines so far.
-        strange: the last bytes that were no line of this protocol.
+        good, bad: numbers of lines so far.
+        strange: the last bytes that were not a line of this protocol.
     """
 
     def __init__(self) -> None:
-        """Begin in the middle of a line: what comes before the first end of one is not counted."""
+        """Start in the middle of a line: bytes before the first line end are not counted."""
         self._rest = b""
         self._whole = False
         self.good = self.bad = 0
         self.strange = b""
 
     def feed(self, data: bytes) -> list[Tilt]:
-        """Return the samples whose lines end in `data`."""
+        """Return the samples of the lines that end in `data`."""
         *lines, rest = (self._rest + data).split(b"\n")
         samples = []
         for line in lines:
@@ -78,7 +78,7 @@ class TiltLines:
                 self.strange = line[:_LONGEST]
             self._whole = True
         if len(rest) > _LONGEST:
-            # No end of a line in so many bytes: binary. What follows until the next end belongs to it.
+            # No line end in so many bytes: binary data, up to the next line end.
             self.strange = rest[:_LONGEST]
             self.bad += 1
             rest, self._whole = b"", False
@@ -87,11 +87,11 @@ class TiltLines:
 
 
 class SerialInclinometer:
-    """Reads the lab's lines from a serial port, without ever waiting for it.
+    """Reader of the lab's lines from a serial port; it never blocks.
 
     Attributes:
-        lines: counts of good and bad ones.
-        problem: why reading ended, "" if it did not: the port is gone.
+        lines: numbers of good and bad lines.
+        problem: reason why reading ended; "" while it goes on.
     """
 
     def __init__(self, port: str, *, baud: int = 9600, request: bool = False, start: float = 10.0) -> None:
@@ -101,7 +101,7 @@ class SerialInclinometer:
             port: such as /dev/ttyACM0.
             baud: bit/s.
             request: the firmware sends a line for each "i" only.
-            start: how long the sensor may take to begin [s].
+            start: time-out for the first sample [s].
 
         Raises:
             SensorError: no such port, no permission, silent, or another protocol; one line.
@@ -122,12 +122,12 @@ class SerialInclinometer:
             raise
 
     def take(self, frames: Sequence[Frame]) -> None:
-        """Read what is there; keeps the newest sample."""
+        """Read the available bytes and keep the newest sample."""
         del frames
         self._read()
 
     def read(self, now: float, frames: Sequence[Frame]) -> Tilt | None:
-        """Return the newest sample since the last call, None if none came; asks for the next where that is needed."""
+        """Return the newest sample since the last call, or None; request the next one if need be."""
         del now, frames
         self._read()
         self._ask()
@@ -176,6 +176,6 @@ class SerialInclinometer:
             try:
                 self._port.write(_REQUEST)
             except OSError as error:
-                # A full buffer is no end: the sensor is late, which the gate notices.
+                # A full buffer is not an error: the sensor is late, which the gate detects.
                 if not type(error).__name__.endswith("TimeoutException"):
                     self.problem = reason(error)

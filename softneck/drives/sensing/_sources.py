@@ -1,4 +1,4 @@
-"""How the inclinometer that a drives file names is opened: on the bus, serial, or one's own."""
+"""Opening of the inclinometer of a drives file: on the bus, serial, or the user's own."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from ._serial import SensorError, SerialInclinometer
 # 6110h and 6120h, slope of one axis or both in 32 bits, at a resolution of 0.001 deg (6000h = 1; CiA 410, 6.1).
 _SLOPES = {1: struct.Struct("<i"), 2: struct.Struct("<ii")}
 _RESOLUTION = math.radians(0.001)
-# What the sensor sends where it has nothing: the most negative number.
+# Sent by the sensor if it has no measurement: the most negative number.
 _NOTHING = -(2**31)
-# Within this time any inclinometer that sends has sent [s]: 10 samples at 20 Hz.
+# Time in which any active inclinometer sends a sample [s]: 10 samples at 20 Hz.
 LOOK = 0.5
 _PIECE = 0.02
 
 
 class Sensor(Protocol):
-    """What measures the outputs; one that can say why it ended has an attribute `problem` as well."""
+    """A sensor of the outputs; it may also have an attribute `problem` with the reason of a failure."""
 
     def take(self, frames: Sequence[Frame]) -> None:
-        """Look at frames of a cycle in which no sample is due; a sensor that is not on the bus ignores them."""
+        """Process the frames of a cycle without a due sample; sensors that are not on the bus ignore them."""
         ...
 
     def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
-        """Return the newest sample, None if none came since the last call."""
+        """Return the newest sample since the last call, or None."""
         ...
 
 
 def look_at(sensor: Sensor, link: Link, timeout: float) -> Reading | None:
-    """Return the first sample of `sensor` that comes within `timeout` [s], None if none does."""
+    """Return the first sample of `sensor` within `timeout` [s], or None."""
     until = link.now + timeout
     while link.now < until:
         tilt = sensor.read(link.now, link.receive(_PIECE))
@@ -55,7 +55,7 @@ def look_at(sensor: Sensor, link: Link, timeout: float) -> Reading | None:
 
 
 class CanInclinometer:
-    """Reads the slopes that node `node` sends in its first TPDO."""
+    """Reader of the slopes that node `node` sends in its first TPDO."""
 
     def __init__(self, node: int, axes: int = 2) -> None:
         """Listen for the identifier 180h + node.
@@ -71,14 +71,14 @@ class CanInclinometer:
         self._newest: Reading | None = None
 
     def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
-        """Return the newest sample among `frames`, and those since the last call; None if none came."""
+        """Return the newest sample in `frames` or since the last call, or None."""
         del now
         self.take(frames)
         newest, self._newest = self._newest, None
         return newest
 
     def take(self, frames: Sequence[Frame]) -> None:
-        """Look at frames of a cycle in which no sample is due."""
+        """Process the frames of a cycle without a due sample."""
         for frame in frames:
             if frame.identifier != self._identifier or frame.remote or frame.error:
                 continue
@@ -88,13 +88,13 @@ class CanInclinometer:
 
 
 class _Changed:
-    """A sensor whose samples are changed: it is mounted with other axes or signs, or one angle of its two is meant."""
+    """A sensor with transformed samples: for other axes or signs of its mounting, or one of its two angles."""
 
     def __init__(self, sensor: Any, change: Callable[[Reading], Reading]) -> None:
         self._sensor, self._change, self.take = sensor, change, sensor.take
 
     def __getattr__(self, name: str) -> Any:
-        # What not every sensor has: name, problem, close.
+        # Optional attributes: name, problem, close.
         return getattr(self._sensor, name)
 
     def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
@@ -106,13 +106,13 @@ class _Changed:
 def open_sensor(
     kind: str, node: int, source: SensorSource, robot: Robot = NECK, *, axes: Sequence[str] = ()
 ) -> Iterator[Any]:
-    """Yield the inclinometer of a drives file, or what else measures the outputs of `robot`; see `Sensor`.
+    """Yield the inclinometer of a drives file, or another sensor of the outputs of `robot`; see `Sensor`.
 
-    Its samples are turned by `axes`, see `DrivesFile.sensor_axes`.
+    Its samples are transformed by `axes`, see `DrivesFile.sensor_axes`.
 
     Raises:
-        SettingsError: a simulated one, a factory that cannot be called, or that returns no sensor.
-        SensorError: no port, no permission, silent, or another protocol.
+        SettingsError: a simulated sensor, a factory that cannot be called, or one that does not return a sensor.
+        SensorError: no port, no permission, no data, or another protocol.
     """
     sensor = _opened(kind, node, source, robot)
     if axes:
@@ -138,7 +138,7 @@ def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
                     '"python".'
                 )
             sensor = SerialInclinometer(source.port, baud=source.baud, request=source.request, start=source.start)
-            # Of a robot with one output the sensor sits with its first axis in that plane.
+            # For a robot with one output the first axis of the sensor is in its plane.
             first = lambda tilt: sample_of(tilt.values[:1], tilt.rates[:1], valid=tilt.valid)  # noqa: E731
             return sensor if count == 2 else _Changed(sensor, first)
         case "python":
@@ -148,29 +148,29 @@ def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
 
 
 _METHODS = ("take", "read")
-# A call that takes longer than this has cost bus cycles [s]; the loop itself stops after five of them.
+# A longer call delays bus cycles [s]; the loop stops after five of them.
 _LONG = 0.02
 
 
 class PythonInclinometer:
-    """Asks a sensor of the user's own; after its first mistake it is asked no more, and the loop goes to rest.
+    """Adapter of a user's own sensor; after its first error it is not called again, and the loop goes to rest.
 
     Attributes:
-        problem: why it is asked no more, or which call took long; "" if all is well.
+        problem: reason why it is not called again, or the call that took long; "" if there is none.
     """
 
     def __init__(self, sensor: Any, name: str, outputs: int = 2) -> None:
-        """Ask `sensor` for so many outputs; it is called `name` where something is said about it."""
+        """Wrap `sensor` with this number of outputs; messages call it `name`."""
         self._sensor, self.name, self._outputs = sensor, name, outputs
         self.problem = ""
         self._ended = False
 
     def take(self, frames: Sequence[Frame]) -> None:
-        """Hand over frames of a cycle without a sample."""
+        """Pass on the frames of a cycle without a sample."""
         self._call("take", frames)
 
     def read(self, now: float, frames: Sequence[Frame]) -> Reading | None:
-        """Return the newest sample; None if none came, or where it returned something else."""
+        """Return the newest sample; None if there is none or the sensor returned another type."""
         answer = self._call("read", now, frames)
         if answer is None:
             return None
@@ -181,7 +181,7 @@ class PythonInclinometer:
             return None
 
     def _sample(self, answer: Any) -> Reading:
-        """Return a `Tilt`, or one number for each output of another robot, as a sample."""
+        """Convert a `Tilt`, or for other robots one number for each output, to a sample."""
         if isinstance(answer, Tilt) and self._outputs == 2:
             values, rates = ([float(value) for value in told] for told in (answer.values, answer.rates))
             return sample_of(values, rates, valid=bool(answer.valid))
@@ -193,10 +193,10 @@ class PythonInclinometer:
         return sample_of(values)
 
     def close(self) -> None:
-        """Close it if it can be closed."""
+        """Close the sensor if it has `close`."""
         close = getattr(self._sensor, "close", None)
         if close is not None:
-            # What fails now can no longer move or stop anything.
+            # An error here no longer affects the drives.
             with contextlib.suppress(Exception):
                 close()
 
@@ -206,7 +206,7 @@ class PythonInclinometer:
         begin = time.monotonic()
         try:
             answer = getattr(self._sensor, method)(*arguments)
-        except Exception as error:  # whatever it is, the drives must be led to rest rather than dropped
+        except Exception as error:  # after any error the drives must go to rest and not lose their set-points
             self._end(f"`{method}` raised {type(error).__name__}: {' '.join(str(error).split())}")
             return None
         took = time.monotonic() - begin
@@ -221,20 +221,20 @@ class PythonInclinometer:
 def make_python_sensor(
     python: str, options: Mapping[str, Any], folder: Path, *, outputs: int = 2
 ) -> PythonInclinometer:
-    """Call the factory `package.module:factory` with `options`; `folder` is looked into for the module too.
+    """Call the factory `package.module:factory` with `options`; the module is also searched in `folder`.
 
-    Its sensor says `Tilt`s, or for a robot of other than two outputs a sequence with one number for each [rad].
+    Its sensor returns `Tilt`s, or for robots without two outputs a sequence with one number for each output [rad].
 
     Raises:
-        SettingsError: there is no such factory, or it returns no sensor.
-        SensorError: it raises something.
+        SettingsError: there is no such factory, or it does not return a sensor.
+        SensorError: the factory raises an error.
     """
     module, _, name = python.partition(":")
     place = str(folder.resolve())
     sys.path.insert(0, place)
     try:
         factory = getattr(importlib.import_module(module), name)
-    except Exception as error:  # a module of the user's own raises what it likes while it is imported
+    except Exception as error:  # importing a user's module may raise any error
         raise SettingsError(
             f"[sensor] python = `{python}` cannot be found ({type(error).__name__}: {' '.join(str(error).split())}); "
             "write package.module:factory."
