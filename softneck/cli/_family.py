@@ -95,7 +95,7 @@ def _facts(path: Path, family: Family) -> dict[str, Any]:
         "sample_time_s": family.sample_time,
         "axes": axes,
         "cross_gains": {
-            "from": ["theta_i", "phi_i", "delta_i"] if family.robot.is_neck else list(family.axes),
+            "from": [*family.robot.input_names, family.robot.cocontraction_name][: len(next(iter(family.cross)))],
             **dict(zip(family.axes, family.cross, strict=True)),
         },
         "compression": _named(family.compression),

@@ -198,7 +198,7 @@ def command(
         return
     facts: dict[str, Any] = {}
     whose = find_robot(robot, beside=log)
-    if robot_out is not None or named is not None or (layout_file is None and not whose.is_neck):
+    if robot_out is not None or named is not None or (layout_file is None and not _can_guess(whose)):
         imported, layout, facts = _of_robot(
             job, whose, robot_out, known=robot is not None or robot_file_of(log) is not None
         )
@@ -210,6 +210,13 @@ def command(
         layout, proposed = read_layout(layout_file, robot=whose), None
         imported = import_log(log, layout)
     _finish(job, imported, facts, layout, proposed)
+
+
+def _can_guess(robot: Robot) -> bool:
+    """Return whether a robot's channels are those that are looked for in a log without titles."""
+    from softneck.signals.recording._channels import OUTPUTS, SET_POINTS
+
+    return (robot.set_points, robot.outputs.names) == (SET_POINTS, OUTPUTS)
 
 
 def _recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any]]:

@@ -172,7 +172,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
         "sample_time_s": recording.sample_time,
         "channels": ", ".join(recording.channels),
         **({} if html is None else {"html": str(html)}),
-        **({} if recording.robot.is_neck else {"robot": recording.robot.label()}),
+        **({"robot": recording.robot.label()} if recording.robot.in_header() else {}),
         "quality": found,
     }
 

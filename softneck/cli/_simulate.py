@@ -155,6 +155,7 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
 
 
 def _page(name: str, result: Result, view: Path | None) -> str:
+    from softneck.core import to_si
     from softneck.plots import Section, Table, page
     from softneck.plots._charts import loop_chart
     from softneck.plots._neck3d import not_drawn
@@ -166,15 +167,13 @@ def _page(name: str, result: Result, view: Path | None) -> str:
         result.signals.time, result.signals.signals, "Reference, outputs and motors", limits=result.bounds,
         robot=result.robot,
     )  # fmt: skip
-    what = "angle" if result.robot.is_neck else "output"
+    what = "angle" if to_si(result.robot.outputs.unit)[1] == "rad" else "output"
     words = (
         f"Order {result.order}, metrics of the {result.angle} {what}, {result.real_time_factor:.0f} times real time."
     )
     method = [words]
     if view is not None:
-        method.append(
-            Markup('<a href="{}">The {} in 3-D</a>').format(view.name, "neck" if result.robot.is_neck else "robot")
-        )
+        method.append(Markup('<a href="{}">The robot in 3-D</a>').format(view.name))
     else:
         method.append(not_drawn(result.robot))
     return page(

@@ -96,9 +96,11 @@ class MotorFault:
         require_one_of("kind", self.kind, MOTOR_FAULTS)
         _check_window(self.start, self.duration)
         require_whole("motor", self.motor, 0, len(self.robot.motors.names))
-        if self.robot.is_neck:
-            require_between("size", self.size, -6.0, 6.0, "rad")
         require_finite("size", self.size)
+        motors, (factor, unit) = self.robot.motors, to_si(self.robot.motors.unit)
+        if motors.setpoint_min is not None and motors.setpoint_max is not None:
+            most = factor * max(map(abs, (*motors.setpoint_min, *motors.setpoint_max)))
+            require_between("size", self.size, -most, most, unit)
         if self.kind == "slow":
             require_positive("rate", self.rate, "rad/s")
         if self.kind == "offset" and self.size == 0.0:

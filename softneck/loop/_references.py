@@ -114,7 +114,7 @@ class RecordingReference(Shown):
         return tuple(self.table[reference_row(time, self.table, near), 1:].tolist())
 
 
-def reference(kind: str, robot: Robot = _NECK, **values: float) -> RobotReference:
+def reference(kind: str, values: Mapping[str, float], robot: Robot = _NECK) -> RobotReference:
     """Return a reference of outputs, `inclination`, `cocontraction`, `at`, `rise` and `frequency`, all in SI.
 
     Raises:
@@ -139,22 +139,22 @@ def reference(kind: str, robot: Robot = _NECK, **values: float) -> RobotReferenc
 
 def StepReference(**values: float) -> RobotReference:
     """Return a step of a neck: `pitch`, `roll`, `cocontraction` [rad], `at` [s]."""
-    return reference("step", **values)
+    return reference("step", values)
 
 
 def RampReference(**values: float) -> RobotReference:
     """Return a ramp of a neck: `pitch`, `roll`, `cocontraction` [rad], `at`, `rise` [s]."""
-    return reference("ramp", **values)
+    return reference("ramp", values)
 
 
 def SineReference(**values: float) -> RobotReference:
     """Return a sine of a neck: `pitch`, `roll`, `cocontraction` [rad], `frequency` [Hz], `at` [s]."""
-    return reference("sine", **values)
+    return reference("sine", values)
 
 
 def RotationReference(**values: float) -> RobotReference:
     """Return a rotation of a neck: `inclination`, `cocontraction` [rad], `frequency` [Hz], `at`, `rise` [s]."""
-    return reference("rotation", **values)
+    return reference("rotation", values)
 
 
 def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
@@ -172,7 +172,7 @@ def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise SettingsError(f"`{key}` must be a number; got {value!r}.")
         chosen[name] = factor * value
-    return reference(kind, robot, **chosen)
+    return reference(kind, chosen, robot)
 
 
 def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:

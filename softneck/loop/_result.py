@@ -133,8 +133,6 @@ def metric_names(robot: Robot) -> tuple[str, ...]:
 
 def _beyond(P: np.ndarray, robot: Robot) -> np.ndarray:
     """Return (time,) where a set-point (time, motors) is beyond what its motor may do."""
-    if robot.is_neck:
-        return np.asarray(np.any(np.abs(P) > MAX_POSITION * (1.0 + 1e-9), axis=1))
     low, high = robot.motors.setpoint_min, robot.motors.setpoint_max
     beyond = np.zeros(P.shape, dtype=bool)
     if low is not None and high is not None:
@@ -177,8 +175,11 @@ def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list
 def _axis(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
     r, y = result[f"{axis}_reference"], result.angle(axis, angle)
     step = _find_step(r)
-    if step is not None and step[0] == 0 and not result.robot.is_neck:
-        step = (0, float(_held(y)[0]), step[2])  # where it stood, which need not be zero
+    if step is not None and step[0] == 0:
+        outputs = result.robot.outputs
+        at = outputs.names.index(axis)
+        stood = float(_held(y)[0]) if outputs.rest is None else to_si(outputs.unit)[0] * outputs.rest[at]
+        step = (0, stood, step[2])
     first = 0 if step is None else step[0]
     error = r - y
     known = np.isfinite(error)

@@ -26,7 +26,7 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.core._shown import Shown
 from softneck.signals import Recording
 
-from ._neck import VirtualNeck
+from ._neck import VirtualNeck, has_own_tendons
 from ._parameters import NeckParameters
 from ._presets import PRESETS
 
@@ -123,7 +123,9 @@ def calibrate(
     if not recordings or len(payloads) != len(recordings):
         raise DataError(f"{len(recordings)} recordings and {len(payloads)} payloads were given; give one for each.")
     for recording in recordings:
-        recording.robot.require_neck("a calibrated neck")
+        if not has_own_tendons(recording.robot):
+            whose = recording.robot.label()
+            raise SettingsError(f"a calibrated neck has tendons at 0, 120, 240 deg and two outputs; not robot {whose}.")
     runs = [
         _Run.of(run, float(kg))
         for recording, kg in zip(recordings, payloads, strict=True) for run in recording.runs()

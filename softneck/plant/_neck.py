@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,6 +22,20 @@ INTERNAL_STEP = 0.001
 # What the queues must hold: the upper ends of `drive_latency` and `sensor_delay` [s].
 _LONGEST_LATENCY = 0.1
 _LONGEST_DELAY = 0.2
+# Where the tendons of a neck file are meant to stand, and how many outputs it bends [deg].
+_MEANT, _BENDS = (0.0, 120.0, 240.0), 2
+
+
+def has_own_tendons(robot: Robot) -> bool:
+    """Return whether a robot's tendons stand where those of neck files are meant to, which measured them better."""
+    return robot.directions.angles_deg == _MEANT and len(robot.outputs.names) == _BENDS
+
+
+def tendons_of(robot: Robot, parameters: NeckParameters) -> tuple[float, ...]:
+    """Return where a robot's tendons stand [rad]: as it says, or as its neck file measured."""
+    if has_own_tendons(robot):
+        return parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3
+    return tuple(math.radians(angle % 360.0) for angle in robot.directions.angles_deg)
 
 
 def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
@@ -30,9 +44,10 @@ def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
              maximum=float(high), nominal=1.0)
         for j, (name, (low, high)) in enumerate(zip(robot.set_points, ranges, strict=True))
     )  # fmt: skip
-    outputs, pushes = robot.outputs.names, ("in the direction of tendon 1", "a quarter turn from tendon 1")
-    if not robot.is_neck:
-        pushes = ("in the direction of 0 deg", "in the direction of 90 deg")
+    outputs, shown = robot.outputs.names, robot.outputs.shown
+    pushes = ("in the direction of 0 deg", "in the direction of 90 deg")
+    if robot.directions.angles_deg[0] == 0.0:
+        pushes = ("in the direction of tendon 1", "a quarter turn from tendon 1")
     return (
         *set_points,
         Port(name="payload", unit="kg", description="mass on the platform", minimum=0.0, maximum=5.0),
@@ -42,7 +57,7 @@ def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
         ),
         *(
             Port(name=f"base_tilt_{name}", unit="rad", description=f"lean of the base in {name}", minimum=-1.5,
-                 maximum=1.5)
+                 maximum=1.5, display_unit=shown)
             for name in outputs
         ),
     )  # fmt: skip
@@ -50,14 +65,22 @@ def _inputs(robot: Robot, ranges: Matrix) -> tuple[Port, ...]:
 
 def _outputs(robot: Robot) -> tuple[Port, ...]:
     outputs, motors = robot.outputs.names, range(1, len(robot.motors.names) + 1)
-    towards = ("towards tendon 1", "across it") if robot.is_neck else ("towards 0 deg", "towards 90 deg")
+    first, shown = robot.directions.angles_deg[0] == 0.0, robot.outputs.shown
+    towards = ("towards tendon 1", "across it") if first else ("towards 0 deg", "towards 90 deg")
     return (
         *(
-            Port(name=name, unit="rad", description=f"true inclination against the vertical, {where}")
+            Port(
+                name=name, unit="rad", description=f"true inclination against the vertical, {where}", display_unit=shown
+            )
             for name, where in zip(outputs, towards, strict=False)
         ),
         *(
-            Port(name=f"{name}_measured", unit="rad", description=f"{name} as the inclinometer gives it")
+            Port(
+                name=f"{name}_measured",
+                unit="rad",
+                description=f"{name} as the inclinometer gives it",
+                display_unit=shown,
+            )
             for name in outputs
         ),
         *(Port(name=f"{name}_rate_measured", unit="rad/s", description=f"{name} rate of the gyro") for name in outputs),
@@ -96,9 +119,8 @@ class VirtualNeck(Shown):
     robot: Robot = field(default_factory=Robot.preset)
 
     def __post_init__(self) -> None:
-        if not self.robot.is_neck:
-            require_tendons(self.robot)
-            self.parameters.check_buckling(len(self.robot.motors.names))
+        require_tendons(self.robot)
+        self.parameters.check_buckling(len(self.robot.motors.names))
 
     @classmethod
     def of(cls, robot: Robot, neck: NeckParameters | None = None) -> VirtualNeck:
@@ -118,7 +140,7 @@ class VirtualNeck(Shown):
             name = robot.require("neck", "the virtual plant")
             inside = robot.folder is not None and name not in PRESETS
             neck = NeckParameters.preset(str(robot.folder / name) if inside else name)  # pyright: ignore[reportOptionalOperand]
-        if robot == Robot.preset():
+        if not robot.in_header():
             return cls(neck)
         scale = to_si(robot.outputs.unit)[0]
         given = {
@@ -160,8 +182,8 @@ class VirtualNeck(Shown):
             runtime=sized_name(RUNTIME, motors, outputs),
             sample_time=sample_time,
             arrays=([setup],),  # pyright: ignore[reportArgumentType]
-            inputs=_as_shown(_inputs(self.robot, self.ranges()), self.robot),
-            outputs=_as_shown(_outputs(self.robot), self.robot),
+            inputs=_inputs(self.robot, self.ranges()),
+            outputs=_outputs(self.robot),
             parameters=(*self._parameter_ports(), seed),
         )
 
@@ -171,20 +193,20 @@ class VirtualNeck(Shown):
 
     def _parameter_ports(self) -> tuple[Port, ...]:
         ports = self.parameters.ports()
-        if self.robot.is_neck:
+        if has_own_tendons(self.robot):
             return ports
         first = [port.name for port in ports].index("tendon_angle_1")
         angles = tuple(
             Port(name=f"tendon_angle_{j}", unit="rad", description=f"direction of tendon {j}",
-                 start=math.radians(angle % 360.0), minimum=-7.0, maximum=7.0)
-            for j, angle in enumerate(self.robot.directions.angles_deg, 1)
+                 start=angle, minimum=-7.0, maximum=7.0)
+            for j, angle in enumerate(tendons_of(self.robot, self.parameters), 1)
         )  # fmt: skip
         return (*ports[:first], *angles, *ports[first + 3 :])
 
     def summary(self) -> str:
         """Return a few lines on the neck, for people."""
         p = self.parameters
-        what = "the tendon-driven soft neck" if self.robot.is_neck else f"robot {self.robot.label()}"
+        what = f"robot {self.robot.label()}" if self.robot.in_header() else "the tendon-driven soft neck"
         return "\n".join(
             [
                 f"virtual neck: a physics model of {what}",
@@ -195,26 +217,10 @@ class VirtualNeck(Shown):
         )
 
 
-def _as_shown(ports: tuple[Port, ...], robot: Robot) -> tuple[Port, ...]:
-    """Return ports that say in which units people see the robot; those of a neck are the usual ones."""
-    if robot.is_neck:
-        return ports
-    motors, outputs = robot.motors.unit, robot.outputs.display_unit
-
-    def shown(port: Port) -> str:
-        if port.unit == "rad":
-            return motors if port.name in (*robot.set_points, *robot.motor_positions) else outputs
-        return f"{outputs}/s" if port.unit == "rad/s" else ""
-
-    return tuple(replace(port, display_unit=shown(port)) for port in ports)
-
-
 def _ranges(robot: Robot, limit: float) -> Matrix:
-    """Return the least and the largest set-point of each motor [rad]; +-`limit` of a neck and where none is given."""
+    """Return the least and the largest set-point of each motor [rad]; +-`limit` where none is given."""
     scale, motors = to_si(robot.motors.unit)[0], len(robot.motors.names)
-    given = (robot.motors.setpoint_min, robot.motors.setpoint_max)
-    if robot == Robot.preset():
-        given = (None, None)
+    given = (robot.motors.setpoint_min, robot.motors.setpoint_max) if robot.in_header() else (None, None)
     low, high = (np.full(motors, end) if side is None else scale * np.array(side)
                  for side, end in zip(given, (-limit, limit), strict=True))  # fmt: skip
     return np.column_stack([low, high])

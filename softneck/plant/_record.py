@@ -102,7 +102,7 @@ def _channels(robot: Robot) -> dict[str, str]:
 
 def _between_samples(robot: Robot, sample_time: float) -> int:
     """Return how many rows go from one sample of the sensor to the next: 1 unless the robot's is slower."""
-    slow = robot != Robot.preset() and robot.rate_hz is not None
+    slow = bool(robot.in_header()) and robot.rate_hz is not None
     return max(1, round(1.0 / (robot.rate_hz * sample_time))) if slow else 1  # pyright: ignore[reportOptionalOperand]
 
 

@@ -117,7 +117,7 @@ def run_command(
     if drives_file is None and "drives" in setup.files:
         drives_file = Path(setup.files["drives"][0])
     virtual = neck_of(setup.loop)
-    moves: Any = asked.robot if asked.robot or setup.loop.robot.is_neck else setup.loop.robot
+    moves: Any = asked.robot or (setup.loop.robot if setup.loop.robot.in_header() else None)
     chosen = target_of(drives_file, asked.bus, asked.simulated, asked.arm, neck=virtual, robot=moves)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")

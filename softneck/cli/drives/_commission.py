@@ -93,14 +93,15 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
     """
     from softneck.drives import jog
     from softneck.drives.running._virtual import physics_of
+    from softneck.plant._neck import has_own_tendons, tendons_of
 
     require_log(asked.log, force=force)
     chosen = asked.target()
     if motor > len(chosen.file.nodes):
         raise click.BadParameter(f"{motor} is not in the range 1<=x<={len(chosen.file.nodes)}.", param_hint="'--motor'")
     # A neck's tendons stand where its own file says.
-    physics = physics_of(chosen.file.moves, None) if chosen.is_neck else None
-    angles = physics and (physics.tendon_angle_1, physics.tendon_angle_2, physics.tendon_angle_3)
+    physics = physics_of(chosen.file.moves) if has_own_tendons(chosen.file.moves) else None
+    angles = physics and tendons_of(chosen.file.moves, physics)
     with moving(asked, chosen, "jog", force=force, homed=True) as (session, keyboard):
         with progress("jog", quiet=as_json) as tell:
             found = jog(

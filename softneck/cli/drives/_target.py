@@ -90,11 +90,6 @@ class Target:
     neck: NeckParameters | None = None
     path: Path | None = None
 
-    @property
-    def is_neck(self) -> bool:
-        """Whether the drives move a neck."""
-        return self.file.moves.is_neck
-
 
 _OPTIONS = {
     "drives": click.option("--drives", type=click.Path(path_type=Path), metavar="DRIVES.toml",

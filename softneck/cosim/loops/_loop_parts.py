@@ -234,7 +234,7 @@ class PartOpener:
 
     def plant_of(self, robot: Robot, made: Part) -> Part:
         """Return the plant of a loop of `robot`: the one that was `made`, or its virtual plant of the same physics."""
-        if robot.is_neck or self._physics is None:
+        if self._physics is None:
             return made
         return BlockPart(VirtualNeck.of(robot, self._physics).block(sample_time=self._step))
 

@@ -154,7 +154,7 @@ class Result(Shown):
             "angle": self.angle,
             "sample_time_s": self.signals.sample_time,
             "duration_s": len(self.signals.time) * self.signals.sample_time,
-            **({} if self.robot.is_neck else {"robot": {"name": self.robot.name, "hash": self.robot.hash}}),
+            **({"robot": {"name": self.robot.name, "hash": self.robot.hash}} if self.robot.in_header() else {}),
         }
         return certificate_contents("simulate", holds=self.holds, files=self.files, more=more)
 

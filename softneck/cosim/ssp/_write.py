@@ -270,7 +270,7 @@ def _fmu_of(name: str, part: Part, folder: Path, compiled: bool, robot: Robot) -
         raise SettingsError(
             f"the {name} is a {type(part).__name__}, of which no FMU can be built; give an FMU or a file."
         )
-    told = None if robot.is_neck else (robot.name, robot.hash)
+    told = (robot.name, robot.hash) if robot.in_header() else None
     target, info = folder / f"{name}.fmu", FmuInfo(description=f"{block.kind} of a loop", robot=told)
     if compiled:
         build_compiled_fmu(block, target, info=info)

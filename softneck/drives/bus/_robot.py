@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SettingsError, to_si
+from softneck.plant._neck import has_own_tendons
 from softneck.robot import Robot, find_robot
+from softneck.robot._scaling import Scaling
 from softneck.robot._search import robot_file_of
 
 from ..master._settings import ChannelSettings, LimitSettings
@@ -63,7 +65,7 @@ def require_table(table: Mapping[str, Any], robot: Robot | None) -> Mapping[str,
         )
     watch = table.get("watch", {})
     missing = [key for key in _WATCHED if not isinstance(watch, dict) or key not in watch]
-    if missing and not robot.is_neck and robot.weights() is not None:
+    if missing and not Scaling.of(robot).is_identity and robot.weights() is not None:
         raise SettingsError(
             f"[watch] `{missing[0]}` is missing ({_WATCHED[missing[0]]}): that of robot {robot.label()} is not assumed."
         )
@@ -93,8 +95,8 @@ def channels_of(robot: Robot | None, limits: LimitSettings) -> ChannelSettings |
     rows = () if weights is None else tuple(tuple(row) for row in weights.tolist())
     return ChannelSettings(
         outputs=robot.outputs.names,
-        # The neck's are those of [watch], or of the neck file that the drives are set up for.
-        weights=None if robot.is_neck else rows,
+        # Tendons of a neck file are those of [watch], or of the neck file that the drives are set up for.
+        weights=None if has_own_tendons(robot) else rows,
         ranges=ranges(robot, limits),
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from softneck.core import Vector
 from softneck.plant import NeckParameters, VirtualNeck, settle
+from softneck.plant._neck import has_own_tendons, tendons_of
 from softneck.robot import Robot
 
 from ..bus._file import DrivesFile, Neck, default_drives
@@ -40,11 +41,11 @@ def neck_drives(parameters: NeckParameters, robot: Robot | None = None) -> Drive
     pulls = _newton_per_ampere(parameters) / _newton_per_ampere(paper)
     pretension = parameters.pretension / paper.pretension
     upright = file.zero.tilt
-    if not file.moves.is_neck:
+    if not has_own_tendons(file.moves):
         # Friction of the gears leaves four tendons that are tightened one by one 6 deg off, where three leave 2 deg.
         upright = 2.0 * upright + _rest(VirtualNeck(parameters.without_noise(), file.moves))
-    tilts = _tilt(VirtualNeck(parameters.without_noise(), file.moves)) / _tilt(VirtualNeck(paper.without_noise()))
     angles = (parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3)
+    tilts = _tilt(VirtualNeck(parameters.without_noise(), file.moves)) / _tilt(VirtualNeck(paper.without_noise()))
     return replace(
         file,
         drives=drives,
@@ -73,10 +74,8 @@ def _rest(neck: VirtualNeck) -> float:
 
 def _tilt(neck: VirtualNeck) -> float:
     """Return how far the neck tilts when its tendons are moved as Eq. 9 and 10 have it, without payload [rad]."""
-    p, weights = neck.parameters, neck.robot.weights()
-    P: Vector = _PULLED * 2.0 / 3.0 * np.cos(np.array([p.tendon_angle_1, p.tendon_angle_2, p.tendon_angle_3]))
-    if not neck.robot.is_neck and weights is not None:
-        # Along the first output's direction, so that the motors come to as much together.
-        P = _PULLED * weights[0] / np.dot(weights[0], weights[0])
+    # Along the first output's direction, so that the motors come to as much together.
+    meant = np.cos(np.radians(neck.robot.directions.angles_deg))
+    P: Vector = _PULLED / np.dot(meant, meant) * np.cos(tendons_of(neck.robot, neck.parameters))
     out = settle(neck.block(), P).outputs
     return math.hypot(*(float(angle) for angle in out[: len(neck.robot.outputs.names)]))

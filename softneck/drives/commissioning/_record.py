@@ -220,9 +220,7 @@ class Experiment:
     def _signals(self, number: int) -> list[Excitation]:
         """Return what is played in round `number`: a signal by name, or the runs of a recording."""
         if Path(self.signal).suffix.lower() not in (".csv", ".parquet"):
-            # A neck's signals are those of the paper, whatever its own limits.
-            own = None if self.robot is None or self.robot.is_neck else self.robot
-            return [signal(self.signal, duration=self.duration, seed=self.seed + number, robot=own)]
+            return [signal(self.signal, duration=self.duration, seed=self.seed + number, robot=self.robot)]
         recording = read_recording(self.signal)
         require_same_robot(self.robot or NECK, recording.robot, f"{self.signal} and the drives: set-points")
         rows = None if self.duration is None else max(2, round(self.duration / recording.sample_time))

@@ -247,7 +247,7 @@ def _upright(file: DrivesFile, look: Look) -> dict[str, float]:
     if not worst <= file.zero.tilt:
         told = ", ".join(f"{name} {math.degrees(angle):.1f}" for name, angle in found.items())
         raise CheckFailedError(
-            f"the {'neck' if file.moves.is_neck else 'robot'} leans by {told} deg with all tendons tight; "
+            f"the robot leans by {told} deg with all tendons tight; "
             f"{math.degrees(file.zero.tilt):g} deg are allowed. No zero was set: look for a tendon that slipped or "
             "hangs."
         )

@@ -159,8 +159,8 @@ def _run_session(
     settings = file.master_settings(sample_time, guarding=checked.guarding, late_modes=tuple(checked.late_modes))
     settings = settings if session.settings is None else session.settings(settings)
     if log is not None:
-        whose = {} if file.moves.is_neck else {"robot": file.moves.as_dict()}
-        log.describe(run_facts(settings, session.files, simulated=session.simulated, **whose, **session.facts))
+        facts = {**file.moves.in_header(), **session.facts}
+        log.describe(run_facts(settings, session.files, simulated=session.simulated, **facts))
         pilot = LoggedPilot(pilot)
         session = replace(session, watches=(*session.watches, log.watch(pilot)))
     master = Master(settings, pilot)

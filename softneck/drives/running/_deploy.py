@@ -13,6 +13,7 @@ from softneck.cosim.loops._loop_file import LoopSetup
 from softneck.cosim.loops._simulate import reach_beyond
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters
+from softneck.plant._neck import has_own_tendons
 from softneck.robot import Robot
 from softneck.robot._channels import is_set_point
 from softneck.signals.recording._channels import NECK
@@ -25,7 +26,7 @@ from ..master import Frame, Master
 from ..sensing._sources import Sensor
 from ._bus_loop import Session, run_session
 from ._pilot import LoopPilot, RunLog
-from ._virtual import Watch, physics_of, simulated_plant
+from ._virtual import Watch, simulated_plant
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +81,9 @@ def neck_of(loop: Loop) -> NeckParameters | None:
     ports = getattr(loop.plant, "parameters", None) or getattr(block, "parameters", ())
     starts = {port.name: port.start for port in ports}
     # The tendons of another robot stand where its robot file says.
-    names = [name for name in NeckParameters.names() if loop.robot.is_neck or not name.startswith("tendon_angle")]
+    names = [
+        name for name in NeckParameters.names() if has_own_tendons(loop.robot) or not name.startswith("tendon_angle")
+    ]
     if not all(name in starts for name in names):
         return None
     values = {name: starts[name] for name in names}
@@ -116,12 +119,9 @@ def run_simulated(
     Raises:
         CheckFailedError: the pre-flight failed.
     """
-    parameters = neck or deployed.neck
-    if parameters is None and file.moves.is_neck:
-        parameters = physics_of(file.moves)
     loop = deployed.loop
     pilot = LoopPilot(loop, file.moves)
-    virtual = simulated_plant(file, parameters, sample_time=pilot.sample_time, seed=noise_seed(loop))
+    virtual = simulated_plant(file, neck or deployed.neck, sample_time=pilot.sample_time, seed=noise_seed(loop))
     disturbances = {name: value for name, value in loop.plant_inputs.items() if not is_set_point(name)}
     virtual.set(**disturbances)
     link = VirtualLink(virtual)

@@ -197,7 +197,7 @@ class RunLog:
     @property
     def _truths(self) -> tuple[str, ...]:
         names = (*self._robot.outputs.names, *truths(self._robot))
-        return names if self._robot.is_neck else names[:-1]
+        return names if self._robot.neck is not None else names[:-1]
 
     def speeds(self) -> Matrix:
         """Return the motors' speeds at all rows, (rows, motors) [rad/s]."""

@@ -39,9 +39,7 @@ def simulated_neck(file: DrivesFile, parameters: NeckParameters, **how: Any) -> 
     Raises:
         SettingsError: a robot without tendons, or that the neck's physics does not fit.
     """
-    # The neck's tendons stand where its own file says.
-    robot = None if file.moves.is_neck else file.moves
-    return SimulatedNeck(parameters, _settings(file, **how), robot)
+    return SimulatedNeck(parameters, _settings(file, **how), file.moves)
 
 
 def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
@@ -88,9 +86,7 @@ def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -
 
 def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParameters | None:
     """Return the physics of what stands for a robot: `neck`, or what the robot names; None where nothing does."""
-    if robot.is_neck:
-        return neck or VirtualNeck.of(robot, None if robot.neck else NeckParameters.paper()).parameters
-    if robot.directions.kind != "tendons" or (neck is None and robot.neck is None):
+    if robot.tendon_angles is None or (neck is None and robot.neck is None):
         return None
     return VirtualNeck.of(robot, neck).parameters
 

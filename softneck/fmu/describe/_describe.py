@@ -243,7 +243,7 @@ def fmu_info(
         license="BSD-3-Clause (runtime); the model is its author's",
         documentation="\n".join(parts),
         stop_time=stop_time,
-        robot=None if robot is None or robot.is_neck else (robot.name, robot.hash),
+        robot=(robot.name, robot.hash) if robot is not None and robot.in_header() else None,
     )
 
 
