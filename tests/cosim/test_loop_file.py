@@ -216,7 +216,7 @@ def _judge(path: Path) -> list[Any]:
         ("payload = 0.5", 'payload = "heavy"', "must be a number; got 'heavy'"),
         ('kind = "step"', 'kind = "jump"', r"\[reference\] kind must be one of step, ramp"),
         ('kind = "step"', 'kind = "recording"', r"unknown key `pitch_deg` of \[reference\]"),
-        ("pitch_deg = 15.0", "pitch = 15.0", "degrees"),
+        ("pitch_deg = 15.0", "pitch = 15.0", "may be in rad or deg"),
         ('"pitch.overshoot_pct"', '"pitch.beauty"', "limit on unknown metric `pitch.beauty`"),
         (
             "[limits]",
