@@ -89,6 +89,13 @@ class Door:
         """Return a setting [s] in scaled seconds, and what is usual where it is not given."""
         return usual if asked is None else self.scaling.scale_seconds(asked)
 
+    def findings(self) -> dict[str, object]:
+        """Return directions and time constants in SI where they were learned."""
+        robot = self.recording.robot
+        if robot.weights() is not None and robot.time_constant_s is not None:
+            return {}
+        return replace(self.directions, seconds=self.scaling.second * self.directions.seconds).findings()
+
     def shown(self, values: Matrix) -> Matrix:
         """Return scaled differences (.., outputs) of outputs in the unit in which people see them."""
         return in_display_unit(self.recording.robot, self.scaling.output_unit * values)
@@ -110,9 +117,6 @@ class Door:
             arrays: scaled.
             findings: in SI.
         """
-        robot = self.recording.robot
-        if robot.weights() is None or robot.time_constant_s is None:
-            seconds = self.scaling.second * self.directions.seconds
-            findings = {**findings, **replace(self.directions, seconds=seconds).findings()}
+        findings = {**findings, **self.findings()}
         arrays = arrays if self.scaling.is_identity else in_si(arrays, self.scaling)
         return fitted_model(kind, settings, self.recording, arrays=arrays, findings=findings)

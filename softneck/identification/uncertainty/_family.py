@@ -9,10 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, Matrix, SettingsError, Vector, require_one_of, write_archive
+from softneck.core import (
+    DataError,
+    FileFormatError,
+    Matrix,
+    SettingsError,
+    Vector,
+    require_one_of,
+    to_si,
+    write_archive,
+)
 from softneck.core._shown import Shown
 from softneck.robot import Robot
-from softneck.signals import Recording, redefinition_matrix
+from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
 
 from ..linear._srivc_fit import Continuous
@@ -34,7 +43,6 @@ if TYPE_CHECKING:
 
 AXES = ("pitch", "roll")
 SCOPES = ("window", "point", "recording")
-_INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -76,7 +84,7 @@ class Family(Shown):
         compression: (3,) static gain [m/rad], pole [1/s], dead time [s] of G_delta; NaN where not recorded.
         settings, findings: what was asked and what was found.
         robot: whose plant it is; its outputs and motors in their SI units where a neck's are in rad.
-        directions: (outputs, motors) weights of the motors in each axis's input; None for a neck, whose are Eq. 9, 10.
+        directions: (outputs, motors) weights of the motors in each axis's input; None: those that the robot gives.
         measured: by the names of the outputs, what the recordings themselves show of it; empty in files of before.
     """
 
@@ -91,6 +99,10 @@ class Family(Shown):
     robot: Robot = field(default_factory=Robot.preset)
     directions: Matrix | None = None
     measured: dict[str, AxisMeasured] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.directions is None:
+            object.__setattr__(self, "directions", self.robot.weights())
 
     def nominal(self, output: str) -> Continuous:
         """Return the nominal plant of an axis, `K exp(-L s)/(s + p)`."""
@@ -156,7 +168,7 @@ class Family(Shown):
             if abs(part.sample_time - self.sample_time) > 1e-6 * self.sample_time:
                 raise DataError(f"the family is at {self.sample_time:g} s, a recording at {part.sample_time:g} s.")
         source = str(self.settings.get("source", "set_points"))
-        weights = redefinition_matrix()[:2] if self.directions is None else self.directions
+        weights = np.asarray(self.directions)
         directions = Directions(self.robot.outputs.names, weights, np.ones(len(weights)), learned=False)
         responses, why = measured_responses(recordings, source)
         lines, table = list(why), {}
@@ -170,35 +182,47 @@ class Family(Shown):
         return lines, table
 
     def summary(self) -> str:
-        """Return a few lines, in degrees; of another robot in the SI units of its channels."""
-        if not self.robot.is_neck:
-            return "\n".join(self._plain_lines())
-        lines = [f"family of {self.findings.get('recordings', 0)} recordings, {1e3 * self.sample_time:g} ms"]
+        """Return a few lines, in the units in which people see outputs and motors."""
+        robot = self.robot
+        shown, per = robot.outputs.display_unit, robot.motors.unit
+        factor, unit = to_si(per)[0] / to_si(shown)[0], f"{shown}/{per}"
+        lines = [
+            f"family of {self.findings.get('recordings', 0)} recordings of robot {robot.label()}, "
+            f"{1e3 * self.sample_time:g} ms"
+        ]
         for name, axis in self.axes.items():
             counts = [int(np.sum(axis.where[:, 0] == scope)) for scope in range(3)]
             low, high = axis.box
             gain, pole, delay = axis.nominal
             lines.append(
-                f"{name}: G(s) = exp(-{delay:.3f} s) {np.degrees(gain * pole):.2f}/(s + {pole:.2f}) deg/rad; "
-                f"gain {np.degrees(low[0]):.2f} to {np.degrees(high[0]):.2f} deg/rad, "
-                f"pole {low[1]:.2f} to {high[1]:.2f} 1/s, dead time {1e3 * low[2]:.0f} to {1e3 * high[2]:.0f} ms"
+                f"{name}: G(s) = exp(-{delay:.4g} s) {factor * gain * pole:.4g}/(s + {pole:.4g}) {unit}; "
+                f"gain {factor * low[0]:.4g} to {factor * high[0]:.4g} {unit}, "
+                f"pole {low[1]:.4g} to {high[1]:.4g} 1/s, dead time {1e3 * low[2]:.4g} to {1e3 * high[2]:.4g} ms"
             )
             lines.append(
                 f"  {counts[0]} windows, {counts[1]} operating points, {counts[2]} recordings; "
                 f"{int(axis.used.sum())} samples in the plant, |G/G0 - 1| at most {axis.envelope.max():.2f}, "
                 f"by the weight covered to {self.covered(name):.3f}"
             )
-        lines.append(_cross_line(self.cross))
+        lines.append(f"neglected cross gains [{unit}]: {self._cross_gains(factor)}")
         if np.isfinite(self.compression).all():
             K, p, L = self.compression
-            lines.append(f"compression: G_delta(s) = exp(-{L:.3f} s) {1e3 * K * p:.3f}/(s + {p:.2f}) mm/rad")
-        else:
-            lines.append("compression: not recorded or not excited, so there is no G_delta")
+            K *= 1e3 * to_si(per)[0]
+            lines.append(f"compression: G_delta(s) = exp(-{L:.3f} s) {K * p:.4g}/(s + {p:.4g}) mm/{per}")
         lines += self._measured_lines()
-        for key in ("caution",):
-            if key in self.findings:
-                lines.append(f"{key}: {self.findings[key]}")
+        lines += [f"caution: {self.findings['caution']}"] if "caution" in self.findings else []
         return "\n".join(lines)
+
+    def _cross_gains(self, factor: float) -> str:
+        """Return the gains from each input to the outputs that it is not meant for."""
+        names = (*self.robot.input_names, self.robot.cocontraction_name)
+        parts = []
+        for i, output in enumerate(self.axes):
+            for j, value in enumerate(self.cross[i]):
+                if j != i:
+                    text = f"{factor * value:+.2g}" if np.isfinite(value) else "not excited"
+                    parts.append(f"{names[j]} to {output} {text}")
+        return ", ".join(parts) or "none"
 
     def _measured_lines(self) -> list[str]:
         """Return what the recordings themselves say, or that they were not asked."""
@@ -224,23 +248,6 @@ class Family(Shown):
                 for part in told.get("unheard", {}).get(name, [])
             ]
         return lines
-
-    def _plain_lines(self) -> list[str]:
-        lines = [
-            f"family of {self.findings.get('recordings', 0)} recordings of robot {self.robot.label()}, "
-            f"sampled every {self.sample_time:g} s"
-        ]
-        for name, axis in self.axes.items():
-            low, high = axis.box
-            gain, pole, delay = axis.nominal
-            lines.append(
-                f"{name}: G(s) = exp(-{delay:.4g} s) {gain * pole:.4g}/(s + {pole:.4g}); gain {low[0]:.4g} to "
-                f"{high[0]:.4g}, pole {low[1]:.4g} to {high[1]:.4g} 1/s, dead time {low[2]:.4g} to {high[2]:.4g} s; "
-                f"{int(axis.used.sum())} samples, |G/G0 - 1| at most {axis.envelope.max():.2f}, by the weight covered "
-                f"to {self.covered(name):.3f}"
-            )
-        lines += self._measured_lines()
-        return [*lines, f"caution: {self.findings.get('caution', '')}"]
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the family to an `.npz` file."""
@@ -278,9 +285,9 @@ class Family(Shown):
             for name in robot.outputs.names
         }
         for name, axis in axes.items():
-            _check(name, axis, arrays["frequency"].size, robot)
-        weights = arrays.get("directions")
-        if not robot.is_neck and (weights is None or weights.shape != (len(axes), len(robot.motors.names))):
+            _check(name, axis, arrays["frequency"].size)
+        weights = arrays.get("directions", robot.weights())
+        if weights is None or weights.shape != (len(axes), len(robot.motors.names)):
             raise FileFormatError("its array `directions` is not of outputs x motors.")
         measured = {}
         for name in robot.outputs.names:
@@ -310,7 +317,7 @@ class Family(Shown):
     def _system(self, model: Continuous, output: str, continuous: bool, pade: int) -> control.TransferFunction:
         import control
 
-        names = {"inputs": [_INPUTS[output] if self.robot.is_neck else f"{output}_input"], "outputs": [output]}
+        names = {"inputs": [self.robot.input_names[self.robot.outputs.names.index(output)]], "outputs": [output]}
         if continuous:
             if not 0 <= pade <= 12:
                 raise SettingsError(f"`pade` must be between 0 and 12; got {pade}.")
@@ -336,22 +343,7 @@ def relative_errors(samples: Matrix, nominal: Vector, frequency: Vector, sample_
     return np.array([np.abs(response_of(one_pole(row), frequency, sample_time) / G0 - 1.0) for row in samples])
 
 
-def _cross_line(cross: Matrix) -> str:
-    def gain(axis: int, source: int) -> str:
-        value = cross[axis, source]
-        return "not excited" if not np.isfinite(value) else f"{np.degrees(value):+.2f}"
-
-    return (
-        f"neglected by Eq. 9-11 [deg/rad]: phi_i to pitch {gain(0, 1)}, theta_i to roll {gain(1, 0)}, "
-        f"delta_i to pitch {gain(0, 2)}, delta_i to roll {gain(1, 2)}"
-    )
-
-
-# What no neck reaches, and a damaged file does: gains [rad/rad], poles [1/s]; dead times [s].
-_LARGEST, _LONGEST = 1e4, 10.0
-
-
-def _check(name: str, axis: AxisFamily, frequencies: int, robot: Robot) -> None:
+def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
     n = axis.samples.shape[0]
     shapes = {
         "samples": (n, 3), "std": (n, 4), "where": (n, 5), "used": (n,), "nominal": (3,), "box": (2, 3),
@@ -365,11 +357,5 @@ def _check(name: str, axis: AxisFamily, frequencies: int, robot: Robot) -> None:
             raise FileFormatError(f"its array `{name}_{key}` is not finite.")
     for key in ("samples", "nominal", "box"):
         table = np.atleast_2d(getattr(axis, key))
-        if not robot.is_neck:
-            if (table[:, 1] <= 0.0).any() or (table[:, 2] < 0.0).any():
-                raise FileFormatError(f"its array `{name}_{key}` is not of poles above and dead times from zero.")
-        elif (np.abs(table) > _LARGEST).any() or (table[:, 2] < 0.0).any() or (table[:, 2] > _LONGEST).any():
-            raise FileFormatError(
-                f"its array `{name}_{key}` is not of gains and poles up to {_LARGEST:g} and dead times from 0 to "
-                f"{_LONGEST:g} s."
-            )
+        if (table[:, 1] <= 0.0).any() or (table[:, 2] < 0.0).any():
+            raise FileFormatError(f"its array `{name}_{key}` is not of poles above and dead times from zero.")

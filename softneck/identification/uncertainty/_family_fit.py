@@ -21,12 +21,15 @@ from softneck.core import (
     silent,
 )
 from softneck.core._blas_threads import one_blas_thread
+from softneck.robot._scaling import Scaling
 from softneck.signals import Recording, concatenate
 from softneck.signals.recording._recording import conditions
 
 from ..linear._oe import SOURCES
+from ..linear._regression import MAX_DELAY
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
-from ..models._directions import Directions, directions_of
+from ..models._directions import Directions
+from ..models._door import Door
 from ..models._fitting import check_training
 from ._family import SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
@@ -142,8 +145,6 @@ def cross_gains(
 ) -> tuple[Matrix, Matrix]:
     """Return static gains (outputs, channels) from the inputs of all axes to each output, and their deviations.
 
-    Of a neck (2, 3) [rad/rad], from theta_i, phi_i, delta_i to pitch and roll.
-
     Every input is given the pole and the dead time of the output's own axis; gains and an offset for each run by
     least squares, so that only ratios of slow effects are told.
 
@@ -179,6 +180,8 @@ def cross_gains(
 
 
 _FREQUENCIES = 100
+# [s] of a window: Eq. 22 goes through several of its waves.
+_WINDOW = 8.0
 # From a tenth of the neck's slowest time constants.
 _LOWEST = 0.05
 # Local models faster than this are stopped, not found: 40 1/s are 25 ms.
@@ -193,34 +196,34 @@ _CAUTION = (
 class FamilySettings:
     """Local models `K exp(-L s)/(s + p)` by instrumental variables, and the uncertain plant over them.
 
-    Of another robot one for each output, from its direction, given or learned; what is in seconds here goes by its time
-    constant over a neck's 0.2 s.
-    Every recording (payload) is cut into windows; windows of one inclination and direction make an operating point.
+    One for each output, from its redefined input; the fit sees scaled quantities. Every recording (payload) is cut into
+    windows; windows of one inclination and direction make an operating point.
 
     Attributes:
-        window: length of a window [s]; shorter runs are one window.
-        inclination_step: width of the operating points [rad].
+        window: length of a window [s]; shorter runs are one window. None: 40 time constants, of a neck 8 s.
+        inclination_step: width of the operating points, of scaled outputs [rad].
         directions: sectors of direction; 1 takes all together.
         weight_order: of W, 1 to 3.
-        max_delay: bound on dead times [s].
+        max_delay: bound on dead times [s]; None: one and a half time constants, of a neck 0.3 s.
         source: "set_points", or "positions" of the motors.
         confidence: of each circle of the measured frequency responses that the weight of the data covers.
     """
 
-    window: float = 8.0
+    window: float | None = None
     inclination_step: float = float(np.radians(7.5))
     directions: int = 4
     weight_order: int = 2
-    max_delay: float = 0.3
+    max_delay: float | None = None
     source: str = "set_points"
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        require_between("window", self.window, 1.0, 1000.0, "s")
+        for name in ("window", "max_delay"):
+            if (seconds := getattr(self, name)) is not None:
+                require_positive(name, seconds, "s")
         require_between("inclination_step", self.inclination_step, 0.001, np.pi, "rad")
         require_whole("directions", self.directions, 1, 72)
         require_whole("weight_order", self.weight_order, 1, 3)
-        require_positive("max_delay", self.max_delay, "s")
         require_one_of("source", self.source, SOURCES)
         require_between("confidence", self.confidence, 0.5, 0.9999)
 
@@ -246,39 +249,53 @@ class FamilySettings:
         sample_time = _one_sample_time(parts)
         for part in parts:
             check_training(part)
-        robot, together = parts[0].robot, concatenate(parts)
-        motors = [run.motor_positions if self.source == "positions" else run.set_points for run in together.runs()]
-        directions = directions_of(together, motors)
-        # Seconds of a neck, by the robot's time constant.
-        slow = directions.stretch
-        frequency = np.geomspace(_LOWEST / slow, np.pi / sample_time, _FREQUENCIES)
-        search = SrivcFitOptions(
-            sample_time=sample_time, offset=True, max_delay=self.max_delay * slow, fastest=_FASTEST / slow
+        door = Door.of(concatenate(parts))
+        scaling = door.scaling
+        times = {"window": door.seconds(self.window, _WINDOW), "max_delay": door.seconds(self.max_delay, MAX_DELAY)}
+        named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
+        if len(named) != len(parts):
+            raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")
+        scaled = replace(self, **times)
+        found = in_si(scaled._scaled_family([door.scaled(part) for part in parts], door, named, progress), scaling)
+        tested = {
+            **found.findings["tested"],
+            "sha256": [digest(part) for part in parts],
+            "conditions": [conditions(part) for part in parts],
+        }
+        progress(1.0, "done")
+        return replace(
+            found,
+            sample_time=sample_time,
+            robot=parts[0].robot,
+            settings=asdict(self) | {key: scaling.second * (value or 0.0) for key, value in times.items()},
+            findings={**found.findings, "tested": tested, **door.findings()},
         )
+
+    def _scaled_family(self, parts: list[Recording], door: Door, names: list[str], progress: Progress) -> Family:
+        """Return the family in scaled quantities."""
+        directions, Ts, source = door.directions, parts[0].sample_time, self.source
+        length, lead = self.window or _WINDOW, self.max_delay or MAX_DELAY
+        upright = door.recording.robot.outputs.rest is not None and len(directions.names) <= 2
+        frequency = np.geomspace(_LOWEST, np.pi / Ts, _FREQUENCIES)
+        search = SrivcFitOptions(sample_time=Ts, offset=True, max_delay=lead, fastest=_FASTEST)
         cut = [
             window
             for number, part in enumerate(parts)
-            for window in windows(
-                part, number, directions, length=self.window * slow, lead=self.max_delay * slow, source=self.source
-            )
+            for window in windows(part, number, directions, length=length, lead=lead, source=source, upright=upright)
         ]
         axes, dropped = {}, {}
         for axis, name in enumerate(directions.names):
             progress(0.8 * axis / len(directions.names), f"local models of {name}")
-            found, dropped[name] = self._local_models(search, cut, axis, len(parts), slow)
-            axes[name] = self._axis(name, found, frequency, sample_time, dropped[name])
+            found, dropped[name] = self._local_models(search, cut, axis, len(parts))
+            axes[name] = self._axis(name, found, frequency, Ts, dropped[name])
         progress(0.8, "cross gains")
         nominal = [one_pole(axes[name].nominal) for name in directions.names]
         cross, cross_std = cross_gains(parts, nominal, directions, self.source)
-        squeezed = None
-        if robot.is_neck:
-            squeezed = fit_compression(parts, SrivcFitOptions(sample_time=sample_time, offset=True), self.source)
-        weights = None if robot.is_neck else directions.weights
+        squeezed = fit_compression(parts, SrivcFitOptions(sample_time=Ts, offset=True), directions, self.source)
         progress(0.9, "frequency responses")
         measured, tested = self._measured(search, parts, directions, nominal, names)
-        progress(1.0, "done")
         return Family(
-            sample_time=sample_time,
+            sample_time=Ts,
             axes=axes,
             frequency=frequency,
             cross=cross,
@@ -291,10 +308,9 @@ class FamilySettings:
                 "windows_that_said_too_little": dropped,
                 "caution": _CAUTION,
                 "tested": tested,
-                **({} if robot.is_neck else directions.findings()),
             },
-            robot=robot,
-            directions=weights,
+            robot=parts[0].robot,
+            directions=directions.weights,
             measured=measured,
         )
 
@@ -304,12 +320,9 @@ class FamilySettings:
         parts: list[Recording],
         directions: Directions,
         nominal: Sequence[Continuous],
-        names: Sequence[str] | None,
+        named: list[str],
     ) -> tuple[dict[str, AxisMeasured], dict[str, Any]]:
-        """Return what the recordings show of each axis, and what the findings say of that."""
-        named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
-        if len(named) != len(parts):
-            raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")
+        """Return the measured responses of each axis, and how they were tested, for the findings."""
         responses, why = measured_responses(parts, self.source)
         found, silent_ones = {}, {}
         for axis, name in enumerate(directions.names):
@@ -322,9 +335,8 @@ class FamilySettings:
                 why.append(f"{name}: no band of its response is known within 30 %; record `multisine --band 0.5,25`")
         amplitudes = [[] if response is None else response.amplitude.tolist() for response in responses]
         tested = {
-            "confidence": self.confidence, "names": named, "sha256": [digest(part) for part in parts], "why": why,
-            "amplitude": [max(sizes, default=0.0) for sizes in amplitudes], "unheard": silent_ones,
-            "conditions": [conditions(part) for part in parts],
+            "confidence": self.confidence, "names": named, "sha256": [], "why": why,
+            "amplitude": [max(sizes, default=0.0) for sizes in amplitudes], "unheard": silent_ones, "conditions": [],
         }  # fmt: skip
         return found, tested
 
@@ -353,10 +365,10 @@ class FamilySettings:
         return replace(cover, needed=judge_records(runs, cover, points, Ts))
 
     def _local_models(
-        self, search: SrivcFitOptions, cut: Sequence[Window], axis: int, recordings: int, slow: float
+        self, search: SrivcFitOptions, cut: Sequence[Window], axis: int, recordings: int
     ) -> tuple[list[Local], int]:
         """Return the local models of an axis: windows, operating points, recordings; and how many windows gave none."""
-        single = [fit_local(search, [window], axis, scope="window", stretch=slow) for window in cut]
+        single = [fit_local(search, [window], axis, scope="window") for window in cut]
         there = [local for local in single if local is not None]
         near = one_pole(np.median([local.numbers for local in there], axis=0)) if there else None
         # A point is made of windows that said something alone; one that stood still adds nothing.
@@ -367,13 +379,10 @@ class FamilySettings:
             key = (window.recording, int(window.inclination / self.inclination_step), sector)
             points.setdefault(key, []).append(window)
         found = [*there]
-        found += [
-            fit_local(search, group, axis, scope="point", near=near, stretch=slow)
-            for _, group in sorted(points.items())
-        ]
+        found += [fit_local(search, group, axis, scope="point", near=near) for _, group in sorted(points.items())]
         for number in range(recordings):
             group = [window for window in useful if window.recording == number]
-            found.append(fit_local(search, group, axis, scope="recording", near=near, stretch=slow))
+            found.append(fit_local(search, group, axis, scope="recording", near=near))
         return [local for local in found if local is not None], len(cut) - len(there)
 
     def _axis(self, name: str, found: list[Local], frequency: Vector, sample_time: float, lost: int) -> AxisFamily:
@@ -419,6 +428,40 @@ class FamilySettings:
         W = np.abs(np.polyval(above, 1j * w) / np.polyval(below, 1j * w))
         excess = float(np.max(relative_errors(plants, nominal, w, sample_time) / W))
         return above * max(1.0, excess), below
+
+
+def in_si(family: Family, scaling: Scaling) -> Family:
+    """Return the family in SI: gains, poles, dead times, frequencies and weights."""
+    if scaling.is_identity:
+        return family
+    second, motor = scaling.second, scaling.motor_unit
+    gains = scaling.output_unit / motor
+    axes, measured = {}, {}
+    for (name, axis), gain in zip(family.axes.items(), gains, strict=True):
+        numbers = np.array([gain, 1.0 / second, second])
+        powers = second ** np.arange(axis.weight.shape[1])[::-1]
+        axes[name] = replace(
+            axis, samples=numbers * axis.samples, std=np.append(numbers, gain / second) * axis.std,
+            where=np.where([False, False, True, False, False] & (axis.where >= 0.0), second, 1.0) * axis.where,
+            nominal=numbers * axis.nominal, box=numbers * axis.box, weight=powers * axis.weight,
+        )  # fmt: skip
+    for name, found in family.measured.items():
+        gain, model = float(gains[list(family.axes).index(name)]), found.model
+        order = second ** -np.arange(1.0, model.a.size + 1.0)
+        b = gain * order[-model.b.size :] * model.b
+        measured[name] = replace(
+            found, model=Continuous(a=order * model.a, b=b, delay=second * model.delay),
+            held_out=gain * motor * found.held_out, points=found.points * [1.0, 1.0 / second, gain, gain, gain],
+            frequency=found.frequency / second, borders=found.borders / second,
+        )  # fmt: skip
+    tested = family.findings["tested"]
+    amplitude = [size if size is None else motor * size for size in tested["amplitude"]]
+    return replace(
+        family, axes=axes, measured=measured, frequency=family.frequency / second,
+        cross=gains[:, None] * family.cross, cross_std=gains[:, None] * family.cross_std,
+        compression=family.compression * [1.0 / motor, 1.0 / second, second],
+        findings={**family.findings, "tested": {**tested, "amplitude": amplitude}},
+    )  # fmt: skip
 
 
 def _one_sample_time(parts: list[Recording]) -> float:

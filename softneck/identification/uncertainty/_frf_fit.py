@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, SettingsError, Vector, require_between, require_one_of, to_si
 from softneck.core._shown import Shown
 from softneck.robot import Robot
-from softneck.signals import Recording, redefine
+from softneck.signals import Recording
 from softneck.signals.recording._files import RecordingLike, opened_recording
 
 from ..linear._oe import SOURCES
@@ -303,17 +303,17 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
 def input_names(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
     """Return names of the inputs and their weights (q, motors).
 
-    The neck's are theta_i, phi_i, delta_i (Eq. 9-11). Other robots have one for each output, as their directions are
-    given, and one for each way to move motors that moves no output; without directions, the motors themselves.
+    One for each output, as the directions are given, and one for each way to move motors that moves no output (of the
+    neck theta_i, phi_i, delta_i, Eq. 9-11); without directions, the motors themselves.
     """
     weights, motors = robot.weights(), len(robot.motors.names)
-    if robot.is_neck:
-        return ("theta_i", "phi_i", "delta_i"), redefine(np.eye(3)).T
     if weights is None:
         return robot.set_points, np.eye(motors)
+    if robot.directions.names:
+        return robot.directions.names, robot.redefinition()[0]
     rest = np.linalg.svd(weights)[2][weights.shape[0] :]
     return (
-        *(f"towards_{name}" for name in robot.outputs.names),
+        *robot.input_names,
         *(f"cocontraction_{k + 1}" for k in range(rest.shape[0])),
     ), np.vstack([weights, rest])
 

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.signals import Recording, redefine
+from softneck.signals import Recording
 
 from ..linear._srivc_fit import Continuous, Runs, SrivcFitOptions, deviations
 from ..models._directions import Directions
 
-# Below this spread of its input a window says nothing of an axis [rad]: 0.05 rad move the neck by 0.3 deg.
+# Below this spread of its scaled input a window does not show an axis: 0.05 rad move the neck by 0.3 deg.
 _LEAST_INPUT = 0.05
-# Of another robot: in parts of the input's spread, of a neck's 2 rad; and how far a neck goes from its mean [rad].
-_LEAST_PART, _NECK_TILT = 0.025, 0.2
+# How far scaled outputs go from their mean: of the neck some 0.2 rad.
+_OUTPUT_SPREAD = 0.2
 # A local model is kept where these are known to better than these parts of themselves.
 _WORST_GAIN, _WORST_POLE = 0.3, 0.6
 _LEAST_FIT = 50.0
@@ -59,10 +59,9 @@ class Window:
     Attributes:
         recording: index.
         time: of its middle [s].
-        inputs: (time, channels) theta_i, phi_i, delta_i of a neck; that of each output of another robot.
+        inputs: (time, channels) the redefined inputs, and co-contraction where the robot names it.
         outputs: (time, outputs), NaN in the rows before.
         inclination, direction: means over it [rad].
-        least: (channels,) the spread of an input below which it says nothing.
     """
 
     recording: int
@@ -71,7 +70,6 @@ class Window:
     outputs: Matrix
     inclination: float
     direction: float
-    least: Vector
 
     def run(self, axis: int) -> tuple[Vector, Vector]:
         """Return input and output of an axis."""
@@ -80,7 +78,7 @@ class Window:
     def excited(self, axis: int) -> bool:
         """Return whether the axis is driven and measured in it."""
         y = self.outputs[:, axis]
-        return float(self.inputs[:, axis].std()) > self.least[axis] and int(np.isfinite(y).sum()) > 0.5 * y.size
+        return float(self.inputs[:, axis].std()) > _LEAST_INPUT and int(np.isfinite(y).sum()) > 0.5 * y.size
 
 
 def tilt(outputs: Matrix) -> tuple[Vector, Vector]:
@@ -91,26 +89,27 @@ def tilt(outputs: Matrix) -> tuple[Vector, Vector]:
 
 
 def axis_inputs(run: Recording, directions: Directions, source: str) -> Matrix:
-    """Return what drives each axis (time, channels): theta_i, phi_i, delta_i of a neck."""
+    """Return the redefined inputs (time, channels): one an output, and co-contraction where it is named."""
     motors = run.motor_positions if source == "positions" else run.set_points
-    return redefine(motors) if run.robot.is_neck else motors @ directions.weights.T
+    T = directions.redefinition if run.robot.directions.names else directions.weights
+    return motors @ T.T
 
 
-def _place(outputs: Matrix, recording: Recording) -> tuple[Vector, Vector]:
-    """Return inclination and direction (time,) [rad]; of another robot how far it is from its mean, as a neck would be.
+def _place(outputs: Matrix, recording: Recording, upright: bool) -> tuple[Vector, Vector]:
+    """Return inclination and direction (time,) [rad] of angles from upright; of other outputs their way from the mean.
 
-    A neck's operating points are 7.5 deg wide, and it goes some 0.2 rad to each side.
+    Operating points are 7.5 deg wide, and a neck goes some 0.2 rad to each side: others are taken as large.
     """
-    if recording.robot.is_neck:
+    if upright:
         return tilt(outputs)
-    seen = recording.outputs
-    moved = _NECK_TILT * (outputs - np.nanmean(seen, axis=0)) / np.nanstd(seen, axis=0)
+    measured = recording.outputs
+    moved = _OUTPUT_SPREAD * (outputs - np.nanmean(measured, axis=0)) / np.nanstd(measured, axis=0)
     other = moved[:, 1] if moved.shape[1] > 1 else np.zeros(len(moved))
     return np.linalg.norm(moved, axis=1), np.arctan2(moved[:, 0], -other)
 
 
 def windows(
-    recording: Recording, number: int, directions: Directions, *, length: float, lead: float, source: str
+    recording: Recording, number: int, directions: Directions, *, length: float, lead: float, source: str, upright: bool
 ) -> list[Window]:
     """Cut every run into half-overlapping windows of `length` [s], a shorter run of at least half of it into one.
 
@@ -121,12 +120,11 @@ def windows(
         length: of a window [s].
         lead: rows before a window whose inputs still act in it [s].
         source: "set_points" or "positions".
+        upright: whether outputs are one or two angles from a rest that the robot gives.
     """
     Ts = recording.sample_time
     size, before = round(length / Ts), round(lead / Ts)
     cut: list[Window] = []
-    spread = axis_inputs(recording, directions, source).std(axis=0)
-    least = np.full(spread.size, _LEAST_INPUT) if recording.robot.is_neck else _LEAST_PART * spread
     for run in recording.runs():
         U = axis_inputs(run, directions, source)
         Y = run.outputs
@@ -136,7 +134,7 @@ def windows(
             first, stop = max(start - before, 0), min(start + size, len(run))
             outputs = Y[first:stop].copy()
             outputs[: start - first] = np.nan
-            inclination, direction = _place(Y[start:stop], recording)
+            inclination, direction = _place(Y[start:stop], recording, upright)
             # The mean of a direction is that of its vector.
             mean = np.nanmean(inclination * np.exp(1j * direction))
             cut.append(
@@ -147,7 +145,6 @@ def windows(
                     outputs=outputs,
                     inclination=float(np.nanmean(inclination)),
                     direction=float(np.angle(mean)),
-                    least=least,
                 )
             )
     return cut
@@ -160,7 +157,6 @@ def fit_local(
     *,
     scope: str,
     near: Continuous | None = None,
-    stretch: float = 1.0,
 ) -> Local | None:
     """Fit one model to all windows of a group, each with its own start and offset; None where they say too little.
 
@@ -170,20 +166,19 @@ def fit_local(
         axis: of the outputs.
         scope: of the result.
         near: model to start from as well.
-        stretch: by how much the robot is slower than a neck.
     """
     chosen = [window for window in group if window.excited(axis)]
     if not chosen:
         return None
     runs: Runs = [window.run(axis) for window in chosen]
-    fits = [search.start(runs, pole / stretch, delay) for pole in _POLES for delay in (0.3 * search.max_delay,)]
+    fits = [search.start(runs, pole, delay) for pole in _POLES for delay in (0.3 * search.max_delay,)]
     if near is not None:
         fits.append(search.improve(runs, near, [np.zeros(2) for _ in runs]))
     there = [fit for fit in fits if fit is not None]
     if not there:
         return None
     best = min(there, key=lambda fit: fit.cost)
-    std, percent = deviations(search, runs, best, stretch)
+    std, percent = deviations(search, runs, best, 1.0)
     model = best.model
     gain, pole = model.b[0] / model.a[0], model.a[0]
     sure = std[0] < _WORST_GAIN * abs(gain) and std[1] < _WORST_POLE * pole and percent > _LEAST_FIT
@@ -206,16 +201,18 @@ def fit_local(
     )
 
 
-def fit_compression(recordings: Sequence[Recording], search: SrivcFitOptions, source: str) -> Continuous | None:
-    """Return G_delta from delta_i [rad] to compression [m], None where it was not logged or not excited."""
+def fit_compression(
+    recordings: Sequence[Recording], search: SrivcFitOptions, directions: Directions, source: str
+) -> Continuous | None:
+    """Return G_delta from co-contraction to compression [m], None where it was not logged or not excited."""
     runs: list[tuple[Vector, Vector]] = []
     for recording in recordings:
         for run in recording.runs():
-            if "compression" not in run.channels:
+            if "compression" not in run.channels or not run.robot.directions.names:
                 continue
-            U = redefine(run.motor_positions if source == "positions" else run.set_points)
+            U = axis_inputs(run, directions, source)
             # In millimetres the numbers are of the order of one.
-            runs.append((np.ascontiguousarray(U[:, 2]), 1e3 * run.channels["compression"]))
+            runs.append((np.ascontiguousarray(U[:, -1]), 1e3 * run.channels["compression"]))
     if not runs or max(float(u.std()) for u, _ in runs) < 0.05:
         return None
     fits = [fit for pole in (5.0, 1.5, 15.0) if (fit := search.start(runs, pole, 0.1)) is not None]

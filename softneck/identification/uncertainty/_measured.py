@@ -291,9 +291,9 @@ def _own_response(
     from scipy.stats import f
 
     output = directions.names[axis]
-    own = ("theta_i", "phi_i")[axis] if found.robot.is_neck else f"towards_{output}"
+    own = found.robot.input_names[axis]
     share = np.array([float(name == own) for name in found.inputs])
-    if not found.robot.is_neck and own not in found.inputs:
+    if own not in found.inputs and found.robot.weights() is None:
         # The inputs are the motors: of `G_j = G w_j` least squares gives G.
         weights = directions.weights[axis]
         motors = list(found.robot.set_points)

@@ -282,7 +282,7 @@ def test_pressures_and_lengths_are_shown_in_their_units() -> None:
     assert f"0.50 rad/s: {slowest:.3g} +-" in said
     assert "mm/bar" in said
     assert found.amplitude[0] > 0.0
-    assert f"towards_x {1e-5 * found.amplitude[0]:.2g};" in said
+    assert f"x_input {1e-5 * found.amplitude[0]:.2g};" in said
 
 
 def test_motors_that_were_not_always_logged_are_filled_and_not_zero() -> None:
