@@ -149,12 +149,12 @@ def _sizes(
     high: tuple[float, ...] | None, data: Matrix | None, half_range: float, count: int,
 ) -> tuple[Vector, Vector]:  # fmt: skip
     """Return unit and rest (count,) in SI."""
-    middle = np.zeros(count) if data is None else np.nanmean(data, axis=0)
-    middle = middle if rest is None else factor * np.array(rest)
+    known = np.zeros((1, count)) if data is None else np.where(np.isfinite(data).any(axis=0), data, 0.0)
+    middle = np.nanmean(known, axis=0) if rest is None else factor * np.array(rest)
     if nominal is not None:
         return factor * np.array(nominal), middle
     if low is not None and high is not None:
         return factor * (np.array(high) - np.array(low)) / (2.0 * half_range), middle
-    spans = np.ones(count) if data is None else np.nanmax(data, axis=0) - np.nanmin(data, axis=0)
+    spans = np.ones(count) if data is None else np.nanmax(known, axis=0) - np.nanmin(known, axis=0)
     units = spans / (1.0 if data is None else 2.0 * half_range)
     return np.where(units > 0.0, units, 1.0), middle

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix
+from softneck.robot._scaling import TIME_CONSTANT
 from softneck.signals import Recording
 
 from ..models._scores import nrmse_fit
@@ -39,9 +40,9 @@ def held_outputs(run: Recording) -> Matrix:
     return y
 
 
-# Dead times of a neck and its drives: the response is free, tap by tap, for so long [s].
+# Dead times of a robot and its drives: the response is free, tap by tap, for so many scaled seconds.
 _FREE_SECONDS = 0.3
-# Beyond, each octave of time constants [s] has its own pole: a lag between two of them is met to 1e-3.
+# Beyond, each octave of scaled time constants has its own pole: a lag between two of them is met to 1e-3.
 _TIME_CONSTANTS = 0.0125 * 2.0 ** np.arange(10)
 # So does the initial state of a stretch; what is faster has gone before its first row is judged.
 _DECAYS = _TIME_CONSTANTS[3:]
@@ -58,8 +59,9 @@ def best_linear(
 
     For a finite horizon persistence and, in free run, every stable linear model of the set-points lies below.
     """
-    inputs = np.concatenate([_response_columns(stretch.recording) for stretch in stretches])
-    columns = np.column_stack([np.ones(len(inputs)), inputs, _decay_columns(stretches)])
+    Ts = stretches[0].recording.sample_time * TIME_CONSTANT / (rows.robot.time_constant_s or np.nan)
+    inputs = np.concatenate([_response_columns(stretch.recording.set_points, Ts) for stretch in stretches])
+    columns = np.column_stack([np.ones(len(inputs)), inputs, _decay_columns(stretches, Ts)])
     result: list[list[float | None]] = []
     for horizon in horizons:
         if horizon is None:
@@ -72,9 +74,9 @@ def best_linear(
 
 def _fits(columns: Matrix, measured: Matrix) -> list[float | None]:
     there = np.isfinite(measured)
-    if (there[:, 0] == there[:, 1]).all():
+    if (there[:, :1] == there).all():
         return _fit_axes(columns, measured, there[:, 0])
-    return [_fit_axes(columns, measured[:, [axis]], there[:, axis])[0] for axis in range(2)]
+    return [_fit_axes(columns, measured[:, [axis]], there[:, axis])[0] for axis in range(measured.shape[1])]
 
 
 def _fit_axes(columns: Matrix, measured: Matrix, rows: np.ndarray) -> list[float | None]:
@@ -90,9 +92,8 @@ def _fit_axes(columns: Matrix, measured: Matrix, rows: np.ndarray) -> list[float
     return [fit if np.isfinite(fit) else None for fit in fits]
 
 
-def _response_columns(run: Recording) -> Matrix:
-    """Return the three set-points (time, n) of the samples before, tap by tap, and then through the ladder."""
-    Ts, u = run.sample_time, run.set_points
+def _response_columns(u: Matrix, Ts: float) -> Matrix:
+    """Return the set-points (time, n) of the samples before, tap by tap, and then through the ladder."""
     taps = round(_FREE_SECONDS / Ts) + 1
     columns = [_late(u, lag) for lag in range(1, taps + 1)]
     stage = columns[-1]
@@ -116,13 +117,13 @@ def _filtered(numerator: list[float], denominator: list[float], x: Matrix) -> Ma
     return np.asarray(lfilter(numerator, denominator, x, axis=0, zi=z)[0])
 
 
-def _decay_columns(stretches: Sequence[ScoredStretch]) -> Matrix:
+def _decay_columns(stretches: Sequence[ScoredStretch], Ts: float) -> Matrix:
     """Return decaying exponentials (time, 7 for each stretch), each zero outside its stretch."""
     columns = np.zeros((sum(len(s.recording) for s in stretches), len(_DECAYS) * len(stretches)))
     row = 0
     for number, stretch in enumerate(stretches):
         n = len(stretch.recording)
-        t = np.arange(n) * stretch.recording.sample_time
+        t = np.arange(n) * Ts
         for i, seconds in enumerate(_DECAYS):
             columns[row : row + n, len(_DECAYS) * number + i] = np.exp(-t / seconds)
         row += n
@@ -152,13 +153,13 @@ class Baselines:
 def baselines(stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | str]) -> Baselines:
     """Return the baselines of the stretches judged.
 
-    The best linear model looks for what lasts as long as on a neck: of other robots there is none.
+    The best linear model has poles about the robot's time constant; there is none where its file does not give one.
     """
-    axes, neck = rows.names, rows.robot.is_neck
+    axes = rows.names
     nothing: list[float | None] = [None] * len(axes)
     names = [str(h) for h in horizons]
     steps = [None if h == "inf" else int(h) for h in horizons]
-    bounds = best_linear(stretches, rows, steps) if neck else [nothing for _ in steps]
+    bounds = best_linear(stretches, rows, steps) if rows.robot.time_constant_s else [nothing for _ in steps]
     held: dict[str, dict[str, float | None]] = {}
     for name, k in zip(names, steps, strict=True):
         if k is not None:

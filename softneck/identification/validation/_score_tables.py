@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, to_si
 from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 
 from ..models._model import Model
 from ..models._ports import BOUNDED, trained_range
@@ -132,34 +133,27 @@ def _interval(totals: Matrix) -> list[float] | None:
 
 # Three ranges from the middle is six amplitudes: no gain that is wrong by a factor of two gets there.
 RANGES = 3.0
-# Where the neck hardly moved, noise is all there is to compare with; within 15 deg no model has run away.
+# Where scaled outputs hardly moved, noise is all there is to compare with; within 15 deg no model has run away.
 _LEAST_RANGE = np.radians(5.0)
 
 
-def divergence(
-    time: Vector, stretch: np.ndarray, free_run: Matrix, measured: Matrix, *, neck: bool = True
-) -> list[float | None]:
-    """Return for each stretch the time [s] at which its free run left the data's range, or None.
+def divergence(rows: Rows, simulated: Matrix) -> list[float | None]:
+    """Return for each segment the time [s] at which its simulation (time, outputs) left the data's range, or None.
 
-    Left is: further than three times the measured range (the larger of the two axes', at least 5 deg) from its
-    middle, further than half a turn from zero, or no finite number.
-
-    Args:
-        time: (time,) [s].
-        stretch: (time,) number of the stretch.
-        free_run: (time, 2) [rad].
-        measured: (time, 2) [rad]; NaN where missed or not scored.
-        neck: whether these are angles; of other robots any number of outputs in any unit, with neither 5 deg nor turns.
+    Left is: further than three times the measured range (the largest of the outputs', at least 5 deg of the scaled
+    ones) from its middle, an angle further than half a turn from zero, or no finite number.
     """
-    middle, reach = _range(measured, _LEAST_RANGE if neck else 0.0)
-    inside = (np.abs(free_run - middle) <= RANGES * reach) & (np.abs(free_run) < (np.pi if neck else np.inf))
+    unit = Scaling.of(rows.robot, set_points=None, outputs=rows.measured).output_unit
+    middle, width = _range(rows.measured / unit)
+    turn = np.pi if to_si(rows.robot.outputs.unit)[1] == "rad" else np.inf
+    inside = (np.abs(simulated / unit - middle) <= RANGES * width) & (np.abs(simulated) < turn)
     gone = ~inside.all(axis=1)
-    first = [np.flatnonzero(gone & (stretch == number)) for number in range(int(stretch[-1]) + 1)]
-    return [float(time[rows[0]]) if rows.size else None for rows in first]
+    first = [np.flatnonzero(gone & (rows.stretch == number)) for number in range(int(rows.stretch[-1]) + 1)]
+    return [float(rows.time[found[0]]) if found.size else None for found in first]
 
 
-def _range(measured: Matrix, least: float) -> tuple[Vector, float]:
-    middle, widths = np.zeros(measured.shape[1]), [least]
+def _range(measured: Matrix) -> tuple[Vector, float]:
+    middle, widths = np.zeros(measured.shape[1]), [_LEAST_RANGE]
     for axis, y in enumerate(measured.T):
         there = y[np.isfinite(y)]
         if there.size:

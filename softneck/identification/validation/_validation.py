@@ -301,7 +301,7 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
     outputs = _predictions(model, parts, rules)
     lost: list[float | None] = [None] * len(parts.stretches)
     if INFINITE in outputs:
-        lost = divergence(rows.time, rows.stretch, outputs[INFINITE][:, :axes], rows.measured, neck=rows.robot.is_neck)
+        lost = divergence(rows, outputs[INFINITE][:, :axes])
     first = min((t for t in lost if t is not None), default=None)
     measured = {h: rows.judged(None if h == INFINITE else int(h)) for h in horizons}
     predicted = {h: outputs[h][:, :axes] for h in horizons}
@@ -353,7 +353,7 @@ def _cold_fits(model: Model, parts: Parts, rules: Rules) -> dict[str, float | No
     rows = parts.rows
     free = np.concatenate([model.simulate(s.recording, motors=rules.motors, warm_up=0) for s in parts.stretches])
     free = free[:, : len(rows.names)]
-    lost = divergence(rows.time, rows.stretch, free, rows.measured, neck=rows.robot.is_neck)
+    lost = divergence(rows, free)
     measured = {INFINITE: rows.measured}
     gone = any(t is not None for t in lost)
     return score_tables(rows, rows.time, measured, {INFINITE: free}, lost=gone)["fits"][INFINITE]
