@@ -126,7 +126,9 @@ def answer(seen: World, folder: Path) -> Matrix:
     model, path = model_of(seen), folder / "Plant.fmu"
     build_fmu(model, path)
     names = seen.robot.outputs.names
-    ports = {variable.name: variable for variable in fmpy.read_model_description(str(path)).modelVariables}
+    ports: dict[str, Any] = {
+        variable.name: variable for variable in fmpy.read_model_description(str(path)).modelVariables
+    }
     shown = seen.robot.outputs.display_unit
     if to_si(shown)[1] != shown:
         assert {ports[name].declaredType.displayUnit if ports[name].declaredType else ports[name].displayUnit
