@@ -27,9 +27,7 @@ from softneck.verification._requirements import (
 )
 from softneck.verification._scale import Scale, digits
 
-_RISE, _OVERSHOOT = "sim.rise_s", "sim.overshoot_pct"
-# Three standard deviations of the default noise, 0.05 deg, of the default step, 15 deg [%].
-_NOISE_PCT = 1.0
+_RISE = "sim.rise_s"
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Least, largest and unit of the numbers of [track].
 _TRACK = {
@@ -114,10 +112,6 @@ def make_tune_requirements(
     usual = {
         name: scale.table(limits if name == "require" else defaults[name]) for name in defaults if name != "version"
     }
-    # What three standard deviations of the noise add to the largest output, beyond what they add to the neck's.
-    share = scale.factor("noise_deg") / scale.factor("size_deg") - 1.0
-    most = usual["require"][_OVERSHOOT]["max"] + max(0.0, _NOISE_PCT * share)
-    usual["require"][_OVERSHOOT] = {"max": digits(most)}
     if rise is not None:
         usual["require"][_RISE] = {"max": rise}
     if not stepping:

@@ -74,7 +74,8 @@ class LoopUnderTest:
         compiled: as one function where all parts are blocks; that takes some ten seconds once, and each run a tenth.
         axes: that are raised.
         robot: whose loop it is.
-        time, size: of another robot than the neck: by how much it is slower, and an output in SI for each rad of neck.
+        time, size: by how much the robot is slower than the neck, and an output in SI for each rad of the neck.
+        noise: of the sensor over the neck's, in the unit of `size`.
     """
 
     name: str
@@ -88,6 +89,13 @@ class LoopUnderTest:
     robot: Robot = _NECK
     time: float = 1.0
     size: float = 1.0
+    noise: float = 1.0
+
+    @property
+    def kicks(self) -> tuple[float, ...]:
+        """Small before large; what noise hides, no model has learned."""
+        large = self.size * _LARGE
+        return tuple(dict.fromkeys((min(max(self.size, self.noise) * _SMALL, large), large)))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -186,8 +194,8 @@ def _group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float
     sparse = math.isfinite(least)
     # Leaning changes how loud a plant is, and not which loops need their gain to be stable.
     postures = loop.postures()[:1] if coarse or what == "gain_down" else loop.postures()
-    for lean, kick in product(postures, (_SMALL, _LARGE)):
-        posture, amplitude = tuple(loop.size * angle for angle in lean), loop.size * kick
+    for lean, amplitude in product(postures, loop.kicks):
+        posture = tuple(loop.size * angle for angle in lean)
         case = _Case(loop, axes, what, amplitude, posture)
         none = 1.0 if what != "delay" else 0.0
         if least <= none:

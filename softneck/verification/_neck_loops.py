@@ -429,7 +429,7 @@ def loops_under_test(
             order=order, constants=plant.carrying(kg),
             # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
             axes=axes if kg == min(payloads) else axes[-1:], robot=robot, time=scale.time,
-            size=scale.si(scale.size) / math.radians(1.0),
+            size=scale.si(scale.size) / math.radians(1.0), noise=scale.si(scale.noise) / math.radians(1.0),
         )
         for plant, payloads in known for kg in sorted({float(min(payloads)), float(max(payloads))})
     ]  # fmt: skip

@@ -341,7 +341,7 @@ def check_number(name: str, value: Any, key: str, ends: tuple[float, float, str]
         require_whole(name, value, int(low), int(high))
     own = scale.name_of(key)
     if own != key or scale.factor(key) != 1.0:
-        size, unit = (scale.size if key in ("size_deg", "noise_deg") else scale.factor(key)), own.rpartition("_")[2]
+        size, unit = scale.factor("size_deg" if key == "noise_deg" else key), own.rpartition("_")[2]
         low, high = (size * low, size * high) if scale.known else (-math.inf if low < 0.0 else 0.0, math.inf)
     require_between(name, float(value), low, high, unit)
 

@@ -86,9 +86,6 @@ class Scale:
             return self.load
         if name == "noise_deg":
             return self.noise
-        if name == "size_deg":
-            # More than twice the noise: overshoot and settling are told of a larger step, of twice the size at most.
-            return min(max(self.size, 0.5 * self.noise), 2.0 * self.size)
         if name == "circle_rad_s":
             return 1.0 / self.time
         if name.endswith("_deg") and name not in _ANGLES:

@@ -188,6 +188,7 @@ def test_margins_by_experiment_of_a_linear_plant_are_those_of_its_loop(name: str
     size = 0.01 if name == "bellows" else 0.5
     loop = LoopUnderTest(
         name="m", plant=lambda: BlockPart(block), controller=controller.block(), compiled=False, robot=robot, size=size,
+        noise=size,
         axes=robot.outputs.names,
     )  # fmt: skip
     rest = (0.0,) * len(robot.outputs.names)
@@ -209,7 +210,7 @@ def test_of_a_loop_that_does_not_answer_nothing_is_certified() -> None:
     block, controller = model.block(), design_controller("pi", model)
     loop = LoopUnderTest(
         name="m", plant=lambda: BlockPart(block), controller=controller.block(), compiled=False, robot=BELLOWS,
-        size=0.01, axes=BELLOWS.outputs.names,
+        size=0.01, noise=0.01, axes=BELLOWS.outputs.names,
     )  # fmt: skip
     found = crossings([loop], coarse=True)
     assert [item.value for item in found] == [0.0 if item.what == "delay" else 1.0 for item in found]
