@@ -56,7 +56,7 @@ def main(
     except SettingsError as error:
         raise click.BadParameter(str(error), param_hint="--habit") from error
     virtual = SimulatedNeck(NeckParameters.preset(neck), SimulatedSettings(**common))
-    # All that compiles at its first call does so before the drives answer.
+    # Compile everything before the drives answer.
     virtual.move()
     virtual.sample(0.0)
     gc.freeze()
@@ -75,7 +75,7 @@ def _print(now: float, neck: SimulatedDrives, row: int) -> None:
 
 @contextlib.contextmanager
 def signals(neck: SimulatedDrives) -> Iterator[None]:
-    """Let SIGUSR1 open and close the Enable inputs of all drives, and SIGUSR2 silence and wake the inclinometer."""
+    """Handle SIGUSR1 (toggles the Enable inputs of all drives) and SIGUSR2 (toggles the inclinometer)."""
     if not hasattr(signal, "SIGUSR1"):
         yield
         return

@@ -1,4 +1,4 @@
-"""The drive behind the bus: objects, power states, modes, faults, and their effect on the motion row."""
+"""A simulated drive: objects, power states, modes, faults, and their effect on its row of the motion table."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
 
 # Current in internal units: A x 65520 / (2 I_peak).
 _CURRENT_RANGE = 65520.0
-# A stop ramp is over when the demand stands [counts/s].
+# Speed of the demand below which a stop ramp is over [counts/s].
 _STANDS = 1.0
 _FOLLOWING_ERROR, _ENABLE_INPUT, _GUARDING = 0x8611, 0x5441, 0x8130
-# 2000h by fault. That a fault shows there is known, which bit it is not: unverified like all that no hardware told.
+# Fault -> bit of 2000h. The bits are not verified on hardware.
 _MOTION_ERRORS = {_GUARDING: 1 << 0, 0x2340: 1 << 1, _FOLLOWING_ERROR: 1 << 3, 0x2310: 1 << 8, 0x4310: 1 << 11,
                   0x3210: 1 << 12, 0x3220: 1 << 13, _ENABLE_INPUT: 1 << 15}  # fmt: skip
 _LIMIT_CODES = {1.0: 0xFF06, -1.0: 0xFF07}
 
 
 class Axis:
-    """One drive's objects and power stage; the node around it speaks CAN.
+    """Objects and power stage of one drive; its node handles CAN.
 
     Attributes:
         values: (index, subindex) -> value of every object.
         state: of the power state machine.
         emergencies: codes not yet sent, with error register.
-        fault: code of the fault that holds, 0 if none.
+        fault: code of the active fault, 0 if none.
         homed: whether the encoder's zero was set since the last reset.
         enable_input: the hardware input; without it the drive faults.
-        habits: what it refuses that others do not.
-        device_name: which type it is (1008h), "" where it does not tell.
-        counts_per_turn: of the motor, once in which its encoder's index comes.
+        habits: its restrictions compared with other drives.
+        device_name: its type (1008h), "" if it has none.
+        counts_per_turn: of the motor; the encoder's index pulse occurs once a turn.
     """
 
     def __init__(
         self, node: int, profile: Profile, motion: Vector, *, peak_current: float, slow_loop: float,
         habits: WireHabits | None = None,
     ) -> None:  # fmt: skip
-        """Make a drive with number `node` that acts on its row `motion` of the servo runtime."""
+        """Make a drive with node number `node` and its row `motion` of the servo runtime."""
         self.node, self.profile, self.motion = node, profile, motion
         self.peak_current, self.slow_loop = peak_current, slow_loop
         self.enable_input, self.habits = True, habits or WireHabits()
@@ -71,7 +71,7 @@ class Axis:
     # -- life cycle ---------------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Power-on or node reset: start values everywhere; the encoder's zero is lost."""
+        """Reset all objects to their start values, as after power-on; the encoder's zero is lost."""
         self.values = {key: item.start for key, item in self.profile.items.items()}
         for key in ((0x1018, 4), (0x1018, 2)):
             self.values[key] = 1000 + self.node if key[1] == 4 else self.profile.products.get(self.device_name, 0)
@@ -95,7 +95,7 @@ class Axis:
     def _default_limits(self) -> None:
         key = (0x207F, 0)
         if key in self.values:
-            self.values[key] = 32760  # the peak current: whoever does not set it has no limit
+            self.values[key] = 32760  # the peak current: no limit unless set
 
     @property
     def _units_per_count(self) -> float:
@@ -121,7 +121,7 @@ class Axis:
         return NO_SUBINDEX if known else NO_OBJECT
 
     def size(self, index: int, subindex: int) -> int:
-        """Return how many bytes an object takes; 4 of one that is not there."""
+        """Return the size of an object [bytes]; 4 for an unknown one."""
         item = self.profile.items.get((index, subindex))
         return item.size if item else 4
 
@@ -163,7 +163,7 @@ class Axis:
         return allowed is None or value in allowed
 
     def _configure(self) -> None:
-        """Carry what the objects say into the motion row."""
+        """Copy the settings in the objects to the motion row."""
         v, m = self.values, self.motion
         unit, square = self._units_per_count, self._units_per_count * (1.0 if self._plain else self.slow_loop)
         m[servo.SERVO_SPEED] = v[(0x6081, 0)] / unit
@@ -220,7 +220,7 @@ class Axis:
             self._mode_bits(word, before)
 
     def _mode_bits(self, word: int, before: int) -> None:
-        """What bits 4 to 6 start: a move in mode 1, homing in mode 6."""
+        """Execute bits 4 to 6 of the control word: a move in mode 1, homing in mode 6."""
         mode, m = self.values[(0x6060, 0)], self.motion
         rising = word & 0x10 and not before & 0x10
         self._acknowledged = bool(word & 0x10)
@@ -268,7 +268,7 @@ class Axis:
         self._stop_then = then
 
     def trip(self, code: int) -> None:
-        """A fault: tell it once, react as 605Eh says, latch."""
+        """Enter a fault: report it once, react by 605Eh, and latch it."""
         if self.state in (power.FAULT, power.REACTION):
             return
         self.fault = code
@@ -280,7 +280,7 @@ class Axis:
             self._enter(power.FAULT)
 
     def connection_lost(self) -> None:
-        """Guarding or heartbeat failed: tell it, and do what 6007h says."""
+        """Handle a failure of guarding or heartbeat: report it and react by 6007h."""
         option = self.values[(0x6007, 0)]
         if option == 1:
             self.trip(_GUARDING)

@@ -1,4 +1,4 @@
-"""Simulated drives, whatever they turn: nodes on the bus, rows of motion; and what a sensor does wrong."""
+"""Simulated drives of any plant: nodes on the bus, motion table, and faults of the sensor."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from ._node import CanFrame, SimulatedDrive
 from ._profiles import PROFILES
 
 _TICK = 1e-3
-# What the ring must hold: the upper end of `drive_latency`, 0.1 s, in ticks.
+# Length of the ring buffer [ticks]: longer than the largest `drive_latency`, 0.1 s.
 _RING = 128
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class SimulatedSettings(Shown):
-    """How the simulated drives are set up; given by whoever configured the real ones.
+    """Settings of the simulated drives, as configured on the real ones.
 
     Attributes:
         nodes: node numbers, one for each motor.
@@ -37,11 +37,11 @@ class SimulatedSettings(Shown):
         slow_loop: [s], one each.
         sample_time: of the inclinometer [s].
         cycle: time between SYNC messages [s].
-        hold: time over which master and drives spread one move of the set-point [s]; half of it counts as part of
+        hold: time over which master and drives spread one change of the set-point [s]; half of it counts as part of
             the neck's drive latency.
-        homed: the drives were zeroed with the neck at rest before.
+        homed: whether the drives were zeroed with the neck at rest before.
         seed: of the inclinometer's noise.
-        habits: of drives that are stricter than the most obliging ones.
+        habits: restrictions of the drives.
     """
 
     nodes: tuple[int, ...] = (1, 2, 3)
@@ -67,23 +67,23 @@ class SimulatedSettings(Shown):
 
 
 class SimulatedDrives(abc.ABC):
-    """All drives of a robot with what they turn and what measures it, stepped by whoever owns the time.
+    """All drives of a robot with their plant and sensor; the caller advances the time.
 
     Attributes:
         settings: of the drives.
-        drives: the nodes on the bus; twins: with the number of one of them.
+        drives: the nodes on the bus; twins: further nodes with the number of one of them.
         motion: (motors, SERVO_SIZE), see the servo runtime; ring: (motors, n) past demands.
-        ticks: of the servo loops in one bus cycle; h: time of one [s].
+        ticks: of the servo loops in one bus cycle; h: length of a tick [s].
         sensor: "works", "drops", "freezes", "nan", "jumps", or "silent" on a bus.
-        newest: the last sample that was taken.
+        newest: the last sample.
     """
 
     def __init__(self, settings: SimulatedSettings, *, current_limit: float, latency: float) -> None:
-        """Make drives without power; if `homed`, they know their zero.
+        """Make drives without power; `homed` ones have their zero.
 
         Args:
             settings: of the drives.
-            current_limit: until somebody sets it [A].
+            current_limit: initial current limit [A].
             latency: of the cyclic mode [s].
         """
         count = len(settings.nodes)
@@ -99,7 +99,7 @@ class SimulatedDrives(abc.ABC):
             self.motion[row, servo.SERVO_LAG] = max(0, round(lag / self.h))
             self.motion[row, servo.SERVO_PLACE], self.motion[row, servo.SERVO_GEARING] = 0, 1.0
         self.drives = tuple(self._drive(settings, row, current_limit) for row in range(count))
-        # A second device with somebody's number turns nothing; its boot-up message was long ago.
+        # A second device with a used node number has no plant; its boot-up message was earlier.
         self.twins = tuple(twin(node, settings) for node in (settings.habits.twin,) if node)
         self._latency = settings.habits.sdo_latency
         self._late: list[tuple[float, CanFrame]] = []
@@ -108,26 +108,26 @@ class SimulatedDrives(abc.ABC):
 
     @abc.abstractmethod
     def set(self, **disturbance: float) -> None:
-        """Set what acts from outside, by name."""
+        """Set disturbances by name."""
 
     @abc.abstractmethod
     def tear(self, tendon: int) -> None:
-        """Let a tendon, from 1 on, hang."""
+        """Make a tendon slack; the first has number 1."""
 
     @abc.abstractmethod
     def move(self) -> None:
-        """Let one cycle of time pass for drives and what they turn."""
+        """Advance drives and plant by one bus cycle."""
 
     @abc.abstractmethod
     def truth(self) -> Mapping[str, float]:
-        """Return what is true at the last sample, by name: outputs [rad], tensions [N]."""
+        """Return the true values at the last sample by name: outputs [rad], tensions [N]."""
 
     @abc.abstractmethod
     def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
-        """Return values [rad] and rates [rad/s] of a new sample of a sensor that works, and whether it came."""
+        """Return values [rad], rates [rad/s] and validity of a new sample of a healthy sensor."""
 
     def block(self, motor: int) -> None:
-        """Hold a winch, from 1 on, where it is, whatever its motor does."""
+        """Block a winch at its position; the first has number 1."""
         self.motion[motor - 1, servo.SERVO_STUCK] = 1.0
 
     def sample(self, now: float) -> Sample:
@@ -143,7 +143,7 @@ class SimulatedDrives(abc.ABC):
         return self.newest
 
     def run(self, frames: Sequence[CanFrame], now: float) -> list[CanFrame]:
-        """Deliver `frames` at `now` [s], and return what the drives say; SDO answers after their latency."""
+        """Deliver `frames` at `now` [s] and return the frames of the drives; SDO answers after their latency."""
         drives = (*self.drives, *self.twins)
         for frame in frames:
             for drive in drives:
@@ -166,7 +166,7 @@ class SimulatedDrives(abc.ABC):
         axis.tick, axis.counts_per_turn = self.h, s.counts_per_turn[row]
         m[servo.SERVO_CURRENT_LIMIT] = current_limit
         if s.homed:
-            # As `drives commission --only zero` leaves it: home offset 1 count, which no drive has after a reset.
+            # As after `drives commission --only zero`: home offset 1 count, which no drive has after a reset.
             axis.values[(0x607C, 0)] = 1
             m[servo.SERVO_ZERO], m[servo.SERVO_POSITION] = 1.0, 1.0
             axis.homed = True
@@ -174,7 +174,7 @@ class SimulatedDrives(abc.ABC):
 
 
 def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
-    """Return a drive with number `node` that turns nothing, as one that was forgotten on the bus."""
+    """Return a drive with number `node` without a plant, like one left on the bus by mistake."""
     axis = Axis(
         node, PROFILES[settings.profile](), np.zeros(servo.SERVO_SIZE), peak_current=10.0, slow_loop=1e-3,
         habits=settings.habits,
@@ -188,7 +188,7 @@ def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
 def sensed(
     kind: str, values: tuple[float, ...], rates: tuple[float, ...], *, valid: bool
 ) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
-    """Return what a sensor says that "works", "drops", gives "nan" or "jumps" by 60 deg: values, rates, valid."""
+    """Return values, rates and validity from a sensor that "works", "drops", gives "nan" or "jumps" by 60 deg."""
     nothing = (math.nan,) * len(values)
     if kind == "nan":
         return nothing, nothing, True
@@ -199,7 +199,7 @@ def sensed(
 
 
 class Sample(NamedTuple):
-    """One sample of the sensor: values [rad] and rates [rad/s] of all outputs; NaN, not `valid` where it drops."""
+    """One sample of the sensor: values [rad] and rates [rad/s] of all outputs; NaN and not `valid` if dropped."""
 
     time: float
     values: tuple[float, ...]

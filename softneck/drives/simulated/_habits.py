@@ -1,6 +1,6 @@
-"""How simulated drives differ from the most obliging ones: each habit by itself, all off by default.
+"""Restrictions by which simulated drives can differ from the most permissive ones; all off by default.
 
-What of it a real drive has nobody knows before hardware is there; a master has to live with any of it.
+Which of them a real drive has is only known on hardware; the master must work with any of them.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from softneck.core import SettingsError, require_between, require_one_of, requir
 
 from ._sdo import WRITE_ONLY, WRONG_STATE, WRONG_VALUE
 
-# The object of the mode, and those that a drive may take and not tell: control word, mode, homing method,
-# interpolation period, target speed.
+# The object of the mode, and those that may be write-only: control word, mode, homing method, interpolation period,
+# target speed.
 _MODE = 0x6060
 _NOT_TOLD = frozenset({0x6040, _MODE, 0x6098, 0x60C2, 0x60FF})
-# What a run needs, and so no drive can lack.
+# Objects that a run needs, so that no drive may lack them.
 _NEEDED = frozenset({0x1000, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6040, 0x6041, _MODE, 0x6064, 0x607A})
 _MODES = (1, 3, 6, 8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WireHabits:
-    """How strict simulated drives are; 0 and False are off.
+    """Restrictions of simulated drives; 0 and False are off.
 
     Attributes:
-        sdo_latency: from an SDO request to its answer [s]; drives that are at work take 1 to 50 ms.
+        sdo_latency: from an SDO request to its answer [s]; real drives take 1 to 50 ms.
         write_only: 6040h, 6060h, 6098h, 60C2h and 60FFh can be written and not read.
         mode_when: the mode (6060h) may be written "always", "off" (not in Operation Enabled) or "enabled" (only there).
         lacks: indices of objects that the drive does not have.
-        twin: number of a second device that answers there, 0 for none.
+        twin: node number that a second device also has, 0 for none.
     """
 
     sdo_latency: float = 0.0
@@ -46,14 +46,14 @@ class WireHabits:
         require_one_of("mode_when", self.mode_when, ("always", "off", "enabled"))
         require_whole("twin", self.twin, 0, 126)
         if needed := sorted(_NEEDED.intersection(self.lacks)):
-            raise SettingsError(f"`lacks` may not hold {needed[0]:04X}h: a drive without it is none.")
+            raise SettingsError(f"`lacks` may not hold {needed[0]:04X}h: every drive has it.")
 
     def unreadable(self, index: int) -> int:
-        """Return why an object cannot be read, an SDO abort code, or 0."""
+        """Return the SDO abort code for reading an object, or 0 if it is readable."""
         return WRITE_ONLY if self.write_only and index in _NOT_TOLD else 0
 
     def unwritable(self, index: int, value: int, *, enabled: bool) -> int:
-        """Return why an object does not take a value, an SDO abort code, or 0."""
+        """Return the SDO abort code for writing a value to an object, or 0 if it is accepted."""
         if index != _MODE:
             return 0
         if value not in _MODES:
@@ -62,10 +62,10 @@ class WireHabits:
 
 
 def habits_of(texts: Sequence[str]) -> WireHabits:
-    """Return the habits that NAME=VALUE set, values as in TOML: `sdo_latency=0.05`, `lacks=[0x1003]`.
+    """Return the habits of texts NAME=VALUE, with values as in TOML: `sdo_latency=0.05`, `lacks=[0x1003]`.
 
     Raises:
-        SettingsError: no such habit, or another kind of value.
+        SettingsError: an unknown habit, or a value of another type.
     """
     defaults = {field.name: field.default for field in fields(WireHabits)}
     given: dict[str, Any] = {}

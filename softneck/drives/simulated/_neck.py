@@ -1,4 +1,4 @@
-"""Simulated drives on the virtual neck, or on a robot built like it, and its inclinometer: what hangs on the bus."""
+"""Simulated drives on the virtual neck, or on a robot built like it, with its inclinometer."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ._servo_runtime import SERVO_GEARING
 
 
 class SimulatedNeck(SimulatedDrives):
-    """The neck with its drives.
+    """The virtual neck with its drives.
 
     Attributes:
         outputs: the neck's outputs at the inclinometer's last sample, in the order of its block; of a neck (14,).
@@ -27,7 +27,7 @@ class SimulatedNeck(SimulatedDrives):
     """
 
     def __init__(self, parameters: NeckParameters, settings: SimulatedSettings, robot: Robot | None = None) -> None:
-        """Put the neck, or `robot`, at rest; its drives are without power and, if `homed`, know their zero."""
+        """Put the neck, or `robot`, at rest; its drives are without power, and `homed` ones have their zero."""
         super().__init__(settings, current_limit=parameters.current_limit, latency=parameters.drive_latency)
         self.parameters = parameters
         robot = Robot.preset() if robot is None else robot
@@ -41,7 +41,7 @@ class SimulatedNeck(SimulatedDrives):
         self._free = VirtualNeckState.parts(VirtualNeckArrays(block.arrays))["free"]
         self.outputs: Vector = start.outputs.copy()
         self.disturbance: Vector = np.zeros(len(self._disturbances))
-        # A drive with another gear than the neck's pulls with that one; what it has to accelerate stays the neck's.
+        # A drive with another gear than the neck's pulls with that gear; the inertia stays the neck's.
         self.motion[:, SERVO_GEARING] = np.array(settings.gear) / parameters.gear_ratio
         self._functions: ModuleType = load_functions(
             sized_name("softneck.drives.simulated._servo_runtime", motors, self._angles)
@@ -61,15 +61,15 @@ class SimulatedNeck(SimulatedDrives):
             self.disturbance[self._disturbances.index(name)] = value
 
     def tear(self, tendon: int) -> None:
-        """Let a tendon, from 1 on, hang: it is a metre too long."""
+        """Make a tendon slack, one metre too long; the first has number 1."""
         self._x[self._free][tendon - 1] += 1.0
 
     def move(self) -> None:
-        """Let one cycle of time pass for drives and neck."""
+        """Advance drives and neck by one bus cycle."""
         self._functions.servo_ticks(self._q, self._x, self.disturbance, self.motion, self.ring, self.ticks, self.h)
 
     def _shown(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return what the inclinometer gives, and its gyro: behind the true angles."""
+        """Return the angles of the inclinometer and the rates of its gyro; in `outputs` after the true angles."""
         m = self._angles
         return tuple(self.outputs[m : 2 * m].tolist()), tuple(self.outputs[2 * m : 3 * m].tolist())
 

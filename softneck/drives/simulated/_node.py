@@ -50,11 +50,11 @@ class SimulatedDrive:
     Attributes:
         axis: the drive behind it.
         nmt: its NMT state as the protocol codes it.
-        alive: False while it has no supply: then it neither hears nor speaks.
+        alive: False while it has no supply: then it neither receives nor sends.
     """
 
     def __init__(self, axis: Axis) -> None:
-        """Put `axis` on the bus; it speaks first when `tick` is called."""
+        """Put `axis` on the bus; it first sends at the next `tick`."""
         self.axis, self.alive = axis, True
         self._out: list[CanFrame] = []
         self._sdo = SdoServer(axis.read, self._write, axis.size)
@@ -76,7 +76,7 @@ class SimulatedDrive:
         self._watch_times()
 
     def power_cycle(self, now: float) -> None:
-        """Lose the supply for an instant: all start values, no zero, a boot-up message."""
+        """Simulate a short loss of supply: start values, lost zero, boot-up message."""
         self._out.clear()
         self.axis.reset()
         self._boot(now)
@@ -84,7 +84,7 @@ class SimulatedDrive:
     # -- frames in ----------------------------------------------------------------------------------------------
 
     def receive(self, now: float, frame: CanFrame) -> None:
-        """Take one frame from the bus."""
+        """Process one frame from the bus."""
         identifier, data, remote = frame
         if not self.alive:
             return
@@ -155,7 +155,7 @@ class SimulatedDrive:
         try:
             return pdo.packed.pack(*[action() for action in pdo.actions])
         except struct.error:
-            # A value beyond its field, such as a speed: the lowest bits, as a register would show them.
+            # A value beyond its field, such as a speed: its lowest bits, as in a register.
             sizes = [self.axis.profile.items[key].size for key in pdo.keys]
             pairs = zip(pdo.actions, sizes, strict=True)
             return b"".join((int(action()) & ((1 << 8 * size) - 1)).to_bytes(size, "little") for action, size in pairs)
@@ -163,7 +163,7 @@ class SimulatedDrive:
     # -- time ---------------------------------------------------------------------------------------------------
 
     def tick(self, now: float) -> list[CanFrame]:
-        """Do what is due at `now` and return all frames to send since the last call."""
+        """Process the events due at `now` and return all frames to send since the last call."""
         if not self.alive:
             self._out.clear()
             return []
@@ -192,14 +192,14 @@ class SimulatedDrive:
         return frames
 
     def _remember(self, code: int) -> None:
-        """Keep an error in 1003h, the newest first."""
+        """Store an error in 1003h, newest first."""
         v = self.axis.values
         self._errors = [code, *self._errors][:2] if v[(0x1003, 0)] else [code]
         v[(0x1003, 0)] = len(self._errors)
         v |= {(0x1003, place): error for place, error in enumerate(self._errors, start=1)}
 
     def _events(self) -> None:
-        """Send what changed."""
+        """Send the event-driven PDOs with changed data."""
         for pdo in self._transmit_pdos:
             if pdo.kind >= 254 and (data := self._packed(pdo)) != pdo.sent:
                 self._send(pdo, data)
@@ -230,7 +230,7 @@ class SimulatedDrive:
         return code
 
     def _check_pdo(self, index: int, subindex: int, data: bytes) -> int:
-        """PDOs are changed while they are switched off, mappings while their count is 0 (CiA 301, 7.5.2.36)."""
+        """Check that mappings are only changed while the PDO is off and their count is 0 (CiA 301, 7.5.2.36)."""
         v = self.axis.values
         mapping = bool(index & 0x200)
         communication = (index & ~0x200, 1)

@@ -1,4 +1,4 @@
-"""The power state machine of a drive (CiA 402-2) as tables: what a control word asks for and where it leads."""
+"""The power state machine of a drive (CiA 402-2) as tables: requests of control words, and transitions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ STATES = {0x00: "NOT_READY", 0x40: "DISABLED", 0x21: "READY", 0x23: "SWITCHED_ON
           0x0F: "REACTION", 0x08: "FAULT"}  # fmt: skip
 NOT_READY, SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, REACTION, FAULT = STATES
 
-# What a control word asks for: (mask, value, request), first match wins; bit 7 is looked at for its rising edge.
+# Requests of control words: (mask, value, request), first match wins; bit 7 acts by its rising edge.
 _REQUESTS = (
     (0x02, 0x00, "disable voltage"),
     (0x06, 0x02, "quick stop"),
@@ -36,10 +36,10 @@ _TRANSITIONS = {
 
 
 def request(word: int) -> str:
-    """Return what control word `word` asks for."""
+    """Return the request in control word `word`; "" for none."""
     return next((name for mask, value, name in _REQUESTS if word & mask == value), "")
 
 
 def next_state(state: int, word: int) -> int:
-    """Return the state after control word `word`; the same one if it asks for nothing new."""
+    """Return the state after control word `word`; unchanged without a transition."""
     return _TRANSITIONS.get((state, request(word)), state)

@@ -1,7 +1,7 @@
-"""What the two kinds of simulated drive have: the objects of their EDS files, and where they differ beside them.
+"""The two kinds of simulated drives: the objects of their EDS files, and further differences.
 
-`ipos2015` follows Technosoft's manual P091.063 (2015) as far as the facts of this project quote it; `ds402` is a
-drive after CiA 301/402 with heartbeat consumer. No real drive was at hand to compare.
+`ipos2015` follows Technosoft's manual P091.063 (2015); `ds402` is a drive after CiA 301/402 with heartbeat consumer.
+Neither has been compared with a real drive.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class Profile:
         items: object list with start values.
         heartbeat_consumer: has 1016h.
         late_mode_display: 6061h shows 8 only in Operation Enabled.
-        rated_current: [A], for 6073h and 6078h; 0 where currents are in internal units.
-        types: peak current [A] -> type of such a drive, as 1008h tells it.
-        products: type -> product code (1018h), of those that are public.
+        rated_current: [A], for 6073h and 6078h; 0 if currents are in internal units.
+        types: peak current [A] -> type of the drive, as in 1008h.
+        products: type -> product code (1018h), if public.
         units_per_count: internal speed units for one count per second; None: 65536 per slow-loop sample.
     """
 
@@ -60,7 +60,7 @@ class Profile:
     products: Mapping[str, int] = field(default_factory=dict)
 
     def name_of(self, peak_current: float) -> str:
-        """Return the type of a drive with that peak current [A]; the text of 1008h where there is only one."""
+        """Return the type of a drive with that peak current [A]; the text of 1008h if there is only one type."""
         return self.types.get(peak_current, self.items[(0x1008, 0)].text)
 
 

@@ -21,19 +21,19 @@ Size = Callable[[int, int], int]
 
 
 class SdoServer:
-    """Answers requests; `read` returns bytes or an abort code, `write` an abort code or 0.
+    """SDO server; `read` returns bytes or an abort code, `write` an abort code or 0.
 
-    As of small drives: whatever can be written has four bytes at most, so nothing is downloaded in segments or blocks.
+    As in small drives, writable objects have four bytes at most, so there are no segmented or block downloads.
     """
 
     def __init__(self, read: Read, write: Write, size: Size) -> None:
-        """Serve the objects behind `read` and `write`; `size` tells that of one [bytes]."""
+        """Serve the objects of `read` and `write`; `size` returns the size of an object [bytes]."""
         self._read, self._write, self._size = read, write, size
         self._left: bytes | None = None
         self._toggle = 0
 
     def answers(self, data: bytes) -> list[bytes]:
-        """Return the responses (8 bytes each) to request `data`; none where none is due."""
+        """Return the responses (8 bytes each) to request `data`; empty if none is due."""
         if len(data) != 8:
             return []
         command = data[0] >> 5
@@ -51,7 +51,7 @@ class SdoServer:
 
     def _download(self, data: bytes, index: int, subindex: int) -> bytes:
         self._left = None
-        # Where the size is not said it is that of the object.
+        # A request without a size has the size of the object.
         size = 4 - ((data[0] >> 2) & 3) if data[0] & 0x01 else self._size(index, subindex)
         code = self._write(index, subindex, data[4 : 4 + size])
         return self._abort(index, subindex, code) if code else struct.pack("<BHB4x", 0x60, index, subindex)

@@ -1,4 +1,4 @@
-"""Simulated drives on a bus of python-can, in real time: for tries of the whole path without hardware."""
+"""Simulated drives on a bus of python-can, in real time, to test the whole path without hardware."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def serve(
     stopped: Callable[[], bool] | None = None,
     report: Callable[[float, SimulatedDrives, int], None] | None = None,
 ) -> None:
-    """Answer frames on `bus` and let the neck move, until `stopped` returns True.
+    """Answer frames on `bus` and advance the plant, until `stopped` returns True.
 
     Args:
         bus: an open bus of python-can.
-        neck: what hangs on it; of more than two outputs the first two are sent.
+        neck: drives and plant; of more than two outputs the first two are sent.
         sensor_node: node of the inclinometer, which sends its slopes in a TPDO of its own (CiA 410, 0.001 deg).
         stopped: asked in each cycle.
         report: called with (monotonic time, neck, row) whenever the drive in that row changes its power state.
@@ -62,7 +62,7 @@ def serve(
         try:
             message = bus.recv(rest)
         except (can.CanError, OSError):
-            # A bus that is down answers at once: no reason to spin.
+            # A bus that is down returns at once: do not spin.
             time.sleep(min(rest, 1e-3))
             continue
         if message is not None and not message.is_error_frame and not message.is_extended_id:
@@ -84,6 +84,6 @@ def _send(bus: Any, frames: list[CanFrame]) -> None:
     import can
 
     for frame in frames:
-        # A bus that is down loses frames; drives do not care.
+        # A bus that is down loses frames, which does not affect the drives.
         with contextlib.suppress(can.CanError, OSError):
             bus.send(can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False))

@@ -83,7 +83,7 @@ def servo_ticks(
 
 
 def servo_read(m: np.ndarray, position: float, speed: float) -> None:
-    """Fill what the drive measures."""
+    """Fill the measurements of the drive."""
     m[SERVO_POSITION] = math.floor(m[SERVO_SCALE] * position + m[SERVO_ZERO] + 0.5)
     m[SERVO_ACTUAL_SPEED] = m[SERVO_SCALE] * speed
 
@@ -99,7 +99,7 @@ def servo_tick(
 ) -> float:
     """Return the torque at the winch [N m] over the next tick; `position` [rad] and `speed` [rad/s] are the winch's."""
     counts = m[SERVO_SCALE] * position + m[SERVO_ZERO]
-    # Without power the demand follows the winch: whoever switches on starts where it stands.
+    # Without power the demand follows the winch, so that switching on starts at its position.
     if m[SERVO_POWER] < 0.5:
         m[SERVO_DEMAND] = counts
         m[SERVO_DEMAND_SPEED] = 0.0
@@ -108,7 +108,7 @@ def servo_tick(
         m[SERVO_LATE] = 0.0
         m[SERVO_LEFT] = 0.0
         m[SERVO_AT_LIMIT] = 0.0
-        ring[:] = counts  # nor is an old demand still on its way
+        ring[:] = counts  # and no old demand is pending
         return 0.0
     servo_generate(m, h)
     servo_limit(m)
@@ -117,7 +117,7 @@ def servo_tick(
         place = 0
     m[SERVO_PLACE] = place
     ring[place] = m[SERVO_DEMAND]
-    # Latency is the bus's: profiles are generated in the drive itself.
+    # Only the bus has latency: profiles are generated in the drive.
     demand = ring[place - int(m[SERVO_LAG])] if m[SERVO_MODE] == 8.0 else m[SERVO_DEMAND]
     servo_follow(m, demand - counts, h)
     gain, speed_limit, bandwidth, reset, _, supply, back_emf, inertia, _, _ = drive
@@ -126,11 +126,11 @@ def servo_tick(
     wanted = min(max(gain * (demand - counts) / m[SERVO_SCALE], -speed_limit), speed_limit)
     error = inertia * bandwidth * (wanted - speed)
     asked = error + m[SERVO_INTEGRAL]
-    most = m[SERVO_CURRENT_LIMIT] * pull  # what the drive is set to, not the neck's own limit
+    most = m[SERVO_CURRENT_LIMIT] * pull  # the limit set in the drive, not the neck's own
     if m[SERVO_STUCK] > 0.5:
-        # A blocked winch is held where it is by something stronger than the motor, which pushes in vain.
+        # A blocked winch is held in place by a force stronger than the motor.
         m[SERVO_CURRENT] = math.copysign(m[SERVO_CURRENT_LIMIT], demand - counts)
-        # That something: a PI controller of zero speed, without limit.
+        # That force: a PI controller for zero speed, without limit.
         m[SERVO_INTEGRAL] += -h * reset * inertia * bandwidth * speed
         return m[SERVO_INTEGRAL] - inertia * bandwidth * speed
     high = min(most, supply - back_emf * speed)
@@ -145,7 +145,7 @@ def servo_tick(
 
 
 def servo_generate(m: np.ndarray, h: float) -> None:
-    """Move the demand by one tick, in the mode that is on."""
+    """Advance the demand by one tick in the active mode."""
     mode = m[SERVO_MODE]
     if mode == 8.0:
         if m[SERVO_LEFT] > 0.5:
@@ -163,7 +163,7 @@ def servo_generate(m: np.ndarray, h: float) -> None:
         way = m[SERVO_TARGET] - m[SERVO_DEMAND]
         # The speed from which the profile still stops at the target, one tick ahead.
         stop = math.sqrt(2.0 * m[SERVO_DECELERATION] * abs(way))
-        # No faster than the way that is left within one tick either.
+        # At most the remaining way within one tick.
         aim = math.copysign(min(min(m[SERVO_SPEED], stop), abs(way) / h), way)
         v = servo_ramp(v, aim, m[SERVO_ACCELERATION], m[SERVO_DECELERATION], h)
     elif mode == 3.0:
@@ -182,7 +182,7 @@ def servo_ramp(v: float, aim: float, acceleration: float, deceleration: float, h
 
 
 def servo_limit(m: np.ndarray) -> None:
-    """Hold the demand within the software limits (607Dh)."""
+    """Limit the demand to the software limits (607Dh)."""
     m[SERVO_AT_LIMIT] = 0.0
     if m[SERVO_LOW] >= m[SERVO_HIGH]:
         return
@@ -197,7 +197,7 @@ def servo_limit(m: np.ndarray) -> None:
 
 
 def servo_follow(m: np.ndarray, error: float, h: float) -> None:
-    """Watch the following error (6065h, 6066h)."""
+    """Monitor the following error (6065h, 6066h)."""
     if m[SERVO_WINDOW] > 0.0 and abs(error) > m[SERVO_WINDOW]:
         m[SERVO_LATE] += h
         if m[SERVO_LATE] > m[SERVO_TIMEOUT]:

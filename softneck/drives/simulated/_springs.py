@@ -1,6 +1,6 @@
-"""A stand-in for robots without a virtual plant: each motor against a spring, outputs by the robot's directions.
+"""A simple plant for robots without a virtual plant: motors on springs, outputs by the robot's directions.
 
-It holds drives, master and sensor to each other in every fault, and says nothing of the robot's own dynamics.
+It tests drives, master and sensor in every fault, and is no model of the robot's own dynamics.
 """
 
 from __future__ import annotations
@@ -27,26 +27,27 @@ from ._drives import Sample, SimulatedDrives, SimulatedSettings
 from ._servo_runtime import SERVO_POSITION, SERVO_SCALE, SERVO_ZERO
 from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRING_SIZE, SPRING_STIFFNESS
 
-# From rest to the end of its range a tendon pulls by this part more than at rest, if its motor can.
+# Increase of a tendon's pull from rest to the end of its range, relative to rest; and share of the spare motor torque
+# that it may use.
 _MORE, _SPARE = 0.4, 0.8
-# How far winches are loose before `drives commission --only zero` [rad].
+# Slack of the winches before `drives commission --only zero` [rad].
 _LOOSE = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpringSettings:
-    """What the motors turn, and what is measured of it.
+    """Settings of the springs and of the measured outputs.
 
     Attributes:
-        outputs: names of what is measured.
-        weights: (outputs, motors), where the outputs end for each radian of the motors [rad/rad].
-        pole: of the lag on the way there [1/s].
+        outputs: names of the measured outputs.
+        weights: (outputs, motors), static gains from motors to outputs [rad/rad].
+        pole: of the outputs' first-order lag [1/s].
         reach: largest size of each motor's set-point [rad].
         torque_constant, efficiency: of motors and gears [N m/A].
         current_limit: of each motor [A].
         winch_radius: [m].
         pretension_current: which holds a tendon at P = 0 [A].
-        noise_std: of the sensor [rad]; a sensor without any noise would look frozen.
+        noise_std: of the sensor [rad]; without noise it would count as frozen.
     """
 
     outputs: tuple[str, ...]
@@ -67,14 +68,14 @@ class SpringSettings:
 
 
 class SimulatedSprings(SimulatedDrives):
-    """Springs with their drives and sensor, in the place of a `SimulatedNeck`.
+    """Springs with their drives and sensor, in place of a `SimulatedNeck`.
 
     Attributes:
-        outputs: (2, outputs) values [rad] and rates [rad/s] as they are.
+        outputs: (2, outputs) true values [rad] and rates [rad/s].
     """
 
     def __init__(self, springs: SpringSettings, settings: SimulatedSettings) -> None:
-        """Put all at rest; drives are without power, and tendons are loose where they were not homed."""
+        """Start at rest; drives are without power, and tendons are slack unless homed."""
         latency = NeckParameters.paper().drive_latency
         super().__init__(settings, current_limit=springs.current_limit[0], latency=latency)
         self._springs = springs
@@ -83,7 +84,7 @@ class SimulatedSprings(SimulatedDrives):
         self._winches[3] = 1.0
         if not settings.homed:
             self._winches[0], self._winches[3] = -_LOOSE, 0.0
-            # Encoders begin at zero where they get their supply.
+            # Encoders start at zero at power-on.
             self.motion[:, SERVO_ZERO] = self.motion[:, SERVO_SCALE] * _LOOSE
             self.motion[:, SERVO_POSITION] = 0.0
         self._table = np.array([_spring(springs, settings.gear[row], row) for row in range(count)])
@@ -95,21 +96,21 @@ class SimulatedSprings(SimulatedDrives):
         self.newest = self._last = Sample(0.0, nothing, nothing, valid=True)
 
     def set(self, **disturbance: float) -> None:
-        """Take no disturbance: there is nothing here that a load could bend.
+        """Refuse disturbances, as springs take no load.
 
         Raises:
-            SettingsError: one that is not zero.
+            SettingsError: a disturbance that is not zero.
         """
         for name, value in disturbance.items():
             if value:
                 raise SettingsError(f"`{name}`: simulated drives that turn springs take no load; leave it out.")
 
     def tear(self, tendon: int) -> None:
-        """Let tendon `tendon`, from 1, hang: nothing pulls at its winch any more."""
+        """Make a tendon slack, so that it no longer pulls at its winch; the first has number 1."""
         self._table[tendon - 1, SPRING_REST : SPRING_STIFFNESS + 1] = 0.0
 
     def move(self) -> None:
-        """Let one cycle of time pass."""
+        """Advance by one bus cycle."""
         self._functions.springs_ticks(
             self._table, self._springs.weights, self._share, self._winches, self.outputs, self.motion, self.ring,
             self.ticks, self.h,
@@ -127,7 +128,7 @@ class SimulatedSprings(SimulatedDrives):
 
 
 def _spring(springs: SpringSettings, gear: float, row: int) -> Vector:
-    """Return the row of the table for one motor: what is not given of it is as in the paper's."""
+    """Return the row of the table for one motor; values that are not given are the paper's."""
     motor = NeckParameters.paper().vector()
     motor[NECK_GEAR_RATIO], motor[NECK_CURRENT_LIMIT] = gear, springs.current_limit[row]
     motor[NECK_TORQUE_CONSTANT], motor[NECK_GEAR_EFFICIENCY] = springs.torque_constant, springs.efficiency

@@ -1,6 +1,6 @@
 """Motors that turn winches against springs, and outputs that follow them by weights and one lag.
 
-The columns of `springs` say what each motor turns; its drive is one row of `motion`, see the servo runtime.
+The columns of `springs` describe the load of each motor; its drive is one row of `motion`, see the servo runtime.
 """
 
 import math
@@ -28,11 +28,11 @@ def springs_ticks(
     ticks: int,
     h: float,
 ) -> None:
-    """Advance all by `ticks` of `h` [s].
+    """Advance drives, winches and outputs by `ticks` of `h` [s].
 
-    `winches` (4, motors) are position [rad], speed [rad/s], pull [N m] and 1.0 where the tendon is taut; `outputs`
-    (2, outputs) values and rates; `weights` (outputs, motors) where outputs end for motors at rest there, `share` of
-    that way goes by in a tick.
+    `winches` (4, motors) are position [rad], speed [rad/s], pull [N m] and 1.0 if the tendon is taut; `outputs`
+    (2, outputs) values and rates; `weights` (outputs, motors) the static gains, `share` the part of the remaining
+    distance that the outputs move in a tick.
     """
     for _ in range(ticks):
         for i in range(winches.shape[1]):
@@ -57,7 +57,7 @@ def spring_advance(s: np.ndarray, winches: np.ndarray, i: int, m: np.ndarray, ri
     torque = servo_tick(m, ring, position, speed, drive, s[SPRING_PER_AMPERE], h)
     pull = s[SPRING_REST] + s[SPRING_STIFFNESS] * position
     if winches[3, i] < 0.5:
-        # Before it was tightened for the first time it hangs, and comes under tension on the last part of its way.
+        # A tendon that was never tightened is slack, and comes under tension on the last part of the way to zero.
         pull = s[SPRING_REST] * (1.0 + position / SPRING_CATCH)
         winches[3, i] = 1.0 if position >= -0.1 * SPRING_CATCH else 0.0
     pull = max(0.0, pull)  # a tendon only pulls
