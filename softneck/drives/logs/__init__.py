@@ -1,5 +1,5 @@
 """Logs of runs, written beside the control loop and read back to the bit, and their replay.
 
-A killed run stays readable up to its last second.
+The log of a killed run is readable up to its last second.
 May import `drives.bus` and `drives.master`.
 """

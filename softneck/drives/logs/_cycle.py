@@ -1,4 +1,4 @@
-"""One cycle of the master as it is logged: all that it saw, decided and sent, as text that reads back to the bit."""
+"""One logged cycle of the master: its inputs, decisions and frames, as text that reads back to the bit."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from ..master._fieldbus import node_state
 from ..master._gate import Reading, sample_of
 from ..master._master import Measurement, Motors, Pilot, reference_of
 
-# What the pilot was asked and what it said: ("start", None), ("finished", bool), ("step", set-points or None) and, of a
-# loop, ("reference", what it wanted its outputs to be), or (what, "Error: text") where it raised.
+# A call of the pilot and its result: ("start", None), ("finished", bool), ("step", set-points or None) and, for a loop,
+# ("reference", reference), or (name, "Error: text") for an exception.
 Answer = tuple[str, Any]
 
 
 class Cycle(NamedTuple):
-    """What went into one step of the master, and what came out.
+    """Inputs and outputs of one step of the master.
 
     Attributes:
         time: of the step [s], monotonic.
-        received: frames in, in their order.
-        tilt: the inclinometer's sample, None if none came.
-        taken: requests from outside since the step before: (start, finish or stop; why).
+        received: received frames in order.
+        tilt: the inclinometer's sample, None if missing.
+        taken: requests from outside since the step before: (start, finish, leave or stop; reason).
         answers: of the pilot in this step.
-        sent: frames out.
+        sent: sent frames.
         phase: after the step.
         positions, setpoints, tensions: of the motors [rad], [rad], [N].
     """
@@ -45,23 +45,23 @@ class Cycle(NamedTuple):
 
 
 class LoggedPilot:
-    """Passes on to `pilot` and keeps what it answered, until `take`."""
+    """Wrapper of a pilot that stores its answers until `take`."""
 
     def __init__(self, pilot: Pilot) -> None:
-        """Listen to `pilot`."""
+        """Wrap `pilot`."""
         self._pilot = pilot
         self._answers: list[Answer] = []
 
     def start(self) -> None:
-        """Begin anew."""
+        """Start a new run of the pilot."""
         self._heard("start", self._pilot.start)
 
     def step(self, measured: Measurement) -> Motors | None:
-        """Return what the pilot returns."""
+        """Return the set-points of the pilot."""
         return self._heard("step", lambda: self._pilot.step(measured))
 
     def finished(self, index: int) -> bool:
-        """Return what the pilot returns."""
+        """Return whether the pilot has finished."""
         return self._heard("finished", lambda: self._pilot.finished(index))
 
     def _heard(self, what: str, ask: Callable[[], Any]) -> Any:
@@ -75,7 +75,7 @@ class LoggedPilot:
 
     @property
     def reference(self) -> tuple[float, ...]:
-        """What the pilot's is; one that closes no loop has none, and none is kept."""
+        """The reference of the pilot; pilots without a loop have none, and none is stored."""
         reference = reference_of(self._pilot)
         if reference:
             self._answers.append(("reference", reference))
@@ -96,7 +96,7 @@ def cycle_of(
     tilt: Reading | None,
     sent: Sequence[Frame],
 ) -> Cycle:
-    """Return the step that `master` has just done."""
+    """Return the last step of `master`."""
     return Cycle(
         now, tuple(received), tilt, master.taken, pilot.take(), tuple(sent), str(master.supervisor.phase),
         master.positions, master.setpoints, master.tensions,
@@ -104,7 +104,7 @@ def cycle_of(
 
 
 def encode_cycle(cycle: Cycle) -> dict[str, Any]:
-    """Return JSON values of a cycle; what is empty is left out, numbers that are not finite are texts."""
+    """Return JSON values of a cycle, without empty entries; numbers that are not finite become texts."""
     table: dict[str, Any] = {
         "time": cycle.time,
         "phase": cycle.phase,
@@ -126,10 +126,10 @@ def encode_cycle(cycle: Cycle) -> dict[str, Any]:
 
 
 def decode_cycle(table: dict[str, Any]) -> Cycle:
-    """Return the cycle that `encode_cycle` made `table` of.
+    """Return the cycle of a table from `encode_cycle`.
 
     Raises:
-        KeyError, TypeError, ValueError: it made none.
+        KeyError, TypeError, ValueError: not such a table.
     """
     tilt = table.get("tilt")
     return Cycle(
@@ -150,16 +150,16 @@ def decode_cycle(table: dict[str, Any]) -> Cycle:
 
 
 def frame_text(frame: Frame) -> str:
-    """Return `201#0f00a1b2c3d4`; after `#` stand R for a remote request, X for what is about the bus, not from it."""
+    """Return a text such as `201#0f00a1b2c3d4`; after `#`, R marks a remote request and X an error of the adapter."""
     kind = ("R" if frame.remote else "") + ("X" if frame.error else "")
     return f"{frame.identifier:03X}#{kind}{frame.data.hex()}"
 
 
 def frame_of(text: str) -> Frame:
-    """Return the frame of `frame_text`.
+    """Return the frame of a text from `frame_text`.
 
     Raises:
-        ValueError: it is none.
+        ValueError: not such a text.
     """
     number, _, data = text.partition("#")
     digits = data.lstrip("RX")
@@ -176,7 +176,7 @@ def _motors(values: Sequence[Any]) -> Motors:
 
 
 def _tilt(values: Sequence[Any]) -> Reading:
-    """Return the sample that was logged as its values, its rates, and whether it is valid."""
+    """Return the sample that was logged as values, rates and validity."""
     *numbers, valid = values
     count = len(numbers) // 2
     return sample_of(_motors(numbers[:count]), _motors(numbers[count:]), valid=bool(valid))
@@ -186,7 +186,7 @@ _NMT = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset", 130: "reset
 
 
 def meaning(frame: Frame) -> str:
-    """Return one frame in words, its bytes behind; for our own PDO mapping."""
+    """Return one frame in words and bytes, for softneck's PDO mapping."""
     text = _words(frame)
     bytes_ = "remote request" if frame.remote else frame.data.hex(" ") or "no data"
     return f"{text} [{bytes_}]"

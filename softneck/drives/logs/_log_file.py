@@ -1,4 +1,4 @@
-"""Reads the log of a run back: what it was, its cycles and its signals, up to where the file is cut."""
+"""Reading of the log of a run: facts, cycles and signals, up to the end of a truncated file."""
 
 from __future__ import annotations
 
@@ -45,13 +45,13 @@ class LoggedRun:
 
     Attributes:
         path: of the file.
-        facts: what `run_facts` said.
-        cycles: steps of the master, in their order.
+        facts: those of `run_facts`.
+        cycles: steps of the master in order.
         rows: one for each sample of the controller while it ran: signal -> value in SI.
-        row_cycles: in which step of `cycles` each row was logged.
+        row_cycles: index in `cycles` of each row.
         events: (time [s], name, text).
-        cut: why reading ended early, "" if the log is complete.
-        outside: frames that no cycle holds, of the pre-flight and the end: (time [s], whether we sent it, frame).
+        cut: reason why reading ended early, "" if the log is complete.
+        outside: frames outside all cycles, of pre-flight and end: (time [s], whether the master sent it, frame).
     """
 
     path: Path
@@ -64,7 +64,7 @@ class LoggedRun:
     outside: tuple[tuple[float, bool, Frame], ...] = ()
 
     def frames(self) -> list[tuple[float, bool, Frame]]:
-        """Return all frames on the wire: (time [s], whether we sent it, frame)."""
+        """Return all frames on the bus: (time [s], whether the master sent it, frame)."""
         cycles = [
             (cycle.time, sent, frame)
             for cycle in self.cycles
@@ -77,7 +77,7 @@ class LoggedRun:
         """Return the settings of the run's master.
 
         Raises:
-            FileFormatError: they are damaged, or of another version.
+            FileFormatError: damaged settings, or those of another version.
         """
         try:
             table = dict(self.facts["settings"])
@@ -87,7 +87,7 @@ class LoggedRun:
             raise FileFormatError(f"{self.path}: its settings do not fit this softneck ({error}).") from error
 
     def signals(self) -> LoopResult:
-        """Return the rows as the result of the run had them."""
+        """Return the rows as signals, as in the result of the run."""
         rows = self._owned_rows()
         names = list(dict.fromkeys(name for row in rows for name in row))
         signals: dict[str, Vector] = {name: np.array([row.get(name, math.nan) for row in rows]) for name in names}
@@ -100,10 +100,10 @@ class LoggedRun:
 
     @property
     def robot(self) -> Robot:
-        """What the drives moved: the neck where the log does not say.
+        """The robot of the run; the neck if the log has none.
 
         Raises:
-            FileFormatError: what it says is no robot.
+            FileFormatError: a damaged robot.
         """
         if "robot" not in self.facts:
             return NECK
@@ -114,7 +114,7 @@ class LoggedRun:
 
     @property
     def sample_time(self) -> float:
-        """Of the controller [s]."""
+        """Sample time of the controller [s]."""
         settings = self.settings()
         return settings.sample_cycles * settings.bus.cycle
 
@@ -134,7 +134,7 @@ class LoggedRun:
             raise FileFormatError(f"{self.path}: holds positions of other motors than its robot's.") from error
         if "run" not in self.rows[0]:
             return recording_of(self.signals(), motion_at(times, positions, self.row_cycles)[1], robot)
-        # A row of an experiment is logged when its set-points were sent to their end.
+        # A row of an experiment is logged in the last cycle of its sample.
         late = self.settings().sample_cycles - 1
         columns = experiment_channels(
             experiment_table(self._owned_rows(), robot),
@@ -149,7 +149,7 @@ class LoggedRun:
 
 
 def read_run_log(path: str | Path) -> LoggedRun:
-    """Read a `.mcap` log of `softneck drives`; one that is cut is read up to the cut.
+    """Read a `.mcap` log of `softneck drives`; a truncated file is read up to its end.
 
     Raises:
         FileFormatError: no such file, not MCAP, or not a log of softneck.
@@ -230,7 +230,7 @@ def _tuple(value: Any) -> Any:
 
 
 def _damage() -> tuple[type[Exception], ...]:
-    """Return what damaged bytes make of mcap's reader and its decompressor: it has no common base class."""
+    """Return the exceptions that damaged bytes cause in mcap's reader and decompressor, which share no base class."""
     import zstandard
     from mcap.exceptions import McapError
 
@@ -245,7 +245,7 @@ def _word(error: BaseException) -> str:
 
 
 def changed_files(log: LoggedRun) -> list[str]:
-    """Return a line for each file of the run that is gone or is not what it was."""
+    """Return a line for each file of the run that is missing or has changed."""
     lines = []
     for role, entry in log.facts.get("files", {}).items():
         path = Path(str(entry.get("path")))

@@ -1,4 +1,4 @@
-"""A recorded run through the same core: the same frames in must give the same frames out, bit for bit."""
+"""Replay of a logged run: the same received frames must give the same sent frames, bit for bit."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from ._log_file import LoggedRun, read_run_log
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Where a replay first did something else.
+    """The first difference between a replay and its log.
 
     Attributes:
         cycle: number of the step.
-        time: [s] after the first one.
-        what: in which it differs, in words.
+        time: [s] after the first step.
+        what: the quantity that differs, in words.
         logged, replayed: both sides.
     """
 
@@ -37,21 +37,21 @@ class Difference:
     replayed: str
 
     def __str__(self) -> str:
-        """One line."""
+        """Return one line on the difference."""
         return f"cycle {self.cycle}, t = {self.time:.3f} s: {self.what}: logged {self.logged}, replayed {self.replayed}"
 
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What a replay found.
+    """Result of a replay.
 
     Attributes:
-        cycles: steps that were replayed.
-        frames: out, that were compared.
-        answers: of the controller that were computed again and compared; 0 where the logged ones were used.
-        phase, fault: in which the replayed run ended, and why.
-        difference: the first one, None if there is none.
-        notes: what the reader of the result must know.
+        cycles: number of replayed steps.
+        frames: number of compared frames.
+        answers: number of controller answers computed again and compared; 0 if the logged ones were used.
+        phase, fault: last phase of the replayed run, and the fault that ended it.
+        difference: the first one, or None.
+        notes: on the result.
     """
 
     cycles: int
@@ -63,7 +63,7 @@ class Replay:
     notes: tuple[str, ...] = ()
 
     def require(self) -> None:
-        """Raise CheckFailedError if anything differs."""
+        """Raise CheckFailedError if there is a difference."""
         if self.difference is not None:
             raise CheckFailedError(f"the replay differs from the log at {self.difference}.")
 
@@ -86,7 +86,7 @@ class Replay:
 
 
 class _ReplayPilot:
-    """A pilot that answers what the log says that one answered."""
+    """A pilot with the answers in the log."""
 
     def __init__(self) -> None:
         self.answers: list[Answer] = []
@@ -120,7 +120,7 @@ class _ReplayPilot:
 
 
 class _DivergenceError(Exception):
-    """The replayed core asks for what the logged one did not."""
+    """The replayed master calls the pilot differently from the log."""
 
 
 def replay(
@@ -130,14 +130,13 @@ def replay(
     *,
     watches: Sequence[Callable[..., object]] = (),
 ) -> Replay:
-    """Feed the log's frames, samples, requests and times to a new master and compare all that it sends.
+    """Feed the log's frames, samples, requests and times to a new master and compare its frames with the log.
 
     Args:
         log: of the run.
-        pilot: the run's controller, which is then computed again and compared too; without it the core gets the
-            logged answers of the controller.
+        pilot: the run's controller, to compute and compare its answers too; without it the logged answers are used.
         notes: for the result.
-        watches: called after each cycle, as those of a run are.
+        watches: called after each cycle, as in a run.
 
     Raises:
         DataError: the log has no cycles.
@@ -172,10 +171,10 @@ def replay(
 
 
 def logged_motion(log: LoggedRun, like: MasterSettings) -> Motion:
-    """Return the undisturbed motion of a log, to compare with on drives that are set up as `like`.
+    """Return the undisturbed motion of a log, for drives with the settings `like`.
 
     Raises:
-        DataError: it is of other drives, or was not undisturbed.
+        DataError: a log of other drives, or a run that ended with a fault.
         CheckFailedError: the replay differs from the log.
     """
     settings = log.settings()
@@ -206,11 +205,11 @@ def _ask_again(master: Master, what: str, why: str) -> None:
 
 
 def _first(logged: Cycle, again: Cycle) -> tuple[str, str, str] | None:
-    """Return what differs first in one step: the controller's answer, then the frames, then the phase."""
-    # Logs from before loops were compared with hold no references.
+    """Return the first difference in one step: in the controller's answer, the frames, or the phase."""
+    # Logs from before the comparison of loops have no references.
     told = any(what == "reference" for what, _ in logged.answers)
     answers = tuple(answer for answer in again.answers if told or answer[0] != "reference")
-    # By their text: NaN is not equal to itself, and 0.0 is to -0.0.
+    # Compared as texts: NaN is not equal to itself, and 0.0 is equal to -0.0.
     if repr(logged.answers) != repr(answers):
         return "the controller's answer", _answers(logged.answers), _answers(again.answers)
     if logged.sent != again.sent:
@@ -228,16 +227,16 @@ def _answers(answers: Sequence[Answer]) -> str:
 
 
 def baseline(logs: Sequence[str | Path]) -> Baseline:
-    """Return what plausibility is judged by; `save` it and name it in the drives file: [supervision] baseline.
+    """Return the baseline of logs; `save` it and set `[supervision] baseline` in the drives file.
 
     Args:
         logs: `.mcap` of `softneck drives record`, such as one without and one with a payload, together at least 40 s;
-            those of `run` let a loop's tracking be compared as well.
+            logs of `run` add the tracking model of a loop.
 
     Raises:
         SettingsError: no log.
-        DataError: of different drives, disturbed, too short, or motors that did not move.
-        CheckFailedError: a log that does not replay.
+        DataError: different drives, disturbed or too short motion, or motors that did not move.
+        CheckFailedError: a log whose replay differs.
     """
     if not logs:
         raise SettingsError("no log was given.")

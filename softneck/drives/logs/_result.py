@@ -1,4 +1,4 @@
-"""What a run on drives leaves: its signals as `softneck simulate` names them, and what happened."""
+"""Result of a run on drives: its signals, named as by `softneck simulate`, and its events."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from softneck.signals.recording._channels import NECK, known_channels
 
 from ..master import Event
 
-# 10 us a bin, up to 200 ms; what is longer falls into the last.
+# Width [s] and number of the bins of a histogram up to 200 ms; longer periods are in the last bin.
 _BIN = 1e-5
 _BINS = 20_000
 
 
 class CycleTimes:
-    """Periods between cycles and the time each one took.
+    """Statistics of the periods between cycles and of the computing times.
 
     Attributes:
-        count: periods so far.
-        late: those beyond one and a half cycles.
-        missed: cycles in which no step began: a period of n cycles misses n - 1.
+        count: number of periods.
+        late: number of periods beyond 1.5 cycles.
+        missed: cycles without a step: a period of n cycles misses n - 1.
         longest_period, longest_step: [s].
     """
 
     def __init__(self, cycle: float) -> None:
-        """Begin with nothing; `cycle` is the period that is wanted [s]."""
+        """Start empty; `cycle` is the nominal period [s]."""
         self.cycle = cycle
         self.count = self.late = self.missed = 0
         self.longest_period = self.longest_step = 0.0
@@ -41,7 +41,7 @@ class CycleTimes:
         self._last: float | None = None
 
     def take(self, now: float, step: float) -> None:
-        """Add a cycle that began at `now` [s] and took `step` [s]."""
+        """Add a cycle with start time `now` [s] and computing time `step` [s]."""
         self.longest_step = max(self.longest_step, step)
         if self._last is not None:
             period = now - self._last
@@ -53,7 +53,7 @@ class CycleTimes:
         self._last = now
 
     def quantile(self, share: float) -> float:
-        """Return the period that `share` of all are at most [s], to 10 us; 0 without any."""
+        """Return the quantile `share` of the periods [s], to 10 us; 0 without periods."""
         wanted, seen = share * self.count, 0
         for index, number in enumerate(self._bins):
             seen += number
@@ -62,12 +62,12 @@ class CycleTimes:
         return 0.0
 
     def __str__(self) -> str:
-        """In ms."""
+        """Return quantiles of the periods in ms."""
         p50, p99 = 1e3 * self.quantile(0.5), 1e3 * self.quantile(0.99)
         return f"p50 {p50:.2f}   p99 {p99:.2f}   max {1e3 * self.longest_period:.2f}"
 
     def table(self) -> dict[str, float | int]:
-        """Return what JSON holds."""
+        """Return the JSON values."""
         return {
             "cycles": self.count,
             "late": self.late,
@@ -87,12 +87,12 @@ def signal_units(names: Iterable[str]) -> dict[str, str]:
 
 
 def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Recording:
-    """Return a run as a recording: as measured, with true angles and tensions where simulated drives know them.
+    """Return a run as a recording: measured values, with true angles and tensions from simulated drives.
 
     Args:
         signals: of the run.
         speeds: of the motors at its samples, (time, motors) [rad/s].
-        robot: what was moved.
+        robot: of the run.
     """
     known = set(known_channels(robot))
     channels = {name: values for name, values in signals.signals.items() if name in known}
@@ -109,7 +109,7 @@ def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Re
 
 
 _UNHEARD = "The drives cannot be reached; their own guarding stops them within 0.1 s"
-# What is known of the drives' power after these; after all others they are off.
+# Event -> text on the power of the drives after it; after other events they are off.
 _POWER = {
     "bus_off": _UNHEARD,
     "bus_silent": _UNHEARD,
@@ -124,7 +124,7 @@ def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
     after = " Run `softneck drives commission --only zero` before the next run." if rehome else ""
     if fault.name == "operator":
         raise CheckFailedError(f"stopped at t = {fault.time:.3f} s by the operator. The drives are off.{after}")
-    # Where no word reaches the drives, what they do is theirs, and nobody here can know it.
+    # If the drives cannot be reached, their state is unknown.
     off = _POWER.get(fault.name, "The drives are off")
     raise CheckFailedError(
         f"stopped at t = {fault.time:.3f} s: {fault}. {off}; look for the cause, then `softneck drives reset`.{after}"
@@ -132,7 +132,7 @@ def require_unstopped(fault: Event | None, *, rehome: bool = False) -> None:
 
 
 def fault_table(fault: Event | None) -> dict[str, Any] | None:
-    """Return what JSON holds of what ended a run early."""
+    """Return the JSON values of the event that ended a run early; None without one."""
     if fault is None:
         return None
     return {"time_s": fault.time, "event": fault.name, "node": fault.node, "text": str(fault)}
@@ -140,23 +140,23 @@ def fault_table(fault: Event | None) -> dict[str, Any] | None:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class DrivesResult(Shown):
-    """What came of one run on the drives.
+    """Result of one run on the drives.
 
     Attributes:
         signals: one row for each sample of the controller while it ran.
-        phase: in which the run ended: "done" or "stopped".
-        fault: what ended it early, None if nothing did.
-        counts: how often each event happened.
-        events: the last of them.
+        phase: last phase of the run: "done" or "stopped".
+        fault: event that ended it early, or None.
+        counts: number of occurrences of each event.
+        events: the last ones.
         rehome: whether a drive lost its zero.
         cycles: of the bus.
         cycle: bus period [s].
         wall_time: [s].
-        simulated: whether the drives were.
+        simulated: whether the drives were simulated.
         times: of the cycles, in real time.
-        terminated: whether SIGTERM asked for the end.
+        terminated: whether SIGTERM ended it.
         speeds: of the motors at the rows of `signals`, (rows, motors) [rad/s].
-        robot: what was moved.
+        robot: of the run.
     """
 
     signals: LoopResult
@@ -177,20 +177,20 @@ class DrivesResult(Shown):
 
     @property
     def completed(self) -> bool:
-        """Whether the loop ran to its end and nothing stopped it."""
+        """Whether the loop ran to its end without a stop."""
         return self.fault is None and self.phase == "done" and not self.terminated
 
     @property
     def real_time_factor(self) -> float:
-        """Time on the bus over the time it took."""
+        """Ratio of the time on the bus to the wall-clock time."""
         return self.cycles * self.cycle / max(self.wall_time, 1e-9)
 
     def require(self) -> None:
-        """Raise CheckFailedError if something ended the run early."""
+        """Raise CheckFailedError if a fault ended the run early."""
         require_unstopped(self.fault, rehome=self.rehome)
 
     def recording(self) -> Recording:
-        """Return the run as a recording: as measured, with true angles where simulated drives know them."""
+        """Return the run as a recording: measured values, with true angles from simulated drives."""
         return recording_of(self.signals, self.speeds, self.robot)
 
     def table(self) -> dict[str, Any]:

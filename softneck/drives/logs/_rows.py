@@ -1,8 +1,8 @@
-"""Rows of an experiment, as they are collected and logged, and the recording that they make.
+"""Rows of an experiment, as collected and logged, and the recording made from them.
 
-Where the motors were, and how fast, at the samples of a run follows from the positions of all bus cycles. A drive takes
-its position at a SYNC, and the master reads it one cycle later: what was at t_k is known in the cycle after it. Speeds
-(606Ch) are not mapped: they would be three more frames in each cycle, and are a difference of counts as well.
+Positions and speeds of the motors at the samples of a run are computed from the positions of all bus cycles. A drive
+samples its position at a SYNC, and the master reads it one cycle later: the position at t_k is known in the next cycle.
+Speeds (606Ch) are not mapped: they would need three more frames in each cycle, and are also differences of counts.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Motion:
     """Times and positions of all bus cycles so far."""
 
     def __init__(self, motors: int = 3) -> None:
-        """Begin with nothing."""
+        """Start empty."""
         self._times, self._positions, self._motors = array("d"), array("d"), motors
 
     def __len__(self) -> int:
@@ -31,7 +31,7 @@ class Motion:
         return len(self._times)
 
     def take(self, now: float, positions: Sequence[float]) -> None:
-        """Add what the cycle at `now` [s] read [rad]."""
+        """Add the positions [rad] read in the cycle at `now` [s]."""
         self._times.append(now)
         self._positions.extend(positions)
 
@@ -43,13 +43,13 @@ class Motion:
 def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[Matrix, Matrix]:
     """Return positions [rad] and speeds [rad/s] of the motors at the times of `cycles`, (rows, motors) each.
 
-    A speed is the central difference over the cycles before and after: off by h^2/6 of the third derivative, and by at
-    most one count over 2 h. NaN where the cycles after it are missing.
+    A speed is the central difference over the cycles before and after, with an error of h^2/6 of the third derivative,
+    and of at most one count over 2 h. NaN if the cycles after it are missing.
 
     Args:
         times: of all cycles, (cycles,) [s].
         positions: as read in all cycles, (cycles, motors) [rad]: those of the cycle before.
-        cycles: which ones.
+        cycles: indices of the cycles.
     """
     k = np.asarray(cycles, dtype=np.int64)
     here = np.full((k.size, positions.shape[1]), np.nan)
@@ -63,12 +63,12 @@ def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[
 
 
 def truths(robot: Robot) -> tuple[str, ...]:
-    """Return what simulated drives know of a robot beyond what is measured: tensions, and a neck's compression."""
+    """Return the channels that only simulated drives have: tensions, and the compression of a neck."""
     return (*(f"tension_{j}" for j in range(1, len(robot.motors.names) + 1)), "compression")
 
 
 def columns_of(robot: Robot) -> tuple[str, ...]:
-    """Return what a row of an experiment holds: set-points, outputs, their rates, and what `truths` are."""
+    """Return the columns of an experiment: set-points, outputs, their rates, and `truths`."""
     outputs = robot.outputs.names
     return (*robot.set_points, *outputs, *(f"{name}_rate" for name in outputs), *truths(robot))
 
@@ -97,13 +97,13 @@ def experiment_table(rows: Sequence[Mapping[str, float]], robot: Robot = NECK) -
 def experiment_recording(
     columns: Mapping[str, Vector], run: Vector, sample_time: float, robot: Robot = NECK
 ) -> Recording | None:
-    """Return rows of an experiment without its pauses; None where there are fewer than two, or no angles.
+    """Return the rows of an experiment without its pauses; None for fewer than two rows, or without angles.
 
     Args:
         columns: channel -> (rows,).
         run: number of the run of each row, 0 in pauses, (rows,).
         sample_time: [s].
-        robot: what was moved.
+        robot: of the run.
     """
     kept = np.flatnonzero(run)
     if kept.size < 2:

@@ -1,4 +1,4 @@
-"""Writes the log of a run: frames and all that replay needs, in a thread beside the control loop."""
+"""Writing of the log of a run: frames and all data for a replay, in a thread beside the control loop."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from ._cycle import Cycle, LoggedPilot, cycle_of, encode_cycle, frame_text
 RUN_LOG = ".mcap"
 LOG_VERSION = 2
 METADATA = "softneck.run"
-# Files are handed to the operating system this often [s]: what a killed process may lose beside a piece of a file.
+# Period of flushes to the operating system [s]: the data that a killed process may lose, besides one chunk.
 _FLUSH = 0.25
-# Uncompressed bytes in one piece: a cycle has 400 or more, so that a piece is filled in less than 1 s at 20 Hz.
+# Uncompressed bytes in one chunk: a cycle has 400 or more, so that a chunk is filled in less than 1 s at 20 Hz.
 _PIECE = 8192
-# Cycles that may wait for the disk before the loop drops them: 200 s at 100 Hz.
+# Length of the queue before the loop drops cycles: 200 s at 100 Hz.
 _WAITING = 20_000
 
 
@@ -45,7 +45,7 @@ def _schema(**kinds: Any) -> dict[str, Any]:
 _SCHEMAS: dict[str, dict[str, Any]] = {
     "softneck.Cycle": _schema(time="number", phase="string", received=["string"], sent=["string"],
                               positions=["number"], setpoints=["number"], tensions=["number"]),
-    # What no cycle holds: frames of the pre-flight, of `zero`, of the end.
+    # Frames outside all cycles: of the pre-flight, of `zero`, of the end.
     "softneck.Frame": _schema(time="number", sent="boolean", frame="string"),
     "softneck.Signals": {"type": "object", "additionalProperties": {"type": "number"}},
     # A well-known schema: Foxglove shows it in its log panel.
@@ -65,15 +65,15 @@ class _Entry(NamedTuple):
 
 
 def partial(path: Path) -> Path:
-    """Return the name of a log that is not finished."""
+    """Return the path of an unfinished log."""
     return path.with_name(f"{path.stem}.part{path.suffix}")
 
 
 def require_log_path(path: Path, *, force: bool = False) -> None:
-    """Raise where `RunLogger` would not write to `path`.
+    """Raise an error if `RunLogger` cannot write to `path`.
 
     Raises:
-        SettingsError: an ending that no log has.
+        SettingsError: another ending than `.mcap`.
         OutputFileError: the file exists.
     """
     if path.suffix.lower() != RUN_LOG:
@@ -85,11 +85,11 @@ def require_log_path(path: Path, *, force: bool = False) -> None:
 def run_facts(
     settings: MasterSettings, files: Mapping[str, str | Path], *, simulated: bool, **more: Any
 ) -> dict[str, Any]:
-    """Return what a log says about its run: the master's settings and the files, by hash, that acted in it."""
+    """Return the facts of a run for its log: the master's settings, and the files by hash."""
     told = dataclasses.asdict(settings) | {"bus": dataclasses.asdict(settings.bus) | {"off": sorted(settings.bus.off)}}
     return {
         "softneck": __version__,
-        # Logs of a neck say nothing of channels, as they always did.
+        # Logs of a neck have no `channels`, as in earlier versions.
         "settings": {key: value for key, value in told.items() if value is not None},
         "simulated": simulated,
         "files": {role: {"path": str(Path(path).resolve()), "sha256": file_hash(path)} for role, path in files.items()},
@@ -98,15 +98,15 @@ def run_facts(
 
 
 class RunLogger:
-    """Writes the log of one run. The loop puts a few references into a queue; a thread makes text of them.
+    """Writer of the log of one run. The loop only puts references into a queue; a thread encodes them.
 
-    A log has `.part` before its ending until the run is over; one that a killed process leaves behind can be read.
+    A log has `.part` before its ending until the run is over; the log of a killed process can be read.
 
     Attributes:
         path: of the log.
-        lost: cycles that were dropped because the disk did not keep up.
-        problem: why writing ended, "" if it did not.
-        described: whether a run began: before that a log holds nothing to replay.
+        lost: number of cycles dropped because the disk was too slow.
+        problem: reason why writing ended, "" while it goes on.
+        described: whether a run has started; before that there is no data for a replay.
     """
 
     def __init__(self, path: Path, *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
@@ -115,12 +115,12 @@ class RunLogger:
         Args:
             path: of the log.
             force: replace an existing one.
-            wait: the loop may wait for the disk, as in virtual time.
-            epoch: wall-clock time [s] of t = 0 of the loop's clock; taken once, so that a jump of the wall clock
-                does not matter.
+            wait: whether the loop may wait for the disk, as in virtual time.
+            epoch: wall-clock time [s] of t = 0 of the loop's clock; read once, so that jumps of the wall clock have no
+                effect.
 
         Raises:
-            SettingsError: an ending that no log has.
+            SettingsError: another ending than `.mcap`.
             OutputFileError: the file exists or cannot be written.
         """
         self.path = path
@@ -142,30 +142,30 @@ class RunLogger:
         self._thread.start()
 
     def describe(self, facts: Mapping[str, Any]) -> None:
-        """Say what the run is; before the first cycle."""
+        """Write the facts of the run; before the first cycle."""
         self.described = True
         self._put(_Entry(self._swap()))
         self._put(dict(facts))
 
     def frame(self, now: float, from_master: bool, frame: Frame) -> None:
-        """Take one frame on the wire; it is written where no cycle holds it."""
+        """Add one frame on the bus; it is written separately if it is outside all cycles."""
         self._frames.append((now, from_master, frame))
         if len(self._frames) >= 256:
             self._put(_Entry(self._swap()))
 
     def signals(self, row: Mapping[str, float] | None) -> None:
-        """Take the row of a sample of the controller; it is written with the cycle."""
+        """Add the row of a sample of the controller; it is written with the cycle."""
         self._row = row
 
     def watch(self, pilot: LoggedPilot) -> Callable[..., None]:
-        """Return what is to be called after each step of a master that asks `pilot`."""
+        """Return the callback for each step of a master with the pilot `pilot`."""
 
         def watch(
             now: float, received: Sequence[Frame], sent: Sequence[Frame], tilt: Reading | None, master: Master
         ) -> None:
             row, self._row = self._row, None
             cycle = cycle_of(master, pilot, now, received, tilt, sent)
-            # A frame that this cycle does not hold may be one that the next one receives.
+            # A frame that is not in this cycle may be received in the next one.
             held = {id(frame) for frame in (*received, *sent)}
             more = [item for item in self._older if id(item[2]) not in held]
             self._older = [item for item in self._frames if id(item[2]) not in held]
@@ -185,18 +185,18 @@ class RunLogger:
         return tuple(reversed(news))
 
     def __enter__(self) -> RunLogger:
-        """Be a context."""
+        """Return the logger itself."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Close, whatever happened: a log of what went wrong is worth most."""
+        """Close the log, also after an error."""
         self.close()
 
     def close(self) -> None:
-        """Write what is left and give the file its name.
+        """Write the remaining entries and rename the file.
 
         Raises:
-            OutputFileError: the log is not complete; the line says why.
+            OutputFileError: the log is not complete; the message has the reason.
         """
         if not self._thread.is_alive() and self._stream.closed:
             return
@@ -230,7 +230,7 @@ class RunLogger:
         try:
             self._stream.close()
         except OSError as error:
-            # What was kept back for a full disk does not fit now either; closing it again gives it up.
+            # Buffered data does not fit on a full disk; closing again discards it.
             self.problem = self.problem or error.strerror or str(error)
             with contextlib.suppress(OSError):
                 self._stream.close()
@@ -260,7 +260,7 @@ class RunLogger:
                     return
 
     def _begun(self) -> tuple[Any, dict[str, int]]:
-        """Begin MCAP with JSON messages, in small compressed pieces; return its writer, and topic -> channel."""
+        """Start an MCAP file of JSON messages in small compressed chunks; return its writer, and topic -> channel."""
         from mcap.writer import Writer
 
         writer = Writer(self._stream, chunk_size=_PIECE)
@@ -283,7 +283,7 @@ class RunLogger:
         stamp = self._stamp(entry.time)
         self._add("/cycle", stamp, encode_cycle(entry.cycle))
         if entry.signals is not None:
-            # A number that is missing is left out: JSON has none for it.
+            # Missing numbers are left out, as JSON has no NaN.
             row = {name: value for name, value in entry.signals.items() if math.isfinite(value)}
             self._add("/signals", stamp, row)
         for event in entry.events:

@@ -1,5 +1,5 @@
-"""Plausibility: whether motors, currents and tilt behave as they did on undisturbed motion, and which fault they show.
+"""Fault detection: comparison of motors, currents and tilt with undisturbed motion, and fault isolation.
 
-An observer without I/O beside the master, and what it is calibrated from.
+A detector without I/O beside the master, and its calibration.
 May import `signals` and below.
 """

@@ -1,4 +1,4 @@
-"""What the supervisor compares with: models and thresholds, all from undisturbed motion of the commissioning run."""
+"""Baseline of the fault detection: models and thresholds from undisturbed motion of the commissioning run."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Rows = tuple[Row, ...]
 
 
 class Tracking(NamedTuple):
-    """What the tracking of a loop is compared with; all empty without one.
+    """Reference model of the tracking of a loop; all fields are empty without a loop.
 
     Attributes:
         weights: c_i.
-        whitening: of each output's residual; spread: variance of its innovation [rad^2], and what is added for each
-            rad^2 between reference and model, and of change of the model over two samples.
-        bias: largest mean over a second of each residual on runs that it was not fitted on [rad].
+        whitening: filter of each output's residual; spread: variance of its innovation [rad^2], and its increase for
+            each rad^2 between reference and model, and for each rad^2 of change of the model over two samples.
+        bias: largest mean over a second of each residual on runs outside the fit [rad].
         thresholds: of the charts, an upper and a lower one for each output.
     """
 
@@ -38,37 +38,38 @@ class Tracking(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Baseline:
-    """Undisturbed motion in numbers; `calibrate` makes it.
+    """Models and thresholds of undisturbed motion, made by `calibrate`.
 
     Attributes:
-        cycle: of the bus [s]; sample_cycles: of these between two samples of the tilt.
-        outputs: how many are measured.
-        drive: of each motor, how its step follows from what was left to the set-points of the last cycles.
-        drive_spread: of its residual, variance [rad^2] and what is added for each rad^2 of the step. It is not
-            whitened: a motor that stands though asked shows in the mean, which whitening takes away.
-        drive_fastest: largest step that a motor takes in a cycle, with a margin [rad].
-        current: of each motor, change of its tension over three cycles from changes of positions, speed, acceleration.
+        cycle: of the bus [s]; sample_cycles: bus cycles between two samples of the tilt.
+        outputs: number of measured outputs.
+        drive: for each motor, coefficients of its step from the distances to the set-points of the last cycles.
+        drive_spread: variance of its residual [rad^2], and its increase for each rad^2 of the step. It is not whitened:
+            a motor that does not move shows in the mean, which whitening would remove.
+        drive_fastest: largest step of each motor in a cycle, with a margin [rad].
+        current: for each motor, coefficients of the change of its tension over three cycles from changes of positions,
+            speed and acceleration.
         current_whitening, current_spread: of its residual [N].
-        current_top: largest tension seen of each, where its current may be cut off [N].
-        current_reach: how far each motor was behind its set-points in nearly all cycles [rad].
-        load: of each motor, mean of the other tensions from the motors' positions and one [N]. What these are off by
-            over some seconds is what a payload makes of them. load_low: least of it that is known ground [N].
-        level: of each motor, its tension from the same features, that of the others by `load`, and one: a payload is in
-            all of them. level_spread: variance of the residual [N^2].
-        tilt: (outputs, lags x motors) tilt from the motors' positions so many samples ago.
-        lags: these [samples].
-        tilt_whitening: of each output's residual.
-        tilt_spread: variance [rad^2], and what is added for each rad^2 of change over two samples, and of way.
-        tilt_bias: how far slow errors of the model carry each output's residual without any fault [rad].
-        gyro_whitening, gyro_spread: the same of angles against integrated rates; () without a gyro.
-        gyro_wander: variance of what angles and gyro differ by [rad^2].
-        noise: variance of second differences of each output beside the model [rad^2].
-        missing: part of the samples that did not come; missing_threshold: of the chart that counts them.
-        reach: of each motor, lowest and highest position seen [rad].
-        slack: of each tendon: below this it may hang, and the tilt is not what the motors say [N].
+        current_top: largest measured tension of each motor, where its current may be saturated [N].
+        current_reach: distance of each motor from its set-points in nearly all cycles [rad].
+        load: for each motor, coefficients of the mean of the other tensions from the motors' positions and a constant
+            [N]. Its residual over some seconds is caused by a payload. load_low: smallest calibrated residual [N].
+        level: for each motor, coefficients of its tension from the same features, the residual of the others by
+            `load` (a payload changes all tensions), and a constant. level_spread: variance of the residual [N^2].
+        tilt: (outputs, lags x motors) coefficients of the tilt from past positions of the motors.
+        lags: of these positions [samples].
+        tilt_whitening: filter of each output's residual.
+        tilt_spread: variance [rad^2], and its increase for each rad^2 of change over two samples, and of distance.
+        tilt_bias: slow model error of each output without any fault [rad].
+        gyro_whitening, gyro_spread: the same for angles against integrated rates; () without a gyro.
+        gyro_wander: variance of the difference between angles and gyro [rad^2].
+        noise: variance of second differences of each output's residual [rad^2].
+        missing: share of missing samples; missing_threshold: of their chart.
+        reach: lowest and highest position of each motor [rad].
+        slack: for each tendon, tension below which it may be slack and the tilt does not follow the motors [N].
         motor_thresholds, tilt_thresholds: of the charts, in the order of their names.
-        tracking: of a loop, where the experiments had one.
-        seconds: of motion that it was calibrated from.
+        tracking: of a loop, if the experiments had one.
+        seconds: of motion used for the calibration.
     """
 
     cycle: float
@@ -106,24 +107,24 @@ class Baseline:
 
     @property
     def motors(self) -> int:
-        """How many there are."""
+        """Number of motors."""
         return len(self.drive)
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
-        """Write it as JSON; an existing file is replaced only with `force`."""
+        """Write the baseline as JSON; an existing file is replaced only with `force`."""
         text = json.dumps({"kind": _KIND, "version": _VERSION, **asdict(self)}, indent=1)
         with atomic_write(path, force=force) as part:
             part.write_text(text + "\n", encoding="utf-8")
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Baseline:
-        """Return what `asdict` made, lists for tuples too.
+        """Return the baseline for a table of `asdict`, also with lists in place of tuples.
 
         Raises:
-            SettingsError: keys that are missing or unknown.
+            SettingsError: missing or unknown keys.
         """
         known = {item.name for item in fields(cls)}
-        # Files from before loops were compared with have no `tracking`.
+        # Files from before the comparison of loops have no `tracking`.
         wrong = sorted((known - _LATER) ^ (set(table) - _LATER))
         if wrong:
             raise SettingsError(f"`{wrong[0]}` is missing or unknown in what the supervisor compares with.")
@@ -132,10 +133,10 @@ class Baseline:
 
 
 def load_baseline(path: str | Path) -> Baseline:
-    """Read what `Baseline.save` wrote.
+    """Read a baseline from a file of `Baseline.save`.
 
     Raises:
-        FileFormatError: no such file, or not one of these.
+        FileFormatError: no such file, or another kind of file.
     """
     source = Path(path)
     try:

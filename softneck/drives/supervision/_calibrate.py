@@ -1,4 +1,4 @@
-"""From undisturbed motion to a baseline: models by least squares, thresholds from what they leave over elsewhere."""
+"""Calibration of a baseline from undisturbed motion: models by least squares, thresholds from held-out residuals."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from ._motor_models import Features, Flags, Motion, features_of, level_rows, mot
 from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
 from ._tracking import LoopRun, fit_tracking, tracking_scores
 
-# What the tilt may still answer to [s], in samples that lie closer together where it answers most.
+# Memory of the tilt model [s], and number of its lags, which are denser for recent positions.
 _REACH = 0.5
 _LAGS = 8
-# Motors and loads further out than this part of the seen range are not known ground, and no motor is so much faster.
+# Margin beyond the measured range of positions, loads and speeds, as a share of it.
 _MARGIN = 0.2
 _LEAST = 20.0
-# Runs of a loop, of all together [s]: four minutes showed a third of the slow error that a quarter of an hour does, and
-# the tracking cried wolf once in eight hours.
+# Least total length of runs of a loop [s]: four minutes showed a third of the slow error of a quarter of an hour, and
+# the tracking chart then had a false alarm every eight hours.
 _LEAST_LOOPS = 600.0
 # See `calibrate`; by `benchmarks/supervisor_choice.py`.
 _KNOWN_BIAS = 0.25
-# What is further out than this part of the cycles counts for seldom.
+# Quantile of cycles that counts as nearly all.
 _NEARLY = 0.95
 
 
@@ -41,18 +41,19 @@ def calibrate(
     seed: int = 0,
     known_bias: float = _KNOWN_BIAS,
 ) -> Baseline:
-    """Return what the supervisor compares with.
+    """Return the baseline of undisturbed motion.
 
-    Thresholds come from stretches that their models were not fitted on: each is left out once, a single one by halves.
-    Runs of a loop are for its tracking alone: motors and tilt are compared with experiments, which overload no motor.
+    Thresholds come from held-out segments: each segment is left out of the fit once, a single one by halves. Runs of a
+    loop are used for its tracking only: motors and tilt are calibrated on experiments, which overload no motor.
 
     Args:
-        motions: undisturbed; those without a loop together at least 40 s.
-        cycle: of the bus [s]; sample_cycles: of these for one sample of the tilt.
-        slack: tension below which a tendon hangs [N].
+        motions: undisturbed; those without a loop at least 40 s in total.
+        cycle: of the bus [s]; sample_cycles: bus cycles for one sample of the tilt.
+        slack: tension below which a tendon is slack [N].
         budget: of false alarms; `charts` and `step` are set here.
         seed: of the bootstrap.
-        known_bias: part of the largest slow error that the tilt's charts take for no fault; the bootstrap has the rest.
+        known_bias: share of the largest slow error that the charts of the tilt allow without a fault; the bootstrap
+            covers the rest.
 
     Raises:
         DataError: too little motion, or motors that did not move.
@@ -82,7 +83,7 @@ def calibrate(
     charts = motor[0].shape[1] + tilt[0].shape[1] + 1 + (2 * runs[0].values.shape[1] if runs else 0)
     shared = replace(budget or Budget(), charts=charts)
     rng = np.random.default_rng(seed)
-    # Of samples that come or not by chance, e^-h bounds the rate of false alarms (Basseville and Nikiforov, 5.2.2).
+    # If samples are missing at random, e^-h bounds the rate of false alarms (Basseville and Nikiforov, 5.2.2).
     seldom = -np.log(shared.rate / shared.charts * cycle * sample_cycles)
     whole = replace(whole, tilt_bias=bias, missing_threshold=float(seldom))
     h = thresholds(motor, replace(shared, step=cycle), rng)
@@ -92,7 +93,7 @@ def calibrate(
 
 
 def _loops(loops: Sequence[Motion], model: Baseline) -> list[LoopRun]:
-    """Return the runs of a loop, two halves of a single one, that are long enough."""
+    """Return the runs of a loop that are long enough; a single run is split into halves."""
     runs = []
     for part in loops[0].halves() if len(loops) == 1 else loops:
         walk = _Walk(model)
@@ -105,7 +106,7 @@ def _loops(loops: Sequence[Motion], model: Baseline) -> list[LoopRun]:
 
 
 def require_loops(seconds: float) -> None:
-    """Raise DataError unless so many seconds of loops, those with taut tendons, are enough to compare with."""
+    """Raise DataError if the runs of a loop with taut tendons are too short for its tracking model."""
     if seconds < _LEAST_LOOPS:
         raise DataError(
             f"{seconds:.0f} s of a loop's motion with taut tendons are too few to compare its tracking with. Run it "
@@ -114,7 +115,7 @@ def require_loops(seconds: float) -> None:
 
 
 def _tracking(runs: Sequence[LoopRun], budget: Budget, rng: np.random.Generator) -> Tracking:
-    """Return what a loop's tracking is compared with; thresholds from runs that it was not fitted on."""
+    """Fit the tracking model of a loop, with thresholds from held-out runs."""
     fitted = [fit_tracking([other for other in runs if other is not run]) for run in runs]
     slow = [_second(tracking_scores(model, run)[1], run.step) for model, run in zip(fitted, runs, strict=True)]
     bias = row_of(np.max(slow, axis=0))
@@ -123,7 +124,7 @@ def _tracking(runs: Sequence[LoopRun], budget: Budget, rng: np.random.Generator)
 
 
 def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
-    """Return the scores of all charts on one stretch: of motors (cycles, charts), of the tilt (samples, charts)."""
+    """Return the scores of all charts on one segment: of motors (cycles, charts), of the tilt (samples, charts)."""
     walk = _Walk(baseline)
     ours, theirs = [], []
     for k in range(len(motion.due)):
@@ -134,7 +135,7 @@ def scores_of(baseline: Baseline, motion: Motion) -> tuple[Matrix, Matrix]:
 
 
 class _Walk:
-    """The charts over a stretch of motion, none of which ever says anything."""
+    """The charts over a segment of motion, with infinite thresholds."""
 
     def __init__(self, baseline: Baseline) -> None:
         self._gains = np.array(baseline.current)
@@ -144,7 +145,7 @@ class _Walk:
         self.tilt.begin()
 
     def step(self, motion: Motion, k: int) -> bool:
-        """Take row `k`; return whether it held a sample."""
+        """Process row `k`; return whether it has a sample."""
         self.motors.step(motion.setpoints[k], motion.positions[k], motion.tensions[k])
         if not motion.due[k]:
             return False
@@ -173,7 +174,7 @@ def fit(
     top = np.max([np.abs(motion.tensions).max(axis=0) for motion in motions], axis=0)
     reach = np.nanquantile(np.concatenate([f.behind for f in features]), _NEARLY, axis=0)
     lags = _lags(step)
-    # At rest nobody knows which way friction holds: a tendon is taut for certain above that much only.
+    # At rest the sign of friction is unknown: a tendon is certainly taut only above this tension.
     least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
     load, (least_load, most_load), level, level_spread = level_rows(known, least, top, reach)
     samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
@@ -204,7 +205,7 @@ def fit(
 
 
 def _slow(baseline: Baseline, motion: Motion) -> Vector:
-    """Return how far the mean of a second of the residual goes on a stretch that the models were not fitted on."""
+    """Return the largest mean over a second of the residual on a segment outside the fit."""
     walk, rows = _Walk(baseline), []
     for k in range(len(motion.due)):
         if walk.step(motion, k):
@@ -224,7 +225,7 @@ def _second(rows: Matrix, step: float) -> Vector:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Samples:
-    """The samples of one stretch: positions, tilt with gaps bridged, rates, whether all tendons are taut, and came."""
+    """Samples of one segment: positions, tilt (gaps interpolated), rates, flags for taut tendons and valid samples."""
 
     positions: Matrix
     values: Matrix
@@ -248,7 +249,7 @@ class _Samples:
 
 
 def _lags(step: float) -> tuple[int, ...]:
-    """Return samples back to half a second: 0, 1, 2, then further and further apart."""
+    """Return lags up to half a second [samples]: 0, 1, 2, then with growing distances."""
     last = max(_LAGS, round(_REACH / step))
     return tuple(sorted({0, 1, 2, *np.unique(np.round(np.geomspace(3, last, _LAGS - 2)).astype(int)).tolist()}))
 
@@ -260,7 +261,7 @@ def _lagged(s: _Samples, lags: tuple[int, ...]) -> Matrix:
 
 
 def _tilt_gains(samples: Sequence[_Samples], lags: tuple[int, ...]) -> Matrix:
-    """Return (outputs, lags x motors) by least squares, with an offset of its own for each stretch."""
+    """Fit the gains (outputs, lags x motors) by least squares, with a separate offset for each segment."""
     X, y = [], []
     for s in samples:
         good = (np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5)[lags[-1] :]
@@ -280,7 +281,7 @@ def _predicted(s: _Samples, tilt: Matrix, lags: tuple[int, ...], motors: int) ->
 
 
 def _stretches(values: Matrix, good: Flags, least: int) -> list[Matrix]:
-    """Return the runs of rows that are `good`, without the first `least` rows of all, and none of under 50 rows."""
+    """Return the contiguous rows that are `good`, in parts of 50 rows or more, from a given row on."""
     usable = good.copy()
     usable[:least] = False
     edges = np.flatnonzero(np.diff(np.concatenate([[0], usable.astype(int), [0]])))
@@ -316,7 +317,7 @@ def _tilt_noise(
 
 
 def _gyro_noise(samples: Sequence[_Samples], step: float) -> tuple[Rows, Row, Row]:
-    """Return whitening of angles against integrated rates, variance after and before it; () without rates."""
+    """Return the whitening of angles minus integrated rates, with the variance after and before; () without rates."""
     if not all(np.isfinite(s.rates[s.came]).all() for s in samples):
         return (), (), ()
     levels: list[Matrix] = []

@@ -1,6 +1,6 @@
-"""What the charts of motors and tilt add up, cycle by cycle: whitening, features, hypotheses, scores.
+"""Scores of the charts of motors and tilt, cycle by cycle: whitening, features, hypotheses, scores.
 
-All arrays are the callers' (`MotorCharts`, `TiltCharts`), who say what they hold.
+All arrays belong to the callers (`MotorCharts`, `TiltCharts`), which document them.
 """
 
 import math
@@ -8,29 +8,29 @@ import math
 import numpy as np
 
 SUPERVISED_NOT = -1e6
-# An innovation counts for no more than this many standard deviations, and so does a fault: no model is right to a few
-# per cent in each sample, and none alone shall decide.
+# Innovations and faults are clipped to this number of standard deviations: no model is accurate to a few per cent in
+# each sample, and no single sample should decide.
 CHART_CLIP = 5.0
 
 
 def chart_shift(innovation: float, mean: float, variance: float, sight: float) -> float:
-    """Return s for a shift by `mean`; one beyond `sight` standard deviations is taken for one of so many."""
+    """Return s for a shift by `mean`, which is limited to `sight` standard deviations."""
     spread = max(math.sqrt(variance), abs(mean) / sight)
     e = innovation / spread
     f = mean / spread
-    # Clipped around the fault's mean as well: what the fault explains may be as large as it likes.
+    # Clipped around the fault's mean as well: the part explained by the fault is not limited.
     seen = min(max(e, min(f, 0.0) - CHART_CLIP), max(f, 0.0) + CHART_CLIP)
     return f * seen - 0.5 * f * f
 
 
 def chart_spread(innovation: float, variance: float, ratio: float) -> float:
-    """Return s for a variance that changed by `ratio` (Basseville and Nikiforov, example 2.2.2)."""
+    """Return s for a change of variance by `ratio` (Basseville and Nikiforov, example 2.2.2)."""
     square = min(innovation * innovation / variance, CHART_CLIP * CHART_CLIP * max(1.0, ratio))
     return 0.5 * (1.0 - 1.0 / ratio) * square - 0.5 * math.log(ratio)
 
 
 def chart_whiten(coefficients: np.ndarray, past: np.ndarray, values: np.ndarray, channel: int) -> None:
-    """Turn a channel of `values` (kinds, channels) into innovations, and keep it in `past` (order, kinds, channels)."""
+    """Whiten a channel of `values` (kinds, channels) in place, and store it in `past` (order, kinds, channels)."""
     order = coefficients.shape[0]
     for i in range(values.shape[0]):
         value = values[i, channel]
@@ -43,7 +43,7 @@ def chart_whiten(coefficients: np.ndarray, past: np.ndarray, values: np.ndarray,
 
 
 def chart_push(past: np.ndarray, values: np.ndarray) -> None:
-    """Put `values` (channels,) before the rows of `past`, whose last one goes."""
+    """Insert `values` (channels,) as the first row of `past` and drop the last one."""
     for k in range(past.shape[0] - 1, 0, -1):
         for j in range(values.shape[0]):
             past[k, j] = past[k - 1, j]
@@ -54,9 +54,10 @@ def chart_push(past: np.ndarray, values: np.ndarray) -> None:
 def supervised_features(
     now: tuple, past: tuple, x: np.ndarray, edges: np.ndarray, asked: tuple[int, int], cycle: float
 ) -> None:
-    """Take one cycle of (set-points, positions, tensions), each (motors,), into `past` of each and the features `x`.
+    """Add one cycle of (set-points, positions, tensions), each (motors,), to `past` and compute the features `x`.
 
-    `x` is (cycles, motors, features): positions of all motors, friction at each edge, three speeds, what was asked.
+    `x` is (cycles, motors, features): positions of all motors, friction at each edge, three speeds, and the distances
+    to past set-points.
     """
     setpoints, positions, tensions = now
     s, p, tension = past
@@ -88,14 +89,14 @@ def supervised_motors(model: tuple, rules: tuple, past: tuple, x: np.ndarray, wh
     """Fill the scores (kinds x motors,) of one cycle: jams, jumps, and each scale of the currents.
 
     Args:
-        model: drive, its spread, its fastest steps, current, its spread, top, reach, and below what tension a tendon
-            may hang.
+        model: drive, its spread, its fastest steps, current, its spread, top, reach, and the tension below which a
+            tendon may be slack.
         rules: of `MotorRules`.
         past: set-points, positions, tensions so far.
         x: features.
-        white: coefficients and past of the currents' whitening, and room for (1 + scales, motors).
-        rest: cycles for which each current says nothing (motors,).
-        scales: wrong scales of a current.
+        white: coefficients and past of the currents' whitening, and a buffer (1 + scales, motors).
+        rest: remaining cycles for which each current is not evaluated (motors,).
+        scales: hypotheses of a wrong current scale.
         cycle: of the bus [s].
         scores: out.
     """
@@ -111,10 +112,10 @@ def supervised_motors(model: tuple, rules: tuple, past: tuple, x: np.ndarray, wh
             behind = max(behind, abs(s[k, i] - p[0, i]))
         moved = p[0, i] - p[1, i]
         spread = drive_spread[i, 0] + drive_spread[i, 1] * expected * expected
-        # What turns is not jammed, however late it is: an overloaded motor still creeps.
+        # A motor that turns is not jammed, even if it is late: an overloaded motor still creeps.
         turns = abs(moved) > stands * cycle
         scores[i] = SUPERVISED_NOT if turns else chart_shift(moved - expected, -expected, spread, CHART_CLIP)
-        # More than was asked, or the other way, and than a motor ever did: less is what a jam or a weak current does.
+        # A jump is larger than expected, or in the other direction, and larger than any calibrated step.
         jumps = abs(moved) > abs(expected) and abs(moved) > fastest[i]
         more = abs(moved - expected) / math.sqrt(spread) if jumps else 0.0
         scores[n + i] = more - usual
@@ -127,22 +128,22 @@ def supervised_motors(model: tuple, rules: tuple, past: tuple, x: np.ndarray, wh
         for k in range(scales.shape[0]):
             values[1 + k, i] = (scales[k] - 1.0) * change
         chart_whiten(coefficients, before, values, i)
-        # Nor does a current at its limit speak, or that of a tendon that hangs, or that did a moment ago.
+        # Currents at their limit, or of a tendon that is or was just slack, are not evaluated.
         silent = abs(abs(tension[0, i]) / top[i] - 1.0) < near_top or taut < slack[i]
         rest[i] = cut if silent else rest[i] - 1.0
-        # Nor where more is asked than in nearly all of the commissioning run.
+        # Nor those of motors further from their set-points than in nearly all of the commissioning run.
         quiet = behind > reach[i] or rest[i] > 0.0 or change * change < excited * excited * current_spread[i, 0]
         spread = current_spread[i, 0] + current_spread[i, 1] * change * change
         for k in range(scales.shape[0]):
             f = values[1 + k, i]
-            # What passes for right is not one scale but all within a part of it.
+            # All scales within a tolerance of the right one count as right.
             allowed = known * min(f * f / (abs(scales[k] - 1.0) * spread), sight * sight)
             score = chart_shift(values[0, i], f, spread, sight) - allowed
             scores[(2 + k) * n + i] = 0.0 if quiet else score
 
 
 def supervised_load(off: np.ndarray, load: np.ndarray, counted: np.ndarray, memory: float) -> None:
-    """Take what the other tensions of each motor are off by (motors,) [N] into their mean of the last cycles."""
+    """Update the mean over the last cycles of the residual of each motor's other tensions (motors,) [N]."""
     counted[0] = min(counted[0] + 1.0, memory)
     for i in range(load.shape[0]):
         load[i] += (off[i] - load[i]) / counted[0]
@@ -153,9 +154,10 @@ def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, re
     """Fill the scores (scales x motors,) of each tension against those of the other tendons, which share a payload.
 
     Args:
-        model: level, its spread, mean of the others by place, top, reach, and below what tension a tendon may hang.
+        model: level, its spread, mean of the others by position, top, reach, and the tension below which a tendon may
+            be slack.
         rules, past, x, rest, scales, scores: as in `supervised_motors`.
-        carried: what the others are off by, its mean of the last cycles (motors,) each, and how many were counted.
+        carried: residual of the others, its mean over the last cycles (motors,) each, and the number of cycles.
     """
     level, spread, others, top, reach, slack = model
     sight, near_top, memory = rules[2], rules[5], rules[7]
@@ -175,24 +177,24 @@ def supervised_levels(model: tuple, rules: tuple, past: tuple, x: np.ndarray, re
     if known:
         supervised_load(off, load, counted, memory)
     for i in range(n):
-        # Of a few cycles friction has not averaged out.
+        # Over a few cycles friction has not averaged out.
         expected, quiet = level[i, features + 1], not known or counted[0] < 0.1 * memory
         for j in range(features):
             expected += level[i, j] * x[0, i, j]
         for j in range(n):
             quiet = quiet or rest[j] > 0.0
         expected += level[i, features] * load[i]
-        # What hangs has no scale: half of a tension must be well above that.
+        # A slack tendon shows no scale: half of the expected tension must be well above slack.
         quiet = quiet or expected < 3.0 * slack[i]
         for k in range(scales.shape[0]):
             score = chart_shift(tension[0, i] - expected, (scales[k] - 1.0) * expected, spread[i], sight)
-            # What was added up before is of another moment: half an answer each time is none.
+            # A sum from before the pause does not count: two halves of the evidence are not evidence.
             scores[k * n + i] = SUPERVISED_NOT if quiet else score
 
 
 def supervised_angle(gains: np.ndarray, lags: np.ndarray, past: np.ndarray, positions: np.ndarray,
                      parts: np.ndarray) -> None:  # fmt: skip
-    """Fill each motor's part of the tilt (motors, outputs) [rad] from its positions so far."""
+    """Compute each motor's part of the tilt (motors, outputs) [rad] from its past positions."""
     chart_push(past, positions)
     for i in range(parts.shape[0]):
         for a in range(parts.shape[1]):
@@ -202,7 +204,7 @@ def supervised_angle(gains: np.ndarray, lags: np.ndarray, past: np.ndarray, posi
 
 
 def supervised_faults(gears: np.ndarray, offset: float, seen: tuple, raw: np.ndarray) -> None:
-    """Fill what the residual is, and what each fault would make of it: `raw` (1 + hypotheses, outputs)."""
+    """Fill `raw` (1 + hypotheses, outputs) with the residual and its mean under each fault hypothesis."""
     residual, parts, began, late, stuck = seen
     n, m = parts.shape
     raw[:] = 0.0
@@ -214,7 +216,7 @@ def supervised_faults(gears: np.ndarray, offset: float, seen: tuple, raw: np.nda
         raw[0, a] = residual[a]
         at = 1
         for g in range(gears.shape[0]):
-            # The file's gear is off by this: the winch turned so many times what its counts say.
+            # Wrong gear in the drives file: the winch turned this number of times as far as its counts.
             for i in range(n):
                 raw[at, a] = (gears[g] - 1.0) * (parts[i, a] - began[i, a])
                 at += 1
@@ -223,7 +225,7 @@ def supervised_faults(gears: np.ndarray, offset: float, seen: tuple, raw: np.nda
         raw[at + a, a] = stuck[a] - angle
         raw[at + m + a, a] = -2.0 * moved
         at += 2 * m
-        # Axes a and a + 1 are swapped: each shows what the other one did.
+        # Axes a and a + 1 are swapped: each shows the motion of the other.
         if a > 0:
             raw[at + a - 1, a] -= moved
             raw[at + a - 1, a - 1] += moved
@@ -238,16 +240,16 @@ def supervised_faults(gears: np.ndarray, offset: float, seen: tuple, raw: np.nda
 
 def supervised_tilt(spreads: np.ndarray, allowed: np.ndarray, squares: tuple, white: tuple, sums: tuple,
                     lately: float, good: bool, scores: np.ndarray) -> None:  # fmt: skip
-    """Fill the scores of the first hypotheses, and forget all but `lately` of what they explained.
+    """Fill the scores of the first hypotheses, and discount their evidence by `lately`.
 
     Args:
         spreads: variance of each output and its parts in the squares (outputs, 3).
-        allowed: how far slow errors of the model carry each innovation (outputs,).
-        squares: of the change over two samples, and of the way (outputs,) each.
+        allowed: slow model error of each innovation (outputs,).
+        squares: of the change over two samples, and of the distance (outputs,) each.
         white: coefficients, past and values of the whitening.
         sums: explained and information of each hypothesis.
-        lately: part of these that is kept.
-        good: whether the model holds.
+        lately: discount factor of these.
+        good: whether the model is valid.
         scores: out.
     """
     coefficients, before, values = white
@@ -268,7 +270,7 @@ def supervised_tilt(spreads: np.ndarray, allowed: np.ndarray, squares: tuple, wh
 
 
 def supervised_noise(bend: np.ndarray, noise: np.ndarray, ratios: np.ndarray, good: bool, scores: np.ndarray) -> None:
-    """Fill the scores of the noise: for each output each ratio of variances."""
+    """Fill the scores of the noise, for each output and each ratio of variances."""
     for a in range(bend.shape[0]):
         for k in range(ratios.shape[0]):
             score = chart_spread(bend[a], noise[a], ratios[k])

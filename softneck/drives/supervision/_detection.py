@@ -1,22 +1,22 @@
 """Change detection without I/O: whitening of residuals, cumulative sums, thresholds from undisturbed motion.
 
-A free-run residual is correlated from sample to sample, and a cumulative sum over it drifts far beyond the thresholds
-that hold for white noise: Johnson and Bagshaw, "The effect of serial correlation on the performance of CUSUM tests",
+The residual of a simulation is correlated from sample to sample, and a cumulative sum over it drifts far beyond the
+thresholds for white noise: Johnson and Bagshaw, "The effect of serial correlation on the performance of CUSUM tests",
 Technometrics 16 (1974), find the run length cut by four at a correlation of 0.5. An autoregression makes it white.
 
-Charts ask whether one fault explains the residual better than none: Page's CUSUM in the form of Basseville and
+Charts test whether one fault explains the residual better than none: Page's CUSUM in the form of Basseville and
 Nikiforov, "Detection of Abrupt Changes" (1993), sec. 2.2 and 7.2.1. With an innovation e of variance v, and the mean f
 that the fault would give it,
 
     s = f e / v - f^2 / (2 v),     S <- max(0, S + s),     alarm where S > h.
 
-Without a fault s falls by f^2 / (2 v) on average, with it it rises by as much: that half is the *information* of the
-sample about the fault, and a fault that is not excited has none.
+Without the fault s falls by f^2 / (2 v) on average, with it s rises by as much. This is the *information* of the sample
+about the fault; a fault that is not excited has none.
 
-Thresholds: scores of undisturbed motion are drawn again in blocks, which keep what correlation is left (Kuensch, Annals
+Thresholds: scores of undisturbed motion are resampled in blocks, which keep the remaining correlation (Kuensch, Annals
 of Statistics 17, 1989), the same block for all charts. The largest sum in each window of such a path has an exponential
-tail (sec. 5.2.2: e^-h for a likelihood ratio of white noise), which carries from what a few minutes show to what the
-budget asks.
+tail (sec. 5.2.2: e^-h for a likelihood ratio of white noise), which extrapolates from a few minutes of data to the rate
+of the budget.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from softneck.runtime import load_functions
 
 from ._charts_runtime import CHART_CLIP
 
-# Rows per coefficient below which an order is not tried: fewer fit the noise.
+# Least number of rows per coefficient for an order; with fewer rows the noise is fitted.
 _ROWS_EACH = 20
 
 
 @dataclass(frozen=True, slots=True)
 class Whitening:
-    """The filter `e_k = r_k - sum a_j r_(k-j)`; what a fault adds to a residual goes through the same.
+    """The whitening filter `e_k = r_k - sum a_j r_(k-j)`; the mean under a fault passes through it as well.
 
     Attributes:
         coefficients: a_1..a_p.
@@ -48,14 +48,14 @@ class Whitening:
 
     @classmethod
     def fit(cls, residuals: Sequence[Vector], *, most: int = 6) -> Whitening:
-        """Return the autoregression of the order that Akaike's criterion, corrected for few rows, finds best.
+        """Fit an autoregression with the order of the smallest corrected Akaike criterion (AICc).
 
         Args:
-            residuals: undisturbed stretches, each (time,); no row looks back across their borders.
-            most: highest order that is tried.
+            residuals: of undisturbed segments, each (time,); regressors do not cross segments.
+            most: highest order.
 
         Raises:
-            DataError: a residual that is not finite, or no stretch of 20 rows.
+            DataError: a residual that is not finite, or no segment of 20 rows.
         """
         if not all(np.isfinite(part).all() for part in residuals):
             raise DataError("residuals must be finite to fit a whitening filter.")
@@ -78,29 +78,29 @@ class Whitening:
         return cls(tuple(float(value) for value in found))
 
     def apply(self, residual: Vector) -> Vector:
-        """Return the innovations (time - p,) of one stretch (time,)."""
+        """Return the innovations (time - p,) of one segment (time,)."""
         order = len(self.coefficients)
         return residual[order:] - lags(residual, order) @ np.array(self.coefficients)
 
 
 def lags(x: Vector, order: int) -> Matrix:
-    """Return (time - order, order): in each row the `order` values before, the latest first."""
+    """Return (time - order, order): each row has the `order` previous values, latest first."""
     return np.column_stack([x[order - j : len(x) - j] for j in range(1, order + 1)]) if order else np.zeros((len(x), 0))
 
 
 class Filter:
-    """Whitening filters that run along, one for each channel: for residuals and for all that faults would add to them.
+    """Recursive whitening filters, one for each channel, for residuals and for their means under faults.
 
     Attributes:
         coefficients: (order, channels), zero beyond a channel's own order.
-        past: values so far, the latest first (order, kinds, channels).
-        seen: how many values it took.
+        past: past values, latest first (order, kinds, channels).
+        seen: number of values so far.
     """
 
     __slots__ = ("_step", "coefficients", "past", "seen")
 
     def __init__(self, channels: Sequence[Whitening], kinds: int = 1) -> None:
-        """Know nothing yet; values have shape (kinds, channels)."""
+        """Start without values; these have shape (kinds, channels)."""
         order = max((len(channel.coefficients) for channel in channels), default=0)
         padded = [[*channel.coefficients, *(0.0,) * (order - len(channel.coefficients))] for channel in channels]
         self.coefficients = np.array(padded).reshape(len(channels), order).T.copy()
@@ -110,7 +110,7 @@ class Filter:
 
     @property
     def settled(self) -> bool:
-        """Whether it has seen as many values as it looks back."""
+        """Whether its memory is filled."""
         return self.seen >= len(self.past)
 
     def step(self, value: Matrix) -> Matrix:
@@ -128,24 +128,24 @@ class Filter:
 
 
 def shift_score(innovation: Vector, mean: Vector, variance: Vector, *, sight: float = CHART_CLIP) -> Vector:
-    """Return s for the hypotheses of `mean` (hypotheses, channels), all at once: shape (hypotheses,).
+    """Return s (hypotheses,) for the hypotheses `mean` (hypotheses, channels).
 
     Args:
         innovation: e (channels,).
-        mean: f of each hypothesis, through the same whitening (hypotheses, channels).
+        mean: f of each hypothesis, after the same whitening (hypotheses, channels).
         variance: v of the innovation (channels,).
-        sight: a fault that would show as more standard deviations is taken for one of so many.
+        sight: limit of a fault in standard deviations.
     """
     spread = np.maximum(np.sqrt(variance), np.abs(mean) / sight)
     e = innovation / spread
     f = mean / spread
-    # Clipped around the fault's mean as well: what the fault explains may be as large as it likes.
+    # Clipped around the fault's mean as well: the part explained by the fault is not limited.
     seen = np.clip(e, np.minimum(f, 0.0) - CHART_CLIP, np.maximum(f, 0.0) + CHART_CLIP)
     return (f * (seen - 0.5 * f)).sum(axis=-1)
 
 
 class Charts:
-    """Many cumulative sums side by side.
+    """Parallel cumulative sums.
 
     Attributes:
         sums: S of each (charts,).
@@ -155,17 +155,17 @@ class Charts:
     __slots__ = ("sums", "thresholds")
 
     def __init__(self, thresholds: Vector) -> None:
-        """Begin at zero."""
+        """Start at zero."""
         self.thresholds = np.asarray(thresholds, dtype=np.float64)
         self.sums = np.zeros(len(self.thresholds))
 
     def step(self, scores: Vector) -> int:
-        """Add `scores` (charts,); return the chart that fits best of those beyond their thresholds, -1 for none."""
+        """Add `scores` (charts,); return the chart with the largest sum beyond its threshold, -1 for none."""
         self.sums = np.maximum(0.0, self.sums + scores)
         beyond = self.sums > self.thresholds
         if not beyond.any():
             return -1
-        # They are likelihood ratios against the same "nothing": the largest is the likeliest fault.
+        # The sums are likelihood ratios against no fault: the largest is the most likely fault.
         return int(np.argmax(np.where(beyond, self.sums, -np.inf)))
 
 
@@ -175,15 +175,15 @@ _TAIL = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Budget:
-    """How often all charts together may cry wolf, and how that is carried over.
+    """Budget of false alarms of all charts, and settings of the extrapolation to it.
 
     Attributes:
         rate: false alarms per second of motion, of all charts together [1/s].
-        charts: that share it.
+        charts: number of charts.
         step: between two scores [s].
-        block: that is drawn at once [s]: longer than what correlation whitening leaves.
-        window: whose largest sum is looked at [s].
-        windows: drawn of them.
+        block: length of resampled blocks [s]: longer than the correlation after whitening.
+        window: length of the windows whose largest sum is used [s].
+        windows: number of windows.
     """
 
     rate: float = 1.0 / (300.0 * 3600.0)
@@ -203,7 +203,7 @@ class Budget:
 
 
 def thresholds(scores: list[Matrix], budget: Budget, rng: np.random.Generator) -> Vector:
-    """Return h (charts,) for charts whose scores on undisturbed motion are `scores`, each stretch (time, charts).
+    """Return the thresholds h (charts,) from scores on undisturbed motion, one array (time, charts) for each segment.
 
     Raises:
         DataError: less than ten blocks of motion, or scores that are not finite.
@@ -211,14 +211,14 @@ def thresholds(scores: list[Matrix], budget: Budget, rng: np.random.Generator) -
     largest = window_maxima(scores, budget, rng)
     border = np.quantile(largest, 1.0 - _TAIL, axis=0)
     excess = np.maximum(largest - border, 0.0).sum(axis=0) / max(_TAIL * len(largest), 1.0)
-    # Of a likelihood ratio the tail falls as e^-h; what the motion shows may only make it heavier.
+    # The tail of a likelihood ratio falls as e^-h; the data may only make it heavier.
     scale = np.maximum(excess, 1.0)
     share = budget.rate * budget.window / budget.charts
     return np.maximum(border + scale * np.log(_TAIL / share), largest.max(axis=0))
 
 
 def window_maxima(scores: list[Matrix], budget: Budget, rng: np.random.Generator) -> Matrix:
-    """Return the largest sums (windows, charts) in windows of paths that are drawn block by block."""
+    """Return the largest sums (windows, charts) in windows of resampled paths."""
     length = max(1, round(budget.block / budget.step))
     starts = [part[: len(part) - length + 1] for part in scores if len(part) >= length]
     rows = sum(len(part) for part in starts)
@@ -230,7 +230,7 @@ def window_maxima(scores: list[Matrix], budget: Budget, rng: np.random.Generator
     joined = np.concatenate([part for part in scores if len(part) >= length])
     if not np.isfinite(joined).all():
         raise DataError("scores must be finite to find thresholds.")
-    # Where a block may begin: not so late in a stretch that it would run into the next.
+    # Possible starts of blocks, so that no block crosses segments.
     first, begins = 0, []
     for part in starts:
         begins.append(first + np.arange(len(part)))
@@ -239,7 +239,7 @@ def window_maxima(scores: list[Matrix], budget: Budget, rng: np.random.Generator
     blocks = max(1, round(budget.window / budget.block))
     sums = np.zeros((budget.windows, joined.shape[1]))
     largest = np.zeros_like(sums)
-    # A window goes on from a block before it, so that it does not begin from rest.
+    # Each window follows a first block, so that its sums do not start at zero.
     for number in range(-1, blocks):
         at = rng.choice(begin, budget.windows)
         for k in range(length):

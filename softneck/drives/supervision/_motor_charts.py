@@ -1,4 +1,4 @@
-"""Per motor: does its position follow its set-point as it did, does it jump, does its current fit its motion."""
+"""Charts of each motor: following of the set-point, jumps of the position, and scale of the current."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from ._charts_runtime import SUPERVISED_NOT
 from ._detection import Charts, Filter, Whitening
 
 RUNTIME = "softneck.drives.supervision._charts_runtime"
-# Set-points that a step of a motor may still answer to [cycles]: the slowest drives' latency is 0.1 s.
+# Memory of the drive model [cycles]: the latency of the slowest drives is 0.1 s.
 _SET_POINTS = 12
-# Speeds over which Coulomb friction is smoothed [rad/s]: which one the gear has is fitted.
+# Speeds over which Coulomb friction is smoothed [rad/s]; the fit selects among them.
 EDGES = (0.1, 0.5)
-# Changes of tension are taken over this many cycles: over one they are half a count of the drive's current.
+# Cycles between two compared tensions: over one cycle the change is half a count of the drive's current.
 _OVER = 3
-# Of these, which the current answers to: what is left to the set-points some cycles ago is the speed that is asked now.
+# Range of lags of the set-points in the model of the current: the distance to them is the requested speed.
 _ASKED = (2, 10)
 _OWN = len(EDGES) + 3 + _ASKED[1] - _ASKED[0]
-# Cycles after a jump until it shows whether the drive moved its winch after it, which it does after 10 ms or so.
+# Cycles after a jump until it is decided whether the drive moved its winch, which takes about 10 ms.
 _JUDGED = 4
-# Of the way back that a drive is expected to lead its winch in these: less is none at all.
+# Share of the expected way back in these cycles below which the drive counts as not moving.
 _BACK = 0.5
-# A current scale that is wrong is wrong by the ratio of two peak currents.
+# Hypotheses of a wrong current scale: ratios of two peak currents.
 SCALES = (2.0, 0.5)
 
 
 class MotorRules(NamedTuple):
-    """What the charts of motors go by.
+    """Parameters of the charts of motors.
 
     Attributes:
-        usual: standard deviations by which a position jumped.
-        excited: changes of tension below so many standard deviations say nothing of their scale: half of them is
-            rounding, and motors that only tremble are not what the model was fitted on.
-        sight: standard deviations that a change of tension counts for: its transients are the least well known, and a
-            wrong scale is in all.
-        known: part of a change that the models of the currents are good to.
-        stands: slower than this a motor stands [rad/s]: a few counts of its encoder a cycle.
-        near_top: part of the largest tension of all within which it may be cut off.
-        rest: so long that tells in what follows, and a tendon that hung [cycles].
-        carries: what the tendons carry is their mean over so long [cycles]: friction averages out, no payload changes.
+        usual: standard deviations of a jump of the position.
+        excited: standard deviations of a change of tension below which its scale is not evaluated: half of such a
+            change is rounding, and the model was not fitted on motors that only tremble.
+        sight: limit of a change of tension in standard deviations: transients are modelled worst, and a wrong scale is
+            in all samples.
+        known: relative accuracy of the models of the currents.
+        stands: speed below which a motor stands still [rad/s]: a few encoder counts a cycle.
+        near_top: share of the largest tension within which the current may be saturated.
+        rest: cycles without evaluation after saturation or slack [cycles].
+        carries: averaging time of the load of the tendons [cycles]: friction averages out, and the payload is constant.
     """
 
     usual: float = 4.0
@@ -62,15 +62,15 @@ _RULES = tuple(RULES)
 
 
 class MotorFeatures:
-    """What the models of drive and tendon are linear in.
+    """Regressors of the models of drive and tendon.
 
     Attributes:
-        past: set-points (12, motors), positions (5, motors) and tensions (4, motors) so far, the latest first.
+        past: set-points (12, motors), positions (5, motors) and tensions (4, motors), latest first.
         x: features of the last cycles (4, motors, features).
     """
 
     def __init__(self, motors: int, cycle: float) -> None:
-        """Know nothing yet."""
+        """Start with an empty memory."""
         self._cycle, self._seen = cycle, 0
         self._functions: Any = load_functions(RUNTIME)
         self.past = (np.zeros((_SET_POINTS, motors)), np.zeros((5, motors)), np.zeros((_OVER + 1, motors)))
@@ -79,18 +79,18 @@ class MotorFeatures:
 
     @property
     def full(self) -> bool:
-        """Whether all that it looks back at was seen."""
+        """Whether its memory is filled."""
         return self._seen > _SET_POINTS + _OVER
 
     def step(self, setpoints: Vector, positions: Vector, tensions: Vector) -> None:
-        """Take one cycle, the set-points sent in the one before; all (motors,)."""
+        """Add one cycle, with the set-points sent in the cycle before; all (motors,)."""
         now = (setpoints, positions, tensions)
         self._functions.supervised_features(now, self.past, self.x, self._edges, _ASKED, self._cycle)
         self._seen += 1
 
     @property
     def behind(self) -> Vector:
-        """How far each motor was behind its set-points at most lately (motors,) [rad]."""
+        """Largest recent distance of each motor from its set-points (motors,) [rad]."""
         return np.abs(self.past[0] - self.past[1][0]).max(axis=0)
 
     @property
@@ -100,24 +100,24 @@ class MotorFeatures:
 
     @property
     def drive(self) -> Matrix:
-        """What each step is predicted from (motors, regressors): what was left to set-points of the last cycles.
+        """Regressors of each step (motors, regressors): distances to the set-points of the last cycles.
 
-        Not from its last steps: of a motor that stands one would predict that it stands.
+        The last steps are not used: the model of a standing motor would predict that it stands.
         """
         return (self.past[0] - self.past[1][1]).T
 
     @property
     def tension_change(self) -> Vector:
-        """Over three cycles [N]."""
+        """Change of the tensions over three cycles [N]."""
         return self.past[2][0] - self.past[2][_OVER]
 
     @property
     def current(self) -> Matrix:
-        """What that follows from (motors, features)."""
+        """Regressors of the change of tension (motors, features)."""
         return self.x[0] - self.x[_OVER]
 
     def taut(self, model: Matrix) -> Vector:
-        """Return what of the tensions friction and damping do not explain by `model` (motors, features) [N]."""
+        """Return the tensions without friction and damping by `model` (motors, features) [N]."""
         return self.past[2][0] - np.einsum("ij,ij->i", model[:, self.x.shape[1] :], self.x[0][:, self.x.shape[1] :])
 
 
@@ -137,7 +137,7 @@ class MotorCharts:
     """
 
     def __init__(self, baseline: Baseline, thresholds: Vector | None = None) -> None:
-        """Begin; `thresholds` other than the baseline's are for calibrating."""
+        """Start at zero; `thresholds` other than the baseline's are for the calibration."""
         b = self._b = baseline
         n = b.motors
         self._names = motor_names(n)
@@ -167,16 +167,16 @@ class MotorCharts:
 
     @property
     def known_load(self) -> bool:
-        """Whether the tendons carry no more than in the experiments: a scale that is wrong shows in all but its own."""
+        """Whether the load of the tendons is calibrated; a wrong scale shows in the loads of all other motors."""
         return bool(self._load[1].max() >= self._b.load_low)
 
     @property
     def judging(self) -> bool:
-        """Whether a position jumped and it does not show yet why."""
+        """Whether a position jumped and the cause is not yet decided."""
         return self._jump is not None
 
     def step(self, setpoints: Vector, positions: Vector, tensions: Vector) -> tuple[str, int, str] | None:
-        """Take one cycle; return (event, motor from 0, detail) of the fault that is found, None for none."""
+        """Process one cycle; return (event, motor from 0, detail) of a detected fault, or None."""
         f, n = self.features, self._b.motors
         f.step(setpoints, positions, tensions)
         if not f.full:
@@ -191,7 +191,7 @@ class MotorCharts:
             self._levels, _RULES, f.past, f.x, self._rest, self._scales, self._load, self.scores[at:]
         )
         if not self.known_load:
-            # As for the tilt: nobody saw how such a load is shared.
+            # As for the tilt: the distribution of such a load is not calibrated.
             self.scores[2 * n :] = SUPERVISED_NOT
         found = self.charts.step(self.scores)
         if found < 0:
@@ -206,10 +206,10 @@ class MotorCharts:
         return name, motor, f"motor {motor + 1} at {positions[motor]:.2f} rad, set-point {setpoints[motor]:.2f} rad"
 
     def _judged(self, motor: int) -> tuple[str, int, str] | None:
-        """Say what a jump was: a drive whose encoder slipped leads its winch back, one that was misread does not."""
+        """Decide the cause of a jump: a drive whose encoder slipped moves its winch back, a misread one does not."""
         f, (left, jumped, slipped, misread, went) = self.features, self._jump or (0, 0.0, 0.0, 0.0, 0.0)
         asked = float(self._model[0][motor] @ f.drive[motor])
-        # A drive that is where it was, whatever it says, still has to go what it had to.
+        # After a misreading the drive has not moved, so that the expected motion remains.
         slipped, misread = slipped + asked, misread + asked + float(self._model[0][motor].sum()) * jumped
         moved = float(f.moved[motor])
         went += moved

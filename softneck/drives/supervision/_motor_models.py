@@ -1,4 +1,4 @@
-"""Models of drives and tendons: what the steps and the tensions of undisturbed motion follow from, by least squares."""
+"""Models of drives and tendons: least-squares fits of steps and tensions in undisturbed motion."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Motion:
-    """One stretch of undisturbed motion, a row for each bus cycle.
+    """One segment of undisturbed motion, a row for each bus cycle.
 
     Attributes:
-        setpoints: that were sent the cycle before (time, motors) [rad].
+        setpoints: sent in the cycle before (time, motors) [rad].
         positions: (time, motors) [rad]; tensions: (time, motors) [N].
         values: of the tilt (time, outputs) [rad]; NaN in cycles without a sample.
         rates: of its gyro, the same [rad/s]; NaN without one.
         due: cycles in which a sample was due (time,).
-        references: of the loop that moved it, as known when the tilt was measured (time, outputs) [rad]; NaN in cycles
+        references: of the loop at the time of the measurement of the tilt (time, outputs) [rad]; NaN in cycles
             without one.
     """
 
@@ -54,7 +54,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """Of each cycle and motor: regressors and what they explain."""
+    """Regressors and targets of each cycle and motor."""
 
     drive: Matrix
     moved: Matrix
@@ -77,7 +77,7 @@ def features_of(motion: Motion, cycle: float) -> Features:
 
 
 def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most: int = 6) -> tuple[Rows, Rows, Rows]:
-    """Fit each motor's model; return coefficients, whitening, and variance with its part in the square of the model."""
+    """Fit each motor's model; return coefficients, whitening, and variance with its increase by the model's square."""
     gains, white, spread = [], [], []
     for i in range(motors):
         kept = [np.isfinite(part[:, i]).all(axis=-1) for part in X]
@@ -94,7 +94,7 @@ def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most:
         shape = np.concatenate([model[order:] ** 2 for model in models])
         gains.append(row_of(theta))
         white.append(filter_.coefficients)
-        # Cycles at the current limit are for the bootstrap: the variance is that of the others.
+        # The variance excludes cycles at the current limit, which the bootstrap covers.
         spread.append(variance_of(squares, shape[:, None], all_but=0.005))
     return tuple(gains), tuple(white), tuple(spread)
 
@@ -102,11 +102,11 @@ def motor_rows(X: list[Matrix], y: list[Matrix], motors: int, why: str, *, most:
 def level_rows(
     known: Sequence[tuple[Motion, Features]], slack: Vector, top: Vector, reach: Vector
 ) -> tuple[Rows, tuple[float, float], Rows, Row]:
-    """Fit each tension by the motors' places and what all carry, where all may be believed; not for one motor.
+    """Fit each tension by the motors' positions and the common load, on valid cycles; trivial for one motor.
 
-    Return coefficients of the others' mean by positions, least and most that all were off by together, coefficients of
-    each tension, and its variance. What the others are off by is averaged: in least squares the friction that they have
-    at the moment would make any payload look smaller than it is.
+    Return coefficients of the others' mean by positions, least and largest common residual, coefficients of each
+    tension, and its variance. The residual of the others is averaged: their momentary friction would bias the least
+    squares towards smaller payloads.
     """
     n = len(slack)
     if n < 2:
@@ -129,20 +129,20 @@ def level_rows(
         theta = _robust(X, y) if len(y) > 10 * X.shape[1] else np.zeros(X.shape[1])
         rows.append(row_of(theta))
         spread.append(float(np.var(y - X @ theta)) if theta.any() else 1.0)
-    # Of the first cycles friction has not averaged out.
+    # In the first cycles friction has not averaged out.
     seen = np.concatenate([[0.0], *(loads.max(axis=1)[round(0.1 * RULES.carries) :] for loads in carried)])
     return tuple(row_of(row) for row in load), (float(seen.min()), float(seen.max())), tuple(rows), tuple(spread)
 
 
 def _believed(motion: Motion, f: Features, slack: Vector, top: Vector, reach: Vector) -> Flags:
-    """Return the cycles in which no tendon may hang, no motor is near its limit, and none far behind."""
+    """Return the cycles with taut tendons, motors below their current limits, and small following errors."""
     T = motion.tensions
     good = ((slack <= T) & ((1.0 - RULES.near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
     return np.asarray(good & np.isfinite(f.place).all(axis=(1, 2)))
 
 
 def _carried(off: Matrix, memory: float) -> Matrix:
-    """Return the mean of the last cycles, as the chart takes it."""
+    """Return the mean over the last cycles, as in the chart."""
     functions, load, counted = load_functions(RUNTIME), np.zeros(off.shape[1]), np.zeros(1)
     rows = np.empty_like(off)
     for k, row in enumerate(off):
@@ -152,20 +152,20 @@ def _carried(off: Matrix, memory: float) -> Matrix:
 
 
 def _robust(X: Matrix, y: Vector) -> Vector:
-    """Return least squares by Huber's weights: a few cycles at the current limit are not the model's business."""
+    """Return the robust least-squares fit by Huber's weights, which discount cycles at the current limit."""
     theta = np.linalg.lstsq(X, y, rcond=None)[0]
     for _ in range(10):
         off = np.abs(y - X @ theta)
-        # 1.48 median is the standard deviation of what is normal; 2.5 as in Huber's proposal 2.
+        # 1.48 median is the standard deviation of a normal distribution; 2.5 as in Huber's proposal 2.
         weight = np.sqrt(np.minimum(1.0, 2.5 * 1.48 * np.median(off) / np.maximum(off, 1e-12)))
         theta = np.linalg.lstsq(X * weight[:, None], y * weight, rcond=None)[0]
     return theta
 
 
 def variance_of(squares: Vector, shapes: Matrix, *, all_but: float = 0.0) -> Row:
-    """Return c_0, c_1, ... >= 0 of `squares ~ c_0 + shapes c`: least squares, each row weighed by what it expects.
+    """Return c_0, c_1, ... >= 0 of `squares ~ c_0 + shapes c` by weighted least squares.
 
-    Without the part `all_but` of the rows with the largest squares.
+    Each row is weighted by its expected value; the share `all_but` of rows with the largest squares is left out.
     """
     from scipy.optimize import nnls
 
@@ -186,18 +186,18 @@ def row_of(values: Vector) -> Row:
 
 
 class MotionLog:
-    """Called after each cycle of a run, as all who watch one are."""
+    """Collector of motion, called after each cycle of a run."""
 
     def __init__(self) -> None:
-        """Hold nothing yet."""
+        """Start empty."""
         self._rows: list[tuple[tuple[float, ...], ...]] = []
         self._sent: tuple[float, ...] | None = None
         self._asked: tuple[float, ...] = ()
         self._outputs = 0
 
     def __call__(self, _now: float, _in: Sequence[Any], _out: Sequence[Any], sample: Any, master: Any) -> None:
-        """Take one cycle; `sample` is what the sensor said."""
-        # The step that is over has counted itself already.
+        """Add one cycle; `sample` is the sensor's sample or None."""
+        # The finished step has already increased `cycle`.
         due = (master.cycle - 1) % master.settings.sample_cycles == 0
         values, rates = (), ()
         if sample is not None and sample.valid:
@@ -209,7 +209,7 @@ class MotionLog:
         self._sent, self._asked = master.setpoints, master.reference
 
     def motion(self) -> Motion:
-        """Return what was gathered."""
+        """Return the collected motion."""
         none = (math.nan,) * self._outputs
         columns = [[row[k] or none for row in self._rows] for k in range(7)]
         arrays = [np.array(column, dtype=np.float64) for column in columns]

@@ -1,4 +1,4 @@
-"""The supervisor's second half: beside the master, told all that the drives and the sensor say, each cycle."""
+"""Plausibility checks beside the master: all charts, evaluated with the data of each cycle."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from ._motor_charts import MotorCharts
 from ._tilt_charts import TiltCharts
 from ._tracking import TrackingCharts
 
-# Samples that go missing: as many as this, or thrice as many as did.
+# Rate of missing samples that is a fault: at least this, and three times the calibrated rate.
 _RATE_LEAST = 0.2
-# From the first chart beyond its threshold until the fault is named [s]: the likeliest one may need a little longer.
+# Time from the first chart beyond its threshold until the fault is named [s]: the right chart may take longer.
 _RIPE = 0.1
-# A current may be the first to show what is not its scale.
+# The same for a chart of a current, which other faults may raise first [s].
 _RIPE_CURRENT = 0.3
-# The tilt's model rests, or holds, for so long until it counts as said, or as over [s].
+# Time without a valid tilt model until it is reported, and with one until the report may be repeated [s].
 _RESTS = 5.0
-# Or until it is so much likelier than the next, as a logarithm.
+# Lead in log likelihood over the next fault at which it is named at once.
 _LEAD = 20.0
 
 
 class Finding(NamedTuple):
-    """A fault that explains what is seen better than none does.
+    """A detected fault.
 
     Attributes:
         name: of the event.
         motor: from 0; -1 for none.
-        detail: for people.
+        detail: further text.
     """
 
     name: str
@@ -43,12 +43,12 @@ class Plausibility:
     """All charts over one run.
 
     Attributes:
-        motors, tilt, tracking: the charts; the last where there is a loop to compare with.
-        rests: why the tilt is not compared, in the sample in which that is to be said; else "".
+        motors, tilt, tracking: the charts; the last only with a tracking model.
+        rests: reason why the tilt is not compared, in the sample in which it must be reported; else "".
     """
 
     def __init__(self, baseline: Baseline) -> None:
-        """Know nothing yet."""
+        """Start with empty charts."""
         self._b = baseline
         self._gains = np.array(baseline.current)
         self.motors = MotorCharts(baseline)
@@ -62,20 +62,20 @@ class Plausibility:
         self._current: Finding | None = None
 
     def begin(self) -> None:
-        """Take what tilt and motors say now, at rest, for where they begin."""
+        """Take the present tilt and motor positions, at rest, as the start."""
         self.tilt.begin()
         self._missing = 0.0
 
     def cycle(
         self, setpoints: Sequence[float], positions: Sequence[float], tensions: Sequence[float]
     ) -> Finding | None:
-        """Take one bus cycle: set-points sent before it [rad], positions [rad] and tensions [N] of all motors."""
+        """Process one bus cycle: set-points sent before it [rad], positions [rad] and tensions [N] of all motors."""
         self._now += 1
         found = self.motors.step(np.array(setpoints), np.array(positions), np.array(tensions))
         if found is not None and found[0] != "current_scale":
             return Finding(*found)
         if found is not None:
-            # Whatever goes wrong takes another current: it is its scale if nothing else shows.
+            # Every fault changes the current: its scale is wrong only if no other chart reacts.
             self._current = Finding(*found)
             self._since = self._now if self._since is None else self._since
         return self._ripe()
@@ -87,12 +87,12 @@ class Plausibility:
         rates: Sequence[float],
         reference: Sequence[float] = (),
     ) -> Finding | None:
-        """Take what is due at a sample, after `cycle`.
+        """Process a sample, after `cycle`.
 
         Args:
             positions: of the motors [rad].
-            values: of the tilt [rad], None where none came; rates: of its gyro [rad/s] or NaN.
-            reference: that the loop had when it was measured [rad], () without one.
+            values: of the tilt [rad], None if missing; rates: of its gyro [rad/s] or NaN.
+            reference: of the loop at the time of the measurement [rad], () without one.
         """
         if self._rate(values is None):
             return Finding("sensor_rate", -1, "samples are missing more often than in the commissioning run")
@@ -106,13 +106,13 @@ class Plausibility:
             self._since = self._now
         if self.tracking is not None and self.tracking.step(reference, values, valid=self.tilt.valid) >= 0:
             off = ", ".join(f"{value:.1f}" for value in np.degrees(self.tracking.residual))
-            # Whatever goes wrong leads the loop astray: it is the loop if nothing else shows.
+            # Every fault disturbs the tracking: the loop is wrong only if no other chart reacts.
             self._current = self._current or Finding("astray", -1, f"tilt less what the loop made of it {off} deg")
             self._since = self._now if self._since is None else self._since
         return None
 
     def _count_rest(self) -> None:
-        """Say it once where the tilt's model rested for long, and again only after it held for as long."""
+        """Report once if the tilt model was invalid for long, and again only after it was valid for as long."""
         self.rests, self._why = "", self.tilt.off or self._why
         most = round(_RESTS / (self._b.cycle * self._b.sample_cycles))
         self._rested = max(0, self._rested - 1) if self.tilt.valid else min(most, self._rested + 1)
@@ -122,7 +122,7 @@ class Plausibility:
             self._said_so = False
 
     def _ripe(self) -> Finding | None:
-        """Return what explains best what was seen since the first chart spoke, once that is long enough ago."""
+        """Return the most likely fault once the first chart has been beyond its threshold for long enough."""
         if self._since is None:
             return None
         found, lead = self.tilt.likeliest()
@@ -138,7 +138,7 @@ class Plausibility:
         return Finding(name, number if name == "gear_wrong" else -1, self._said(name, number, size))
 
     def _rate(self, missing: bool) -> bool:
-        """CUSUM of a rate of missing samples that is thrice the usual, and at least a fifth."""
+        """Update the CUSUM for a rate of missing samples of three times the calibrated one, or a fifth."""
         usual = max(self._b.missing, 1e-3)
         other = min(0.9, max(_RATE_LEAST, 3.0 * usual))
         score = math.log(other / usual) if missing else math.log((1.0 - other) / (1.0 - usual))

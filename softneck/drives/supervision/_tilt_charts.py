@@ -1,4 +1,4 @@
-"""The tilt against what the motors' positions give, and against its own gyro: which fault explains what is left."""
+"""Charts of the tilt: residuals against the motors' positions and the gyro, and the fault that explains them."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from ._baseline import Baseline
 from ._detection import Charts, Filter, Whitening, shift_score
 from ._motor_charts import RUNTIME
 
-# Faults as large as those that have to be found: a gear of another stage, a filter that takes 0.2 s, 1.5 deg of drift
-# (half of the 3 deg that a fault may lead the neck astray), a fifth or five times the noise.
+# Sizes of the faults to detect: a gear of another stage, a filter with a delay of 0.2 s, 1.5 deg of drift (half of the
+# 3 deg by which a fault may move the neck), a fifth or five times the noise.
 _GEARS = (2.0, 0.5)
 _LATE = 0.2
 _OFFSET = math.radians(1.5)
 _NOISES = (1.0 / 25.0, 25.0)
-# What angles and gyro differ by leaks away over the first time, and its rate, the gyro's own bias, is averaged over the
+# The difference of angles and gyro decays with the first time constant; its rate, the gyro's bias, is averaged over the
 # second [s].
 _FORGET, _BIAS = 6.0, 15.0
-# Time in which a drift has to be found: the bias is taken from before [s].
+# Time in which a drift must be detected: the bias is estimated from older samples [s].
 _OLD = 4.0
-# Times that the model looks back, until it is believed.
+# Waiting time until the model is valid, in multiples of its memory.
 _SETTLED = 2
-# Faults are weighed by what was seen in about this time [s].
+# Time constant of the evidence for faults [s].
 _LATELY = 0.5
-# Samples at rest that say where tilt and model begin.
+# Number of samples at rest for the initial offset of tilt and model.
 _REST = 25
-# Faults that the residual of the model tells of; of these, what a gyro that stays behind confirms. One that goes along
-# denies nothing: of a unit that hangs the gyro hangs too.
+# Faults that change the residual of the model; and those among them that a gyro without motion confirms. A gyro that
+# agrees with the angles does not exclude them: in a frozen unit the gyro is frozen too.
 _OF_MODEL = frozenset(
     {"gear_wrong", "sensor_stuck", "sensor_reversed", "sensor_swapped", "sensor_late", "tilt_unexplained"}
 )
@@ -53,10 +53,10 @@ def tilt_names(motors: int, outputs: int, *, gyro: bool) -> list[tuple[str, int,
 
 
 class TiltModel:
-    """Free-running tilt from the motors' positions, with each motor's part of it."""
+    """Simulation of the tilt from the motors' positions, with the part of each motor."""
 
     def __init__(self, tilt: Matrix, lags: tuple[int, ...], motors: int) -> None:
-        """Know nothing yet; `tilt` is (outputs, lags x motors)."""
+        """Start without positions; `tilt` is (outputs, lags x motors)."""
         self._gains = tilt.reshape(len(tilt), len(lags), motors).copy()
         self._lags = np.array(lags)
         self._past = np.zeros((max(lags) + 1, motors))
@@ -64,9 +64,9 @@ class TiltModel:
         self._functions: Any = load_functions(RUNTIME)
 
     def step(self, positions: Vector) -> Matrix:
-        """Return each motor's part of the tilt (motors, outputs) [rad], but for an offset."""
+        """Return each motor's part of the tilt (motors, outputs) [rad], without the offset."""
         if not self._begun:
-            # Motors stood before the first sample.
+            # The motors are at rest before the first sample.
             self._past[:] = positions
             self._begun = True
         parts = np.empty((len(positions), len(self._gains)))
@@ -75,7 +75,7 @@ class TiltModel:
 
 
 class GyroLevel:
-    """Angles less integrated rates, with what is slow forgotten: the gyro's own bias, and where the angles began.
+    """Difference of angles and integrated rates, without slow parts: bias of the gyro and initial angle.
 
     Attributes:
         level: [rad] (outputs,).
@@ -83,7 +83,7 @@ class GyroLevel:
     """
 
     def __init__(self, outputs: int, step: float) -> None:
-        """Begin at zero."""
+        """Start at zero."""
         self._step = step
         self.level = np.zeros(outputs)
         self._bias = np.zeros(outputs)
@@ -97,7 +97,7 @@ class GyroLevel:
         return self._averaged * self._step > _BIAS / 10.0
 
     def take(self, values: Vector | None, rates: Vector) -> bool:
-        """Take a sample; return whether the level went on."""
+        """Process a sample; return whether the level was updated."""
         last, self._last = self._last, None
         if values is None or not np.isfinite(rates).all():
             return False
@@ -107,7 +107,7 @@ class GyroLevel:
         change = values - last[0] - 0.5 * self._step * (rates + last[1])
         self._samples += 1
         self._late.append(change)
-        # The bias is that of before: of the older half of what was seen, or of what is as old as a drift may become.
+        # The bias is estimated from the older half of the samples, or from those older than a drift to detect.
         while len(self._late) > min(self._samples // 2, round(_OLD / self._step)):
             self._averaged += 1
             share = max(self._step / _BIAS, 1.0 / self._averaged)
@@ -122,13 +122,13 @@ class TiltCharts:
     Attributes:
         scores: of the last sample, in the order of `tilt_names`.
         charts: their sums.
-        valid: whether the model is on known ground; off: why not in this sample, "" where it is.
-        residual: tilt less model [rad]; gyro: tilt against its rates.
+        valid: whether the model is valid; off: the reason if it is not valid in this sample, else "".
+        residual: tilt minus model [rad]; gyro: tilt against its rates.
         bend: second difference of the residual [rad].
     """
 
     def __init__(self, baseline: Baseline, thresholds: Vector | None = None) -> None:
-        """Begin; `thresholds` other than the baseline's are for calibrating."""
+        """Start at zero; `thresholds` other than the baseline's are for the calibration."""
         b = self._b = baseline
         n, m = b.motors, b.outputs
         self.names = tilt_names(n, m, gyro=bool(b.gyro_spread))
@@ -140,12 +140,12 @@ class TiltCharts:
         self._functions: Any = load_functions(RUNTIME)
         self._gears, self._noises = np.array(_GEARS), np.array(_NOISES)
         self._raw = np.zeros((1 + self._hypotheses, m))
-        # Where angles and gyro part, and what an offset of each output, to either side, would make of it.
+        # Difference of angles and gyro, and its mean for an offset of each output, to either side.
         self._levels = np.vstack([np.zeros(m), np.kron(np.eye(m), np.array([[_OFFSET], [-_OFFSET]]))])
         self.gyro = GyroLevel(m, self._step)
         self._spread, self._gyro_spread = np.array(b.tilt_spread), np.array(b.gyro_spread)
         self._noise = np.array(b.noise)
-        # A slow error of the model goes through the whitening as well, and may look like any fault a little.
+        # A slow model error also passes through the whitening, and resembles any fault a little.
         passes = np.array([1.0 - sum(row) for row in b.tilt_whitening])
         self._bias_allowed = np.abs(passes) * np.array(b.tilt_bias)
         self._slack = np.array(b.slack)
@@ -165,33 +165,33 @@ class TiltCharts:
         self.valid, self.off = False, ""
 
     def begin(self) -> None:
-        """Take the mean of the last samples at rest for where tilt and model begin."""
+        """Take the mean of the last samples at rest as the offset of tilt and model."""
         self._running = True
         self._align()
-        # How the neck came to rest is not the gyro's bias.
+        # The motion before the rest is not a bias of the gyro.
         self.gyro = GyroLevel(self._b.outputs, self._step)
         self.charts.sums[:] = 0.0
 
     def likeliest(self) -> tuple[int, float]:
-        """Return the fault that explains best what was seen lately, and how much better than any of another name.
+        """Return the most likely recent fault, and its lead over the next fault of another name.
 
-        -1 where nothing is beyond its threshold.
+        -1 if no chart is beyond its threshold.
 
-        Likelihoods over the last half second, each fault of the size that fits best within 0.7 and 1.4 of its own. A
-        gyro that tells the same as the angles says that the neck moved, one that does not that the sensor is wrong.
+        Likelihoods over the last half second, with the best size of each fault within 0.7 and 1.4 of its nominal size.
+        A gyro that agrees with the angles shows that the neck moved, one that does not that the sensor is wrong.
         """
         beyond = self.charts.sums > self.charts.thresholds
         names = [name for name, _, _ in self.names]
         told = {name for name, over in zip(names, beyond, strict=True) if over}
         if not told & _OF_MODEL:
-            # Noise and gyro have charts of their own, which nothing else raises.
+            # Noise and gyro have charts that no other fault raises.
             return (int(np.argmax(np.where(beyond, self.charts.sums, -np.inf))), math.inf) if told else (-1, 0.0)
         h = self._hypotheses
         size = np.clip(self._explained / np.maximum(self._information, 1e-12), 0.7, 1.4)
         gain = size * self._explained - 0.5 * size**2 * self._information
         alone = 0.0
         if self._turned is not None and self.gyro.known:
-            # How much likelier angles that left their gyro by the whole residual are than a neck that moved.
+            # Log likelihood ratio of angles that differ from the gyro by the whole residual against a moving neck.
             r = self.residual
             alone = max(0.0, float(np.sum(r * (self.gyro.level - 0.5 * r) / np.array(self._b.gyro_wander))))
             gain = gain + alone * np.array([name in _OF_SENSOR for name in names[:h]])
@@ -205,14 +205,14 @@ class TiltCharts:
     def step(
         self, positions: Vector, taut: Vector, values: Vector | None, rates: Vector, *, known_load: bool = True
     ) -> int:
-        """Take one sample; return the number of a chart beyond its threshold, -1 for none.
+        """Process one sample; return the number of a chart beyond its threshold, -1 for none.
 
         Args:
             positions: of the motors (motors,) [rad].
-            taut: of the tendons, friction apart (motors,) [N].
-            values: of the tilt (outputs,) [rad]; None where it did not come.
+            taut: tensions of the tendons without friction (motors,) [N].
+            values: of the tilt (outputs,) [rad]; None if missing.
             rates: of its gyro (outputs,) [rad/s]; NaN without one.
-            known_load: whether the tendons carry what they did in the experiments.
+            known_load: whether the load of the tendons is within the experiments.
         """
         parts = self._model.step(positions)
         angle = parts.sum(axis=0)
@@ -235,7 +235,7 @@ class TiltCharts:
     # -- parts --------------------------------------------------------------------------------------------------
 
     def _ground(self, positions: Vector, taut: Vector, known_load: bool) -> None:
-        """Tendons that hang or carry more, motors beyond where they were seen: the tilt is not what the model says."""
+        """Mark the model as invalid for slack tendons, larger loads, and motors beyond their calibrated range."""
         self.off = ""
         if not known_load:
             self.off = "more is carried than in the experiments: tilt, tracking and currents rest"
@@ -244,7 +244,7 @@ class TiltCharts:
         elif (positions < self._low).any() or (positions > self._high).any():
             self.off = "a motor is beyond its range in the experiments: tilt and tracking rest"
         out = bool(self.off)
-        # And so long after as the model looks back, and again for the rest that it begins anew from.
+        # Also for the memory of the model afterwards, and once more to average the new offset.
         self._wait = _SETTLED * self._b.lags[-1] if out else max(0, self._wait - 1)
         before, self.valid = self.valid, self._wait == 0
         if self.valid and not before:
@@ -257,7 +257,7 @@ class TiltCharts:
         run.supervised_faults(self._gears, _OFFSET, seen, self._raw)
         change = self._angles[-1] - self._angles[-min(3, len(self._angles))]
         squares = (change**2, (angle - began.sum(axis=0)) ** 2)
-        # An offset that is there from now on was not there before, and a sensor that is stuck now was not.
+        # Offsets and stuck sensors are hypotheses from now on, not for past samples.
         f = self._filter
         f.seen += 1
         good = self.valid and f.settled
@@ -273,7 +273,7 @@ class TiltCharts:
             self.scores[h + 2 * m :] = shift_score(white[0], white[1:], self._gyro_spread) if told else 0.0
         if not good:
             self.charts.sums[: h + 2 * m] = 0.0
-        # Where a chart is empty, its fault begins now: a stuck sensor stays at what the model says.
+        # If a chart is at zero, its fault starts now: a stuck sensor stays at the present angle of the model.
         stuck = 1 + 2 * (self._b.motors + 1)
         for a in range(m):
             if self.charts.sums[stuck - 1 + a] <= 0.0:
@@ -281,7 +281,7 @@ class TiltCharts:
                 f.past[:, stuck + a] = 0.0
 
     def _align(self) -> None:
-        """What tilt and model differ by now is an offset of theirs."""
+        """Take the present difference of tilt and model as the offset."""
         if self._rest:
             self._offset = np.mean(self._rest, axis=0)
         self._began = None

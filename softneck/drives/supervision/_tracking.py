@@ -1,11 +1,11 @@
-"""Tracking against the loop's own expectation: the tilt less what the closed loop made of its references before.
+"""Charts of the tracking of a loop: the tilt against a reference model of the closed loop.
 
 The reference model of a loop is a sum of first-order lags of its reference, the same for all outputs,
 
     y_m = sum c_i x_i,     tau_i x_i' = r - x_i,
 
-whose weights are least squares over undisturbed runs of the loop. It needs no model of neck or tendons. Where tendons
-hang a loop goes otherwise: there nothing is compared.
+whose weights are fitted by least squares to undisturbed runs of the loop. It needs no model of neck or tendons. With
+slack tendons a loop behaves differently and is not compared.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from ._baseline import Tracking
 from ._detection import Charts, Filter, Whitening, shift_score
 from ._motor_models import Flags, Motion, row_of, variance_of
 
-# Time constants of the lags [s]: from one sample to what the slowest loop needs, each twice the one before.
+# Time constants of the lags [s]: from one sample to the slowest loop, each twice the one before.
 _LAGS = tuple(0.04 * 2.0**k for k in range(7))
-# How far astray a loop has to go: half of the 3 deg that a fault may lead the neck.
+# Tracking error to detect: half of the 3 deg by which a fault may move the neck.
 _ASTRAY = math.radians(1.5)
-# Samples without a chart after a reference began, or tendons hung: where the loop was is no business of its reference.
+# Samples without evaluation after the start of a reference or slack tendons: the initial state is not in the model.
 _SETTLE = 150
-# Of each run of a loop [s].
+# Least length of a run of a loop [s].
 _LEAST = 20.0
 
 
@@ -40,13 +40,13 @@ class _Lags:
         self._wait = 0
 
     def step(self, reference: Sequence[float], values: Sequence[float], *, valid: bool) -> bool:
-        """Take a sample; return whether the loop has had a reference, and taut tendons, for long enough."""
+        """Process a sample; return whether the loop has had a reference and taut tendons for long enough."""
         self._wait = max(0, self._wait - 1) if valid else _SETTLE
         if len(reference) != self._outputs or not np.isfinite(reference).all():
             self.seen = 0
             return False
         if not self.seen:
-            # The loop began at rest where it was.
+            # The loop starts at rest at the measured values.
             self.x[:] = values
         self.x += self._share * (np.asarray(reference) - self.x)
         self.seen += 1
@@ -58,11 +58,11 @@ class TrackingCharts:
 
     Attributes:
         scores: of the last sample, upper and lower of each output; charts: their sums.
-        residual: tilt less reference model [rad].
+        residual: tilt minus reference model [rad].
     """
 
     def __init__(self, model: Tracking, outputs: int, step: float, thresholds: Vector | None = None) -> None:
-        """Begin; `thresholds` other than the model's are for calibrating."""
+        """Start at zero; `thresholds` other than the model's are for the calibration."""
         self._lags, self._weights = _Lags(outputs, step), np.array(model.weights)
         self._filter = Filter([Whitening(row) for row in model.whitening], 1 + 2 * outputs)
         self._spread = np.array(model.spread)
@@ -74,10 +74,10 @@ class TrackingCharts:
         self.scores, self.residual = np.zeros(2 * outputs), np.zeros(outputs)
 
     def step(self, reference: Sequence[float], values: Sequence[float] | None, *, valid: bool) -> int:
-        """Take one sample: the reference that the loop had (outputs,) [rad], () for none, and the tilt [rad].
+        """Process one sample: the reference of the loop (outputs,) [rad], () for none, and the tilt [rad].
 
-        Return the number of a chart beyond its threshold, -1 for none. Where tendons hang (not `valid`) a loop does
-        not go as it does elsewhere, nor soon after.
+        Return the number of a chart beyond its threshold, -1 for none. During slack tendons (not `valid`) and shortly
+        after, the loop is not compared.
         """
         if values is None:
             return -1
@@ -100,12 +100,12 @@ class TrackingCharts:
 
 
 def shapes_of(reference: Vector, past: Matrix) -> tuple[Vector, Vector]:
-    """Return what the variance grows with: squares of what is left to the reference, and of the model's change."""
+    """Return the regressors of the variance: squares of the distance to the reference, and of the model's change."""
     return (reference - past[0]) ** 2, (past[0] - past[2]) ** 2
 
 
 def fit_tracking(runs: Sequence[LoopRun]) -> Tracking:
-    """Return the reference model of undisturbed runs of a loop, without bias and thresholds."""
+    """Fit the reference model to undisturbed runs of a loop, without bias and thresholds."""
     X = np.concatenate([run.x[run.good].transpose(0, 2, 1).reshape(-1, len(_LAGS)) for run in runs])
     y = np.concatenate([run.values[run.good].reshape(-1) for run in runs])
     weights = np.linalg.lstsq(X, y, rcond=None)[0]
@@ -145,11 +145,11 @@ class LoopRun:
         step: between samples [s].
         x: lags of its references (samples, lags, outputs).
         values, references: (samples, outputs) [rad].
-        valid: where the tilt's model holds; good: where the tracking may be compared.
+        valid: samples with a valid tilt model; good: samples in which the tracking may be compared.
     """
 
     def __init__(self, motion: Motion, valid: Flags, step: float) -> None:
-        """Take `motion`, and for each of its samples whether the tilt's model holds."""
+        """Make a run of `motion`; `valid` marks the samples with a valid tilt model."""
         self.step, self.valid, self.values = step, valid, motion.values[motion.due]
         none = np.full_like(self.values, np.nan)
         self.references = none if motion.references is None else motion.references[motion.due]
@@ -162,10 +162,10 @@ class LoopRun:
 
     @property
     def seconds(self) -> float:
-        """How long it may be compared with [s]."""
+        """Length of the comparable part [s]."""
         return float(self.good.sum()) * self.step
 
     @property
     def long(self) -> bool:
-        """Whether it says enough by itself, for those that its model is fitted without it."""
+        """Whether it is long enough to be held out of a fit."""
         return self.seconds >= _LEAST
