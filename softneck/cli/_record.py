@@ -163,7 +163,7 @@ def _band(text: str | None) -> tuple[float, float] | None:
 def _allowed(robot: Robot) -> dict[str, float]:
     """Return the bounds on set-points that a robot gives [rad], [rad/s]; of the neck those of its signals."""
     motors, scale = robot.motors, to_si(robot.motors.unit)[0]
-    if robot == Robot.preset():
+    if not robot.in_header():
         return {}
     ends = [*(motors.setpoint_min or ()), *(motors.setpoint_max or ())]
     given = {"position": [abs(end) for end in ends], "speed": motors.rate_limit and [min(motors.rate_limit)]}

@@ -9,11 +9,11 @@ from statistics import NormalDist
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, to_si
+from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 
-from ._faults import AXES, Fault, MotorFault, NeckFault, SensorFault, with_kind
+from ._faults import Fault, MotorFault, NeckFault, SensorFault, with_kind
 from ._faults_runtime import FAULT_ADD, FAULT_DELAY, FAULT_DROPOUT, FAULT_FREEZE, FAULT_SLOW
 from ._part import Part
 from ._wiring import BusSignal, Tap, Wiring, measured_names
@@ -161,7 +161,8 @@ def place_faults(
 def sensor_outputs(fault: SensorFault, plant: Part, robot: Robot = _NECK) -> tuple[str, ...]:
     """Return the plant's outputs that a sensor fault acts on."""
     known = {port.name for port in plant.outputs}
-    axes = robot.outputs.names if fault.axis == "both" else AXES[fault.axis]
+    require_one_of("axis", fault.axis, (*robot.outputs.names, "both"))
+    axes = robot.outputs.names if fault.axis == "both" else (fault.axis,)
     names = fault.signals or tuple(f"{axis}_measured" if f"{axis}_measured" in known else axis for axis in axes)
     for name in names:
         if name not in known:

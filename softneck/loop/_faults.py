@@ -24,21 +24,20 @@ from softneck.robot import Robot
 SENSOR_FAULTS = ("dropout", "freeze", "bias", "outlier", "delay", "noise")
 MOTOR_FAULTS = ("stuck", "slow", "offset")
 _NECK = Robot.preset("neck")
-AXES = {"pitch": ("pitch",), "roll": ("roll",), "both": ("pitch", "roll")}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorFault:
-    """What the measured angles do between the plant and whoever reads them; the true ones stay as they are.
+    """What the measured outputs do between the plant and whoever reads them; the true ones stay as they are.
 
     Attributes:
         kind: "dropout" (no value, `measurement_valid` false), "freeze" (the last value before it), "bias"
             (plus `size`), "outlier" (plus or minus `size` in a `share` of the samples), "delay" (older by
             `delay`), "noise" (plus white noise of standard deviation `std`).
         start: [s]; duration: [s], infinity for the rest of the run.
-        axis: "pitch", "roll" or "both"; "both" are all outputs of another robot, whose single ones are `signals`.
+        axis: one of the robot's outputs, such as "pitch"; "both" for all of them.
         signals: other outputs of the plant instead, such as ("pitch_rate_measured",).
-        size, std: [rad], or the SI unit of `signals`.
+        size, std: in SI.
         share: of the samples, 0 to 1.
         delay: [s], a multiple of the loop's step.
         seed: of "outlier" and "noise".
@@ -57,7 +56,6 @@ class SensorFault:
 
     def __post_init__(self) -> None:
         require_one_of("kind", self.kind, SENSOR_FAULTS)
-        require_one_of("axis", self.axis, tuple(AXES))
         _check_window(self.start, self.duration)
         require_finite("size", self.size, "rad")
         if not 0.0 < self.share <= 1.0:
@@ -149,7 +147,6 @@ _FILE: dict[str, tuple[type, str, tuple[str, ...]]] = {
     "base_tilt": (NeckFault, "base_tilt_", ("pitch", "roll")),
 }
 FAULT_KINDS = tuple(_FILE)
-_UNITS = {"hz": None, "n": "N", "rad_s": "rad/s", "deg_s": "deg/s"}
 
 
 def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> Fault:
@@ -171,6 +168,7 @@ def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) ->
     try:
         if made is NeckFault:
             return NeckFault(values={what + name: value for name, value in chosen.items()}, **window)  # pyright: ignore[reportArgumentType]
+        require_one_of("axis", chosen.get("axis", "both"), (*robot.outputs.names, "both"))
         if made is MotorFault:
             chosen["robot"] = robot
         return made(kind=what, **chosen, **window)  # pyright: ignore[reportArgumentType]
@@ -232,7 +230,7 @@ def _split(key: str) -> tuple[str, float]:
         if name not in plain:
             continue
         try:
-            return name, to_si(_UNITS.get(unit) or unit)[0]
+            return name, to_si("N" if unit == "n" else unit.replace("_", "/"))[0]
         except DataError:
             continue
     return key, 1.0

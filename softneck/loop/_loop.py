@@ -25,9 +25,9 @@ class Loop(Shown):
     """A closed loop.
 
     Attributes:
-        plant, controller, observer: the parts; without an observer the controller sees the measured angles.
-        reference: called with the time [s], returns pitch [rad], roll [rad], co-contraction [rad]; or a part of
-            role "reference", whose outputs are those.
+        plant, controller, observer: the parts; without an observer the controller sees the measured outputs.
+        reference: called with the time [s], returns all outputs and co-contraction, in SI; or a part of role
+            "reference", whose outputs are those.
         duration: [s].
         order: "sequential" (as on the hardware: plant outputs at t_k, observer, controller, plant) or "jacobi"
             (all inputs first, then all steps: one sample more in the observer and one in the controller).
@@ -37,8 +37,7 @@ class Loop(Shown):
         others: further parts by name, such as a filter; and `other_parameters` their parameters.
         other_inputs: part -> constants for inputs of the observer, the controller or one of the others.
         connections: "part.input" -> "part.output", or a `Link` with factor and offset, where names alone do not say it.
-        robot: whose loop it is; of another than the neck the reference returns a value for each output instead of
-            pitch and roll.
+        robot: whose loop it is.
     """
 
     plant: Part

@@ -60,8 +60,6 @@ class LoopResult(Shown):
 
 # Settling is to 5 % of the step, as in the lab's reports and the bake-off of `softneck.design`.
 SETTLING_BAND = 0.05
-# Positions that motors may take [rad] (the public conventions: |P| <= 6 rad).
-MAX_POSITION = 6.0
 # A tendon that pulls less than this hangs [N]: 0.1 g, far below any pretension.
 _SLACK = 1e-3
 _RISE = (0.1, 0.9)
@@ -83,7 +81,7 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
     - `rise_s`: from 10 to 90 % of the step [s], first samples at or beyond; `settling_s`: from the step to the
       first sample from which the error stays below 5 % of it [s]; `overshoot_pct`: of the step, zero if none.
       All three are None where the reference makes no single step, and where the level is never reached.
-    - `rms_error_deg`, `iae` [rad s], `ise` [rad^2 s]: of reference minus angle, over the whole run.
+    - `rms_error_deg`, `iae` [rad s], `ise` [rad^2 s]: of reference minus output, over the whole run.
     - `itae` [rad s^2]: the error's size times the time since the step (since the start without one).
     - `steady_rms_deg`: rms error over the last quarter of the time after the step (of the run without one).
 

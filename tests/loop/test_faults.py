@@ -10,7 +10,9 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.loop import Fault, Loop, LoopResult, MotorFault, NeckFault, SensorFault, SineReference, run_loop
+from softneck.loop._disturbed_bus import sensor_outputs
 from softneck.loop._faults import FAULT_KINDS, make_fault
+from softneck.robot import Robot
 from softneck.runtime import Port
 
 from ._parts import SETPOINTS, FunctionPart, lag_plant, p_controller, ports, relay_observer
@@ -235,3 +237,22 @@ def uneven_delay() -> Fault:
 def test_what_the_plant_lacks_is_named(fault: Callable[[], Fault], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         run(fault())
+
+
+def test_faults_are_of_the_robot_s_outputs_and_units() -> None:
+    robot = Robot.from_dict({
+        "name": "finger", "motors": {"names": ["pressure"], "unit": "kPa", "setpoint_min": 0, "setpoint_max": 150},
+        "outputs": {"names": ["flexion"], "unit": "deg"}, "directions": {"kind": "identified"},
+    })  # fmt: skip
+    slow = make_fault("motor_slow", {"rate_kPa_s": 20.0}, robot)
+    assert isinstance(slow, MotorFault)
+    assert slow.rate == pytest.approx(2e4)
+    plant = FunctionPart(
+        "plant", ports("pressure_setpoint"), ports("flexion", "flexion_measured"), lambda _, u: [float(u[0])] * 2
+    )
+    for axis in ("flexion", "both"):
+        assert sensor_outputs(SensorFault(kind="dropout", axis=axis), plant, robot) == ("flexion_measured",)
+    with pytest.raises(SettingsError, match="`axis` must be one of flexion, both"):
+        sensor_outputs(SensorFault(kind="dropout", axis="pitch"), plant, robot)
+    with pytest.raises(SettingsError, match="`size` must be between"):
+        make_fault("motor_offset", {"size_kPa": 200.0}, robot)

@@ -32,7 +32,7 @@ class LoopSetup(Shown):
         loop: the parts, the reference, the order.
         limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0; of "validity.min" a lower one.
         files: what was read for it: role -> (path, SHA-256).
-        angle: which angle the metrics judge: "true" (where the plant offers it) or "measured".
+        angle: which outputs the metrics judge: "true" (where the plant offers it) or "measured".
     """
 
     loop: Loop

@@ -36,7 +36,7 @@ class Result(Shown):
         wall_time: what the run took [s].
         files: what it was told to read: role -> (path, SHA-256).
         order: "sequential" or "jacobi".
-        angle: which angle the metrics judge, "true" or "measured".
+        angle: which outputs the metrics judge, "true" or "measured".
         closed: whether it was a closed loop; other systems have signals and no metrics.
         remarks: what there is to warn of, one line each: where the plant is a model and knows itself to be wrong.
     """
@@ -127,10 +127,10 @@ class Result(Shown):
         return {"metrics": self.metrics, "limits": self.limits, "real_time_factor": self.real_time_factor}
 
     def trace(self) -> dict[str, list[Any]]:
-        """Return some rows of the run, by which it is known again: their numbers, set-points and angles.
+        """Return some rows of the run, by which it is known again: their numbers, set-points and outputs.
 
         The keys are "row", "motor_setpoint_1" to 3 and "pitch", "roll", or another robot's set-points and outputs; the
-        values have shape (rows,), in SI; an angle that was not measured there is None.
+        values have shape (rows,), in SI; an output that was not measured there is None.
         """
         rows = np.unique(np.linspace(0, len(self.signals.time) - 1, _TRACE_ROWS).astype(int))
         kept = {name: self.signals[name] for name in self.robot.set_points}

@@ -139,7 +139,7 @@ class _Writer:
         return names, closed
 
     def _moved(self, plant: tuple[str, ...]) -> bool:
-        """Return whether somebody feeds all set-points of a plant, which says its angles."""
+        """Return whether somebody feeds all set-points of a plant."""
         description = self.descriptions[self.flat.components[plant].source]
         moved = [port.name for port in description.ports("input") if is_set_point(port.name)]
         return bool(moved) and all((plant, name) in self.flat.links for name in moved)
