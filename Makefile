@@ -29,6 +29,7 @@ check: $(VENV)/.linted
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/python tests/test_prose.py
 
 docs: $(VENV)/.documented
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html

@@ -122,7 +122,7 @@ def tune(
         kinds: of controllers, also as "pi,mpc"; `KINDS_SEARCHED` if none is named, beside recordings without
             `UNCERTIFIED`.
         budget: judgements of candidates.
-        observer: that the loop shall have, if the requirements are kept with it; else a Kalman filter over the nominal
+        observer: of the loop, if the requirements hold with it; else a Kalman filter over the nominal
             plant.
         seed: of the search and of the noise in its loops.
         workers: local processes, as many as cores if not given; 0 for this process.
