@@ -20,8 +20,8 @@ ARCHAIC = (
 )
 # Say instead: fix, run, held-out robot, safety margin, simulation model, your own, false alarm, start, permissive.
 PRIVATE = (
-    "mend(?:s|ed|ing)?|sittings|foreign necks?|ke(?:pt|eps) back|plants? that steps?|of yours|cr(?:y|ies|ied) wolf|"
-    "no business|in vain|begins? anew|goes astray|obliging"
+    "mend(?:s|ed|ing)?|rooms|sittings|foreign necks?|ke(?:pt|eps) back|plants? that steps?|of yours|"
+    "cr(?:y|ies|ied) wolf|no business|in vain|begins? anew|goes astray|obliging"
 )
 WORDS = re.compile(rf"\b(?:{ARCHAIC}|{PRIVATE})\b".replace(" ", r"\s+"), re.IGNORECASE)
 
