@@ -29,6 +29,7 @@ check: $(VENV)/.linted
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports --no-cache
+	$(BIN)/python tests/test_prose.py
 
 docs: $(VENV)/.documented
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs docs/_build/html
@@ -42,10 +43,10 @@ benchmark: $(VENV)/.tested
 conformance: $(VENV)/.tested
 	$(BIN)/python -m tests.fmu.conformance
 
-# Change one thing at a time in the rooms that protect people and promises, and see whether a test notices: an hour or
-# more for all; `make mutate ROOMS="master loop"` tries some. docs/howto/nightly.md has the figures.
+# Mutation tests of the code for safety and certificates: change one thing at a time and see whether a test fails. An hour
+# or more for all; `make mutate AREAS="master loop"` tries some. docs/howto/nightly.md has the figures.
 mutate: $(VENV)/.mutated
-	$(BIN)/python tests/mutation/run.py $(ROOMS) --out build/mutation.json
+	$(BIN)/python tests/mutation/run.py $(AREAS) --out build/mutation.json
 
 # The library of compiled FMUs for all five platforms, cross-compiled by zig into softneck/fmu/compiled/binaries.
 native: $(VENV)/.crossed

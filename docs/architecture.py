@@ -19,9 +19,9 @@ import grimp
 ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs" / "_static" / "architecture.svg"
 PAGE = ROOT / "docs" / "architecture.md"
-BEGIN, END = "<!-- rooms: written by docs/architecture.py -->\n", "<!-- end of rooms -->\n"
+BEGIN, END = "<!-- subpackages: written by docs/architecture.py -->\n", "<!-- end of subpackages -->\n"
 
-# What of the world outside a room touches, told by the modules that it imports, and for files by the functions.
+# Parts of the outside world that a subpackage uses, by the modules that it imports, and for files by the functions.
 WORLD = {
     "FMI": {"fmpy", "pythonfmu"},
     "buses and ports": {"can", "canopen", "serial"},
@@ -47,68 +47,72 @@ _SIGNS = re.compile(r"^ *(?:import|from) (\w+)|\b(\w+)\(", re.MULTILINE)
 Graph = Mapping[str, frozenset[str]]
 # Of the picture [px].
 WIDTH, LEVEL, BOX, MARGIN = 1000.0, 118.0, 58.0, 20.0
-# A long import passes between boxes; it needs less room than a box does.
+# A long import passes between boxes; it needs less space than a box does.
 PASSAGE, GAP = 26.0, 34.0
 # Of a letter in each size of text, generously: fonts differ.
 TITLE, SMALL = 10.5, 6.2
 
 
-def rooms_and_imports() -> Graph:
-    """Return each room of `softneck` with the rooms that it imports, inside functions too."""
+def subpackages_and_imports() -> Graph:
+    """Return each subpackage of `softneck` with the subpackages that it imports, inside functions too."""
     graph = grimp.build_graph("softneck", cache_dir=None)
-    graph.remove_module("softneck.__main__")  # what `python -m softneck` runs is no room
+    graph.remove_module("softneck.__main__")  # the entry of `python -m softneck` is no subpackage
     found: dict[str, set[str]] = {name.partition(".")[2]: set() for name in graph.find_children("softneck")}
     for module in graph.modules:
         for imported in graph.find_modules_directly_imported_by(module):
-            here, there = _room(module), _room(imported)
+            here, there = _subpackage(module), _subpackage(imported)
             if here and there and here != there:
                 found[here].add(there)
-    return {room: frozenset(found[room]) for room in sorted(found)}
+    return {subpackage: frozenset(found[subpackage]) for subpackage in sorted(found)}
 
 
-def _room(module: str) -> str:
+def _subpackage(module: str) -> str:
     return [*module.split("."), ""][1]
 
 
 def levels(graph: Graph) -> dict[str, int]:
-    """Return how many rooms, one on the other, lie below each; raises ValueError if imports go round in a circle."""
+    """Return the number of layers below each subpackage; raise ValueError if imports form a circle."""
     found: dict[str, int] = {}
     while len(found) < len(graph):
-        ready = [room for room in graph if room not in found and graph[room] <= found.keys()]
+        ready = [subpackage for subpackage in graph if subpackage not in found and graph[subpackage] <= found.keys()]
         if not ready:
             raise ValueError(f"imports go round in a circle among {sorted(graph.keys() - found.keys())}")
-        found |= {room: 1 + max((found[below] for below in graph[room]), default=-1) for room in ready}
+        found |= {
+            subpackage: 1 + max((found[below] for below in graph[subpackage]), default=-1) for subpackage in ready
+        }
     return found
 
 
 def direct(graph: Graph) -> Graph:
     """Return the imports that no chain of others implies: those that the picture shows."""
     reach: dict[str, frozenset[str]] = {}
-    for room in sorted(graph, key=levels(graph).__getitem__):
-        reach[room] = graph[room].union(*(reach[below] for below in graph[room]))
+    for subpackage in sorted(graph, key=levels(graph).__getitem__):
+        reach[subpackage] = graph[subpackage].union(*(reach[below] for below in graph[subpackage]))
     return {
-        room: frozenset(b for b in below if not any(b in reach[other] for other in below - {b}))
-        for room, below in graph.items()
+        subpackage: frozenset(b for b in below if not any(b in reach[other] for other in below - {b}))
+        for subpackage, below in graph.items()
     }
 
 
-def inner_rooms(room: str) -> list[str]:
-    """Return the rooms inside a room."""
-    return sorted(path.parent.name for path in (ROOT / "softneck" / room).glob("*/__init__.py"))
+def inner_subpackages(subpackage: str) -> list[str]:
+    """Return the subpackages inside a subpackage."""
+    return sorted(path.parent.name for path in (ROOT / "softneck" / subpackage).glob("*/__init__.py"))
 
 
-def docstring(room: str) -> tuple[str, str, str]:
-    """Return what a room says of itself: what is inside, and two lines on what it keeps to and may import."""
-    text = ast.get_docstring(ast.parse((ROOT / "softneck" / room / "__init__.py").read_text(encoding="utf-8"))) or ""
+def docstring(subpackage: str) -> tuple[str, str, str]:
+    """Return the docstring of a subpackage: its content, and two lines on its rules and imports."""
+    text = (
+        ast.get_docstring(ast.parse((ROOT / "softneck" / subpackage / "__init__.py").read_text(encoding="utf-8"))) or ""
+    )
     inside, _, keeps, may = text.splitlines()
     return inside, keeps, may
 
 
 @cache
-def touches(room: str) -> tuple[str, ...]:
-    """Return what of `WORLD` a room touches."""
+def touches(subpackage: str) -> tuple[str, ...]:
+    """Return the parts of `WORLD` that a subpackage uses."""
     used: set[str] = set()
-    for path in (ROOT / "softneck" / room).rglob("*.py"):
+    for path in (ROOT / "softneck" / subpackage).rglob("*.py"):
         for module, function in _SIGNS.findall(path.read_text(encoding="utf-8")):
             used.add(module or (function if function in WORLD["files"] else ""))
     return tuple(name for name, signs in WORLD.items() if signs & used)
@@ -118,14 +122,14 @@ def table(graph: Graph) -> str:
     """Return the table of subpackages, from the top layer down."""
     level = levels(graph)
     lines = ["| subpackage | what is inside |", "|---|---|"]
-    for room in sorted(graph, key=lambda name: (-level[name], name)):
-        inside = docstring(room)[0]
-        lines.append(f"| `{room}` | {inside} |")
+    for subpackage in sorted(graph, key=lambda name: (-level[name], name)):
+        inside = docstring(subpackage)[0]
+        lines.append(f"| `{subpackage}` | {inside} |")
     return "\n".join(lines) + "\n"
 
 
 def with_table(page: str, text: str) -> str:
-    """Return the page with `text` as its table of rooms."""
+    """Return the page with `text` as its table of subpackages."""
     before, _, rest = page.partition(BEGIN)
     return f"{before}{BEGIN}\n{text}\n{END}{rest.partition(END)[2]}"
 
@@ -141,7 +145,7 @@ def picture(graph: Graph) -> str:
         return height - MARGIN - BOX / 2 - LEVEL * row
 
     lines = [_line([(x[node], y(row)) for node, row in chain]) for chain in chains]
-    boxes = [_box(room, x[room], y(level[room])) for room in sorted(graph)]
+    boxes = [_box(subpackage, x[subpackage], y(level[subpackage])) for subpackage in sorted(graph)]
     return "\n".join([_HEAD.format(w=WIDTH, h=height), *lines, "  </g>", *boxes, "</svg>", ""])
 
 
@@ -158,10 +162,10 @@ Chain = list[tuple[str, int]]
 
 
 def _rows(edges: Graph, level: Mapping[str, int]) -> tuple[list[list[str]], list[Chain]]:
-    """Return what stands on each level, rooms and passages of long arrows, and each arrow from level to level."""
+    """Return the subpackages and long arrows on each level, and each arrow from level to level."""
     rows: list[list[str]] = [[] for _ in range(max(level.values()) + 1)]
-    for room in sorted(level):
-        rows[level[room]].append(room)
+    for subpackage in sorted(level):
+        rows[level[subpackage]].append(subpackage)
     chains: list[Chain] = []
     for above in sorted(edges):
         for below in sorted(edges[above]):
@@ -199,8 +203,10 @@ def _crossings(chains: list[Chain], x: Mapping[str, float]) -> int:
     return sum((a - c) * (b - d) < 0 for row in steps.values() for (a, b), (c, d) in combinations(row, 2))
 
 
-def _box_width(room: str) -> float:
-    return max(110.0, 26.0 + max(TITLE * len(room), *(SMALL * len(line) for line in ("", *_inner_lines(room)))))
+def _box_width(subpackage: str) -> float:
+    return max(
+        110.0, 26.0 + max(TITLE * len(subpackage), *(SMALL * len(line) for line in ("", *_inner_lines(subpackage))))
+    )
 
 
 def _width(name: str) -> float:
@@ -230,17 +236,17 @@ def _line(points: list[tuple[float, float]]) -> str:
     return f'    <path d="{text}"/>'
 
 
-def _inner_lines(room: str) -> list[str]:
-    """Return the names of the rooms inside, in at most two lines."""
-    names = inner_rooms(room)
+def _inner_lines(subpackage: str) -> list[str]:
+    """Return the names of the subpackages inside, in at most two lines."""
+    names = inner_subpackages(subpackage)
     cut = (len(names) + 1) // 2 if len(names) > 4 else len(names)
     return [", ".join(part) for part in (names[:cut], names[cut:]) if part]
 
 
-def _box(room: str, x: float, y: float) -> str:
-    width, inner = _box_width(room), _inner_lines(room)
+def _box(subpackage: str, x: float, y: float) -> str:
+    width, inner = _box_width(subpackage), _inner_lines(subpackage)
     first = y + 5 - 8 * len(inner)
-    texts = [f'    <text x="{x:.0f}" y="{first:.0f}" font-size="16" font-weight="600">{room}</text>']
+    texts = [f'    <text x="{x:.0f}" y="{first:.0f}" font-size="16" font-weight="600">{subpackage}</text>']
     texts += [
         f'    <text x="{x:.0f}" y="{first + 17 + 14 * i:.0f}" font-size="11.5">{line}</text>'
         for i, line in enumerate(inner)
@@ -256,7 +262,7 @@ def _box(room: str, x: float, y: float) -> str:
 
 def main() -> None:
     """Write picture and table."""
-    graph = rooms_and_imports()
+    graph = subpackages_and_imports()
     PICTURE.write_text(picture(graph), encoding="utf-8")
     PAGE.write_text(with_table(PAGE.read_text(encoding="utf-8"), table(graph)), encoding="utf-8")
 

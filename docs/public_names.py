@@ -1,7 +1,7 @@
-"""A table of the public names of each room, made from stubs and docstrings when the pages are built.
+"""A table of the public names of each subpackage, made from stubs and docstrings when the pages are built.
 
-The stub `__init__.pyi` of a room says which names are public; the first line of a docstring, or of the comment `#:`
-above a constant, says what each is for. In a page: the directive `public-names`.
+The stub `__init__.pyi` of a subpackage says which names are public; the first line of a docstring, or of the comment
+`#:` above a constant, says what each is for. In a page: the directive `public-names`.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ PACKAGE = Path(__file__).parents[1] / "softneck"
 
 
 class PublicName(NamedTuple):
-    """One name that a room exports.
+    """One name that a subpackage exports.
 
     Attributes:
-        room: dotted name of the package.
+        subpackage: dotted name of the package.
         name: as it is imported from there.
         target: dotted name where the API page documents it.
         purpose: one line; "" if nobody wrote one.
     """
 
-    room: str
+    subpackage: str
     name: str
     target: str
     purpose: str
 
 
-def rooms() -> list[str]:
-    """Return the rooms that export something, the front door first."""
+def subpackages() -> list[str]:
+    """Return the subpackages that export something, the front door first."""
     stubs = sorted(PACKAGE.rglob("__init__.pyi"), key=lambda path: (len(path.parts), path))
     return [".".join(stub.parent.relative_to(PACKAGE.parent).parts) for stub in stubs]
 
 
-def names_of(room: str) -> Iterator[PublicName]:
-    """Yield the names that a room exports, in the order of its stub; rooms inside it are not among them."""
-    stub = PACKAGE.parent.joinpath(*room.split("."), "__init__.pyi")
+def names_of(subpackage: str) -> Iterator[PublicName]:
+    """Yield the names that a subpackage exports, in the order of its stub; subpackages inside it are not among them."""
+    stub = PACKAGE.parent.joinpath(*subpackage.split("."), "__init__.pyi")
     for node in ast.parse(stub.read_text(encoding="utf-8")).body:
         if isinstance(node, ast.ImportFrom) and node.module is not None:
-            module = importlib.import_module(f"{room}.{node.module}")
-            # What the front door lends is documented in its own room.
-            home = room if room != "softneck" else f"softneck.{node.module.partition('.')[0]}"
+            module = importlib.import_module(f"{subpackage}.{node.module}")
+            # What the front door lends is documented in its own subpackage.
+            home = subpackage if subpackage != "softneck" else f"softneck.{node.module.partition('.')[0]}"
             for alias in node.names:
-                yield PublicName(room, alias.name, f"{home}.{alias.name}", purpose(module, alias.name))
+                yield PublicName(subpackage, alias.name, f"{home}.{alias.name}", purpose(module, alias.name))
 
 
 def purpose(module: Any, name: str) -> str:
@@ -66,9 +66,9 @@ def purpose(module: Any, name: str) -> str:
     return ""
 
 
-def table(room: str) -> str:
-    """Return one room's names as a table in Markdown, the names as links to their documentation."""
-    rows = [f"| {{py:obj}}`{item.name} <{item.target}>` | {_cell(item.purpose)} |" for item in names_of(room)]
+def table(subpackage: str) -> str:
+    """Return one subpackage's names as a table in Markdown, the names as links to their documentation."""
+    rows = [f"| {{py:obj}}`{item.name} <{item.target}>` | {_cell(item.purpose)} |" for item in names_of(subpackage)]
     return "\n".join(["| name | what it is for |", "|---|---|", *rows])
 
 
@@ -77,11 +77,11 @@ def _cell(text: str) -> str:
 
 
 def page() -> str:
-    """Return all tables, each under the name of its room and the first line on what is inside."""
+    """Return all tables, each under the name of its subpackage and the first line on what is inside."""
     parts = []
-    for room in rooms():
-        inside = (importlib.import_module(room).__doc__ or "").partition("\n")[0]
-        parts.append(f"## {room}\n\n{inside}\n\n{table(room)}")
+    for subpackage in subpackages():
+        inside = (importlib.import_module(subpackage).__doc__ or "").partition("\n")[0]
+        parts.append(f"## {subpackage}\n\n{inside}\n\n{table(subpackage)}")
     return "\n\n".join(parts)
 
 
@@ -90,7 +90,7 @@ def setup(app: Any) -> dict[str, bool]:
     from sphinx.util.docutils import SphinxDirective
 
     class PublicNames(SphinxDirective):
-        """`public-names`: the tables of all rooms."""
+        """`public-names`: the tables of all subpackages."""
 
         def run(self) -> list[Any]:
             # Docstrings change while the page with this directive does not.

@@ -1,7 +1,7 @@
 """From a logged experiment on a tendon-driven soft robotic neck to a verified controller on its drives.
 
 The front door: what a first script needs, each name imported when it is first used (PEP 562).
-Everything else is in the rooms: `softneck.signals`, `softneck.identification`, `softneck.design`, ...
+Everything else is in the subpackages: `softneck.signals`, `softneck.identification`, `softneck.design`, ...
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""The shape of the source tree: one package of rooms that import one way, and its public names."""
+"""The shape of the source tree: one package of subpackages that import one way, and its public names."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .data import ROOT
 PACKAGE = ROOT / "softneck"
 FILES = sorted(PACKAGE.rglob("*.py"))
 RUNTIMES = [path for path in FILES if path.name.endswith("_runtime.py")]
-ROOMS = [path for path in FILES if path.name == "__init__.py"]
+SUBPACKAGES = [path for path in FILES if path.name == "__init__.py"]
 
 
 def name_of(path: Path) -> str:
@@ -34,15 +34,15 @@ def imports_of(path: Path) -> list[str]:
     return found
 
 
-def test_every_folder_of_the_package_is_a_room_that_says_what_it_is_for() -> None:
-    assert {path.parent for path in FILES} == {room.parent for room in ROOMS}
-    for room in ROOMS:
-        lines = (ast.get_docstring(ast.parse(room.read_text(encoding="utf-8"))) or "").splitlines()
+def test_every_folder_of_the_package_is_a_subpackage_that_says_what_it_is_for() -> None:
+    assert {path.parent for path in FILES} == {subpackage.parent for subpackage in SUBPACKAGES}
+    for subpackage in SUBPACKAGES:
+        lines = (ast.get_docstring(ast.parse(subpackage.read_text(encoding="utf-8"))) or "").splitlines()
         # A line on what is inside, one that is empty, two on what may enter.
-        assert len(lines) == 4, name_of(room)
+        assert len(lines) == 4, name_of(subpackage)
 
 
-def test_the_names_of_the_design_card_lead_to_their_rooms() -> None:
+def test_the_names_of_the_design_card_lead_to_their_subpackages() -> None:
     for name, target in {"identification": "identification", "design": "design", "fmu_src": "fmu"}.items():
         link = ROOT / name
         if not link.exists():  # unpacked from an archive: nothing of ours uses them
@@ -51,24 +51,24 @@ def test_the_names_of_the_design_card_lead_to_their_rooms() -> None:
         assert link.readlink() == Path("softneck") / target
 
 
-def test_a_room_re_exports_lazily_and_does_nothing_else() -> None:
+def test_a_subpackage_re_exports_lazily_and_does_nothing_else() -> None:
     lazily = "import lazy_loader\n__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)"
     allowed = {ast.unparse(node) for node in ast.parse(lazily).body}
-    for room in ROOMS:
-        code = {ast.unparse(node) for node in ast.parse(room.read_text(encoding="utf-8")).body[1:]}
-        if room.parent == PACKAGE:
+    for subpackage in SUBPACKAGES:
+        code = {ast.unparse(node) for node in ast.parse(subpackage.read_text(encoding="utf-8")).body[1:]}
+        if subpackage.parent == PACKAGE:
             code = {line for line in code if not line.startswith("__version__ = ")}
-        assert code in (set(), allowed), name_of(room)
+        assert code in (set(), allowed), name_of(subpackage)
 
 
 def public_names() -> list[str]:
-    """Return every name that a room re-exports, with its room."""
+    """Return every name that a subpackage re-exports, with its subpackage."""
     found = []
     for stub in sorted(PACKAGE.rglob("__init__.pyi")):
-        room = ".".join(stub.parent.relative_to(ROOT).parts)
+        subpackage = ".".join(stub.parent.relative_to(ROOT).parts)
         for node in ast.parse(stub.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.ImportFrom) and node.module is not None:
-                found += [f"{room}:{alias.name}" for alias in node.names]
+                found += [f"{subpackage}:{alias.name}" for alias in node.names]
     return found
 
 

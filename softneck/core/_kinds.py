@@ -229,7 +229,7 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
 
 @contextmanager
 def fitting(path: str | Path) -> Iterator[None]:
-    """Raise FileFormatError for whatever a header and arrays that do not fit together lead to."""
+    """Turn errors of a header and arrays that do not fit together into FileFormatError."""
     try:
         yield
     except FileFormatError as error:

@@ -28,7 +28,7 @@ _NECK = Robot.preset("neck")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorFault:
-    """What the measured outputs do between the plant and whoever reads them; the true ones stay as they are.
+    """Fault of the measured outputs between plant and observer or controller; the true ones are unchanged.
 
     Attributes:
         kind: "dropout" (no value, `measurement_valid` false), "freeze" (the last value before it), "bias"

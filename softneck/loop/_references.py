@@ -98,7 +98,7 @@ class RecordingReference(Shown):
         if table.ndim != 2 or table.shape[1] < 3:
             raise DataError(f"a recorded reference is a table (rows, outputs + 2); got the shape {table.shape}.")
         if not len(table) or not np.isfinite(table).all() or np.any(np.diff(table[:, 0]) <= 0.0):
-            raise DataError("a recorded reference must be finite with rising time; mend the recording.")
+            raise DataError("a recorded reference must be finite with rising time; fix the recording.")
 
     @classmethod
     def of(cls, time: Vector, channels: Mapping[str, Vector], names: Sequence[str]) -> RecordingReference:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 
 class NeckDefault(float):
-    """A number that stands for a neck where nobody says another; for other robots it says nothing.
+    """A default chosen for the neck; other robots do not use it.
 
-    It is the number in all that it does, and told from the same number given on purpose by its type.
+    It behaves like the number; its type distinguishes it from the same number given explicitly.
     """
 
     __slots__ = ()
 
 
 class NeckCount(int):
-    """The same of whole numbers."""
+    """The same for whole numbers."""
 
     __slots__ = ()

@@ -26,7 +26,7 @@ class Robot(Shown):
     """A robot with its motors, outputs, directions and properties; None if not given.
 
     Attributes:
-        name: for people.
+        name: in messages and reports.
         motors: the 1 to 8 motors.
         outputs: the 1 to 4 measured outputs.
         directions: which motors move which outputs.
@@ -236,7 +236,7 @@ class Robot(Shown):
         )
 
     def summary(self) -> str:
-        """Return a few lines on the robot, for people."""
+        """Return a few lines on the robot."""
         return _summary(self)
 
 

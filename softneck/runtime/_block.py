@@ -21,13 +21,13 @@ class Port:
     Attributes:
         name: FMI variable name.
         unit: SI unit ("rad", "N", ...), "1" for none.
-        description: one line for people.
+        description: one line.
         start: value before anything is set.
         minimum, maximum, nominal: as in FMI; None where there is none.
         boolean: a Boolean, carried as 0.0 or 1.0.
         integer: a whole number; Int64 in FMI 3.0, Real in FMI 2.0.
         missing: NaN is allowed and means "not measured".
-        display_unit: for people; "": what is usual for `unit`.
+        display_unit: unit in tools; "": the usual one for `unit`.
     """
 
     name: str

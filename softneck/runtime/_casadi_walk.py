@@ -333,10 +333,10 @@ class Walk:
         name = ast.unparse(node.func)
         if name in self._text.functions:
             return self.call(name, values)
-        room, _, last = name.rpartition(".")
-        if room in ("np", "math"):
+        owner, _, last = name.rpartition(".")
+        if owner in ("np", "math"):
             return self._library(node, last, values)
-        if room == "":
+        if owner == "":
             return self._builtin(node, name, values)
         if isinstance(node.func, ast.Attribute) and not values and last == "copy":
             return as_objects(self._value(node.func.value))

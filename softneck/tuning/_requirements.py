@@ -44,7 +44,7 @@ class TuneRequirements:
         certificate: what `verify` is asked to hold.
         track: the loops that are judged besides.
         bounds: all requirements, those of `certificate` first; the reserve is taken off.
-        reserve: metric -> what is kept back of its limit for a robot that is not quite as its models.
+        reserve: metric -> safety margin of its limit, for the difference between a robot and its models.
         stated: metrics and keys of [track] that somebody asks something of; the others are as the defaults have them.
         table: of a requirements file that asks `tune` and `verify` for the same: limits as asked, the reserve beside.
     """
@@ -148,7 +148,7 @@ def circles(robot: Robot) -> bool:
 
 
 def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:
-    """Return them with other largest values of some metrics on the plants; what is kept back of them stays."""
+    """Return the requirements with other upper limits of some metrics on the plants; safety margins stay."""
     require = {metric: {"max": digits(limit + asked.reserve.get(metric, 0.0))} for metric, limit in limits.items()}
     table = {**asked.table, "require": {**asked.table.get("require", {}), **require}}
     if "sim.settling_s" in limits:  # a file states seconds of the robot: so must the duration it is compared with

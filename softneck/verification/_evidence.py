@@ -190,7 +190,7 @@ def _tell_data(evidence: Evidence) -> None:
         _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
     if not evidence.crossings:
         evidence.not_computed["margins by experiment"] = (
-            "no plant of yours that steps was given (a nonlinear MODEL, a NECK, an FMU)"
+            "no simulation model was given (a nonlinear MODEL, a NECK, an FMU)"
         )
 
 

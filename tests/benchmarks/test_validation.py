@@ -83,5 +83,5 @@ def test_a_thousand_resamples_of_30000_rows(benchmark: BenchmarkFixture) -> None
     y = np.cumsum(rng.standard_normal((ROWS, 2)), axis=0)
     e = rng.standard_normal((ROWS, 2))
     stretch = np.zeros(ROWS, dtype=int)
-    intervals = benchmark(fit_intervals, [y] * 4, [y - e] * 4, stretch, 0.02)
+    intervals = benchmark(fit_intervals, [y] * 4, [y - e] * 4, stretch, 10.0)
     assert len(intervals) == 4

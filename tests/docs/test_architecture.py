@@ -37,7 +37,7 @@ def drawing() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def graph(drawing: ModuleType) -> Graph:
-    return drawing.rooms_and_imports()
+    return drawing.subpackages_and_imports()
 
 
 def test_picture_and_table_are_those_of_todays_imports(drawing: ModuleType, graph: Graph) -> None:
@@ -48,12 +48,12 @@ def test_picture_and_table_are_those_of_todays_imports(drawing: ModuleType, grap
 def test_the_picture_leaves_out_what_other_arrows_say_and_nothing_else(drawing: ModuleType, graph: Graph) -> None:
     shown = drawing.direct(graph)
 
-    def reach(edges: Graph, room: str) -> set[str]:
-        return {room}.union(*(reach(edges, below) for below in edges[room]))
+    def reach(edges: Graph, subpackage: str) -> set[str]:
+        return {subpackage}.union(*(reach(edges, below) for below in edges[subpackage]))
 
-    for room in graph:
-        assert shown[room] <= graph[room]
-        assert reach(shown, room) == reach(graph, room)
+    for subpackage in graph:
+        assert shown[subpackage] <= graph[subpackage]
+        assert reach(shown, subpackage) == reach(graph, subpackage)
 
 
 def test_every_arrow_points_down_and_no_box_is_cut(drawing: ModuleType, graph: Graph) -> None:
@@ -69,9 +69,9 @@ def test_every_arrow_points_down_and_no_box_is_cut(drawing: ModuleType, graph: G
     assert all(float(begin) < float(end) for begin, end in arrows)
 
 
-def test_every_room_of_the_source_tree_is_in_the_table() -> None:
-    rooms = {path.parent.name for path in (ROOT / "softneck").glob("*/__init__.py")}
-    assert set(re.findall(r"^\| `(\w+)` \|", TEXT, re.MULTILINE)) == rooms
+def test_every_subpackage_of_the_source_tree_is_in_the_table() -> None:
+    subpackages = {path.parent.name for path in (ROOT / "softneck").glob("*/__init__.py")}
+    assert set(re.findall(r"^\| `(\w+)` \|", TEXT, re.MULTILINE)) == subpackages
 
 
 def test_every_function_and_subpackage_in_the_tables_of_places_is_there() -> None:
@@ -91,7 +91,7 @@ def test_every_function_and_subpackage_in_the_tables_of_places_is_there() -> Non
 
 
 @pytest.mark.parametrize(
-    ("outside", "rooms"),
+    ("outside", "subpackages"),
     [
         # The command line and the report ask fmpy what a file is.
         ("FMI", {"fmu", "cosim", "cli", "report"}),
@@ -102,26 +102,26 @@ def test_every_function_and_subpackage_in_the_tables_of_places_is_there() -> Non
     ],
 )
 def test_what_is_outside_is_touched_at_the_edge(
-    outside: str, rooms: set[str], drawing: ModuleType, graph: Graph
+    outside: str, subpackages: set[str], drawing: ModuleType, graph: Graph
 ) -> None:
-    assert {room for room in graph if outside in drawing.touches(room)} <= rooms
+    assert {subpackage for subpackage in graph if outside in drawing.touches(subpackage)} <= subpackages
 
 
-def test_rooms_import_what_their_docstrings_say(drawing: ModuleType, graph: Graph) -> None:
-    """`May import a, b and below` names rooms; those below them are the lower layers of the contract."""
+def test_subpackages_import_what_their_docstrings_say(drawing: ModuleType, graph: Graph) -> None:
+    """`May import a, b and below` names subpackages; those below them are the lower layers of the contract."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
         "contracts"
     ]
     layers = [re.findall(r"softneck\.(\w+)", layer) for layer in contracts[0]["layers"]]
-    height = {room: -row for row, names in enumerate(layers) for room in names}
-    for room, imported in graph.items():
-        said = drawing.docstring(room)[2]
+    height = {subpackage: -row for row, names in enumerate(layers) for subpackage in names}
+    for subpackage, imported in graph.items():
+        said = drawing.docstring(subpackage)[2]
         named = set(re.findall(r"`(\w+)`", said.partition("May import")[2].partition(";")[0].lower()))
         named |= set(re.findall(r"`(\w+)`", said.partition("may import")[2]))
         if "everything" in said:
             continue
         top = max((height[name] for name in named), default=-len(layers))
-        assert all(name in named or ("below" in said and height[name] <= top) for name in imported), room
+        assert all(name in named or ("below" in said and height[name] <= top) for name in imported), subpackage
 
 
 @pytest.mark.slow

@@ -22,14 +22,14 @@ def names() -> ModuleType:
 
 
 def test_every_public_name_says_in_a_line_what_it_is_for(names: ModuleType) -> None:
-    listed = [item for room in names.rooms() for item in names.names_of(room)]
+    listed = [item for subpackage in names.subpackages() for item in names.names_of(subpackage)]
     assert len(listed) > 200
-    assert [f"{item.room}.{item.name}" for item in listed if not item.purpose.endswith((".", ")", "`"))] == []
+    assert [f"{item.subpackage}.{item.name}" for item in listed if not item.purpose.endswith((".", ")", "`"))] == []
 
 
-def test_the_page_has_every_room_and_name(names: ModuleType) -> None:
+def test_the_page_has_every_subpackage_and_name(names: ModuleType) -> None:
     text = names.page()
-    for room in names.rooms():
-        assert f"## {room}\n" in text
-        for item in names.names_of(room):
+    for subpackage in names.subpackages():
+        assert f"## {subpackage}\n" in text
+        for item in names.names_of(subpackage):
             assert f"`{item.name} <{item.target}>`" in text

@@ -1,11 +1,11 @@
 """Change one thing in the source at a time and see whether a test fails: `make mutate`.
 
-The mutants are cosmic-ray's: its operators, applied at every place of a room's files, of which a seeded sample is
+The mutants are cosmic-ray's: its operators, applied at every place of an area's files, of which a seeded sample is
 tried. Cosmic-ray's own runner starts an interpreter for each mutant, which takes longer than most tests here; this one
 forks from a process that has numpy, scipy and numba already. Nothing of the tree that it is started in is touched: it
 works in a copy.
 
-    python tests/mutation/run.py [ROOM ...] [--count 40] [--seed 0] [--out build/mutation.json] [--again FILE]
+    python tests/mutation/run.py [AREA ...] [--count 40] [--seed 0] [--out build/mutation.json] [--again FILE]
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ OUTCOMES = ("killed", "hung", "survived", "equivalent")
 
 
 @dataclass(frozen=True)
-class Room:
+class Area:
     """Files whose mutants must die, and the tests that should kill them, the fastest first."""
 
     name: str
@@ -60,7 +60,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a mutant: "killed", "hung", "survived", or "equivalent" where `rooms.toml` says so."""
+    """What came of a mutant: "killed", "hung", "survived", or "equivalent" where `areas.toml` says so."""
 
     mutant: Mutant
     outcome: str
@@ -68,11 +68,11 @@ class Outcome:
     diff: str
 
 
-def read_rooms(path: Path = HERE / "rooms.toml") -> tuple[dict[str, Room], dict[str, Any]]:
-    """Return name -> room, and the rest of the settings."""
+def read_areas(path: Path = HERE / "areas.toml") -> tuple[dict[str, Area], dict[str, Any]]:
+    """Return name -> area, and the rest of the settings."""
     table = tomllib.loads(path.read_text(encoding="utf-8"))
-    rooms = {name: Room(name, tuple(part["files"]), tuple(part["tests"])) for name, part in table.pop("rooms").items()}
-    return rooms, table
+    areas = {name: Area(name, tuple(part["files"]), tuple(part["tests"])) for name, part in table.pop("areas").items()}
+    return areas, table
 
 
 def cosmic_ray(name: str) -> Any:
@@ -80,12 +80,12 @@ def cosmic_ray(name: str) -> Any:
     return importlib.import_module(f"cosmic_ray.{name}")
 
 
-def mutants_of(root: Path, room: Room, settings: dict[str, Any]) -> Iterator[Mutant]:
-    """Yield every mutant of a room, in the order of files, operators and places."""
+def mutants_of(root: Path, area: Area, settings: dict[str, Any]) -> Iterator[Mutant]:
+    """Yield every mutant of an area, in the order of files, operators and places."""
     plugins, ast = cosmic_ray("plugins"), cosmic_ray("ast")
-    files = sorted({path for pattern in room.files for path in root.glob(pattern)})
+    files = sorted({path for pattern in area.files for path in root.glob(pattern)})
     if not files:
-        raise SystemExit(f"room {room.name}: no file fits {room.files}")
+        raise SystemExit(f"area {area.name}: no file fits {area.files}")
     for path in files:
         tree = ast.get_ast_from_path(path)
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -162,19 +162,19 @@ def _child(root: Path, tests: tuple[str, ...], log: Path) -> None:
         os._exit(code)
 
 
-def try_mutant(root: Path, room: Room, mutant: Mutant, equivalent: list[dict[str, str]], patience: float) -> Outcome:
-    """Apply a mutant in the copy, run the room's tests, put the file back."""
+def try_mutant(root: Path, area: Area, mutant: Mutant, equivalent: list[dict[str, str]], patience: float) -> Outcome:
+    """Apply a mutant in the copy, run the area's tests, put the file back."""
     path = root / mutant.path
     before, after = mutated(root, mutant)
     diff = "".join(difflib.unified_diff(before.splitlines(True), after.splitlines(True), mutant.path, mutant.path, n=0))
     begin = time.monotonic()
     _write(path, after)
     try:
-        code = run_tests(root, room.tests, root / "mutation.log", patience)
+        code = run_tests(root, area.tests, root / "mutation.log", patience)
     finally:
         _write(path, before)
     if code == 5:
-        raise SystemExit(f"room {room.name} has no tests")
+        raise SystemExit(f"area {area.name} has no tests")
     outcome = "hung" if code is None else "survived" if code == 0 else "killed"
     changed = [line[1:].strip() for line in diff.splitlines() if line.startswith("+") and not line.startswith("+++")]
     if outcome == "survived" and any(item["file"] == mutant.path and item["line"] in changed for item in equivalent):
@@ -201,21 +201,21 @@ def copy_of(root: Path, folder: Path) -> Path:
     return folder
 
 
-def run_room(room: Room, settings: dict[str, Any], chosen: list[Mutant]) -> list[Outcome]:
+def run_area(area: Area, settings: dict[str, Any], chosen: list[Mutant]) -> list[Outcome]:
     """Return what came of each mutant."""
     results = []
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         copy = copy_of(ROOT, Path(folder))
         begin = time.monotonic()
-        if run_tests(copy, room.tests, copy / "mutation.log", 1800.0) != 0:
+        if run_tests(copy, area.tests, copy / "mutation.log", 1800.0) != 0:
             raise SystemExit(
-                f"room {room.name}: the tests fail without a mutant\n{(copy / 'mutation.log').read_text()}"
+                f"area {area.name}: the tests fail without a mutant\n{(copy / 'mutation.log').read_text()}"
             )
         patience = max(LEAST, PATIENCE * (time.monotonic() - begin))
-        print(f"{room.name}: without a mutant {time.monotonic() - begin:.0f} s", flush=True)
+        print(f"{area.name}: without a mutant {time.monotonic() - begin:.0f} s", flush=True)
         for number, mutant in enumerate(chosen, start=1):
-            found = try_mutant(copy, room, mutant, settings.get("equivalent", []), patience)
-            print(f"{room.name} {number}/{len(chosen)}: {found.outcome} in {found.seconds:.0f} s", flush=True)
+            found = try_mutant(copy, area, mutant, settings.get("equivalent", []), patience)
+            print(f"{area.name} {number}/{len(chosen)}: {found.outcome} in {found.seconds:.0f} s", flush=True)
             if found.outcome in ("survived", "hung"):
                 print(found.diff, flush=True)
             results.append(found)
@@ -223,11 +223,11 @@ def run_room(room: Room, settings: dict[str, Any], chosen: list[Mutant]) -> list
 
 
 def main() -> None:
-    """Try the rooms' samples and print a table."""
-    rooms, settings = read_rooms()
-    parser = argparse.ArgumentParser(description="Mutate rooms and see which mutants survive their tests.")
-    parser.add_argument("rooms", nargs="*", help=f"of {', '.join(rooms)}; all if not given")
-    parser.add_argument("--count", type=int, default=settings["count"], help="mutants a room")
+    """Try the areas' samples and print a table."""
+    areas, settings = read_areas()
+    parser = argparse.ArgumentParser(description="Mutate areas and see which mutants survive their tests.")
+    parser.add_argument("areas", nargs="*", help=f"of {', '.join(areas)}; all if not given")
+    parser.add_argument("--count", type=int, default=settings["count"], help="mutants an area")
     parser.add_argument("--seed", type=int, default=settings["seed"], help="of the sample")
     parser.add_argument("--out", type=Path, help="JSON of every mutant and what came of it")
     parser.add_argument("--again", type=Path, help="try only what survived there, a file that --out wrote")
@@ -237,13 +237,13 @@ def main() -> None:
     for name in HEAVY:
         importlib.import_module(name)
     table, everything = [], {}
-    for name in asked.rooms or list(before or rooms):
-        possible = list(mutants_of(ROOT, rooms[name], settings))
+    for name in asked.areas or list(before or areas):
+        possible = list(mutants_of(ROOT, areas[name], settings))
         chosen = sample(possible, asked.count, asked.seed)
         if asked.again:
             lived = [item["mutant"] for item in before[name] if item["outcome"] == "survived"]
             chosen = [mutant for mutant in chosen if asdict(mutant) in lived]
-        found = run_room(rooms[name], settings, chosen)
+        found = run_area(areas[name], settings, chosen)
         counts = {kind: sum(item.outcome == kind for item in found) for kind in OUTCOMES}
         meant = len(found) - counts["equivalent"]
         table.append((name, len(possible), counts, counts["survived"] / max(meant, 1)))
@@ -251,7 +251,7 @@ def main() -> None:
         if asked.out:
             asked.out.parent.mkdir(parents=True, exist_ok=True)
             asked.out.write_text(json.dumps(everything, indent=1), encoding="utf-8")
-    print(f"{'room':<14}{'possible':>10}" + "".join(f"{kind:>12}" for kind in OUTCOMES) + f"{'survival':>10}")
+    print(f"{'area':<14}{'possible':>10}" + "".join(f"{kind:>12}" for kind in OUTCOMES) + f"{'survival':>10}")
     for name, possible, counts, share in table:
         print(f"{name:<14}{possible:>10}" + "".join(f"{counts[kind]:>12}" for kind in OUTCOMES) + f"{share:>10.0%}")
 

@@ -297,7 +297,7 @@ class _CalledPart:
     """A part of one's own whose ports have other names."""
 
     def __init__(self, part: Part, names: Mapping[str, str]) -> None:
-        """Take what they are called -> what they shall be."""
+        """Rename the ports by `names`: old name -> new name."""
         self._part, self.sample_time, self.role = part, part.sample_time, part.role
         self.inputs, self.outputs = (_with_names(ports, names) for ports in (part.inputs, part.outputs))
 

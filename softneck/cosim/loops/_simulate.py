@@ -13,7 +13,7 @@ import numpy as np
 from softneck.core import SettingsError, Vector, silent, to_si
 from softneck.core._progress import shown_progress
 from softneck.identification.models._validity import farthest, held
-from softneck.loop import Loop as Loop  # the room hands it on
+from softneck.loop import Loop as Loop  # re-exported by the subpackage
 from softneck.loop import LoopResult, Part, run_loop
 from softneck.loop._loop import System
 from softneck.loop._part import BlockPart

@@ -58,7 +58,7 @@ class VirtualLink:
         tap: called with (time, from_master, frame) for each frame that is on the wire.
         lose: returns whether a frame is lost: (from_master, frame).
         inject: frames of somebody else, delivered to both sides with the next exchange.
-        sampling: whether passing time makes the inclinometer sample; else whoever steps the link does.
+        sampling: whether the link samples the inclinometer as time passes; else its caller does.
     """
 
     def __init__(self, neck: SimulatedDrives) -> None:
@@ -139,7 +139,7 @@ class CanLink:
     """
 
     def __init__(self, bus: Any, name: str, *, echoes: bool = False) -> None:
-        """Use the open `bus`; `echoes` tells that it hands back what we sent, as UDP multicast does."""
+        """Use the open `bus`; `echoes` if it returns the frames sent by this process, as UDP multicast does."""
         self._bus, self.name = bus, name
         self._sent: deque[tuple[int, bytes, bool]] | None = deque(maxlen=4096) if echoes else None
         self.problem = ""
@@ -289,7 +289,7 @@ class GuardedLink:
 
 _ADVICE = {
     errno.EACCES: "Serial adapters belong to the group `dialout`: `sudo usermod -aG dialout $USER`, then log in again",
-    errno.EPERM: "This user is not permitted; ask whoever looks after the machine",
+    errno.EPERM: "This user is not permitted; ask the administrator of the machine",
     errno.ENOENT: "Is it plugged in, is the name right? `ls /dev/serial/by-id` lists serial ports",
     errno.ENODEV: "`ip link show` lists the interfaces of this machine",
     errno.EBUSY: "Another program has it open; end that one",

@@ -135,8 +135,8 @@ def commission(
 ) -> Commissioned:
     """Find out how drives, tendons and sensor are really set up, by moves of some degrees that are guarded.
 
-    Before anything moves, whoever is on the bus is asked who it is; two devices with one number, or a drive that is not
-    there, end it. Then each motor in turn is led out of its slack until the neck tilts by a degree.
+    Before the first motion all devices on the bus are identified; two devices with one number, or a missing drive, end
+    it. Then each motor in turn is led out of its slack until the neck tilts by a degree.
 
     Args:
         session: on which drives; its drives file is what is believed.

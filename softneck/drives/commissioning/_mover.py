@@ -70,8 +70,8 @@ class Mover:
         done: moves of each motor that is over.
         stopped: which guard ended the moves, "" if none did.
         motor: which one moves, from 1 on; 0 before the first.
-        captured: counts at the newest index pulse of the motor that moves, None before the first; whoever reads the
-            drives' objects puts it in.
+        captured: counts at the newest index pulse of the motor that moves, None before the first; set by the code that
+            reads the drives' objects.
     """
 
     def __init__(

@@ -50,7 +50,7 @@ class Session:
             On a bus they run in the control loop: what takes long belongs to another thread or process.
         operator: asked each cycle what somebody at the keyboard wants.
         settings: changes the master's settings, for tests.
-        log: where frames and cycles are written; whoever opened it closes it.
+        log: of frames and cycles; its owner closes it.
         files: role -> path of what acts in the run, for the log.
         facts: what else the log says about the run; `replay` computes an experiment or a jog again from it.
     """

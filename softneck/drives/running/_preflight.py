@@ -40,7 +40,7 @@ DRIVE = 0x192  # device profile in 1000h
 
 
 def require_bus(link: Link) -> None:
-    """Raise BusError if the bus refused a frame: whoever sends nothing hears nothing, which is no drive's fault."""
+    """Raise BusError if the bus refused a frame; without frames no drive can answer."""
     if link.problem:
         raise BusError(f"the bus takes no frames: {link.problem} Nothing was moved.")
 

@@ -292,7 +292,7 @@ class Axis:
             self._enter(power.QUICK_STOP)
 
     def watch(self) -> None:
-        """To be called after each stretch of motion: limits, following error, inputs, the end of stop ramps."""
+        """Update limits, following error, inputs and the end of stop ramps; called after each cycle of motion."""
         m = self.motion
         self._probe()
         if m[servo.SERVO_POWER] < 0.5:

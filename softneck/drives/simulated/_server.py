@@ -30,7 +30,7 @@ def serve(
         bus: an open bus of python-can.
         neck: drives and plant; of more than two outputs the first two are sent.
         sensor_node: node of the inclinometer, which sends its slopes in a TPDO of its own (CiA 410, 0.001 deg).
-        stopped: asked in each cycle.
+        stopped: called in each cycle.
         report: called with (monotonic time, neck, row) whenever the drive in that row changes its power state.
     """
     import can

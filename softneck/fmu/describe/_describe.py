@@ -23,7 +23,7 @@ from softneck.runtime import Block, Port
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FmuInfo:
-    """Texts for people, and the length of the default experiment.
+    """Texts of an FMU, and the length of its default experiment.
 
     Attributes:
         description: one line.
@@ -153,7 +153,7 @@ class Buildable(Protocol):
         ...
 
     def summary(self) -> str:
-        """Return a few lines for people."""
+        """Return a few lines on the object."""
         ...
 
 

@@ -1,7 +1,7 @@
 """FMUs as ZIP archives: reproducible writing, and unpacking into folders with plain paths.
 
 pythonfmu's binary decodes only `%20` in the path it gets and crashes the process on `+`, `#`, `%`,
-parentheses or accents in it, so the folder's own path must be plain, whatever the FMU's path is.
+parentheses or accents in it, so the folder must have a plain path; the FMU itself may have any path.
 """
 
 from __future__ import annotations

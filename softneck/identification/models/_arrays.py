@@ -1,4 +1,4 @@
-"""What a model file's arrays must be before compiled code indexes them; each kind's own checks are in its room.
+"""Checks of a model file's arrays before compiled code indexes them; each kind has further checks of its own.
 
 Models may hold others: the arrays of member 0 of kind `play` are named `0.play.history` and so on, behind the model's
 own; their runtime and their start are put together here.

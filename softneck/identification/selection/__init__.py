@@ -1,5 +1,5 @@
 """Which kind and which settings: tried and ranked in free run over rows held out.
 
 Searches repeat to the bit with the same seed.
-May import all other rooms of `identification`.
+May import all other subpackages of `identification`.
 """

@@ -46,7 +46,7 @@ class FrequencyResponse(Shown):
     Attributes:
         sample_time: [s].
         robot: whose.
-        inputs: (q,) names: theta_i, phi_i, delta_i of the neck, of other robots `towards_<output>` or the motors.
+        inputs: (q,) names: theta_i, phi_i, delta_i of the neck, of other robots `{output}_input`, or the motors.
         frequency: (k,) rising [rad/s].
         response: (k, m, q), NaN where an input was not excited.
         covariance: (k, m q, m q), entry i q + a for `response[:, i, a]`: noise and nonlinear distortion.
@@ -119,13 +119,10 @@ class FrequencyResponse(Shown):
         return best
 
     def own_input(self, output: str) -> str:
-        """Return the input that is meant to move an output: theta_i for pitch, or the one it answers most."""
+        """Return the input that is meant to move an output (of the neck theta_i for pitch); else the strongest."""
         i = self._entry(output, self.inputs[0])[0]
-        named = [
-            name for name in (("theta_i", "phi_i")[i] if i < 2 else "", f"towards_{output}") if name in self.inputs
-        ]
-        if named:
-            return named[0]
+        if self.robot.weights() is not None and self.robot.input_names[i] in self.inputs:
+            return self.robot.input_names[i]
         return self.inputs[int(np.argmax(np.nansum(np.abs(self.response[:, i]), axis=0)))]
 
     def frd(self, output: str | None = None, source: str | None = None) -> control.FrequencyResponseData:

@@ -27,8 +27,8 @@ from ..set_membership._set_membership import knows_what_it_saw, outside_seen
 from ._scored_rows import Rows, ScoredStretch
 
 RESAMPLES = 1000
-# Blocks are at least this long [s], five time constants of a neck, ...
-_LEAST_SECONDS = 1.0
+# Blocks are at least so many time constants long, 1 s of the neck, ...
+_LEAST_TIME_CONSTANTS = 5.0
 # ... and so many correlation times, so that what joins two blocks is little of each (5 and 8 covered no better); ...
 _TIMES = 3.0
 # ... but fewer blocks than this say nothing about how blocks differ.
@@ -36,21 +36,21 @@ _FEWEST_BLOCKS = 8
 
 
 def fit_intervals(
-    measured: list[Matrix], predicted: list[Matrix], stretch: np.ndarray, sample_time: float
+    measured: list[Matrix], predicted: list[Matrix], stretch: np.ndarray, time_constant: float
 ) -> list[list[list[float] | None]]:
     """Return for each prediction and axis the 95 % interval [low, high] of its fit [%].
 
-    None where nothing is measured or moves, or the rows are fewer than eight blocks of 1 s.
+    None where nothing is measured or moves, or the rows are fewer than eight blocks of five time constants.
 
     Args:
         measured, predicted: one pair of (time, 2) for each horizon; NaN in `measured` where not judged.
         stretch: (time,) number of the stretch of rows; sorted.
-        sample_time: [s].
+        time_constant: [samples]; 0 where the robot gives none.
     """
     from scipy.sparse import csr_array
 
     errors = [y - yhat for y, yhat in zip(measured, predicted, strict=True)]
-    length = block_length(np.column_stack([*errors, measured[0]]), stretch, sample_time)
+    length = block_length(np.column_stack([*errors, measured[0]]), stretch, time_constant)
     if length is None:
         return [[None] * measured[0].shape[1] for _ in measured]
     table = np.column_stack([_terms(y, e) for y, e in zip(measured, errors, strict=True)])
@@ -66,14 +66,14 @@ def fit_intervals(
     return [[_interval(totals[:, h, axis]) for axis in range(axes)] for h in range(len(measured))]
 
 
-def block_length(signals: Matrix, stretch: np.ndarray, sample_time: float) -> int | None:
-    """Return the samples of a block: three correlation times of the slowest of the signals (time, n), at least 1 s.
+def block_length(signals: Matrix, stretch: np.ndarray, time_constant: float) -> int | None:
+    """Return the samples of a block: three correlation times of the slowest of the signals (time, n).
 
-    The correlation time is the first lag at which the autocorrelation is below 1/e. Never more than an eighth of
-    the rows; None where that is less than 1 s.
+    The correlation time is the first lag at which the autocorrelation is below 1/e. At least five time constants
+    [samples] and never more than an eighth of the rows; None where both cannot be.
     """
     rows = len(signals)
-    least, most = round(_LEAST_SECONDS / sample_time), rows // _FEWEST_BLOCKS
+    least, most = round(_LEAST_TIME_CONSTANTS * time_constant), rows // _FEWEST_BLOCKS
     if most < max(least, 1):
         return None
     slowest = max(_correlation_time(e, stretch, most) for e in signals.T)
@@ -236,7 +236,8 @@ def interval_tables(
     result: dict[str, dict[str, list[float] | None]] = {h: dict.fromkeys(rows.names) for h in measured}
     kept = [h for h in measured if not (lost and h == INFINITE)]
     if kept:
-        found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.stretch, sample_time)
+        time_constant = (rows.robot.time_constant_s or 0.0) / sample_time
+        found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.stretch, time_constant)
         result |= {h: dict(zip(rows.names, pair, strict=True)) for h, pair in zip(kept, found, strict=True)}
     return result
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of, require_whole, to_si
 from softneck.core._shown import Shown
 from softneck.robot import Robot
+from softneck.robot._scaling import MOTOR_RANGE, TIME_CONSTANT
 
 from ..recording._channels import NECK
 
@@ -26,13 +27,11 @@ _OMEGA = (1.0, 0.25, 1.5, 2.56, 1.75, 1.66, 4.0)
 _PHI_1 = np.array([0.0, 2.09, 4.18])
 _PHI_4 = np.array([0.095, 0.095, 0.95])
 _PHI_3, _PHI_5, _PHI_6, _PHI_7 = 0.32, 0.09, 0.29, 0.67
-# The neck's set-points [rad] (paper, section 3.1), for which sizes below are.
-_NECK_RANGE = 6.0
-# [s] of each signal when no other length is asked for, for the neck.
+# [s] of each signal when no other length is asked for, at the neck's pace.
 _DURATIONS = {"eq22": 200.0, "steps": 26.0, "sine": 30.0, "rotation": 30.0, "aprbs": 140.0, "multisine": 140.0,
               "mixed": 140.0}  # fmt: skip
-# A day at 20 ms is 4 million samples and 1 GB as text.
-_LONGEST = 86_400.0
+# A day at 20 ms: 1 GB as text.
+_MOST_ROWS = 4_320_000
 # Fixed by definition: these tests have one length.
 _FIXED = ("steps", "sine", "rotation")
 
@@ -92,7 +91,9 @@ def signal_names() -> tuple[str, ...]:
 
 
 def signal(name: str, *, duration: float | None = None, seed: int = 0, robot: Robot | None = None) -> Excitation:
-    """Return the set-points of a signal of the public face, at 20 ms or the robot's sample time.
+    """Return the set-points of a signal of the public face, at the robot's sample time.
+
+    Its frequencies and durations are the neck's by the robot's time constant, where the robot gives one.
 
     Args:
         name: eq22, steps, sine, rotation, aprbs, multisine or mixed.
@@ -101,17 +102,19 @@ def signal(name: str, *, duration: float | None = None, seed: int = 0, robot: Ro
         robot: whose motors move, within its range of set-points; None: the neck's.
 
     Raises:
-        SettingsError: unknown name, a duration under a sample or beyond a day, or a robot without sample time.
+        SettingsError: unknown name, a duration under a sample or beyond 4.3 million, or a robot without sample time.
     """
     require_one_of("signal", name, signal_names())
     robot = Robot.preset() if robot is None else robot
     pulls, Ts = Pulls.of(robot), robot.require("sample_time_s", "a signal")
-    longest = 2.0 + 8.0 * pulls.angles.size if name == "steps" else _DURATIONS[name]
+    second = (robot.time_constant_s or TIME_CONSTANT) / TIME_CONSTANT
+    longest = second * (2.0 + 8.0 * pulls.angles.size if name == "steps" else _DURATIONS[name])
     length = longest if duration is None else duration
-    require_between("duration", length, Ts, _LONGEST, "s")
+    require_between("duration", length, Ts, _MOST_ROWS * Ts, "s")
     if name in _FIXED and length > longest:
         raise SettingsError(f"`{name}` is {longest:g} s long by definition; got a duration of {length:g} s.")
-    t = np.arange(round(length / Ts)) * Ts
+    time = np.arange(round(length / Ts)) * Ts
+    t = time / second
     rng = np.random.default_rng(seed)
     makers = {
         "eq22": lambda: eq22(t, pulls),
@@ -122,19 +125,19 @@ def signal(name: str, *, duration: float | None = None, seed: int = 0, robot: Ro
         "multisine": lambda: _multisine(t, rng, pulls),
         "mixed": lambda: _mixed(t, rng, pulls),
     }
-    return Excitation(name, t, _in_range(makers[name](), robot), Ts)
+    return Excitation(name, time, _in_range(makers[name](), robot), Ts)
 
 
 def _in_range(P: Matrix, robot: Robot) -> Matrix:
     """Return set-points of motors that go from -6 to 6 rad as those of a robot's, in SI."""
     given, scale = (robot.motors.setpoint_min, robot.motors.setpoint_max), to_si(robot.motors.unit)[0]
     low, high = (
-        side * _NECK_RANGE if values is None else scale * np.array(values)
+        side * MOTOR_RANGE if values is None else scale * np.array(values)
         for side, values in zip((-1.0, 1.0), given, strict=True)
     )
-    if np.all(low == -_NECK_RANGE) and np.all(high == _NECK_RANGE):
+    if np.all(low == -MOTOR_RANGE) and np.all(high == MOTOR_RANGE):
         return P
-    return np.clip(0.5 * (low + high) + 0.5 * (high - low) * P / _NECK_RANGE, low, high)
+    return np.clip(0.5 * (low + high) + 0.5 * (high - low) * P / MOTOR_RANGE, low, high)
 
 
 def eq22(t: Vector, pulls: Pulls) -> Matrix:
@@ -277,9 +280,10 @@ def multisine_experiments(
     require_between("amplitude", amplitude, 1e-6, 1e6, robot.motors.unit)
     require_whole("realisations", realisations, 1, 100)
     fastest = 2.0 * np.pi / (_SAMPLES_PER_CYCLE * sample_time)
-    if not 2.0 * np.pi / _LONGEST <= low < high <= fastest:
+    slowest = 2.0 * np.pi / (_MOST_ROWS * sample_time)
+    if not slowest <= low < high <= fastest:
         raise SettingsError(
-            f"`band` must rise within {2.0 * np.pi / _LONGEST:.2g} to {fastest:.3g} rad/s, a quarter of the sampling "
+            f"`band` must rise within {slowest:.2g} to {fastest:.3g} rad/s, a quarter of the sampling "
             f"rate; got {low:g},{high:g}."
         )
     weights = robot.weights()

@@ -240,7 +240,7 @@ def _line(draft: Draft, found: dict[str, Unit], name: str) -> str:
 def _checks(draft: Draft) -> tuple[list[str], list[Doubt]]:
     """Say whether the platform rises with the redefined inputs, as the signs of the public face ask.
 
-    An angle that falls is turned round, which is the likelier answer, and doubted.
+    An angle that falls is turned round, which is the more likely answer, and marked as doubtful.
     """
     motors, platform = draft.motors(), draft.platform()
     if motors is None or not platform or len(motors) < 4 * _NECK_LAG:

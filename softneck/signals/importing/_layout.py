@@ -169,11 +169,10 @@ def _layout(table: dict[str, Any], robot: Robot) -> Layout:
     _known_keys(file, {*FILE_KEYS}, "[file]")
     _known_keys(time, _TIME_KEYS, "[time]")
     _known_keys(tilt, {"inclination", "orientation"}, "[tilt]")
-    if tilt:
-        robot.require_neck("[tilt]")
     quaternion = table.get("quaternion", {})
-    if quaternion:
-        robot.require_neck("[quaternion]")
+    for name, given in (("tilt", tilt), ("quaternion", quaternion)):
+        if given and (robot.outputs.names != ("pitch", "roll") or to_si(robot.outputs.unit)[1] != "rad"):
+            raise SettingsError(f"[{name}] gives pitch and roll, which are not the outputs of robot {robot.label()}.")
     if len(tilt) == 1:
         raise SettingsError("[tilt] needs both `inclination` and `orientation`.")
     if type(time.get("run_column", "")) not in (str, int):

@@ -154,7 +154,7 @@ def _beyond(layout: Layout, name: str, reach: float, limit: float) -> str:
         meant = "deg" if source.unit == "rad" else "deg/s"
         hint = f'is it in degrees (`unit = "{meant}"`)?'
     return (
-        f"`{name}` reaches {reach:.4g} {unit}{turns_said}; the motors' range is {limit:.4g} {unit}. Mend its line in "
+        f"`{name}` reaches {reach:.4g} {unit}{turns_said}; the motors' range is {limit:.4g} {unit}. Fix its line in "
         f"the layout: {hint} If the robot does go so far, say so by `setpoint_max` in a robot.toml and --robot."
     )
 

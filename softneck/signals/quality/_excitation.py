@@ -12,6 +12,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 
 from ..recording._recording import Recording
 
@@ -83,7 +84,14 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
     density /= 2.0 * np.pi * max(rows, 1)
     pooled = np.concatenate(runs)
     ranges = np.column_stack([pooled.min(axis=0), pooled.max(axis=0)])
-    return Spectrum(names, bandwidth, omega, density, *_shares(omega, density, bandwidth), _crest(pooled), ranges)
+    least = _least_motion(recording)
+    shares = _shares(omega, density, bandwidth, least)
+    return Spectrum(names, bandwidth, omega, density, *shares, _crest(pooled, least), ranges)
+
+
+def _least_motion(recording: Recording) -> float:
+    """Return the standard deviation of set-points [SI] below which what moves is rounding."""
+    return 1e-9 * Scaling.of(recording.robot, set_points=recording.set_points).motor_unit
 
 
 def _inputs(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
@@ -95,7 +103,7 @@ def _inputs(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
     return (names, T) if T[-1].any() else (names[:-1], T[:-1])
 
 
-def _shares(omega: Vector, density: Matrix, bandwidth: float) -> tuple[Vector, Vector]:
+def _shares(omega: Vector, density: Matrix, bandwidth: float, least: float) -> tuple[Vector, Vector]:
     """Return the share of power below the bandwidth and the highest frequency with real power, both (n,)."""
     inputs = density.shape[1]
     if np.isnan(bandwidth):
@@ -103,24 +111,24 @@ def _shares(omega: Vector, density: Matrix, bandwidth: float) -> tuple[Vector, V
     low = omega <= bandwidth
     total = density.sum(axis=0)
     # Below, an input is constant and its density what rounding leaves.
-    alive = total > 1e-18
+    alive = total * bandwidth > BANDWIDTH * least**2
     share = np.divide(density[low].sum(axis=0), total, out=np.full(inputs, np.nan), where=alive)
     real = density >= _REAL_POWER * density[low].mean(axis=0)
     highest = np.array([omega[np.flatnonzero(real[:, i])[-1]] if alive[i] else 0.0 for i in range(inputs)])
     return share, highest
 
 
-def _crest(inputs: Matrix) -> Vector:
+def _crest(inputs: Matrix, least: float) -> Vector:
     deviation = inputs - inputs.mean(axis=0)
     std = deviation.std(axis=0)
-    return np.divide(np.abs(deviation).max(axis=0), std, out=np.full_like(std, np.nan), where=std > 1e-9)
+    return np.divide(np.abs(deviation).max(axis=0), std, out=np.full_like(std, np.nan), where=std > least)
 
 
 def correlation(recording: Recording) -> Matrix:
     """Return the correlation of the set-points, (motors, motors); NaN with a motor that never moves."""
     u = recording.set_points - recording.set_points.mean(axis=0)
     std = u.std(axis=0)
-    still = std <= 1e-9
+    still = std <= _least_motion(recording)
     z = np.divide(u, std, out=np.full_like(u, np.nan), where=~still)
     return np.clip(z.T @ z / len(z), -1.0, 1.0)
 
@@ -150,12 +158,12 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
     if len(recording) < _FEW_ROWS:
         seconds = len(recording) * recording.sample_time
         said.append(f"{len(recording)} rows ({seconds:.3g} s) are few to train on: record {_FEW_ROWS} or more.")
-    spans = np.ptp(recording.set_points, axis=0)
-    still = [name for name, span in zip(recording.robot.set_points, spans, strict=True) if span < 1e-9]
+    spans, least = np.ptp(recording.set_points, axis=0), _least_motion(recording)
+    still = [name for name, span in zip(recording.robot.set_points, spans, strict=True) if span < least]
     if still:
         said.append(f"{', '.join(still)} never moves: what it does cannot be learned. Move every motor.")
     changes = sum(int((np.diff(run.set_points, axis=0) != 0.0).any(axis=1).sum()) for run in recording.runs())
-    if spans.max() >= 1e-9 and changes < _FEW_CHANGES:
+    if spans.max() >= least and changes < _FEW_CHANGES:
         said.append(f"the set-points change in {changes} rows only: a model is guesswork between them. Record `mixed`.")
     outputs = recording.robot.outputs.names
     if independent_motions(recording) < min(len(outputs), len(spans)):
@@ -203,7 +211,7 @@ def explained(recording: Recording) -> Vector:
     for y in recording.outputs.T:
         parts = [(X[rows] - X[rows].mean(axis=0), y[rows] - y[rows].mean()) for rows in _halves(odd, np.isfinite(y))]
         spread = sum(float(y @ y) for _, y in parts)
-        if spread <= 1e-18 or min(len(y) for _, y in parts) < 2 * X.shape[1]:
+        if spread <= 1e-18 * float(np.nansum(y**2)) or min(len(y) for _, y in parts) < 2 * X.shape[1]:
             found.append(np.nan)
             continue
         found.append(1.0 - min(_unexplained(parts, cut) for cut in _SINGULAR) / spread)

@@ -38,7 +38,7 @@ class Finding:
     """One thing that the report says.
 
     Attributes:
-        severity: ok, note (know it) or warning (mend it, or expect a worse model).
+        severity: ok, note (know it) or warning (fix it, or expect a worse model).
         topic: such as "dropouts" or "excitation".
         channel: that it is about, or empty.
         message: one sentence.

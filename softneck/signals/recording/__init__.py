@@ -1,5 +1,5 @@
 """The recording: named channels over time, its files, resampling, scaling, trends, and Eq. 9-11.
 
-What every other room means by data.
+The data type of every other subpackage.
 May import `robot` and below.
 """

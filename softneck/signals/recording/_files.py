@@ -385,7 +385,7 @@ def _numbers_only(values: Vector, name: str, *, missing: bool) -> Vector:
 
 
 def _no_number(name: str, cell: str, row: int, *, missing: bool) -> DataError:
-    hint = "A missing sample is an empty cell." if missing else "Mend the log or cut it before that row."
+    hint = "A missing sample is an empty cell." if missing else "Fix the log or cut it before that row."
     return DataError(f"column `{name}` holds {cell} at row {row} (the first is 0), where a number is needed. {hint}")
 
 

@@ -274,7 +274,7 @@ class Recording(Shown):
                 row = int(np.argmax(bad))
                 raise DataError(
                     f"channel `{name}` is {values[row]} at row {row} (t = {self.time[row]:g} s); "
-                    "it must be finite. Mend the log or cut it before that row."
+                    "it must be finite. Fix the log or cut it before that row."
                 )
         for name in self.robot.outputs.names if to_si(self.robot.outputs.unit)[1] == "rad" else ():
             far = np.abs(self.channels[name]) > np.pi

@@ -57,7 +57,7 @@ def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tup
     if rule is None:
         raise DataError(
             f"`time` stands still at row {row}: {samples.time[row]:g} s stands there twice ({same.sum()} such row(s)); "
-            'mend the log, or write `duplicates = "first"` (or "last") into [time] of the layout to keep one of each.'
+            'fix the log, or write `duplicates = "first"` (or "last") into [time] of the layout to keep one of each.'
         )
     keep = np.append(True, ~same) if rule == "first" else np.append(~same, True)
     note = f"{same.sum()} row(s) left out: their time stamp stands twice, the first time at row {row}"

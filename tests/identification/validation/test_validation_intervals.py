@@ -12,7 +12,8 @@ from softneck.identification.validation._score_tables import _block_sums, block_
 from ...data import neck_recording
 from ._numbers import number, span
 
-TS = 0.02
+# Time constant [samples]: 0.2 s at 20 ms.
+TC = 10.0
 
 
 def ar1(pole: float, rows: int, rng: np.random.Generator) -> np.ndarray:
@@ -34,7 +35,7 @@ def test_the_true_fit_lies_inside_as_often_as_told(motion: float, error: float, 
     for seed in range(150):
         rng = np.random.default_rng(seed)
         y, e = ar1(motion, rows, rng), 0.2 * ar1(error, rows, rng)
-        for low, high in map(span, fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TS)[0]):
+        for low, high in map(span, fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TC)[0]):
             held += low <= 80.0 <= high
     assert held / 300 >= least
 
@@ -44,7 +45,7 @@ def test_an_interval_holds_the_fit_and_narrows_with_the_length_of_the_record() -
     for rows in (2_000, 32_000):
         rng = np.random.default_rng(rows)
         y, e = ar1(0.9, rows, rng), 0.2 * ar1(0.9, rows, rng)
-        low, high = span(fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TS)[0][0])
+        low, high = span(fit_intervals([y], [y - e], np.zeros(rows, dtype=int), TC)[0][0])
         assert low < nrmse_fit(y[:, 0], y[:, 0] - e[:, 0]) < high
         widths.append(high - low)
     # 16 times the rows, a quarter of the width; each width is known to some 15 %.
@@ -59,15 +60,15 @@ def test_blocks_are_sums_inside_one_run_and_every_row_is_drawn_equally_often() -
     assert sums.sum() == 3 * table.sum()
 
 
-def test_a_block_is_at_least_a_second_and_at_most_an_eighth_of_the_rows() -> None:
+def test_a_block_is_at_least_five_time_constants_and_at_most_an_eighth_of_the_rows() -> None:
     one = np.zeros(4000, dtype=int)
     white = np.random.default_rng(0).standard_normal((4000, 1))
-    assert block_length(white, one, TS) == 50
+    assert block_length(white, one, TC) == 50
     slow = ar1(0.98, 4000, np.random.default_rng(1))
     # 0.98 falls to 1/e in 49.5 samples; one record says so to a third.
-    assert block_length(slow, one, TS) == pytest.approx(3 * 49.5, rel=0.35)
-    assert block_length(np.linspace(0, 1, 4000)[:, None], one, TS) == 500
-    assert block_length(white[:390], one[:390], TS) is None
+    assert block_length(slow, one, TC) == pytest.approx(3 * 49.5, rel=0.35)
+    assert block_length(np.linspace(0, 1, 4000)[:, None], one, TC) == 500
+    assert block_length(white[:390], one[:390], TC) is None
 
 
 def test_a_validation_has_intervals_where_it_has_a_fit() -> None:

@@ -1,5 +1,5 @@
 """What foreign files hold: text in any encoding, spreadsheets, MATLAB, MCAP; and dates as seconds.
 
-Tables come out; what their columns mean is told in the room above.
+Tables come out; the meaning of their columns is in `signals.importing`.
 May import `signals.recording`.
 """
