@@ -15,12 +15,17 @@ from softneck.design.linear._rise import least_rise
 from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import usual_rise
+from softneck.robot._scaling import TIME_CONSTANT
 from softneck.verification._scale import digits
 
 from ._requirements import TuneRequirements, circles
 
 # What has settled has risen before.
 _RISES = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
+
+
+#: The least rise that is asked where nothing limits it, in time constants: what is quicker, models tell less of.
+USUAL_RISE = 2.0
 
 
 def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
@@ -66,7 +71,7 @@ def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
         least = least_rise(axis.nominal, test, size)
         found.append(usual_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
     # Who asks for an earlier settling asks for a rise before it.
-    most = digits(time * max(found))
+    most = digits(time * max(*found, USUAL_RISE * TIME_CONSTANT))
     return min(most, asked.wanted("sim.settling_s") or math.inf) if most < math.inf else None
 
 

@@ -24,7 +24,7 @@ from softneck.verification._neck_loops import OwnPlant, is_own_plant, named_plan
 from softneck.verification._scale import Scale
 from softneck.verification._verify import sources_of, standing_for
 
-from ._beforehand import default_rise, quickest, refuse_impossible
+from ._beforehand import USUAL_RISE, default_rise, quickest, refuse_impossible
 from ._judge import LEVELS, designed, made_ready, watched
 from ._log import Log, digest_of
 from ._requirements import (
@@ -46,8 +46,6 @@ _LEAST_BUDGET = 1
 _VERIFIED = 2
 # Why a kind is left out where nobody names it.
 _UNCERTIFIED = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
-# The rise that is aimed at where nothing limits it, in time constants of the nominal plant.
-_USUAL_RISE = 2.0
 # Motors that are held closer to zero than this, of a neck [rad], have no rule for their co-contraction.
 _TAUT = 0.05
 
@@ -237,7 +235,7 @@ def _aimed(task: Task) -> float:
     if known:
         return min(known)
     source = sources_of(task.linear, task.asked.certificate)[0]
-    return _USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
+    return USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
 def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 from typing import Any
 
 import pytest
 
 from softneck.design import PiSettings
+from softneck.tuning import tune
 from softneck.verification import make_requirements, verify
 from softneck.verification._scale import Scale
 
@@ -57,3 +59,35 @@ def test_a_verdict_does_not_depend_on_units_or_pace(name: str, view: View) -> No
 @pytest.mark.parametrize(("name", "view"), VIEWS)
 def test_a_verdict_is_the_same(name: str, view: View) -> None:
     check(name, view)
+
+
+@cache
+def tuned(name: str, view: View, *, stepping: bool) -> list[float]:
+    """Return of the best of three candidates each metric over its limit; circles are of two angles alone."""
+    seen = world(name, view)
+    model, scale = model_of(seen), Scale(robot=seen.robot)
+    plants = {"m": model, "own": model.block()} if stepping else {"m": model}
+    quiet = {scale.name_of("noise_deg"): 0.0}
+    found = tune(plants, asked(scale, track=quiet), kinds="pi", budget=3, workers=0)
+    bounds = [bound for bound in found.task.asked.bounds if not bound.metric.startswith("track.")]
+    return [found.best.metrics.get(bound.metric, math.nan) / bound.limit for bound in bounds]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "view"), [(name, view) for name, view in VIEWS if not (view.turned_motors or view.turned or view.offset)]
+)
+def test_a_search_is_the_same_on_linear_plants(name: str, view: View) -> None:
+    """Not where motors are turned or moved: `tune` asks for quicker steps, which the motors' limits share otherwise."""
+    plain, seen = (tuned(name, each, stepping=False) for each in (View(), view))
+    assert len(plain) > 10
+    # As a verdict's; settings are rounded to four digits.
+    assert seen == pytest.approx(plain, rel=1e-6, abs=1e-6, nan_ok=True)
+
+
+@pytest.mark.slow
+@pytest.mark.nightly
+@pytest.mark.parametrize("view", [*UNITS["joint"], PACES[0], PACES[2]])
+def test_a_search_over_a_simulation_is_the_same(view: View) -> None:
+    plain, seen = (tuned("joint", each, stepping=True) for each in (View(), view))
+    assert seen == pytest.approx(plain, rel=1e-6, abs=1e-6, nan_ok=True)

@@ -264,8 +264,9 @@ def _controller(asked: Asked) -> Iterator[Step]:
     yield Step(stage="verify", command=command, makes=(certificate, "build/verify.html"),
                reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
     made = asked.backend
-    if made == "compiled" and not Robot.read("robot.toml").is_neck:
-        made = backend(neck=False)
+    if made == "compiled":
+        robot = Robot.read("robot.toml")
+        made = backend(packaged=(len(robot.motors.names), len(robot.outputs.names)) == (3, 2))
     for file, fmu in ((plants[-1], PLANT_FMU), (OBSERVER, OBSERVER_FMU), (BEST, CONTROLLER_FMU)):
         command = ("softneck", "fmu", file, "--backend", made, "-o", fmu, "--force")
         yield Step(stage="FMUs", command=command, makes=(fmu,), reads=(file,))

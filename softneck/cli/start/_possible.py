@@ -35,15 +35,15 @@ def require_disk(folder: Path) -> None:
         )
 
 
-def backend(*, neck: bool = True) -> str:
+def backend(*, packaged: bool = True) -> str:
     """Return the backend of the FMUs: "python", which is said, where none can be compiled here.
 
     Args:
-        neck: whose parts are as large as a neck's; only libraries of those come with softneck.
+        packaged: whether parts are of 3 motors and 2 outputs; only libraries of those come with softneck.
     """
     from softneck.fmu.compiled import _library
 
-    if _library.local_compiler() is not None or _library.have_zig() or (neck and _library.packaged_library()):
+    if _library.local_compiler() is not None or _library.have_zig() or (packaged and _library.packaged_library()):
         return "compiled"
     note("no C compiler was found: the FMUs are written with the Python backend and need softneck where they run")
     return "python"
