@@ -17,9 +17,7 @@ from .shared._console import print_json, print_table
 from .shared._options import common_options
 
 # Extra -> the module it brings, and what for.
-_EXTRAS = {
-    "dask": ("distributed", "studies on a cluster"),
-}
+_EXTRAS = {"dask": ("distributed", "studies on a cluster")}
 
 
 @click.command("doctor", epilog="Example: softneck doctor --json")

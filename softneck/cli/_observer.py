@@ -10,14 +10,7 @@ import click
 from softneck.core import find_kind, refuse_existing, resolve, to_si
 
 from .shared._console import print_json
-from .shared._options import (
-    apply_settings,
-    common_options,
-    kind_command,
-    output_option,
-    set_option,
-    target,
-)
+from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
 
 if TYPE_CHECKING:
     from softneck.estimation._fitted import FittedObserver

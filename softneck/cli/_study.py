@@ -31,12 +31,7 @@ _WORST = 3
 @trust_option
 @common_options("force")
 def command(
-    study_file: Path,
-    output: Path | None,
-    workers: int | None,
-    trust: bool,
-    force: bool,
-    as_json: bool,
+    study_file: Path, output: Path | None, workers: int | None, trust: bool, force: bool, as_json: bool
 ) -> None:
     """Run the loop of STUDY.toml over all that its [vary] names; exit code 1 if every run failed.
 

@@ -25,8 +25,7 @@ _NOTE = (
 
 
 @click.command(
-    "validate",
-    epilog="Example: softneck validate rls.npz nn.npz --data neck.csv --horizon 1,25,inf --html fit.html",
+    "validate", epilog="Example: softneck validate rls.npz nn.npz --data neck.csv --horizon 1,25,inf --html fit.html"
 )
 @click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--data", "data", multiple=True, required=True, type=click.Path(path_type=Path), help="Recordings.")

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 _PATH = click.Path(path_type=Path)
 
 
-@click.command(
-    "verify",
-    epilog="Example: softneck verify pi.npz neck_family.npz -o pi.certificate.json --html pi.html",
-)
+@click.command("verify", epilog="Example: softneck verify pi.npz neck_family.npz -o pi.certificate.json --html pi.html")
 @click.argument("controller", type=_PATH)
 @click.argument("plants", metavar="MODEL|FAMILY|NECK|FMU...", nargs=-1, required=True, type=_PATH)
 @click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")

@@ -130,13 +130,7 @@ class FaultStages:
 
 
 def place_faults(
-    faults: Sequence[Fault],
-    wiring: Wiring,
-    parts: Mapping[str, Part],
-    *,
-    step: float,
-    rows: int,
-    robot: Robot = _NECK,
+    faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], *, step: float, rows: int, robot: Robot = _NECK
 ) -> tuple[Wiring, FaultStages]:
     """Put `faults` between the parts for `rows` rows of `step` [s] and return the wiring with their detours.
 

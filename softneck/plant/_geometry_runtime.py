@@ -88,19 +88,11 @@ def lean_angles(
 
 
 def lean_normal(
-    b1: float,
-    b2: float,
-    A: float,
-    B: float,
-    R: tuple[float, float, float, float, float, float, float, float, float],
+    b1: float, b2: float, A: float, B: float, R: tuple[float, float, float, float, float, float, float, float, float]
 ) -> tuple[float, float, float]:
     """Return the platform's normal n in the world."""
     m1 = B * b1
     m2 = B * b2
     # As the base sees it; 1 - A beta^2 is cos(beta).
     m3 = 1.0 - A * (b1 * b1 + b2 * b2)
-    return (
-        R[0] * m1 + R[1] * m2 + R[2] * m3,
-        R[3] * m1 + R[4] * m2 + R[5] * m3,
-        R[6] * m1 + R[7] * m2 + R[8] * m3,
-    )
+    return (R[0] * m1 + R[1] * m2 + R[2] * m3, R[3] * m1 + R[4] * m2 + R[5] * m3, R[6] * m1 + R[7] * m2 + R[8] * m3)

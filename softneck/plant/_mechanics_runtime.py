@@ -148,12 +148,7 @@ def neck_load(
     above = float(q[NECK_PAYLOAD_HEIGHT])
     half = 0.5 * float(q[NECK_LINK_LENGTH])
     mass = platform + link + carried
-    weight = (
-        NECK_GRAVITY * mass,
-        NECK_GRAVITY * (platform * height + carried * above),
-        push_x,
-        push_y,
-    )
+    weight = (NECK_GRAVITY * mass, NECK_GRAVITY * (platform * height + carried * above), push_x, push_y)
     R = tilt_rotation(base_pitch, base_roll)
     # A thin disc about its diameter.
     disc = 0.25 * platform * float(q[NECK_PLATFORM_RADIUS]) ** 2

@@ -7,13 +7,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from softneck.core import (
-    SettingsError,
-    require_between,
-    require_one_of,
-    require_positive,
-    require_whole,
-)
+from softneck.core import SettingsError, require_between, require_one_of, require_positive, require_whole
 from softneck.core._shown import Shown
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK

@@ -76,11 +76,7 @@ def _acceleration(value: float, entry: DriveEntry, profile: str) -> int:
 
 def option_writes() -> list[Write]:
     """What a drive does when connection, master or itself fails: latch Fault after a quick-stop ramp."""
-    return [
-        Write(0x6007, 0, 1),
-        Write(0x605E, 0, 2),
-        Write(0x605A, 0, 2),
-    ]
+    return [Write(0x6007, 0, 1), Write(0x605E, 0, 2), Write(0x605A, 0, 2)]
 
 
 def limit_writes(file: DrivesFile, entry: DriveEntry) -> list[Write]:
@@ -149,8 +145,4 @@ def mode_writes(file: DrivesFile) -> list[Write]:
     exponent, period = -3, file.cycle * 1e3
     if abs(period - round(period)) > 1e-6:
         exponent, period = -4, file.cycle * 1e4
-    return [
-        Write(0x60C2, 1, round(period)),
-        Write(0x60C2, 2, exponent),
-        Write(0x6060, 0, CSP),
-    ]
+    return [Write(0x60C2, 1, round(period)), Write(0x60C2, 2, exponent), Write(0x6060, 0, CSP)]

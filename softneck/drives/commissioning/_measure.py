@@ -37,11 +37,7 @@ _OPEN = {"pushed": 200.0, "tilt": 1.6}
 
 
 def measure(
-    session: Session,
-    guards: Guards,
-    *,
-    motors: Sequence[int],
-    report: Callable[[float, str], None] | None = None,
+    session: Session, guards: Guards, *, motors: Sequence[int], report: Callable[[float, str], None] | None = None
 ) -> tuple[Moves, RunEnd]:
     """Move `motors` (from 1 on) one after the other, and return what was measured; the drives are off then.
 

@@ -103,10 +103,7 @@ def drive_limits(
 
 
 def record_signal(
-    excitations: Sequence[Excitation],
-    session: Session,
-    *,
-    report: Callable[[float], None] | None = None,
+    excitations: Sequence[Excitation], session: Session, *, report: Callable[[float], None] | None = None
 ) -> ExperimentResult:
     """Play `excitations` one after the other, as runs 1, 2, ...; between them the motors rest for 3 s.
 

@@ -11,15 +11,7 @@ from softneck.core import CheckFailedError, SoftneckError
 
 from ..bus._file import DriveEntry, DrivesFile
 from ..bus._link import GuardedLink, Link
-from ..bus._objects import (
-    HOMED_MARK,
-    MASTER_NODE,
-    Write,
-    current_write,
-    option_writes,
-    speed_of_units,
-    speed_units,
-)
+from ..bus._objects import HOMED_MARK, MASTER_NODE, Write, current_write, option_writes, speed_of_units, speed_units
 from ..bus._sdo import Objects, SdoError
 from ..bus._units import counts_to_position
 from ..master import Frame

@@ -8,11 +8,7 @@ import math
 
 import numpy as np
 
-from softneck.plant._index_runtime import (
-    NECK_GEAR_EFFICIENCY,
-    NECK_GEAR_RATIO,
-    NECK_TORQUE_CONSTANT,
-)
+from softneck.plant._index_runtime import NECK_GEAR_EFFICIENCY, NECK_GEAR_RATIO, NECK_TORQUE_CONSTANT
 from softneck.plant._mechanics_runtime import NeckBody, neck_constants, neck_disturbed, neck_substeps
 from softneck.plant._neck_runtime import neck_read, neck_write
 from softneck.plant._winch_runtime import winch_advance, winch_constants, winch_motion
@@ -89,13 +85,7 @@ def servo_read(m: np.ndarray, position: float, speed: float) -> None:
 
 
 def servo_tick(
-    m: np.ndarray,
-    ring: np.ndarray,
-    position: float,
-    speed: float,
-    drive: tuple,
-    per_ampere: float,
-    h: float,
+    m: np.ndarray, ring: np.ndarray, position: float, speed: float, drive: tuple, per_ampere: float, h: float
 ) -> float:
     """Return the torque at the winch [N m] over the next tick; `position` [rad] and `speed` [rad/s] are the winch's."""
     counts = m[SERVO_SCALE] * position + m[SERVO_ZERO]

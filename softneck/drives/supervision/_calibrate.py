@@ -154,13 +154,7 @@ class _Walk:
         return True
 
 
-def fit(
-    known: Sequence[tuple[Motion, Features]],
-    *,
-    cycle: float,
-    sample_cycles: int,
-    slack: float,
-) -> Baseline:
+def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles: int, slack: float) -> Baseline:
     """Return the models of drives, tendons and tilt, without thresholds."""
     motions, features = [motion for motion, _ in known], [f for _, f in known]
     n, m = motions[0].positions.shape[1], motions[0].values.shape[1]

@@ -141,7 +141,7 @@ _KIND_LIMITS = {
     "virtual_neck": (
         "It is a simple model: its parameters are the paper's or yours and were not measured, its friction and its "
         "link are simplified. Results on it must be confirmed on hardware."
-    ),
+    )
 }
 
 

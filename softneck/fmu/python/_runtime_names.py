@@ -20,11 +20,7 @@ def initialise(arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np
 
 
 def step(
-    arrays: tuple[np.ndarray, ...],
-    parameters: np.ndarray,
-    state: np.ndarray,
-    inputs: np.ndarray,
-    outputs: np.ndarray,
+    arrays: tuple[np.ndarray, ...], parameters: np.ndarray, state: np.ndarray, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
     """Advance by one sample time."""
     raise SettingsError(
