@@ -19,11 +19,11 @@ from softneck.core._errors import missing_extra
 
 from .shared._groups import NearGroup, now
 
-# Subcommand -> module and what it does; a module is imported when its command is called, so that
-# `softneck --help` answers at once.
+# Subcommand -> module, with the command's name where it is not `command`, and what it does; imported when called, so
+# that `softneck --help` answers at once.
 _COMMANDS = {
     "start": ("start._start", "Go from a log to a verdict in one sitting, each step a plain command."),
-    "demo": ("_demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
+    "demo": ("_projects:demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
     "robot": ("_robot", "Show and check a robot.toml, or start one."),
@@ -31,7 +31,7 @@ _COMMANDS = {
     "import": ("_import", "Turn any logger's table into a recording, or bring one to another sample time."),
     "identify": ("_identify", "Identify a model from recordings."),
     "validate": ("_validate", "Validate models on rows that they were not trained on."),
-    "reproduce-paper": ("_reproduce_paper", "Reproduce the paper on the virtual neck, our numbers beside its own."),
+    "reproduce-paper": ("_projects:paper", "Reproduce the paper on the virtual neck, our numbers beside its own."),
     "family": ("_family", "Fit an uncertain linear plant over inclinations and payloads."),
     "fmu": ("_fmu", "Package models, observers, controllers, necks as FMUs, a loop as an SSP file."),
     "observer": ("_observer", "Build a Kalman filter over a linear model."),
@@ -41,8 +41,8 @@ _COMMANDS = {
     "simulate": ("_simulate", "Close the loop that a TOML file describes and judge it; replay the log of a run."),
     "study": ("_study", "Run a loop many times over what varies: ranking, Pareto front, worst cases."),
     "drives": ("drives._commands", "Run controllers on CANopen drives, or on simulated ones."),
-    "report": ("_report", "Write one page on a whole project: data, models, certificates, loops, studies."),
-    "new": ("_new", "Start a project whose closed-loop test passes at once."),
+    "report": ("_projects:report", "Write one page on a whole project: data, models, certificates, loops, studies."),
+    "new": ("_projects:new", "Start a project whose closed-loop test passes at once."),
 }
 _INTERRUPTED, _BAD_INPUT, _OUR_FAULT = 130, 2, 3
 
@@ -59,7 +59,8 @@ class _LazyGroup(NearGroup):
         """Import and return one subcommand."""
         del ctx
         entry = _COMMANDS.get(cmd_name)
-        return import_module(f"softneck.cli.{entry[0]}").command if entry else None
+        module, _, name = entry[0].partition(":") if entry else ("", "", "")
+        return getattr(import_module(f"softneck.cli.{module}"), name or "command") if module else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List all subcommands without importing them."""
