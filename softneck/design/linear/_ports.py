@@ -55,22 +55,24 @@ def controller_outputs(robot: Robot = _NECK) -> tuple[Port, ...]:
 
 def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     """Return the inputs: references, outputs, motors and flags."""
-    neck, unit = robot.is_neck, to_si(robot.outputs.unit)[1]
+    neck, unit, shown = robot.is_neck, to_si(robot.outputs.unit)[1], robot.outputs.shown
     lowest, highest = reference_ranges(robot)
     ranges = motor_ranges(robot, None)
     references = tuple(
-        Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}",
+        Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}", display_unit=shown,
              minimum=None if low <= -_UNLIMITED else low, maximum=None if high >= _UNLIMITED else high)
         for name, low, high in zip(robot.outputs.names, map(float, lowest), map(float, highest), strict=True)
     )  # fmt: skip
     cocontraction = Port(
-        name="cocontraction_reference", unit=to_si(robot.motors.unit)[1],
+        name="cocontraction_reference", unit=to_si(robot.motors.unit)[1], display_unit=robot.motors.shown,
         minimum=None if ranges is None else float(min(ranges[0])),
         maximum=None if ranges is None else float(max(ranges[1])),
         description="wanted delta_i (Eq. 11)" if neck else "wanted mean of the motors that moves no output",
     )  # fmt: skip
     whose = "the neck" if neck else robot.name
-    angles = tuple(Port(name=name, unit=unit, description=f"{name} of {whose}") for name in robot.outputs.names)
+    angles = tuple(
+        Port(name=name, unit=unit, description=f"{name} of {whose}", display_unit=shown) for name in robot.outputs.names
+    )
     motors = _motors(robot, robot.motor_positions, "measured position of motor", ranges)
     flags = (
         Port(name="healthy", description="the angles can be trusted", start=1.0, boolean=True),
@@ -84,7 +86,14 @@ def _motors(robot: Robot, names: Sequence[str], what: str, ranges: tuple[Vector,
         [(None, None)] * len(names) if ranges is None else [(float(a), float(b)) for a, b in zip(*ranges, strict=True)]
     )
     return tuple(
-        Port(name=name, unit=to_si(robot.motors.unit)[1], description=f"{what} {j}", minimum=low, maximum=high)
+        Port(
+            name=name,
+            unit=to_si(robot.motors.unit)[1],
+            description=f"{what} {j}",
+            minimum=low,
+            maximum=high,
+            display_unit=robot.motors.shown,
+        )
         for j, (name, (low, high)) in enumerate(zip(names, ends, strict=True), start=1)
     )
 
