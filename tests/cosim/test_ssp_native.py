@@ -23,7 +23,7 @@ from softneck.cosim.ssp._write import block_without_python
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.fmu import build_compiled_fmu, build_fmu
-from softneck.fmu.describe._description import described_block
+from softneck.fmu.describe._description import exported_block
 from softneck.fmu.python._zip import read_zip, write_zip
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block, Port
@@ -103,7 +103,7 @@ def test_omsimulator_computes_our_jacobi_loop(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["kalman", "pi", pytest.param("guarded", marks=pytest.mark.slow)])
 def test_a_python_fmu_gives_its_block_back(kind: str, tmp_path: Path) -> None:
     """What becomes a compiled FMU is what the Python one was made of: the same arrays, ports and starts."""
-    block = described_block(block_of(kind))
+    block = exported_block(block_of(kind))
     again = block_without_python(build_fmu(block, tmp_path / "Model.fmu"))
     assert again is not None
     for name in ("kind", "role", "runtime", "sample_time"):

@@ -32,7 +32,7 @@ from fmpy.validation import validate_fmu
 
 from softneck.core import load
 from softneck.fmu import build_compiled_fmu, build_fmu
-from softneck.fmu.describe._description import described_block
+from softneck.fmu.describe._description import exported_block
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 from softneck.runtime._compile import load_runtime
@@ -98,7 +98,7 @@ def case(kind: str, backend: str, folder: Path) -> Case:
         build_fmu(block, path, force=True)
     else:
         build_compiled_fmu(block, path, fmi=int(backend.split()[1][0]), force=True)
-    block = described_block(block)
+    block = exported_block(block)
     u = np.tile([port.start for port in block.inputs], (ROWS, 1))
     rng = np.random.default_rng(0)
     for i, port in enumerate(block.inputs):

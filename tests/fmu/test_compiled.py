@@ -105,12 +105,12 @@ def test_fmus_keep_compiled_code_where_softneck_does() -> None:
     ],
 )
 def test_the_cost_decides_what_is_compiled(kind: str, cost: str, toys: Any) -> None:
-    from softneck.fmu.python._build import plain_cost
+    from softneck.fmu.python._build import step_cost
 
     # The paper's 7,000 points; the network's lines do not depend on its size.
     special = {"nlsm": _many_points, "lag": toys.lag}
     block = special[kind]() if kind in special else block_of(kind)
-    assert plain_cost(block) == cost
+    assert step_cost(block) == cost
 
 
 def _many_points() -> Any:
@@ -158,7 +158,7 @@ def test_a_heavy_fmu_compiles_once_and_says_so_and_a_middling_one_waits_for_it(
 ) -> None:
     paths = {}
     for cost in ("light", "middling", "heavy"):
-        monkeypatch.setattr(_build, "plain_cost", lambda _block, cost=cost: cost)
+        monkeypatch.setattr(_build, "step_cost", lambda _block, cost=cost: cost)
         (tmp_path / cost).mkdir()
         paths[cost] = build_fmu(toys.lag(), tmp_path / cost / "Lag.fmu")
     cache = tmp_path / "cache"

@@ -24,8 +24,8 @@ from softneck.fmu.compiled._library import packaged_library
 from softneck.fmu.compiled._model_file import node_of
 from softneck.fmu.compiled._sources import FLAGS, c_sources, sources_key
 from softneck.fmu.compiled.translate._kinds import LIBRARIES, RUNTIMES, ranks_of
-from softneck.fmu.compiled.translate._translate import only_kinds
-from softneck.fmu.describe._description import described_block
+from softneck.fmu.compiled.translate._translate import select_kinds
+from softneck.fmu.describe._description import exported_block
 from softneck.fmu.python._zip import deflate, write_zip
 
 from .every_kind import NATIVE, TS, block_of, inputs_of
@@ -38,7 +38,7 @@ needs_all = pytest.mark.skipif(library is None, reason="the libraries of these s
 
 @pytest.mark.parametrize("kind", NATIVE)
 def test_a_part_of_the_library_holds_each_kind(kind: str) -> None:
-    block = described_block(block_of(kind))
+    block = exported_block(block_of(kind))
     modules = node_of(block.runtime, block.arrays).modules
     assert any(modules <= held for held in LIBRARIES.values()), modules
 
@@ -162,11 +162,11 @@ def _outputs(path: Path, block: Any, u: np.ndarray, running: Any, fmi: int) -> n
 
 def test_the_sources_of_one_kind_hold_no_other() -> None:
     text = c_sources().files["sn_kinds.h"]
-    alone = only_kinds(text, {"softneck.identification.linear._rls_runtime"})
+    alone = select_kinds(text, {"softneck.identification.linear._rls_runtime"})
     assert "sn_kind_count = 1;" in alone
     assert "mpc_" not in alone
     assert len(alone) < len(text) / 10
-    assert only_kinds(text, set(re.findall(r'\{"(softneck\.[\w.@]+)"', text))) == text
+    assert select_kinds(text, set(re.findall(r'\{"(softneck\.[\w.@]+)"', text))) == text
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.fmu.describe._description import described_block
+from softneck.fmu.describe._description import exported_block
 from softneck.runtime._rest_runtime import REST
 
 from ..data import slow_but
@@ -17,7 +17,7 @@ _LEAST_NORMAL = np.finfo(float).tiny
 
 @pytest.mark.parametrize("kind", slow_but(KINDS, ["rls", "play", "pi", "hinf"], ["oe2", "miso"]))
 def test_a_state_at_rest_holds_no_subnormal_number(kind: str) -> None:
-    block = described_block(block_of(kind))  # as its FMU holds it: a controller with the drives inside
+    block = exported_block(block_of(kind))  # as its FMU holds it: a controller with the drives inside
     rng = np.random.default_rng(0)
     at_rest = [port.start for port in block.inputs]
     moved = np.tile(at_rest, (50, 1))
@@ -33,7 +33,7 @@ def test_a_state_at_rest_holds_no_subnormal_number(kind: str) -> None:
 
 
 def test_modelled_drives_end_at_a_set_point_of_zero() -> None:
-    block = described_block(block_of("pi"))
+    block = exported_block(block_of("pi"))
     names = [port.name for port in block.inputs]
     rows = np.zeros((10_000, len(names)))
     rows[:, [names.index("healthy"), names.index("enabled")]] = 1.0

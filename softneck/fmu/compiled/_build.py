@@ -18,14 +18,14 @@ from softneck.runtime._tangent import with_tangent
 from softneck.runtime._tangent_activity import TangentError
 
 from ..describe._describe import Buildable, FmuInfo, block_and_info, documentation_page
-from ..describe._description import Identity, described_block, model_description, motor_positions, terminals_file
+from ..describe._description import Identity, exported_block, model_description, motor_positions, terminals_file
 from ..python._build import check_block, generation_date, license_text, model_name
 from ..python._zip import write_zip
 from ._compilers import PLATFORMS
 from ._library import Library, find_library
 from ._model_file import model_bytes, node_of
 from ._sources import FLAGS, GENERATED, MAIN, PROBE, Sources
-from .translate._translate import only_kinds
+from .translate._translate import select_kinds
 
 FMI_VERSIONS = (2, 3)
 _HOST_NOTE = (
@@ -72,7 +72,7 @@ def build_compiled_fmu(
     check_block(block)
     if fmi not in FMI_VERSIONS:
         raise SettingsError(f"unknown FMI version {fmi}; use 2 or 3.")
-    block = described_block(block)
+    block = exported_block(block)
     ahead = next_outputs(block) if sensitivities else ()
     modules = node_of(block.runtime, block.arrays).modules
     library = find_library(modules, sensitivities=True) if ahead else find_library(modules)
@@ -171,7 +171,7 @@ def _needed_sources(sources: Sources, modules: set[str], fmi: int) -> dict[str, 
     """Return only the sources for this model's kinds and FMI version: 40 kB less than the whole library."""
     other = f"fmi{5 - fmi}.h"
     files = {name: text for name, text in sources.files.items() if name not in (other, PROBE)}
-    files[GENERATED] = only_kinds(files[GENERATED], modules)
+    files[GENERATED] = select_kinds(files[GENERATED], modules)
     files[MAIN] = files[MAIN].replace(f'#include "{other}"\n', "")
     return files
 

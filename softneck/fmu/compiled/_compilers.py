@@ -50,7 +50,7 @@ PLATFORMS = {
 }
 
 
-def here() -> Platform | None:
+def this_platform() -> Platform | None:
     """Return the platform that this Python runs on, or None for one that is not in the table."""
     machine = platform.machine().lower()
     for entry in PLATFORMS.values():

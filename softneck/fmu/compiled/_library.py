@@ -19,10 +19,10 @@ import platformdirs
 from softneck.core import FileFormatError, SettingsError, atomic_write
 
 from ..python._zip import deflate
-from ._compilers import PLATFORMS, compile_for, compile_here, have_zig, here, local_compiler
+from ._compilers import PLATFORMS, compile_for, compile_here, have_zig, local_compiler, this_platform
 from ._sources import GENERATED, HERE, Sources, c_sources, sources_key
 from .translate._kinds import LIBRARIES, RUNTIMES
-from .translate._translate import only_kinds
+from .translate._translate import select_kinds
 
 BINARIES = HERE / "binaries"
 # With the derivatives of the kinds' steps: 1.5 times as large, so only for FMUs with sensitivities.
@@ -116,7 +116,7 @@ def platforms_built() -> tuple[list[str], str]:
     if manifest is not None and manifest["key"] == sources_key():
         return list(manifest["platforms"]), "built with this softneck"
     stale = "; those in binaries/ are of other sources, run `make native`" if manifest is not None else ""
-    machine, compiler = here(), local_compiler()
+    machine, compiler = this_platform(), local_compiler()
     if machine is None or (compiler is None and not have_zig()):
         return [], f"none is built and there is no C compiler{stale}"
     return [machine.name], f"by {compiler[0] if compiler else 'zig'} at the first export{stale}"
@@ -132,9 +132,9 @@ def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Librar
     digests = _finished_files(folder, key)
     for part, name in product(("", *LIBRARIES), PLATFORMS):
         if (file := _file_name(name, part)) not in digests:
-            _keep(folder, file, _deflate(compile_for(_of_part(sources, part), PLATFORMS[name])), digests)
+            _write(folder, file, _deflate(compile_for(_select_part(sources, part), PLATFORMS[name])), digests)
             (folder / _PROGRESS_FILE).write_text(json.dumps({"key": key, "files": digests}), encoding="utf-8")
-    _keep(folder, GENERATED, sources.files[GENERATED].encode(), digests)
+    _write(folder, GENERATED, sources.files[GENERATED].encode(), digests)
     manifest = {"key": key, "platforms": list(PLATFORMS), "files": digests, "refused": sources.refused}
     for path in folder.iterdir():  # of another version
         if path.name not in digests and path.is_file():
@@ -143,13 +143,13 @@ def build_all(folder: Path = BINARIES, *, sensitivities: bool = False) -> Librar
     return _read(folder, manifest)
 
 
-def _of_part(sources: Sources, part: str) -> Sources:
+def _select_part(sources: Sources, part: str) -> Sources:
     if not part:
         return sources
-    return replace(sources, files=sources.files | {GENERATED: only_kinds(sources.files[GENERATED], LIBRARIES[part])})
+    return replace(sources, files=sources.files | {GENERATED: select_kinds(sources.files[GENERATED], LIBRARIES[part])})
 
 
-def _keep(folder: Path, name: str, data: bytes, digests: dict[str, str]) -> None:
+def _write(folder: Path, name: str, data: bytes, digests: dict[str, str]) -> None:
     with atomic_write(folder / name, force=True) as temporary:
         temporary.write_bytes(data)
     digests[name] = hashlib.sha256(data).hexdigest()
@@ -176,7 +176,7 @@ def _deflate(data: bytes) -> bytes:
 
 def _local_library(modules: tuple[str, ...] = RUNTIMES, *, sensitivities: bool = False) -> Library:
     """Return the library of this machine: from the user's cache, or compiled now."""
-    machine, compiler = here(), local_compiler()
+    machine, compiler = this_platform(), local_compiler()
     if machine is None or (compiler is None and not have_zig()):
         raise SettingsError(
             "there is no compiled library here and no C compiler to make one; run `make native` (it needs "

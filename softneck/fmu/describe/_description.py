@@ -108,7 +108,7 @@ class Identity:
     ahead: int = 0
 
 
-def described_block(block: Block) -> Block:
+def exported_block(block: Block) -> Block:
     """Return `block` as in its FMU: controllers with a model of the drives, references with a range."""
     whole = with_modelled_drives(block)
     return replace(whole, inputs=tuple(_with_reference_range(port) for port in whole.inputs))

@@ -28,7 +28,7 @@ from softneck.runtime import Block, Port, load_runtime
 from softneck.runtime._own import PREFIX
 
 from ..describe._describe import HOST_NEEDS, Buildable, FmuInfo, block_and_info, documentation_page
-from ..describe._description import Identity, described_block, generation_tool, model_description, terminals_file
+from ..describe._description import Identity, exported_block, generation_tool, model_description, terminals_file
 from ._module import slave_module
 from ._zip import read_zip, write_zip
 
@@ -69,7 +69,7 @@ def build_fmu(
     refuse_existing(target, force=force)
     block, said = block_and_info(thing, info)
     check_block(block)
-    members = _members(described_block(block), said, name)
+    members = _members(exported_block(block), said, name)
     with atomic_write(target, force=force) as temporary:
         write_zip(temporary, members)
     return target
@@ -134,7 +134,7 @@ def _facts(block: Block, name: str) -> dict[str, Any]:
         "kind": block.kind,
         "role": block.role,
         "sample_time": float(block.sample_time),
-        "cost": "own" if PREFIX in block.runtime else plain_cost(block),
+        "cost": "own" if PREFIX in block.runtime else step_cost(block),
         "module_of_runtime": ""
         if PREFIX in block.runtime
         else block.runtime,  # not for the slave: by this a compiled FMU can be made of this one
@@ -226,7 +226,7 @@ def license_text(package: str, stated: str) -> str:
 _MIDDLING_LINES, _HEAVY_LINES, _HEAVY_NUMBERS = 150, 1000, 20_000
 
 
-def plain_cost(block: Block) -> str:
+def step_cost(block: Block) -> str:
     """Return "light", "middling" or "heavy": the cost of a step of `block` in plain Python."""
     if sum(array.size for array in block.arrays) > _HEAVY_NUMBERS:
         return "heavy"

@@ -59,7 +59,7 @@ class Expressions:
             before = len(self.scope.lines)
             value = self.value(node)
             if len(self.scope.lines) > before and values:
-                written = self.scope.taken_back(before)
+                written = self.scope.cut_lines(before)
                 values = [v if self._is_fixed(v) else self.scope.store(v) for v in values]
                 self.scope.lines += written
             values.append(value)
@@ -67,7 +67,7 @@ class Expressions:
 
     def _is_fixed(self, value: Value) -> bool:
         """Return whether later statements of the same expression cannot change a value."""
-        return value.known is not None or value.code.isidentifier() or value.code in self.scope.lent.values()
+        return value.known is not None or value.code.isidentifier() or value.code in self.scope.by_pointer.values()
 
     def scalar(self, node: ast.expr, kind: Scalar) -> str:
         """Return C of a number of one kind."""
@@ -90,7 +90,7 @@ class Expressions:
     def _name(self, node: ast.Name) -> Value:
         kind = self.scope.variables.get(node.id)
         if kind is not None:
-            return Value(self.scope.lent.get(node.id, f"v_{node.id}"), kind)
+            return Value(self.scope.by_pointer.get(node.id, f"v_{node.id}"), kind)
         if node.id in self.constants:
             return self.value(self.constants[node.id])
         raise self.scope.fail(node, "this name is not defined, or not on every path to here.")

@@ -64,7 +64,7 @@ class Value:
     known: int | float | bool | None = None
 
 
-def lends(kind: Type) -> bool:
+def is_passed_by_pointer(kind: Type) -> bool:
     """Return whether a parameter is passed by pointer: it does not fit two registers."""
     return isinstance(kind, Bundle) or (isinstance(kind, View) and kind.rank > 1)
 
@@ -136,7 +136,7 @@ class Scope:
         lines: of C.
         variables: name -> type, widened from pass to pass.
         allocates: whether the function allocates workspace.
-        lent: parameter passed by pointer, or a named part of one -> C.
+        by_pointer: parameter passed by pointer, or a named part of one -> C.
     """
 
     def __init__(self, function: str, types: CTypes, variables: dict[str, Type]) -> None:
@@ -144,7 +144,7 @@ class Scope:
         self.lines: list[str] = []
         self.temporaries: list[tuple[str, Type]] = []
         self.allocates = False
-        self.lent: dict[str, str] = {}
+        self.by_pointer: dict[str, str] = {}
         self.widened = False
 
     def emit(self, line: str) -> None:
@@ -183,7 +183,7 @@ class Scope:
 
     def argument(self, value: Value) -> str:
         """Return C of an argument: matrices, cubes and tuples by address, others by value."""
-        return self.place(value) if lends(value.type) else value.code
+        return self.place(value) if is_passed_by_pointer(value.type) else value.code
 
     def store(self, value: Value) -> Value:
         """Evaluate `value` into a new variable and return that; constants stay as they are."""
@@ -202,7 +202,7 @@ class Scope:
         finally:
             self.lines = outside
 
-    def taken_back(self, before: int) -> list[str]:
+    def cut_lines(self, before: int) -> list[str]:
         """Remove the lines after the first `before` and return them."""
         written = self.lines[before:]
         del self.lines[before:]

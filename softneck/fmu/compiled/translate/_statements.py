@@ -104,9 +104,9 @@ class Statements:
         if value.type == NONE:
             raise self.scope.fail(target, "there is no value to assign.")
         if isinstance(target, ast.Name):
-            if isinstance(value.type, Bundle) and self._bound[target.id] == 1 and self._is_lent(value):
+            if isinstance(value.type, Bundle) and self._bound[target.id] == 1 and self._is_by_pointer(value):
                 self.scope.variables.setdefault(target.id, value.type)
-                self.scope.lent[target.id] = value.code
+                self.scope.by_pointer[target.id] = value.code
             elif target.id != "_":
                 kind = self.scope.bind(target.id, value.type)
                 self.scope.emit(f"v_{target.id} = {self.scope.cast(value, kind)};")
@@ -114,7 +114,7 @@ class Statements:
             if not isinstance(value.type, Bundle) or len(value.type.items) != len(target.elts):
                 raise self.scope.fail(target, "the tuple has another length.")
             # The target of a pointer parameter does not change meanwhile: it is read in place.
-            held = value if self._is_lent(value) else self.scope.store(value)
+            held = value if self._is_by_pointer(value) else self.scope.store(value)
             for i, (part, kind) in enumerate(zip(target.elts, value.type.items, strict=True)):
                 self.assign(part, Value(held.code + self.scope.types.field(value.type, i), kind))
         elif isinstance(target, ast.Subscript):
@@ -122,16 +122,18 @@ class Statements:
         else:
             raise self.scope.fail(target, "nothing can be assigned to this.")
 
-    def _is_lent(self, value: Value) -> bool:
+    def _is_by_pointer(self, value: Value) -> bool:
         """Return whether `value` is in the target of a pointer parameter."""
-        return self.scope.has_place(value) and any(value.code.startswith(place) for place in self.scope.lent.values())
+        return self.scope.has_place(value) and any(
+            value.code.startswith(place) for place in self.scope.by_pointer.values()
+        )
 
     def _store(self, target: ast.Subscript, value: Value) -> None:
         # Python evaluates the value before the target.
         before = len(self.scope.lines)
         place = self.ex.value(target)
         if len(self.scope.lines) > before and value.known is None:
-            written = self.scope.taken_back(before)
+            written = self.scope.cut_lines(before)
             value = self.scope.store(value)
             self.scope.lines += written
         self.put(target, place, value)
@@ -247,15 +249,15 @@ class Statements:
             for target in ([part.target] if isinstance(part, ast.AnnAssign) else part.targets)
             for name in ast.walk(target) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
         }  # fmt: skip
-        arrays = {name for name in bound if holds_view(self.scope.variables.get(name))}
+        arrays = {name for name in bound if contains_array(self.scope.variables.get(name))}
         inside = {id(part) for part in ast.walk(node)}
         names = (part for part in ast.walk(self._function) if isinstance(part, ast.Name) and id(part) not in inside)
         return bool(arrays & {name.id for name in names})
 
 
-def holds_view(kind: Type | None) -> bool:
+def contains_array(kind: Type | None) -> bool:
     if isinstance(kind, Bundle):
-        return any(holds_view(item) for item in kind.items)
+        return any(contains_array(item) for item in kind.items)
     return isinstance(kind, View)
 
 

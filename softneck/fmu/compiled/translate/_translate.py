@@ -32,9 +32,9 @@ from ._scope import (
     Type,
     Value,
     View,
-    lends,
+    is_passed_by_pointer,
 )
-from ._statements import Statements, holds_view
+from ._statements import Statements, contains_array
 
 _MEMBERS = {
     "member_size": (2, INT, "sn_member_size(w, {})"),
@@ -56,7 +56,7 @@ class _TranslatedFunction:
 
     name: str
     result: Type
-    lent: tuple[bool, ...]
+    by_pointer: tuple[bool, ...]
 
 
 @dataclass(slots=True)
@@ -80,7 +80,7 @@ class Unit:
         arrays = Arrays(ranks)
         try:
             text = bundle(module, loops=False)
-            runtime = _Runtime(self, along_one(text) if tangent else text)
+            runtime = _Runtime(self, with_single_tangent(text) if tangent else text)
             size = runtime.function("state_size", (arrays,))
             start = runtime.function("initialise", (arrays, VECTOR, VECTOR, VECTOR))
             step = runtime.function("step", (arrays, VECTOR, VECTOR, VECTOR, VECTOR))
@@ -118,7 +118,7 @@ class Unit:
         table = "static const sn_kind sn_kinds[] = {\n" + "\n".join(self.kinds) + "\n};\n"
         count = f"static const int sn_kind_count = {len(self.kinds)};\n"
         fast = self._fast()
-        functions = [_fast(text) if defined_name(text) in fast else _small(text) for text in self.functions]
+        functions = [_mark_fast(text) if defined_name(text) in fast else _mark_small(text) for text in self.functions]
         return "\n".join([head, guard, *self.types.declarations, "", *functions, table, count, "#endif\n"])
 
     def _fast(self) -> set[str]:
@@ -173,11 +173,13 @@ class _Runtime:
             raise TranslationError(f"`{node.name}` must be called with all arguments, by position.")
         variables: dict[str, Type] = dict(zip(names, arguments, strict=True))
         bound = {part.id for part in ast.walk(node) if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store)}
-        lent = {name: f"(*v_{name})" for name, kind in variables.items() if lends(kind) and name not in bound}
+        by_pointer = {
+            name: f"(*v_{name})" for name, kind in variables.items() if is_passed_by_pointer(kind) and name not in bound
+        }
         result: Type | None = None
         for _ in range(_MOST_PASSES):
             scope = Scope(node.name, self.unit.types, variables)
-            scope.lent = lent
+            scope.by_pointer = by_pointer
             statements = Statements(node, scope, Expressions(scope, self.constants, self._call), result)
             statements.block(node.body)
             settled = not scope.widened and statements.result == result
@@ -189,7 +191,7 @@ class _Runtime:
         result = NONE if result is None else result
         text = self._text(node, names, arguments, scope, result)
         made = self.unit.keep(re.sub(r"\W", "_", node.name), text)
-        return _TranslatedFunction(made, result, tuple(name in lent for name in names))
+        return _TranslatedFunction(made, result, tuple(name in by_pointer for name in names))
 
     def _text(
         self, node: ast.FunctionDef, names: list[str], arguments: tuple[Type, ...], scope: Scope, result: Type
@@ -199,16 +201,16 @@ class _Runtime:
         widened = [name for name in names if scope.variables[name] != given[name]]
         declared = [
             f"const {spell(kind)} *v_{name}"
-            if name in scope.lent
+            if name in scope.by_pointer
             else f"{spell(kind)} {'a' if name in widened else 'v'}_{name}"
             for name, kind in given.items()
         ]
         # A returned array may be in the workspace: then the caller releases it.
-        releases = scope.allocates and not holds_view(result)
+        releases = scope.allocates and not contains_array(result)
         own = [
             (f"v_{name}", kind)
             for name, kind in scope.variables.items()
-            if (name not in given and name not in scope.lent) or name in widened
+            if (name not in given and name not in scope.by_pointer) or name in widened
         ]
         lines = [f"{spell(kind)} {name}{_zero(kind)};" for name, kind in own + scope.temporaries]
         lines += ["size_t top = w->top;"] if releases else []
@@ -252,14 +254,15 @@ class _Runtime:
         else:
             done = self.function(name, tuple(value.type for value in values))
             codes = [
-                ex.scope.place(value) if lent else value.code for value, lent in zip(values, done.lent, strict=True)
+                ex.scope.place(value) if by_pointer else value.code
+                for value, by_pointer in zip(values, done.by_pointer, strict=True)
             ]
             arguments = "".join(f", {code}" for code in codes)
             value = Value(f"{done.name}(w{arguments})", done.result)
         if value.type == NONE:
             ex.scope.emit(f"{value.code};")
             return Value("", NONE)
-        ex.scope.allocates |= holds_view(value.type)
+        ex.scope.allocates |= contains_array(value.type)
         return ex.scope.store(value)
 
 
@@ -268,12 +271,12 @@ def _tangent_of(runtime: _Runtime, arrays: Arrays) -> str:
     return runtime.function("step_tangent", (arrays, VECTOR, VECTOR, VECTOR, VECTOR, *rows, INT)).name
 
 
-def _fast(text: str) -> str:
+def _mark_fast(text: str) -> str:
     """Return a function as inline, with inline checks of whole numbers."""
     return text.replace("sn_int(", "sn_int_here(").replace("\nstatic ", "\nstatic inline ", 1)
 
 
-def _small(text: str) -> str:
+def _mark_small(text: str) -> str:
     return text.replace("\nstatic ", "\nSN_SMALL static ", 1)
 
 
@@ -308,7 +311,7 @@ def _zero(kind: Type) -> str:
 
 
 @cache
-def along_one(text: str) -> str:
+def with_single_tangent(text: str) -> str:
     """Return the bundle `text` with its `step_tangent` (see `softneck.runtime._tangent`) for a single direction.
 
     Raises:
@@ -373,7 +376,7 @@ def nested_loops(piece: str) -> int:
     return most
 
 
-def only_kinds(text: str, modules: Set[str]) -> str:
+def select_kinds(text: str, modules: Set[str]) -> str:
     """Return `sn_kinds.h` with only the runtimes `modules`."""
     left_out = [entry[0] for entry in _ENTRY.finditer(text) if entry[1] not in modules]
     for entry in left_out:
