@@ -1,18 +1,22 @@
-"""softneck design: a controller from an identified linear model."""
+"""softneck design and observer: a controller, and a filter, from an identified model."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve
+from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve, to_si
 from softneck.core._kinds import kinds_of
 from softneck.robot._loading import load_for_robot
 
 from .shared._console import note, print_json, progress
 from .shared._groups import kinds_complete
 from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
+
+if TYPE_CHECKING:
+    from softneck.estimation._fitted import FittedObserver
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 
@@ -69,3 +73,87 @@ def command(
         print_json({"controller": str(path), "kind": kind, "summary": controller.summary()})
         return
     click.echo(f"{path}\n{controller.summary()}")
+
+
+@click.command(
+    "observer",
+    cls=kind_command("observer", "kalman"),
+    epilog="Example: softneck observer rls.npz -o observer.npz --set sensor=paper",
+)
+@click.argument("model", type=click.Path(path_type=Path))
+@output_option("observer", "OBSERVER")
+@click.option(
+    "--data",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="REC",
+    help="Estimate the noise levels from this recording (maximum likelihood); with --set sensor=NAME all but that of "
+    "the measurement. May be given several times.",
+)
+@set_option
+@common_options("robot", "force")
+def observer_command(
+    model: Path,
+    output: Path | None,
+    data: tuple[Path, ...],
+    robot: str | None,
+    settings: tuple[str, ...],
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Build a filter over the identified MODEL.
+
+    The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; of a nonlinear
+    one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
+    state.
+    """
+    from softneck.estimation._observer import designed
+
+    kind = find_kind("kalman", "observer")
+    path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
+    refuse_existing(path, force=replace)
+    chosen = apply_settings(resolve(kind.settings), settings)
+    observer = designed(chosen, model, robot)
+    told: dict[str, Any] = {}
+    lines: list[str] = []
+    if data:
+        named = {setting.partition("=")[0].strip() for setting in settings}
+        found, lines = _fitted(observer, data, robot, named)
+        observer, fit = found.observer, found.fit
+        told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
+                        "at_bound": list(fit.at_bound), "not_told": list(found.untold), "held_out": found.checks,
+                        "kept": found.kept != "default", "what": found.kept}}  # fmt: skip
+    observer.save(path, force=replace)
+    if as_json:
+        noise = dict(zip(observer.noise_names, observer.noise, strict=True))
+        summary = {"observer": str(path), "kind": observer.block().kind, "form": observer.form, "noise": noise}
+        print_json({**summary, **told, "summary": observer.summary()})
+        return
+    click.echo("\n".join([str(path), observer.summary(), *lines]))
+
+
+def _fitted(
+    observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
+) -> tuple[FittedObserver, list[str]]:
+    """Return what the recordings make of the observer, and what to say of it."""
+    # Imported here: `softneck --help` must not wait for scipy's optimisers.
+    from softneck.estimation import consistency
+    from softneck.estimation._observer import fitted
+    from softneck.signals import read_recording
+
+    recordings = [read_recording(path, robot=robot) for path in data]
+    found = fitted(observer, recordings, named)
+    unit = observer.robot.outputs.display_unit
+    before, after = found.fit.log_likelihood
+    lines = [
+        f"  noise from {found.fit.rows} measurements, {found.fit.outliers} outliers left out; "
+        f"log likelihood of each {before:.2f} -> {after:.2f}"
+    ]
+    if found.untold:
+        lines.append(f"  not told by the data: {', '.join(found.untold)}")
+    errors = ", ".join(f"{name} {error / to_si(unit)[0]:.3f}" for name, error in found.checks.items())
+    verdict = "no better, so the defaults are kept" if found.kept == "default" else f"{found.kept} kept"
+    lines.append(f"  error [{unit}] of the look ahead on {found.rows} rows held out: {errors}: {verdict}")
+    for path, recording in zip(data, recordings, strict=True):
+        lines += [f"  {path.name}: {line}" for line in consistency(found.observer, recording).summary().splitlines()]
+    return found, lines
