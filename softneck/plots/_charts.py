@@ -11,6 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 from softneck.signals import Recording
 from softneck.signals.recording._channels import NECK
 
@@ -87,6 +88,8 @@ def _moved(time: Vector, breaks: np.ndarray, usual: float) -> tuple[Vector, bool
 
 BLACK, _BOUND = "black", "99 % bounds"
 _ZERO = Level(0.0, dashed=False)
+# Of scaled outputs, 1 deg of the neck: noise of one that rests does not fill its panel.
+_LEAST_RANGE = np.radians(1.0)
 _OUTPUT_COLOURS = (BLUE, ORANGE, GREEN, SKY)
 
 
@@ -133,7 +136,8 @@ def validation_chart(
         robot: whose outputs these are; they are drawn in its display unit.
     """
     line = timeline(time, run)
-    panels, unit = [], robot.outputs.display_unit
+    panels, unit, there = [], robot.outputs.display_unit, np.where(np.isfinite(measured).any(axis=0), measured, 0.0)
+    least = shown(_LEAST_RANGE * Scaling.of(robot, outputs=there).output_unit, robot)
     for i, axis in enumerate(robot.outputs.names):
         y = line.spread(shown(measured[:, i], robot))
         curves, errors = [], []
@@ -145,7 +149,7 @@ def validation_chart(
             yhat = line.spread(shown(values[:, i], robot))
             curves.append(Curve(line.x, yhat, name, colour, style, 0.9))
             errors.append(Curve(line.x, y - yhat, name, colour, style, 0.8))
-        panels.append(Panel(curves, f"{axis} [{unit}]", y_range=_range_for(y, curves, 1.0 if unit == "deg" else 0.0)))
+        panels.append(Panel(curves, f"{axis} [{unit}]", y_range=_range_for(y, curves, float(least[i]))))
         panels.append(Panel(errors, f"error [{unit}]", levels=(_ZERO,), legend=False))
     return Chart(title, panels, line.x_label, caption=caption, row_height=1.9)
 

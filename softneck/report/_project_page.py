@@ -100,15 +100,6 @@ def _data(project: Project) -> Section | None:
 def _models(project: Project, progress: Progress) -> Section | None:
     if not project.models:
         return None
-    head = [
-        "model on data",
-        "rows judged",
-        "one step",
-        "25 steps",
-        "free run",
-        "rms free [deg]",
-        "persistence, one step",
-    ]
     rows, charts, texts = [], [], []
     judged_on = list(project.recordings.items())[:_MOST_DATA]
     # What stands beside a model is the same for all that have seen the same rows: it takes longer than to judge one.
@@ -128,7 +119,11 @@ def _models(project: Project, progress: Progress) -> Section | None:
                 charts.append(_judged(result, f"{name} on {data}: free run"))
     tables = [Table("Models", ["model", "kind", "summary"], texts, text=3)]
     if rows:
-        tables.append(Table("Fits in %, pitch/roll, on rows that the model was not trained on", head, rows))
+        outputs = judged_on[0][1][0].robot.outputs  # a project is of one robot
+        head = ["model on data", "rows judged", "one step", "25 steps", "free run",
+                f"rms free [{outputs.display_unit}]", "persistence, one step"]  # fmt: skip
+        title = f"Fits in %, {'/'.join(outputs.names)}, on rows that the model was not trained on"
+        tables.append(Table(title, head, rows))
     words = [] if rows else ["No recording of this project has rows on which a model can be judged."]
     if len(project.recordings) > _MOST_DATA:
         words.append(f"Judged on the first {_MOST_DATA} of {len(project.recordings)} recordings.")

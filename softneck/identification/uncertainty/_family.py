@@ -267,8 +267,9 @@ class Family(Shown):
             "lpv_source": None,  # format 1 names an interpolation over the inclination here; there is none any more
             **self.robot.in_header(),
         }
-        if self.directions is not None:
-            arrays["directions"] = self.directions
+        weights, own = self.directions, self.robot.weights()
+        if weights is not None and (own is None or not np.array_equal(weights, own)):
+            arrays["directions"] = weights
         for name, found in self.measured.items():
             arrays |= {f"{name}_measured_{key}": value for key, value in found.arrays().items()}
         write_archive(path, header, arrays, force=force)
