@@ -127,7 +127,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         table["reference"]["cocontraction"] = task.said_cocontraction
     asked = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
              if b.metric.startswith("sim.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
-    known = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_")
+    known = ("rise_s", "steady_rms_") + (("overshoot_pct", "settling_s") if task.asked.told() else ())
     table["limits"] = {f"{first}.{key}": limit for key, limit in asked.items() if key.startswith(known)}
     words = "" if found.observed else (
         "\n# Without observer.npz: with it in the loop a requirement on the steps breaks, or there is none."

@@ -11,7 +11,6 @@ import numpy as np
 from softneck.core import DataError, Vector, to_si
 from softneck.loop import Loop, LoopResult, SensorFault, run_loop
 from softneck.loop._references import Reference, RobotReference
-from softneck.loop._result import SETTLING_BAND
 from softneck.robot import Robot
 from softneck.runtime import Block
 from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at, step_loop
@@ -22,8 +21,6 @@ from ._requirements import Task, TuneRequirements, circles
 _LED, _TURNS = 2.0, 2.0
 # A reference is known so much earlier at most [s].
 _AHEAD = 0.8
-# Standard deviations of noise: of some hundred samples one may be so far off.
-_SIGMAS = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +71,8 @@ def run_case(
     if case.circle:
         return {}, _distances(loop, task)
     asked = task.asked.certificate
-    # What is asked of a robot is seen by its sensor: a quiet output overshoots less. One whose noise alone leaves the
-    # band in which a step has settled shows neither.
-    told = _SIGMAS * task.asked.track["noise_deg"] <= SETTLING_BAND * case.part * float(asked.sim["size_deg"])
-    values, result = judge_loop(loop, compiled=True, angle="measured" if told else "true")
+    # What is asked of a robot is seen by its sensor: a quiet output overshoots less.
+    values, result = judge_loop(loop, compiled=True, angle="measured" if task.asked.told(case.part) else "true")
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
     name_of = asked.scale.name_of
     found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}

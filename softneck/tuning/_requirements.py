@@ -13,6 +13,7 @@ from typing import Any
 from softneck.core import KINDS, SettingsError, resolve, to_si
 from softneck.identification import Model
 from softneck.loop import default_limits
+from softneck.loop._result import SETTLING_BAND
 from softneck.robot import Robot
 from softneck.verification import Requirements, make_requirements
 from softneck.verification._requirements import (
@@ -28,6 +29,8 @@ from softneck.verification._requirements import (
 from softneck.verification._scale import Scale, digits
 
 _RISE = "sim.rise_s"
+# Standard deviations of noise: of some hundred samples one may be so far off.
+_SIGMAS = 4.0
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Least, largest and unit of the numbers of [track].
 _TRACK = {
@@ -65,6 +68,11 @@ class TuneRequirements:
         """Return the largest value that is allowed of a metric on the plants; None where nothing bounds it."""
         limits = [item.limit for item in self.bounds if item.metric == metric and item.bound != "min"]
         return min(limits, default=None)
+
+    def told(self, part: float = 1.0) -> bool:
+        """Return whether the sensor shows if a part of the step has settled: its noise alone stays in that band."""
+        size = part * float(self.certificate.sim["size_deg"])
+        return _SIGMAS * self.track["noise_deg"] <= SETTLING_BAND * size
 
     def lines(self) -> list[str]:
         """Return each requirement as a line for people."""

@@ -285,10 +285,7 @@ def _nearest(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress
         return found
     asked = loosened(task.asked, {metric: one.limit for metric, one in kept.items()})
     progress(0.9, "verify what holds")
-    verification = verify(
-        found.controller, {**task.linear, **task.own}, asked.certificate, files=files, progress=silent,
-        observer=task.observer if watched(task, found.best.kind) is not None else None,
-    )  # fmt: skip
+    verification = _certified(replace(task, asked=asked), found.controller, found.best.kind, files)
     if not verification.holds:
         return found
     return replace(
@@ -311,18 +308,17 @@ def _verified(
     for number, item in enumerate(promising):
         controller = designed(task, ready, item.kind, item.settings)
         progress(number / len(promising), f"verify {item.kind}")
-        verification = verify(
-            controller,
-            {**task.linear, **task.own},
-            task.asked.certificate,
-            files=files,
-            progress=silent,
-            observer=task.observer if watched(task, item.kind) is not None else None,
-        )
+        verification = _certified(task, controller, item.kind, files)
         if verification.holds:
             return item, verification, controller
         found.append((item, verification, controller))
     return found[0]
+
+
+def _certified(task: Task, controller: Any, kind: str, files: Mapping[str, tuple[str, str]] | None) -> Verification:
+    observer = task.observer if watched(task, kind) is not None else None
+    plants = {**task.linear, **task.own}
+    return verify(controller, plants, task.asked.certificate, files=files, progress=silent, observer=observer)
 
 
 def _observer(task: Task) -> Any:

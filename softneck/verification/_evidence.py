@@ -263,16 +263,12 @@ def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
     smaller = {name.partition(".")[2] for name in table if name.startswith(f"{axes[0]}.")}
     for name in smaller:
         for axis in axes:
-            _add(evidence, f"axes.{name}", evidence_of(part, f"{axis}.{name}", describe))
+            found = f"{axis}.{name}"
+            _add(evidence, f"axes.{name}", Values(part.margins[found], _with_axis(describe, found, axes)))
     for rows in part.structured:
         for row in rows:
             about = _structured_describer(row, part.name)
             _add(evidence, "robust.mu", Values(np.array([row.mu]), about))
-
-
-def evidence_of(part: LinearEvidence, name: str, describe: Describe) -> Values:
-    """Return the values of one margin with a describer that knows its axis."""
-    return Values(part.margins[name], _with_axis(describe, name, part.plants.axes))
 
 
 def _add(evidence: Evidence, name: str, more: Values) -> None:
