@@ -20,7 +20,7 @@ from softneck import __version__
 from ._budget import MOST_JSON, settings_text
 from ._errors import CheckFailedError, FileFormatError
 from ._files import atomic_write, file_hash
-from ._shown import Shown
+from ._repr import ReprMixin
 
 CERTIFICATE_VERSION = 1
 # The commands that write certificates.
@@ -31,7 +31,7 @@ _FOLDER = Path("build") / "certificates"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Certificate(Shown):
+class Certificate(ReprMixin):
     """A certificate as read from its file.
 
     Attributes:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from softneck.core import SettingsError, find_kind, resolve
 from softneck.core._kinds import fitting, make_settings
-from softneck.core._shown import percent
+from softneck.core._repr import percent
 from softneck.robot import Robot
 from softneck.robot._loading import load_for_robot
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._linear_systems import weights_of
 from softneck.robot import Robot
@@ -30,7 +30,7 @@ class HasTransferFunctions(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class LinearNeck(Shown):
+class LinearNeck(ReprMixin):
     """Two transfer functions of one's own as a model of the neck, dead time as poles at zero.
 
     Attributes:
@@ -49,7 +49,7 @@ class LinearNeck(Shown):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class AxisPlant(Shown):
+class AxisPlant(ReprMixin):
     """`y(z) = z^-delay B(z)/A(z) u(z)` with deg B < deg A; monic A.
 
     Attributes:

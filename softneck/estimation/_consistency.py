@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softneck.core import DataError
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
@@ -20,7 +20,7 @@ from ._offline import measured_names
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Consistency(Shown):
+class Consistency(ReprMixin):
     """NIS of a filter over a recording: e' S^-1 e of every measurement that was taken in.
 
     Of a consistent filter chi-square with a degree of freedom for each output. Outliers would drown what it says.

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, to_si, write_archive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized_name
@@ -48,7 +48,7 @@ _SOURCES = {"given": "as given", "sensor": "of the sensor", "robot": "of the rob
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class KalmanObserver(Shown):
+class KalmanObserver(ReprMixin):
     """A designed Kalman filter; `KalmanSettings.design` makes it.
 
     Attributes:

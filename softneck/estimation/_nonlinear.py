@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._linear_systems import KINDS as LINEAR
@@ -50,7 +50,7 @@ _MEANINGS = ("standard deviation", "standard deviation", "of the model's fastest
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class NonlinearObserver(Shown):
+class NonlinearObserver(ReprMixin):
     """A filter over an identified model of any kind; `KalmanSettings.design` makes it.
 
     The angle is what the model makes of the set-points in free run, plus a disturbance that walks: at rest by

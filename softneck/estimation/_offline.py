@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
 
@@ -18,7 +18,7 @@ from ._kalman_runtime import KalmanFullState
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Estimates(Shown):
+class Estimates(ReprMixin):
     """What the filter made of a recording, row by row; angles of another robot are its outputs, in SI.
 
     Attributes:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from softneck.core import SettingsError, require_one_of, require_positive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 
 from ._faults import Fault
@@ -21,7 +21,7 @@ USE_MOTOR_POSITIONS = "use_motor_positions"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Loop(Shown):
+class Loop(ReprMixin):
     """A closed loop.
 
     Attributes:
@@ -100,7 +100,7 @@ class Loop(Shown):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class System(Shown):
+class System(ReprMixin):
     """Parts and their connections; nothing is connected by name, and no part must be a plant or a controller.
 
     Attributes:

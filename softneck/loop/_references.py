@@ -19,7 +19,7 @@ from softneck.core import (
     require_positive,
     to_si,
 )
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 
 from ._reference_runtime import reference_rotation, reference_row, reference_value
@@ -84,7 +84,7 @@ class RobotReference:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class RecordingReference(Shown):
+class RecordingReference(ReprMixin):
     """Recorded outputs of any robot, each row held until the next; the last one is held to the end.
 
     Attributes:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class LoopResult(Shown):
+class LoopResult(ReprMixin):
     """All signals of one run, named as in a recording.
 
     At row k stand the outputs of the plant at t_k and what observer and controller held from t_k on.

@@ -23,7 +23,7 @@ from softneck.core import (
     silent,
 )
 from softneck.core._blas_threads import one_blas_thread
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.signals import Recording
 
 from ._neck import VirtualNeck, has_own_tendons
@@ -47,7 +47,7 @@ _PRIOR = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Calibration(Shown):
+class Calibration(ReprMixin):
     """A neck and how well it follows what it was not fitted to.
 
     Attributes:

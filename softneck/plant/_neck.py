@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 from softneck.runtime._bundle import sized_name
@@ -95,7 +95,7 @@ def _outputs(robot: Robot) -> tuple[Port, ...]:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class VirtualNeck(Shown):
+class VirtualNeck(ReprMixin):
     """A physics model of the tendon-driven soft neck (docs, "The virtual neck"), or of a robot built like it.
 
     Attributes:

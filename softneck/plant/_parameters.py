@@ -13,7 +13,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, SettingsError, Vector, require_between, require_one_of
 from softneck.core._budget import settings_text
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.runtime import Port
 
 from ._presets import PRESETS, SENSORS
@@ -32,7 +32,7 @@ def _number(default: float, unit: str, low: float, high: float, text: str, sourc
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class NeckParameters(Shown):
+class NeckParameters(ReprMixin):
     """Every number of the virtual neck; `about(name)` tells its unit, range and source.
 
     The defaults are the preset `paper`. Sources that read "calibrated" were fitted as the docs page "The

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, Vector, require_one_of, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from ._style import BLUE, GREY, looks
 
@@ -23,7 +23,7 @@ STYLES = ("line", "dashed", "dotted", "points", "marked", "step", "bars", "stems
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Curve(Shown):
+class Curve(ReprMixin):
     """One set of points, drawn in one style; a NaN breaks lines and bands, nothing is drawn across it.
 
     Attributes:
@@ -84,7 +84,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Panel(Shown):
+class Panel(ReprMixin):
     """One pair of axes.
 
     Attributes:
@@ -114,7 +114,7 @@ class Panel(Shown):
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Chart(Shown):
+class Chart(ReprMixin):
     """Panels under each other (or in several columns) that belong together.
 
     Attributes:

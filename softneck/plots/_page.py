@@ -13,14 +13,14 @@ import numpy as np
 from markupsafe import Markup
 
 from softneck.core import atomic_write
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from ._chart import Chart, Curve
 from ._interactive import LICENCE, compressed, draw, library
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Table(Shown):
+class Table(ReprMixin):
     """A table of text; a cell "holds" or "fails" is coloured.
 
     Attributes:
@@ -37,7 +37,7 @@ class Table(Shown):
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Section(Shown):
+class Section(ReprMixin):
     """One part of a page; what is shown stands before its numbers, and these before how they came about.
 
     Attributes:

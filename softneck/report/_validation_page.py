@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, to_si
-from softneck.core._shown import percent
+from softneck.core._repr import percent
 from softneck.identification import INFINITE, Validation
 from softneck.plots import Chart, Section, Table, page
 from softneck.plots._charts import residual_chart, validation_chart

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_positive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from . import _file
 from ._channels import Motors, Outputs, motor_channels, parse_numbered
@@ -22,7 +22,7 @@ from ._redefined import redefinition_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Robot(Shown):
+class Robot(ReprMixin):
     """A robot with its motors, outputs, directions and properties; None if not given.
 
     Attributes:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from ._compile import Runtime, load_runtime
 
@@ -44,7 +44,7 @@ class Port:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class State(Shown):
+class State(ReprMixin):
     """The state of a block at one instant.
 
     Attributes:
@@ -59,7 +59,7 @@ class State(Shown):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Block(Shown):
+class Block(ReprMixin):
     """A discrete-time system with named ports, described by a runtime module and its arrays.
 
     A plant's `step` holds the inputs over [t_k, t_k+1) and returns the outputs at t_k+1; that of an

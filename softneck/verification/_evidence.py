@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, Vector
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.loop._result import shown_unit
 from softneck.runtime import Block
 
@@ -71,7 +71,7 @@ class LinearEvidence:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Evidence(Shown):
+class Evidence(ReprMixin):
     """All that was computed.
 
     Attributes:

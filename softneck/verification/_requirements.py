@@ -14,7 +14,7 @@ from softneck.core import FileFormatError, SettingsError, require_between, requi
 from softneck.core._budget import settings_text
 from softneck.core._certificate import sim_name
 from softneck.core._errors import did_you_mean
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.loop import default_limits
 from softneck.robot import Robot
 
@@ -188,7 +188,7 @@ class Requirement:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Requirements(Shown):
+class Requirements(ReprMixin):
     """What a verification asks of a controller, and how it is tried.
 
     Attributes:

@@ -15,7 +15,7 @@ from softneck.core import DataError, Progress, SettingsError, to_si
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._certificate import certificate_contents
 from softneck.core._progress import shown_progress
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.design.linear._own import own_controller
 from softneck.estimation._axis import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
@@ -35,7 +35,7 @@ from ._worst import write_linear, write_neck
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Verdict(Shown):
+class Verdict(ReprMixin):
     """One requirement and what came of it.
 
     Attributes:
@@ -54,7 +54,7 @@ class Verdict(Shown):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Verification(Shown):
+class Verification(ReprMixin):
     """What a verification found: each requirement, its worst plant, and whether all hold.
 
     Attributes:

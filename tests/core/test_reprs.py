@@ -8,7 +8,7 @@ import inspect
 import pytest
 
 from softneck.core import resolve
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from ..test_layout import public_names
 from ..verification.necks import linear_neck
@@ -19,7 +19,7 @@ def test_whatever_holds_arrays_or_many_things_has_a_short_repr() -> None:
     long = []
     for name in public_names():
         thing = resolve(name)
-        if inspect.isclass(thing) and dataclasses.is_dataclass(thing) and not issubclass(thing, Shown):
+        if inspect.isclass(thing) and dataclasses.is_dataclass(thing) and not issubclass(thing, ReprMixin):
             kinds = [str(field.type) for field in dataclasses.fields(thing)]
             if any(word in kind for kind in kinds for word in ("Matrix", "Vector", "ndarray", "[str, Any]")):
                 long.append(name)

@@ -11,7 +11,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash, require_one_of
 from softneck.core._budget import require_steps
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.loop import Fault, Loop, Part, ReferenceBlock
 from softneck.loop._faults import make_fault
 from softneck.loop._loop import System
@@ -25,7 +25,7 @@ from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener, links, number, nu
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class LoopSetup(Shown):
+class LoopSetup(ReprMixin):
     """A loop with what is asked of it; a loop file describes one.
 
     Attributes:

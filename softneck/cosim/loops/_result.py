@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, to_si
 from softneck.core._certificate import certificate_contents
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.loop import LoopResult, check_limits, metrics
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -27,7 +27,7 @@ _TRACE_ROWS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Result(Shown):
+class Result(ReprMixin):
     """One simulated loop: its signals, its metrics, and whether it keeps its limits.
 
     Attributes:

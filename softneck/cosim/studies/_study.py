@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.design.linear._own import own_attributes, own_controller
 from softneck.loop import Loop, LoopRun
 from softneck.loop._references import reference_key
@@ -30,7 +30,7 @@ Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class Study(Shown):
+class Study(ReprMixin):
     """Many runs of one loop; a study file describes one, `study` runs it.
 
     Attributes:

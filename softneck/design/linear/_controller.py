@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, Vector, atomic_write, write_archive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.identification.models._linear_systems import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import Block, State
@@ -30,7 +30,7 @@ _RUNTIME = "softneck.design.linear._linear_controller_runtime"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class LinearController(Shown):
+class LinearController(ReprMixin):
     """A designed controller of all outputs with reference filter, limits, conditioning and allocation.
 
     Attributes:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_positive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block, Port, bundle
 from softneck.runtime._own import PREFIX, OwnStep, own_of, own_runtime
@@ -24,7 +24,7 @@ from ._ports import controller_inputs, controller_outputs
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class OwnController(Shown):
+class OwnController(ReprMixin):
     """A module with `step` as a controller: `softneck.simulate`, `verify` and `build_fmu` take it as any other.
 
     The module has `state_size(arrays)`, `initialise(arrays, parameters, state, outputs)` and
@@ -72,7 +72,7 @@ class OwnController(Shown):
         return f"{self._name}: a controller of one's own, {1e3 * self.sample_time:g} ms"
 
 
-class ObjectController(Shown):
+class ObjectController(ReprMixin):
     """An object with `step(state, inputs) -> (state, outputs)` as a controller; see docs/howto/own_controller.md.
 
     Attributes:

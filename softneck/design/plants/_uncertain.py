@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, SoftneckError, require_one_of
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import AXES, directions_of, robot_of
 from softneck.robot import Robot
@@ -103,7 +103,7 @@ class UncertainAxis:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class UncertainPlant(Shown):
+class UncertainPlant(ReprMixin):
     """All axes of an uncertain robot, of a neck pitch and roll; what every design of this package works on.
 
     Attributes:

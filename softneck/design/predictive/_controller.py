@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class MpcController(Shown):
+class MpcController(ReprMixin):
     """A linear predictive controller of all outputs; `MpcSettings.design` makes it.
 
     Attributes:

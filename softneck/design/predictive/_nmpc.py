@@ -24,7 +24,7 @@ from softneck.core import (
     to_si,
     write_archive,
 )
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._linear_systems import weights_of
@@ -62,7 +62,7 @@ _GONE = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class NmpcSettings(Shown):
+class NmpcSettings(ReprMixin):
     """Nonlinear predictive control of all axes over `nn`, `play` or `greybox`, in sequential loops.
 
     One Gauss-Newton iteration for each sample, from the shifted plan of the sample before (real-time iteration, Diehl
@@ -238,7 +238,7 @@ class NmpcPart(BlockPart):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class NmpcController(Shown):
+class NmpcController(ReprMixin):
     """A nonlinear predictive controller of all outputs; `NmpcSettings.design` makes it.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_finite, require_one_of, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.estimation._settings import ORDERS
 from softneck.robot import Robot
 from softneck.robot._search import find_robot
@@ -63,7 +63,7 @@ _WISH = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class MpcSettings(Shown):
+class MpcSettings(ReprMixin):
     """Model predictive control of all axes over an identified linear model, moves of the motors as unknowns.
 
     Weights follow from `bandwidth`, the observer from `max_sensitivity`, the reference filter from `rise_s`. Limits of

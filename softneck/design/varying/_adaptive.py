@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si, write_archive
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.estimation import AxisPlant
 from softneck.estimation._forms import Reach
 from softneck.estimation._reach import linear_reach
@@ -265,7 +265,7 @@ class AdaptiveSettings(LoopSettings):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class VaryingController(Shown):
+class VaryingController(ReprMixin):
     """A designed controller of all outputs whose gains follow what it learns.
 
     Attributes:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from softneck.core import SettingsError, require_between, require_one_of, require_positive, require_whole
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.signals.recording._channels import NECK
 
@@ -141,7 +141,7 @@ class Neck(Ranged):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class DrivesFile(Shown):
+class DrivesFile(ReprMixin):
     """All that a drives file (`drives.toml`) says.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import CheckFailedError, Matrix
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
 from softneck.signals import Recording
@@ -139,7 +139,7 @@ def fault_table(fault: Event | None) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class DrivesResult(Shown):
+class DrivesResult(ReprMixin):
     """Result of one run on the drives.
 
     Attributes:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from softneck.core import require_between, require_whole
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from ..supervision._baseline import Baseline
 from ._fieldbus import BusSettings
@@ -118,7 +118,7 @@ class ChannelSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class MasterSettings(Shown):
+class MasterSettings(ReprMixin):
     """All settings of the master: bus, limits, inclinometer, watches, ramps.
 
     Attributes:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, require_between, require_one_of
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 
 from . import _servo_runtime as servo
 from ._axis import Axis
@@ -25,7 +25,7 @@ _RING = 128
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class SimulatedSettings(Shown):
+class SimulatedSettings(ReprMixin):
     """Settings of the simulated drives, as configured on the real ones.
 
     Attributes:

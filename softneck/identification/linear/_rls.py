@@ -21,7 +21,7 @@ from softneck.core import (
 )
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._checks import finite_vector
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
@@ -47,7 +47,7 @@ EXACT_START = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class RecursionState(Shown):
+class RecursionState(ReprMixin):
     """What the recursion remembers.
 
     Attributes:

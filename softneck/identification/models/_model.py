@@ -25,7 +25,7 @@ from softneck.core import (
 )
 from softneck.core import load as load_file
 from softneck.core._checks import finite_matrix, finite_vector
-from softneck.core._shown import Shown, percent
+from softneck.core._repr import ReprMixin, percent
 from softneck.robot import Robot
 from softneck.runtime import Block, State
 from softneck.signals import Recording
@@ -54,7 +54,7 @@ _SEARCHING = ("nlsm",)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Model(Shown):
+class Model(ReprMixin):
     """A plant identified from recordings: motor set-points in, the outputs out (of a neck pitch and roll).
 
     Attributes:

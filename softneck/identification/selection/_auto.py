@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, SoftneckError, resolve, silent
 from softneck.core._blas_threads import one_blas_thread
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.signals import Recording
 from softneck.signals.quality._excitation import poor_excitation
 
@@ -181,7 +181,7 @@ _MOST_TRAINED = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Choice(Shown):
+class Choice(ReprMixin):
     """The outcome of `choose`: all kinds by the least of their scores, and the one that was taken.
 
     Attributes:

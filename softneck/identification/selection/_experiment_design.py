@@ -23,7 +23,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_between, silent, to_si
 from softneck.core._blas_threads import one_blas_thread
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.signals import Excitation, Recording, SetPointLimits, prepare, signal
 
@@ -209,7 +209,7 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class NextExperiment(Shown):
+class NextExperiment(ReprMixin):
     """What to record next.
 
     Attributes:

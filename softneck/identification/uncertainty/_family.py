@@ -19,7 +19,7 @@ from softneck.core import (
     to_si,
     write_archive,
 )
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
@@ -71,7 +71,7 @@ class AxisFamily:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class Family(Shown):
+class Family(ReprMixin):
     """An uncertain linear plant; `FamilySettings.fit` makes it and a design reads it.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector, require_between, require_one_of, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.signals import Recording
 from softneck.signals.recording._files import RecordingLike, opened_recording
@@ -40,7 +40,7 @@ METHODS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
-class FrequencyResponse(Shown):
+class FrequencyResponse(ReprMixin):
     """From inputs, held between samples, to sampled outputs: `y(k) = G(exp(j w T)) u(k)`, in SI.
 
     Attributes:

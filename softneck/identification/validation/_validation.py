@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_one_of, resolve, silent
 from softneck.core._blas_threads import one_blas_thread
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.robot._loading import load_for_robot
 from softneck.signals import Recording
@@ -46,7 +46,7 @@ Scores = dict[str, dict[str, float | None]]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Validation(Shown):
+class Validation(ReprMixin):
     """What one model is worth on one recording.
 
     Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
@@ -374,7 +374,7 @@ def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Comparison(Shown):
+class Comparison(ReprMixin):
     """The scores of every model on every recording.
 
     Attributes:

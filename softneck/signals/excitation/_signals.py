@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of, require_whole, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.robot._scaling import MOTOR_RANGE, TIME_CONSTANT
 
@@ -37,7 +37,7 @@ _FIXED = ("steps", "sine", "rotation")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Excitation(Shown):
+class Excitation(ReprMixin):
     """Motor set-points over time.
 
     Attributes:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import DataError
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS
@@ -42,7 +42,7 @@ _NECK_LAG = 25
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Guess(Shown):
+class Guess(ReprMixin):
     """A layout that was proposed for a log, with the reason for each line.
 
     Attributes:

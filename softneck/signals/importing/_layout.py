@@ -14,7 +14,7 @@ from typing import Any
 from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
 from softneck.core._budget import settings_text
 from softneck.core._files import require_file
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 
 from ..recording._channels import NECK, known_channels, si_unit
@@ -68,7 +68,7 @@ class Quaternion:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
-class Layout(Shown):
+class Layout(ReprMixin):
     """How a foreign log is read: which column is which channel, in which unit.
 
     Attributes:

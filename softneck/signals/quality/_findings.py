@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, require_positive, to_si
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 from softneck.robot._scaling import TIME_CONSTANT, Scaling
 
@@ -64,7 +64,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Quality(Shown):
+class Quality(ReprMixin):
     """What `assess_quality` found; arrays in SI.
 
     Attributes:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, Vector, require_positive, resolve, to_si
 from softneck.core._checks import finite_matrix
-from softneck.core._shown import Shown
+from softneck.core._repr import ReprMixin
 from softneck.robot import Robot, find_robot
 
 from ._channels import NECK, known_channels, may_miss
@@ -83,7 +83,7 @@ _FILES = "softneck.signals.recording._files"  # which reads recordings: by its n
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Recording(Shown):
+class Recording(ReprMixin):
     """Samples of one or more experiments at one sample time.
 
     Attributes:

@@ -18,7 +18,7 @@ _VALUE, _ITEMS = 40, 4
 _NOT_PRINTABLE = re.compile(r"[^\x20-\x7e\u00a0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-class Shown:
+class ReprMixin:
     """Mixin that gives a dataclass made with `repr=False` a short `repr`."""
 
     __slots__ = ()
