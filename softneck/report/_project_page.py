@@ -33,7 +33,14 @@ def project_page(project: Project, *, progress: Progress = silent) -> str:
     """Return the HTML page of a project: what it holds, what that is worth, what held and what failed."""
     title = f"Project {project.folder.resolve().name}"
     sections = [_loops(project), _certificates(project), _data(project), _models(project, progress)]
-    sections += [_uncertain(project), _design(project), _fmus(project), *_studies(project), _problems(project)]
+    designs = _summaries("Observers and controllers", {**project.observers, **project.controllers})
+    sections += [
+        _summaries("Uncertain plant", project.families),
+        designs,
+        _fmus(project),
+        *_studies(project),
+        _problems(project),
+    ]
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     kept = [section for section in sections if section is not None]
     sentence, holds = _sentence(project)
@@ -140,14 +147,6 @@ def _judged(result: Any, title: str) -> Chart:
         result.time, result.measured, {"free run": drawable(result, result.free_run)}, title, run=result.run,
         robot=result.robot,
     )  # fmt: skip
-
-
-def _uncertain(project: Project) -> Section | None:
-    return _summaries("Uncertain plant", project.families)
-
-
-def _design(project: Project) -> Section | None:
-    return _summaries("Observers and controllers", {**project.observers, **project.controllers})
 
 
 def _summaries(title: str, things: Mapping[str, Any]) -> Section | None:

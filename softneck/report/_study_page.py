@@ -163,10 +163,6 @@ def _failures(runs: pd.DataFrame) -> Section:
     return Section("Failed runs", tables=[Table(f"{len(failed)} runs failed", ["run", "error"], rows, text=2)])
 
 
-def _pair(runs: pd.DataFrame, pair: tuple[str, str]) -> tuple[np.ndarray, np.ndarray]:
-    return runs[pair[0]].to_numpy(float), runs[pair[1]].to_numpy(float)
-
-
 def _split(runs: pd.DataFrame, vary: Mapping[str, Any]) -> list[tuple[str, pd.DataFrame]]:
     """Return the runs by the first key that has names for values; all together if there is none."""
     by = _groups(vary)

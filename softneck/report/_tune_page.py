@@ -14,11 +14,9 @@ if TYPE_CHECKING:
     from softneck.tuning._search import Candidate
     from softneck.tuning._tune import Tuned
 
-# More lines than this nobody tells apart; the table has all.
-_DRAWN, _SHOWN = 12, 30
+_SHOWN = 30
 _STEPS = 6
 _SIGNS = {"min": ">=", "max": "<=", "below": "<"}
-_MOST = 3.0
 
 
 def tune_page(found: Tuned) -> str:
@@ -42,7 +40,6 @@ def said_of(found: Tuned) -> str:
 
 def requirement_rows(found: Tuned) -> list[list[str]]:
     """Return a row for each requirement: metric, bound, limit, value of the best, verdict, note."""
-    words = {"min": ">=", "max": "<=", "below": "<"}
     rows = []
     for verdict in found.verification.verdicts:
         item, value, holds = verdict.requirement, verdict.value, verdict.holds
@@ -51,12 +48,12 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
             # Of the loops that only tuning looks at: noise, another dead time.
             value, holds = seen, bool(holds) and item.holds(seen)
         said = "-" if holds is None else "holds" if holds else "fails"
-        rows.append([item.metric, words[item.bound], f"{item.limit:g}", _text(value), said, verdict.note])
+        rows.append([item.metric, _SIGNS[item.bound], f"{item.limit:g}", _text(value), said, verdict.note])
     for item in found.task.asked.bounds:
         if item.metric.startswith("track."):
             value = found.best.metrics.get(item.metric)
             said = "-" if value is None else "holds" if item.holds(value) else "fails"
-            rows.append([item.metric, words[item.bound], f"{item.limit:g}", _text(value), said, ""])
+            rows.append([item.metric, _SIGNS[item.bound], f"{item.limit:g}", _text(value), said, ""])
     return rows
 
 

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     import control
 
 
-AXES = ("pitch", "roll")
 SCOPES = ("window", "point", "recording")
 
 

@@ -246,10 +246,10 @@ class FamilySettings:
             DataError: too short, other sample times, or too few local models that say enough.
         """
         parts = recordings if isinstance(recordings, list) else [recordings]
-        sample_time = _one_sample_time(parts)
+        whole = concatenate(parts)
         for part in parts:
             check_training(part)
-        door = Door.of(concatenate(parts))
+        door = Door.of(whole)
         scaling = door.scaling
         times = {"window": door.seconds(self.window, _WINDOW), "max_delay": door.seconds(self.max_delay, MAX_DELAY)}
         named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
@@ -265,8 +265,8 @@ class FamilySettings:
         progress(1.0, "done")
         return replace(
             found,
-            sample_time=sample_time,
-            robot=parts[0].robot,
+            sample_time=whole.sample_time,
+            robot=whole.robot,
             settings=asdict(self) | {key: scaling.second * (value or 0.0) for key, value in times.items()},
             findings={**found.findings, "tested": tested, **door.findings()},
         )
@@ -462,18 +462,6 @@ def in_si(family: Family, scaling: Scaling) -> Family:
         compression=family.compression * [1.0 / motor, 1.0 / second, second],
         findings={**family.findings, "tested": {**tested, "amplitude": amplitude}},
     )  # fmt: skip
-
-
-def _one_sample_time(parts: list[Recording]) -> float:
-    if not parts:
-        raise DataError("there is no recording to work on.")
-    for part in parts:
-        if not np.isclose(part.sample_time, parts[0].sample_time, rtol=1e-6):
-            raise DataError(
-                f"recordings of different sample times cannot be used together: {parts[0].sample_time:g} s and "
-                f"{part.sample_time:g} s. Resample one of them."
-            )
-    return parts[0].sample_time
 
 
 def _numbers(model: Any) -> Vector:

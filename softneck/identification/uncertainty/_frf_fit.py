@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import DataError, Matrix, SettingsError, Vector, require_between, require_one_of, to_si
 from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
-from softneck.signals import Recording
+from softneck.signals import Recording, concatenate
 from softneck.signals.recording._files import RecordingLike, opened_recording
 
 from ..linear._oe import SOURCES
@@ -275,7 +275,8 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
     """
     parts = [opened_recording(item) for item in (recordings if isinstance(recordings, list | tuple) else [recordings])]
     require_one_of("source", source, SOURCES)
-    robot, sample_time = _one(parts)
+    whole = concatenate(parts)
+    robot, sample_time = whole.robot, whole.sample_time
     names, transform = input_names(robot)
     runs = [_run(run, transform, source) for part in parts for run in part.runs()]
     moving = _moving(runs, names)
@@ -313,21 +314,6 @@ def input_names(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
         *robot.input_names,
         *(f"cocontraction_{k + 1}" for k in range(rest.shape[0])),
     ), np.vstack([weights, rest])
-
-
-def _one(parts: Sequence[Recording]) -> tuple[Robot, float]:
-    if not parts:
-        raise DataError("a frequency response needs at least one recording; got none.")
-    first = parts[0]
-    for part in parts[1:]:
-        if part.robot.hash != first.robot.hash:
-            raise DataError(f"recordings of two robots, {first.robot.label()} and {part.robot.label()}; take one's.")
-        if abs(part.sample_time - first.sample_time) > 1e-9 * first.sample_time:
-            raise DataError(
-                f"recordings at {first.sample_time:g} s and {part.sample_time:g} s; resample one "
-                "(softneck import --resample)."
-            )
-    return first.robot, first.sample_time
 
 
 def _run(run: Recording, transform: Matrix, source: str) -> _Run:

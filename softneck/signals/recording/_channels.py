@@ -10,7 +10,6 @@ from softneck.core import DataError, to_si
 from softneck.robot import Robot
 
 NECK = Robot.preset("neck")
-MOTORS = (1, 2, 3)
 #: Names of the three channels with the motors' set-points of a neck.
 SET_POINTS = NECK.set_points
 MOTOR_POSITIONS = NECK.motor_positions

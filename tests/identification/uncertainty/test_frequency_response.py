@@ -252,7 +252,7 @@ def test_bad_input_is_named() -> None:
         frequency_response(recording(u, y, pitch_reference=u[:, 0]))
     with pytest.raises(DataError, match=r"sizes differ by a factor of 4: .*; make one response of each size"):
         frequency_response([*good, *played(1, amplitude=4.0, realisations=1)])
-    with pytest.raises(DataError, match="needs at least one recording"):
+    with pytest.raises(DataError, match="there is no recording to work on"):
         frequency_response([])
     with pytest.raises(SettingsError, match=r"`band` must rise within .* a quarter of the sampling rate; got 5,2"):
         multisine_experiments(band=(5.0, 2.0))
