@@ -30,7 +30,7 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate, signal
 
 from ..models._arrays import check_arrays
-from ..models._directions import on_motors
+from ..models._directions import NECK_SECONDS, on_motors, time_constant_of
 from ..models._fitting import row_hashes
 from ..models._model import WARM_UP, Model
 from ..models._ports import trained_range, trained_set_points
@@ -166,10 +166,8 @@ def reference(model: Model) -> Recording:
     own = signal("mixed", duration=_REFERENCE, seed=0)
     P = on_motors(own.set_points, motors)
     P = low + (P - P.min(axis=0)) / np.ptp(P, axis=0) * (high - low)
-    seconds = np.array(model.findings.get("time_constants_s", [0.2]))
     # As many samples for another robot, each of its own time constant.
-    stretch = float(np.exp(np.mean(np.log(np.maximum(seconds, 1e-9))))) / 0.2
-    at = np.arange(0.0, len(P) - 1.0, max(Ts / (own.sample_time * stretch), 0.2))
+    at = np.arange(0.0, len(P) - 1.0, max(Ts / (own.sample_time * _scaled(1.0, model)), 0.2))
     P = np.column_stack([np.interp(at, np.arange(len(P)), column) for column in P.T])
     P *= np.minimum(1.0, np.arange(len(P)) / max(_RAMP * len(P) / _REFERENCE, 1.0))[:, None]
     Y = np.full((len(P), len(outputs)), np.nan)
@@ -283,11 +281,11 @@ def scored(recording: Recording) -> np.ndarray:
     return np.isfinite(recording.outputs) & late[:, None]
 
 
-#: The latest data that are looked at [s].
-WINDOW = 30.0
+# The latest data that are looked at, scaled [s].
+_WINDOW = 30.0
 # Weight of a change along the reference beside an error over the window.
 _STRENGTH = 0.1
-# Held out: the last of every so many blocks, so long [s]; between them the window is learnt from.
+# Held out: the last of every so many blocks, so long [scaled s]; between them the window is learnt from.
 _EVERY, _BLOCK = 3, 2.0
 # Set-points that move less than this part of what they do along the reference teach nothing.
 _LEAST_MOTION = 0.1
@@ -333,19 +331,20 @@ class Adaptation:
     """How a model is adapted.
 
     Attributes:
-        window: latest seconds of the recording that are looked at [s].
+        window: latest seconds of the recording that are looked at [s]; None: 150 time constants (of a neck 30 s).
         strength: weight of a change of the old free run along its reference motion beside an error over the window.
-        block: length of a block [s], of which every third is held out.
+        block: length of a block [s], of which every third is held out; None: 10 time constants (of a neck 2 s).
     """
 
-    window: float = WINDOW
+    window: float | None = None
     strength: float = _STRENGTH
-    block: float = _BLOCK
+    block: float | None = None
 
     def __post_init__(self) -> None:
-        require_positive("window", self.window, "s")
         require_positive("strength", self.strength)
-        require_positive("block", self.block, "s")
+        for name, value in (("window", self.window), ("block", self.block)):
+            if value is not None:
+                require_positive(name, value, "s")
 
     @one_blas_thread
     def of(self, model: Model, recording: Recording) -> Model:
@@ -357,12 +356,12 @@ class Adaptation:
         """
         require_adapting(model)
         model.check(recording)
-        window = _latest(recording, self.window)
+        window = _latest(recording, self.window or _scaled(_WINDOW, model))
         if window is None:
             least = (WARM_UP + 1) * recording.sample_time
             why = f"no run of the window goes on for more than {least:.3g} s after all outputs were first measured"
             return _kept(model, Judged(adapted=False, why=why, seconds=0.0))
-        known, held = _split(window, self.block)
+        known, held = _split(window, self.block or _scaled(_BLOCK, model))
         seconds = len(window) * window.sample_time
         if min(known.sum(axis=0).min(), held.sum(axis=0).min()) < _LEAST_ROWS:
             why = "an output was measured in too few of its rows"
@@ -376,7 +375,12 @@ class Adaptation:
         return _accepted(model, window, problem, problem.solve(), held)
 
 
-def adapted(model: Model, recording: Recording, window: float) -> Model:
+def _scaled(seconds: float, model: Model) -> float:
+    """Return so many seconds of a neck for a model [s]."""
+    return seconds * ((time_constant_of(model) or NECK_SECONDS) / NECK_SECONDS)
+
+
+def adapted(model: Model, recording: Recording, window: float | None) -> Model:
     """Return `model.adapted(recording, window=window)`."""
     return Adaptation(window=window).of(model, recording)
 

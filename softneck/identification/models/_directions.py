@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from softneck.robot._scaling import TIME_CONSTANT as NECK_SECONDS
 from softneck.signals import Recording, signal
 from softneck.signals.excitation._signals import SAMPLE_TIME
 from softneck.signals.quality._excitation import BANDWIDTH
+
+if TYPE_CHECKING:
+    from ._model import Model
 
 # Time constants tried: from half a sample to a third of the longest run, beyond which all is drift.
 _TRIED = 40
@@ -120,16 +123,25 @@ def _followed(recording: Recording, motors: list[Matrix], axis: int, given: Matr
     return weights / size, samples
 
 
+def time_constant_of(source: Recording | Model) -> float | None:
+    """Return the time constant [s] of a recording's robot or of a model; None where an output follows no motor."""
+    if source.robot.time_constant_s is not None:
+        return source.robot.time_constant_s
+    if isinstance(source, Recording):
+        try:
+            return directions_of(source, [run.set_points for run in source.runs()]).time_constant
+        except DataError:
+            return None
+    return float(np.exp(np.mean(np.log(np.sort(source.findings.get("time_constants_s", [NECK_SECONDS]))))))
+
+
 def bandwidth_of(recording: Recording) -> float | None:
     """Return up to where outputs follow set-points [rad/s]: a neck's 4 (section 3.1), of others by time constants.
 
     None where an output follows no motor.
     """
-    try:
-        found = directions_of(recording, [run.set_points for run in recording.runs()])
-    except DataError:
-        return None
-    return BANDWIDTH * (NECK_SECONDS / found.time_constant)
+    seconds = time_constant_of(recording)
+    return None if seconds is None else BANDWIDTH * (NECK_SECONDS / seconds)
 
 
 def _first_order(inputs: Sequence[Matrix], outputs: Sequence[Vector]) -> tuple[float, Vector]:

@@ -245,14 +245,15 @@ class Model(ReprMixin):
     def _labelled(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
         return Labelled(np.concatenate(parts), recording.time, {port.name: port.unit for port in self.block().outputs})
 
-    def adapted(self, recording: Recording, *, window: float = 30.0) -> Model:
+    def adapted(self, recording: Recording, *, window: float | None = None) -> Model:
         """Return the model refitted to the latest data, held to what it is where these say nothing.
 
-        Every third block of 2 s of the window is held out: where an output is worse there, this model is kept.
+        Of the window every third block of ten time constants is held out: where an output is worse there, this model
+        is kept.
         `findings["adaptation"]` says what became of it.
 
         Args:
-            recording: whose last `window` [s] is looked at.
+            recording: whose last `window` [s] is looked at; None: 150 time constants, of a neck 30 s.
 
         Raises:
             SettingsError: a kind that cannot adapt.

@@ -18,7 +18,7 @@ from softneck.signals.quality._excitation import poor_excitation
 from ..models._arrays import members
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
-from ..set_membership._set_membership import noise_levels
+from ..set_membership._set_membership import noise_si
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
@@ -406,7 +406,7 @@ class _Race:
     def _short(self, kind: str, train: Recording) -> Model:
         short = dict(_SCREENED.get(kind, {}))
         if kind == "nlsm":
-            short["epsilon"] = _SIGMAS * float(noise_levels(train).max())
+            short["epsilon"] = _SIGMAS * float(noise_si(train).max())
         return _settings(kind, self.seed, short).fit(train)
 
     def _judged(self, kind: str, model: Model) -> Validation:

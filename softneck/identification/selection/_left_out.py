@@ -24,7 +24,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, concatenate
 
-from ..models._directions import unrecorded
+from ..models._directions import time_constant_of, unrecorded
 from ..models._fitting import MIN_ROWS
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
@@ -81,10 +81,10 @@ def weighted_median(values: np.ndarray, weights: Vector) -> Matrix:
 
 # Kinds are compared on so many rows (40 s of Eq. 22); the chosen one is trained on all.
 SCREENED_ROWS = 2000
-# Part of the rows that each region takes, and how far it reaches into what lies before and after [s].
-_REGION, _WIDEN = 0.12, 0.2
-# Over how long a motion is fast or slow [s].
-_MOVED_OVER = 0.5
+# Part of the rows that each region takes, and how far it reaches into what lies before and after [time constants].
+_REGION, _WIDEN = 0.12, 1.0
+# Over how long a motion is fast or slow [time constants].
+_MOVED_OVER = 2.5
 # Runs are left out in so many groups at most; a group of fewer rows says nothing of a free run.
 _MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
 # Errors within 2 s of each other belong together: that is ten time constants of the neck.
@@ -138,7 +138,8 @@ def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> l
         other_excitation: whether `hold_out` is another experiment.
     """
     head, tail = _thinned(train)
-    blanked, judged = _blanked(head)
+    seconds = time_constant_of(train)
+    blanked, judged = (head, []) if seconds is None else _blanked(head, seconds / train.sample_time)
     if tail is not None:
         judged.append(everything("later block", tail))
     if other_excitation:
@@ -184,9 +185,15 @@ def _scored(recording: Recording) -> np.ndarray:
     return np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
 
 
-def _blanked(recording: Recording) -> tuple[Recording, list[Judged]]:
-    """Return the recording without its largest and fastest motions, and those; as it was where too little is left."""
-    far, fast = (_widened(recording, size) for size in (_sizes(recording), _speeds(recording)))
+def _blanked(recording: Recording, slow: float) -> tuple[Recording, list[Judged]]:
+    """Return the recording without its largest and fastest motions, and those; as it was where too little is left.
+
+    Args:
+        recording: to begin with.
+        slow: the robot's time constant in samples.
+    """
+    reach, span = round(_WIDEN * slow), max(round(_MOVED_OVER * slow), 1)
+    far, fast = (_widened(recording, size, reach) for size in (_sizes(recording), _speeds(recording, span)))
     rest = ~(far | fast)
     Y = np.where(rest[:, None], recording.outputs, np.nan)
     if np.isfinite(Y).sum(axis=0).min() < 2 * MIN_ROWS:
@@ -197,9 +204,8 @@ def _blanked(recording: Recording) -> tuple[Recording, list[Judged]]:
     return recording.with_channels(**dict(zip(names, Y.T, strict=True))), judged
 
 
-def _widened(recording: Recording, size: Vector) -> np.ndarray:
+def _widened(recording: Recording, size: Vector, reach: int) -> np.ndarray:
     """Return (time,) the rows with the largest `size`, and those near them in their run."""
-    reach = round(_WIDEN / recording.sample_time)
     inside = size > np.quantile(size, 1.0 - _REGION)
     near = np.ones(2 * reach + 1)
     parts = np.split(inside, np.cumsum([len(run) for run in recording.runs()])[:-1])
@@ -211,9 +217,8 @@ def _sizes(recording: Recording) -> Vector:
     return np.linalg.norm(_scaled(recording), axis=1)
 
 
-def _speeds(recording: Recording) -> Vector:
-    """Return how much the set-points change in half a second around each row (time,)."""
-    span = max(round(_MOVED_OVER / recording.sample_time), 1)
+def _speeds(recording: Recording, span: int) -> Vector:
+    """Return how much the set-points change over `span` samples around each row (time,)."""
     found, start = np.zeros(len(recording)), 0
     U = _scaled(recording)
     for run in recording.runs():

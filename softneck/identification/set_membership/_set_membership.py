@@ -24,7 +24,9 @@ from softneck.core import (
 )
 from softneck.core._blas_threads import one_blas_thread
 from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 from softneck.signals import Recording
+from softneck.signals.recording._scaled import scaled_recording
 
 from ..models._door import Door
 from ..models._drive import DriveModel, fit_drive
@@ -320,6 +322,12 @@ class SetMembership:
             outputs, motors = _OUTPUT_WEIGHTS, _MOTOR_WEIGHTS
         tried = hold_out.choose(outputs, motors, progress)
         return tried[0], tried
+
+
+def noise_si(recording: Recording) -> Vector:
+    """Return `noise_level` of each output (outputs,) of a recording in SI, in SI."""
+    scaling = Scaling.of(recording.robot, set_points=recording.set_points, outputs=recording.outputs)
+    return scaling.output_unit * noise_levels(scaled_recording(recording, replace(scaling, second=1.0)))
 
 
 def noise_levels(recording: Recording) -> Vector:

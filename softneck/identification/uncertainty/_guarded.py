@@ -30,6 +30,7 @@ from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays, within
+from ..models._directions import NECK_SECONDS, time_constant_of
 from ..models._fitting import row_hashes, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._ports import trained_set_points
@@ -186,6 +187,8 @@ def base_or_reason(kind: str, recording: Recording) -> Base | str:
 OF = ("nn", "play", "nlsm")
 # Weight decays of `nn`, one after the other over the members, as over the starts of one network.
 _DECAYS = (0.03, 0.1, 0.01)
+# Scaled seconds from members to base: one and a half time constants.
+_FADE = 0.3
 # Motor positions that stand for all that were seen.
 _SEEN = 200
 
@@ -205,7 +208,7 @@ class Guarded:
         agreement: weight of the squared spread of the members beside the base's squared error.
         unseen: how fast the members' error is taken to grow beyond what was seen, in spreads of the output a spread of
             the motors.
-        fade: time in which the weight can go from members to base [s].
+        fade: time in which the weight can go from members to base [s]; None: 1.5 time constants (of a neck 0.3 s).
         seed: of the first member; the next have the next seeds.
         workers: processes to train `nn` in; None takes all cores, 1 none. It changes no result.
     """
@@ -215,7 +218,7 @@ class Guarded:
     base: str | None = None
     agreement: float = 0.25
     unseen: float = 0.1
-    fade: float = 0.3
+    fade: float | None = None
     seed: int = 0
     workers: int | None = None
 
@@ -228,7 +231,8 @@ class Guarded:
                 raise SettingsError(f"a model of kind `{self.base}` cannot be a base; take {' or '.join(BASES)}.")
         require_positive("agreement", self.agreement)
         require_positive("unseen", self.unseen)
-        require_positive("fade", self.fade, "s")
+        if self.fade is not None:
+            require_positive("fade", self.fade, "s")
         require_whole("seed", self.seed, 0, 2**62)
         if self.workers is not None:
             require_whole("workers", self.workers, 1, 1000)
@@ -261,13 +265,15 @@ class Guarded:
         outputs, motors = len(robot.outputs.names), len(robot.motors.names)
         M = base.model.simulate(recording)[:, outputs : outputs + motors]
         seen, reach = covering(M, _SEEN)
+        seconds = time_constant_of(recording) or NECK_SECONDS
+        fade = _FADE * (seconds / NECK_SECONDS) if self.fade is None else self.fade
         parts = [base.model, *members]
         arrays = {
             "history": np.array([1.0] if (outputs, motors) == (2, 3) else [1.0, outputs, motors]),
             "memory": np.array([float(max(memory_of(part.arrays) for part in parts))]),
             "sigma": base.error,
             "slope": self.unseen * np.nanstd(recording.outputs, axis=0) / np.sqrt(np.mean(M.var(axis=0))),
-            "fading": np.array([self.agreement, Ts / self.fade]),
+            "fading": np.array([self.agreement, Ts / fade]),
             "seen": seen,
             "reach": np.array([reach]),
             **prefixed_arrays([(part.kind, part.arrays) for part in parts]),
