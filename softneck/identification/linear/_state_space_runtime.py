@@ -1,27 +1,54 @@
-"""A linear state space with an observer gain.
+"""A linear state space with an observer gain, around where its robot rests.
 
-    x(k+1) = A x(k) + B u(k - delay) + K (y(k) - C x(k)),    C x = the first states
+    x(k+1) = A x(k) + B u(k - delay) + K (y(k) - offset - C x(k)),    y = C x + offset,    C x = the first states
 
-The first states are the outputs, a neck's pitch and roll.
+The first states are the outputs less the offset. States stand where other kinds keep their histories of outputs
+(n <= outputs H).
 """
 
 import numpy as np
 
-from softneck.identification.linear._state_space_parts_runtime import StateSpaceArrays, lss_observe
-from softneck.identification.models._histories_runtime import NarxState, narx_forward
-from softneck.identification.models._narx_runtime import initialise as initialise
+from softneck.identification.models._histories_runtime import (
+    NarxArrays,
+    NarxState,
+    narx_forward,
+    narx_known,
+    narx_push,
+    narx_rest,
+)
+from softneck.runtime._layout import array
 from softneck.runtime._rest_runtime import REST
+
+
+class StateSpaceArrays(NarxArrays):
+    """Matrices over motors as they are, without redefinition."""
+
+    A = array("n, n", "")
+    B = array("n, motors", "of the motors")
+    K = array("n, outputs", "of what measurements are above the first states")
+    delay = array("2", "dead time [samples], and source: 1 takes motor positions for u, 0 set-points")
+    offset = array("outputs", "outputs where states and inputs are zero; none in the file of a robot that rests there")
+
+
+def initialise(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
+    """Rest: motors at zero, outputs at their start values for ever."""
+    narx_rest(p, parameters, x, outputs)
+    for j in range(p.H):
+        for axis in range(p.outputs):
+            x.y[j, axis] -= p.offset[axis]
 
 
 def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, outputs: np.ndarray) -> None:
     """Advance by one sample."""
     # Not `narx_observe`: `x.y` holds the states here, and no output is pushed into it.
-    lss_observe(p, parameters, x, inputs)
+    narx_known(p, parameters, x, inputs)
+    narx_push(x.u, inputs[: p.motors])
+    narx_push(x.m, x.motors)
     states = x.y
-    # Zero in free run: then the angles of now are the first states.
+    # Zero in free run: then the outputs of now are the first states.
     e = np.empty(p.outputs)
     for axis in range(p.outputs):
-        e[axis] = x.angles[axis] - states[axis]
+        e[axis] = x.angles[axis] - p.offset[axis] - states[axis]
     # Beside the states, as every row needs all the old ones.
     ahead = np.zeros(p.n)
     # Motor positions stand H samples of all motors behind set-points.
@@ -36,4 +63,6 @@ def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.n
             value += p.B[i, j] * x.u[back, j]
         ahead[i] = (value + REST) - REST
     states[: p.n] = ahead
+    for axis in range(p.outputs):
+        ahead[axis] += p.offset[axis]
     narx_forward(p, parameters, x, ahead, outputs)

@@ -16,7 +16,7 @@ from softneck.runtime import load_runtime
 from softneck.runtime._bundle import layout_of, sized_name
 from softneck.runtime._layout import Arrays, StateVector
 
-from ._linear_systems import AFFINE, STATE_SPACE
+from ._linear_systems import STATE_SPACE
 
 COMPOSED = ("guarded",)
 _LEAST_MEMBERS = 2  # a base and one other
@@ -26,6 +26,8 @@ LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
 
 # What says where a model knows the robot: older files, models made by hand and members of others have none.
 VALIDITY = ("ground", "doubt")
+# Left out of files too: the offset of a robot that rests at zero.
+_OPTIONAL = (*VALIDITY, "offset")
 
 
 def without_validity(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
@@ -34,12 +36,12 @@ def without_validity(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
 
 
 def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
-    """Return the arrays as the runtime takes them: in its order, empty ones for `validity` where there are none."""
+    """Return the arrays as the runtime takes them: in its order, with what a file may leave out."""
     own = own_arrays(arrays)
     history = own["history"]
     outputs = int(history[1]) if len(history) > 1 else 2
     motors = len(own["drive"]) if "drive" in own else int(history[2]) if len(history) > 2 else 3
-    empty = {"ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3))}
+    empty = {"ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3)), "offset": np.zeros(outputs)}
     names = _names(_module_of(kind, arrays))
     found = {name: own[name] if name in own else empty[name] for name in names}
     for number, (member, part) in enumerate(members(arrays)):
@@ -51,7 +53,7 @@ def with_validity(kind: str, arrays: Mapping[str, Matrix], ground: Matrix, doubt
     """Return the arrays with those for `validity`, in the order of a file."""
     given = {**arrays, "ground": ground, "doubt": doubt}
     inner = {name: array for name, array in arrays.items() if "." in name}
-    return {**{name: given[name] for name in _names(_module_of(kind, arrays))}, **inner}
+    return {**{name: given[name] for name in _names(_module_of(kind, arrays)) if name in given}, **inner}
 
 
 @cache
@@ -116,9 +118,7 @@ def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
     runtime = KINDS[kind].runtime
     if kind == "greybox" and "payload" in arrays:
         return LOADED_GREYBOX
-    if "A" not in arrays:
-        return runtime
-    return AFFINE if "offset" in arrays else STATE_SPACE
+    return STATE_SPACE if "A" in arrays else runtime
 
 
 def memory_of(arrays: Mapping[str, Matrix]) -> int:
@@ -164,8 +164,8 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
 
 
 def _named(arrays: Mapping[str, Matrix], names: tuple[str, ...]) -> bool:
-    """Return whether arrays are those of a runtime, all in its order, or all but those for `validity`."""
-    return tuple(arrays) in (names, tuple(name for name in names if name not in VALIDITY))
+    """Return whether arrays are those of a runtime in its order, but for what a file may leave out."""
+    return tuple(arrays) == tuple(name for name in names if name in arrays or name not in _OPTIONAL)
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:

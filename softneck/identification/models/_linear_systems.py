@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 KINDS = ("rls", "oe")
 STATE_SPACE = "softneck.identification.linear._state_space_runtime"
-AFFINE = "softneck.identification.linear._affine_runtime"
 UNITS = ("SI", "robot")
 
 

@@ -33,12 +33,13 @@ _NECK_RUNTIMES = (
 )
 # Runtimes for robots of any size, in addition to those above, whose sizes are the neck's and known at compile time.
 _ROBOT_RUNTIMES = (
+    "softneck.identification.linear._rls_runtime",
+    "softneck.identification.linear._oe_runtime",
     "softneck.identification.set_membership._nlsm_runtime",
     "softneck.identification.structured._greybox_runtime",
     "softneck.identification.structured._loaded_greybox_runtime",
     "softneck.identification.uncertainty._guarded_runtime",
     "softneck.identification.networks._nn_runtime",
-    "softneck.identification.linear._affine_runtime",
     "softneck.identification.linear._state_space_runtime",
     "softneck.identification.structured._play_runtime",
     "softneck.estimation._kalman_runtime",
