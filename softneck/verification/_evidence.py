@@ -293,7 +293,7 @@ def _with_axis(describe: Describe, name: str, axes: tuple[str, ...]) -> Describe
 def plant_facts(plants: Plants, row: int) -> dict[str, Any]:
     """Return one plant as JSON values."""
     axes = {
-        axis: dict(zip(("static_gain_rad_per_rad", "pole_per_s", "dead_time_s"), numbers.tolist(), strict=True))
+        axis: dict(zip((f"static_gain_{plants.unit}", "pole_per_s", "dead_time_s"), numbers.tolist(), strict=True))
         for axis, numbers in zip(plants.axes, plants.numbers[row], strict=True)
     }
     return {

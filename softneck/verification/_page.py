@@ -18,7 +18,7 @@ from ._neck_loops import NeckRun, direction
 from ._plants import Plants, mixing
 from ._scale import Scale
 from ._steps import Steps
-from ._verify import Verdict, Verification, gain_unit
+from ._verify import Verdict, Verification
 
 RED, PURPLE = "#D55E00", "#CC79A7"
 # Of 1 to 8 motors.
@@ -308,7 +308,7 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
         Section(
             f"Frequency responses{title}",
             tables=[_margin_table(part)],
-            charts=frequency_charts(part, found.evidence.frequency, gain_unit(found.controller.robot)),
+            charts=frequency_charts(part, found.evidence.frequency, found.necks[0].gain_unit),
         ),
         Section(
             f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector
+from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.estimation import AxisPlant, axis_plant
 from softneck.estimation._axis import directions_of, robot_of
 from softneck.identification.uncertainty._measured import AxisMeasured, response_of
@@ -143,6 +143,11 @@ class UncertainNeck:
         """Of the axes: the robot's outputs."""
         return self.robot.outputs.names
 
+    @property
+    def gain_unit(self) -> str:
+        """Of static gains in SI: `rad/rad` of a neck."""
+        return f"{to_si(self.robot.outputs.unit)[1]}/{to_si(self.robot.motors.unit)[1]}"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plants:
@@ -157,6 +162,7 @@ class Plants:
         numerator, denominator: (n, axes, q) highest power first, monic; the numerator's first is 0.
         delay: (n, axes) samples besides.
         axes: names of the axes.
+        unit: of static gains in SI, as a word.
     """
 
     sample_time: float
@@ -168,6 +174,7 @@ class Plants:
     denominator: np.ndarray
     delay: np.ndarray
     axes: tuple[str, ...] = ("pitch", "roll")
+    unit: str = "rad_per_rad"
 
     def __len__(self) -> int:
         return len(self.names)
@@ -175,11 +182,9 @@ class Plants:
     def take(self, rows: Any) -> Plants:
         """Return some of them: rows as indices."""
         rows = np.atleast_1d(np.asarray(rows, dtype=int))
-        names = tuple(self.names[int(row)] for row in rows)
-        return Plants(
-            self.sample_time, self.numbers[rows], self.cross[rows], names, self.source[rows], self.numerator[rows],
-            self.denominator[rows], self.delay[rows], self.axes,
-        )  # fmt: skip
+        fields = ("numbers", "cross", "source", "numerator", "denominator", "delay")
+        taken: Any = {name: getattr(self, name)[rows] for name in fields}
+        return replace(self, names=tuple(self.names[int(row)] for row in rows), **taken)
 
     def later(self, samples: int) -> Plants:
         """Return the same with `samples` of delay more on all axes, as a loop's order adds."""
@@ -306,7 +311,7 @@ def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, s
     n = numbers.shape[0]
     return Plants(
         Ts, numbers, np.tile(neck.cross, (n, 1)), tuple(names), np.full(n, source), numerator, denominator, delay,
-        neck.names,
+        neck.names, neck.gain_unit.replace("/", "_per_"),
     )  # fmt: skip
 
 
@@ -325,6 +330,7 @@ def measured_plant(neck: UncertainNeck, source: int) -> Plants | None:
     return Plants(
         neck.sample_time, np.array([numbers]), neck.cross[None], (f"{neck.name}: middle of its recordings",),
         np.array([source]), above[None], below[None], np.array([[d for _, _, d in parts]]), neck.names,
+        neck.gain_unit.replace("/", "_per_"),
     )  # fmt: skip
 
 
@@ -388,14 +394,9 @@ def join(parts: list[Plants]) -> Plants:
         rows = [getattr(part, name) for part in parts]
         return np.concatenate([np.pad(row, ((0, 0), (0, 0), (0, q - row.shape[2]))) for row in rows])
 
-    return Plants(
-        parts[0].sample_time,
-        np.concatenate([part.numbers for part in parts]),
-        np.concatenate([part.cross for part in parts]),
-        tuple(itertools.chain.from_iterable(part.names for part in parts)),
-        np.concatenate([part.source for part in parts]),
-        stacked("numerator"),
-        stacked("denominator"),
-        np.concatenate([part.delay for part in parts]),
-        parts[0].axes,
-    )
+    fields = ("numbers", "cross", "source", "delay")
+    joined: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+    return replace(
+        parts[0], names=tuple(itertools.chain.from_iterable(part.names for part in parts)),
+        numerator=stacked("numerator"), denominator=stacked("denominator"), **joined,
+    )  # fmt: skip

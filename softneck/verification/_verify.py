@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, to_si
+from softneck.core import DataError, Progress, SettingsError
 from softneck.core._blas_threads import one_blas_thread
 from softneck.core._certificate import certificate_contents
 from softneck.core._progress import shown_progress
@@ -369,15 +369,10 @@ def _box(neck: UncertainNeck) -> dict[str, Any]:
     return {
         axis: {
             "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
-            "unit": [gain_unit(neck.robot), "1/s", "s"],
+            "unit": [neck.gain_unit, "1/s", "s"],
         }
         for axis, box in zip(neck.names, neck.axes, strict=True)
     }  # fmt: skip
-
-
-def gain_unit(robot: Robot) -> str:
-    """Return the SI unit of static gains, `rad/rad` of a neck."""
-    return f"{to_si(robot.outputs.unit)[1]}/{to_si(robot.motors.unit)[1]}"
 
 
 def plain(value: Any) -> Any:

@@ -143,6 +143,7 @@ def test_steps_of_a_robot_are_those_of_its_equations() -> None:
     model = plant(BELLOWS, gain=1e-7)
     controller = design_controller("pi", model, robot=SLOW)
     plants = all_plants(sources_of({"m": model}, make_requirements(FEW, robot=BELLOWS)), 1, 0).take([0])
+    assert plants.unit == "m_per_Pa"  # of `static_gain_m_per_Pa` in a certificate
     test = StepTest(step=1e-3, duration=2.0, noise=0.0, load=0.0, seed=0)
     steps = run_steps(plants, controller.block(), test, robot=BELLOWS, weights=LEARNED)
     for i in range(3):
