@@ -10,6 +10,7 @@ import fmpy
 import numpy as np
 import pytest
 
+import softneck
 from softneck import build_fmu
 from softneck.cosim import load_loop, make_loop, simulate
 from softneck.design import design_controller
@@ -99,7 +100,16 @@ def test_fmus_have_them_too(parts: tuple[Any, Any], tmp_path: Path) -> None:
     assert [found[0] for found in names] == ["pressure_setpoint", "motor_setpoint_1"]
     assert "pressure_position_measured" in names[0]
     new, old = (make_loop(table({"fmu": str(tmp_path / f"{name}.fmu")}, controller)) for name in ("New", "Old"))
-    np.testing.assert_array_equal(*(simulate(setup)["pressure_setpoint"] for setup in (new, old)))
+    found, other = (simulate(setup)["pressure_setpoint"] for setup in (new, old))
+    np.testing.assert_array_equal(found, other)
+
+
+def test_linear_systems_take_both(parts: tuple[Any, Any]) -> None:
+    model, _ = parts
+    one, other = (model.linearize(at={name: 5e4}) for name in ("pressure_setpoint", "motor_setpoint_1"))
+    np.testing.assert_array_equal(one.A, other.A)
+    at = [softneck.linearize(model, at=0.1, values={n: 5e4}) for n in ("pressure_setpoint", "motor_setpoint_1")]
+    np.testing.assert_array_equal(at[0].B, at[1].B)
 
 
 def test_recordings_take_numbers() -> None:

@@ -140,7 +140,7 @@ def linearize(
     if not isinstance(source, str | Path) or Path(source).suffix != ".fmu":
         if sample_time is not None:
             raise SettingsError("`sample_time` is for FMUs; what is softneck's has its own.")
-        return _of_block(_opened(source), at, given)
+        return _of_block(*_opened(source, at, given))
     with FmuPart(source, role=None if _says_role(source) else "plant", sample_time=sample_time) as part:
         block = block_of(Path(source))
         if block is not None and sample_time in (None, block.sample_time):
@@ -148,12 +148,17 @@ def linearize(
         return _by_pulses(part, part.parameters, at, given, Path(source).stem)
 
 
-def _opened(source: str | Path | Block | Buildable) -> Block:
-    """Return the block of what is ours."""
+def _opened(
+    source: str | Path | Block | Buildable, at: float, given: Mapping[str, float]
+) -> tuple[Block, float, Mapping[str, float]]:
+    """Return the block of what is ours, and the values by the names that its robot has for them."""
     if isinstance(source, str | Path) and Path(source).suffix == ".ssp":
         raise SettingsError(f"{source}: is several FMUs; unzip it and linearize one of those in `resources`.")
     found = buildable(source)
-    return found if isinstance(found, Block) else found.block()
+    if isinstance(found, Block):
+        return found, at, given
+    robot = getattr(found, "robot", None)
+    return found.block(), at, given if robot is None else {robot.own(name): value for name, value in given.items()}
 
 
 def _says_role(path: str | Path) -> bool:

@@ -339,7 +339,7 @@ def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None, u
         outputs = len(block.inputs) - 2 * motors
         state, u = at, at.outputs[outputs : outputs + motors]
     else:
-        u = _set_points(block, at)
+        u = _set_points(block, at, model.robot)
         state = _rest(model, block, u)
     J = jacobian(model, state, u)
     # The last output, `validity`, is no part of the neck: a linear system has none.
@@ -353,14 +353,14 @@ def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None, u
     return shown_system(model, (A, B, C), names, model.kind, units)
 
 
-def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None) -> Vector:
+def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None, robot: Robot) -> Vector:
     """Return the motors' set-points (motors,) that are asked for."""
     motors = _motor_count(block)
     names = [port.name for port in block.inputs[:motors]]
     if at is None:
         return np.zeros(motors)
     if isinstance(at, Mapping):
-        given: Mapping[str, Any] = at
+        given: Mapping[str, Any] = {robot.own(name): value for name, value in at.items()}
         unknown = sorted(set(given) - set(names))
         if unknown:
             raise SettingsError(f"`{unknown[0]}` is not a set-point; `at` takes {', '.join(names)}.")
