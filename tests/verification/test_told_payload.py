@@ -49,7 +49,7 @@ def test_verify_has_the_estimate_of_an_observer_in_the_loops_of_an_mpc() -> None
     found = verify(controller, {"line": neck()}, make_requirements(ASKED), observer=observer)
     runs: list[Any] = found.evidence.necks
     assert [run.payload for run in runs] == [0.0, 1.0]
-    size = math.radians(float(found.requirements.neck["size_deg"]))
+    size = math.radians(float(found.requirements.sim["size_deg"]))
     for run in runs:
         assert run.result is not None
         ends = size * math.cos(run.orientation), size * math.sin(run.orientation)
