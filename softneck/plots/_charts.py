@@ -100,8 +100,8 @@ def recording_chart(recording: Recording, title: str) -> Chart:
     unit, drawn = robot.motors.unit, robot.outputs.display_unit
     sent = recording.set_points / to_si(unit)[0]
     motors = [
-        Curve(line.x, line.spread(sent[:, j]), f"motor {j + 1}", ALL_MOTOR_COLOURS[j], "step", 0.9)
-        for j in range(sent.shape[1])
+        Curve(line.x, line.spread(sent[:, j]), name.replace("_", " "), ALL_MOTOR_COLOURS[j], "step", 0.9)
+        for j, name in enumerate(robot.motors.names)
     ]
     angles = [
         Curve(line.x, line.spread(shown(outputs[:, i], robot)), name, colour, width=0.9)
@@ -188,10 +188,11 @@ def loop_chart(
     panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
     for j, (name, position) in enumerate(zip(robot.set_points, robot.motor_positions, strict=True)):
-        motors.append(Curve(time, signals[name] / to_si(unit)[0], f"set-point {j + 1}", ALL_MOTOR_COLOURS[j], "step"))
+        called = _motor(robot, j)
+        motors.append(Curve(time, signals[name] / to_si(unit)[0], f"set-point {called}", ALL_MOTOR_COLOURS[j], "step"))
         if position in signals:
             measured = signals[position] / to_si(unit)[0]
-            motors.append(Curve(time, measured, f"position {j + 1}", ALL_MOTOR_COLOURS[j], "dashed", 0.8))
+            motors.append(Curve(time, measured, f"position {called}", ALL_MOTOR_COLOURS[j], "dashed", 0.8))
     panels.append(Panel(motors, f"motor [{unit}]"))
     if "tension_1" in signals:
         pulls = [
@@ -200,6 +201,11 @@ def loop_chart(
         ]  # fmt: skip
         panels.append(Panel(pulls, "tension [N]"))
     return Chart(title, panels, caption=caption)
+
+
+def _motor(robot: Robot, number: int) -> str:
+    """Return by what a legend tells a motor apart: its number where it is named by it, else its name."""
+    return robot.motors.names[number].removeprefix("motor_").replace("_", " ")
 
 
 def _output_panel(
@@ -282,8 +288,9 @@ def residual_chart(
         for i, axis in enumerate(axes)
     ]
     for j in range(motors):
+        set_point = f"set-point {_motor(robot, j)}"
         panels += [
-            _stems(cross_lags, cross[i, j], float(cross_bounds[i, j]), f"{axis}: error with set-point {j + 1} earlier")
+            _stems(cross_lags, cross[i, j], float(cross_bounds[i, j]), f"{axis}: error with {set_point} earlier")
             for i, axis in enumerate(axes)
         ]
     return Chart(title, panels, "lag [samples]", columns=len(axes), linked=False, caption=caption, row_height=1.9)

@@ -127,7 +127,7 @@ def test_the_page_of_a_loop_has_a_panel_for_each_output_in_its_unit(call: Call, 
     said = call("simulate", "loop.toml", "--html", "loop.html")
     assert said.code == 0, said.err
     page = (tmp_path / "loop.html").read_text(encoding="utf-8")
-    for label in ("x [mm]", "y [mm]", "z [mm]", "motor [bar]", "set-point 4", "z.rms_error_mm", "the true output"):
+    for label in ("x [mm]", "y [mm]", "z [mm]", "motor [bar]", "set-point d", "z.rms_error_mm", "the true output"):
         assert label in page + charts_of(page), label
     # What tendons bend is what the 3-D view draws.
     assert not (tmp_path / "loop_3d.html").exists()

@@ -42,7 +42,7 @@ def recording() -> Recording:
 def test_a_recording_has_all_motors_and_outputs_in_the_robot_s_units(recording: Recording) -> None:
     r = recording
     motors, outputs = recording_chart(r, "x").panels
-    assert [curve.label for curve in motors.curves] == [f"motor {j}" for j in range(1, 6)]
+    assert [curve.label for curve in motors.curves] == [f"p{j}" for j in range(5)]
     assert len({curve.colour for curve in motors.curves}) == 5
     assert (motors.y_label, outputs.y_label) == ("set-point [bar]", "output [mm]")
     np.testing.assert_allclose(motors.curves[4].y, r.set_points[:, 4] / 1e5)
@@ -70,7 +70,7 @@ def test_residual_tests_of_a_robot_are_a_grid_of_its_outputs_and_motors(recordin
     own: Any = (lags, np.ones((3, 3)), np.ones(3))
     chart = residual_chart(own, (lags, np.ones((3, 5, 3)), np.ones((3, 5))), "x", robot=recording.robot)
     assert (chart.columns, len(chart.panels)) == (3, 18)
-    assert chart.panels[17].title == "z: error with set-point 5 earlier"
+    assert chart.panels[17].title == "z: error with set-point p4 earlier"
     with pytest.raises(DataError, match=r"\(3, lags\) and \(3, 5, lags\)"):
         residual_chart(own, (lags, np.ones((2, 3, 3)), np.ones((2, 3))), "x", robot=recording.robot)
 

@@ -132,7 +132,8 @@ class Quality(ReprMixin):
         noise = ", ".join(f"{channel.name} {channel.shown(channel.noise):.3g} {unit}" for channel in measured)
         lines.append(f"noise (standard deviation): {noise}")
         if pairs := _pairs(self):
-            which = ", ".join(f"{i + 1}-{j + 1}" for i, j in pairs)
+            names = [name.removeprefix("motor_") for name in self.robot.motors.names]
+            which = ", ".join(f"{names[i]}-{names[j]}" for i, j in pairs)
             lines.append(f"correlation of motors {which}: {', '.join(_number(self.correlation[p]) for p in pairs)}")
         steps = [
             f"{channel.name} {channel.shown(channel.quantum):.3g}"
@@ -311,7 +312,8 @@ def _correlation(quality: Quality) -> Iterator[Finding]:
     for i, j in _pairs(quality):
         r = quality.correlation[i, j]
         if abs(r) > _RELATED:
-            message = f"motors {i + 1} and {j + 1} move together (correlation {r:.2f})."
+            names = [quality.robot.motors.names[k].removeprefix("motor_") for k in (i, j)]
+            message = f"motors {names[0]} and {names[1]} move together (correlation {r:.2f})."
             advice = "Their effects cannot be told apart well; move them independently."
             yield Finding("warning" if abs(r) > _ALIKE else "note", "correlation", "", message, advice)
 
