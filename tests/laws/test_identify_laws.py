@@ -44,8 +44,9 @@ def fitted(label: str, name: str, view: View) -> tuple[World, Model]:
 def check(label: str, name: str, view: View) -> None:
     (plain, model), (seen, other) = fitted(label, name, View()), fitted(label, name, view)
     expected, found = plain.simulated(model), seen.simulated(other)
-    turned = bool(view.turned or view.motors or view.outputs)
-    if label == "nn" and turned:  # a start draws weights for channels in their order
+    turned = bool(view.turned or view.motors or view.outputs or view.offset)
+    # A start draws weights for channels in their order, and its steps make much of the rounding of another middle.
+    if label == "nn" and turned:
         spread = max(np.abs(expected - plain.simulated(_seeded(name, seed))).max() for seed in (1, 2, 3))
         assert np.abs(found - expected).max() < 2.0 * spread
         return

@@ -65,6 +65,13 @@ def eq21_table(recording: Recording) -> Matrix:
     return lag_table((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,), sizes=sizes)
 
 
+def spread_table(recording: Recording) -> Matrix:
+    """Return a regressor for a scaled recording whose dead time nobody knows: three samples of y and of all u."""
+    sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
+    lags = [1 + i * max(round(2.0 * _APART / recording.sample_time), 1) for i in range(3)]
+    return lag_table(lags, lags, [], sizes=sizes)
+
+
 def regressor_scale(table: Matrix, scaling: Scaling, base_rest: Vector | float = 0.0) -> tuple[Matrix, Matrix]:
     """Return what each regressor of each output (outputs, n) is at rest in SI, and its unit.
 

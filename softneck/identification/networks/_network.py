@@ -33,7 +33,7 @@ from ..models._door import Door
 from ..models._drive import LoadedDrive, drive_start, fit_correction, load_in_si
 from ..models._fitting import SAME_EXCITATION, training_recording
 from ..models._model import Model
-from ..models._regressors import eq21_table, regression, regressor_scale
+from ..models._regressors import eq21_table, regression, regressor_scale, spread_table
 from ..models._state_space import history_array
 from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_layers, train_axis
 
@@ -149,7 +149,9 @@ class Network:
         """
         door = Door.of(training_recording(recordings, all_motors=True))
         recording, drive = door.data, door.drive
-        table = eq21_table(recording)
+        # The lags of Eq. 21 suit a robot whose pace is known beforehand.
+        known = door.recording.robot.time_constant_s is not None
+        table = eq21_table(recording) if known else spread_table(recording)
         sized = self._sized(recording, table)
         if hold_out is None:
             train, judge = recording.split(1.0 - _HOLD_OUT)
