@@ -4,7 +4,6 @@ from .bus._link import CanLink as CanLink
 from .bus._link import open_bus as open_bus
 from .bus._read import load_drives as load_drives
 from .commissioning._jog import jog as jog
-from .commissioning._neck_file import neck_drives as neck_drives
 from .commissioning._record import Experiment as Experiment
 from .commissioning._record import record_signal as record_signal
 from .commissioning._zero import zero as zero
@@ -19,6 +18,7 @@ from .running._preflight import preflight as preflight
 from .running._preflight import scan as scan
 from .running._stop import reset as reset
 from .running._stop import stop as stop
+from .running._virtual import neck_drives as neck_drives
 from .running._virtual import simulated_neck as simulated_neck
 from .sensing._serial import SerialInclinometer as SerialInclinometer
 from .sensing._sources import CanInclinometer as CanInclinometer

@@ -33,7 +33,6 @@ from softneck.drives import (
 from softneck.drives.bus._file import bus_load, frame_bits
 from softneck.drives.bus._link import VirtualLink
 from softneck.drives.bus._objects import limit_writes
-from softneck.drives.commissioning._neck_file import neck_drives
 from softneck.drives.commissioning._record import drive_limits
 from softneck.drives.logs._cycle import decode_cycle, encode_cycle
 from softneck.drives.logs._run_log import RunLogger
@@ -42,7 +41,7 @@ from softneck.drives.running._bus_loop import Session
 from softneck.drives.running._certified import _require_robot
 from softneck.drives.running._deploy import Deployment
 from softneck.drives.running._pilot import LoopPilot
-from softneck.drives.running._virtual import physics_of, simulated_plant, simulated_springs, stand_in
+from softneck.drives.running._virtual import neck_drives, physics_of, simulated_plant, simulated_springs, stand_in
 from softneck.drives.sensing._sources import CanInclinometer, PythonInclinometer
 from softneck.drives.simulated import SimulatedNeck
 from softneck.drives.simulated._springs import SimulatedSprings
