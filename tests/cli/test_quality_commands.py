@@ -23,7 +23,7 @@ def test_info_tells_the_quality_as_text_json_and_page(call: Call, tmp_path: Path
     text = call("info", "r.csv")
     assert (text.code, text.err) == (0, "")
     assert "rows: 600" in text.out
-    assert "  warning: pitch: misses 20 of 600 samples (3.3 %) in 1 stretch(es); the longest is 0.40 s at" in text.out
+    assert "  warning: pitch: misses 20 of 600 samples (3.3 %) in 1 gap(s); the longest is 0.40 s at" in text.out
     page = call("info", "r.csv", "--html", "q.html", "--json")
     told = json.loads(page.out)
     assert told["html"] == "q.html"

@@ -195,7 +195,7 @@ def test_another_robot_is_judged_by_its_channels() -> None:
     np.testing.assert_array_equal(found.correlation, of_neck.correlation)
     assert found.as_dict()["channels"]["x"]["unit"] == "mm"
     said = found.text()
-    assert "x: misses 20 of 3000 samples (0.67 %) in 1 stretch(es); the longest is 0.40 s at t = 2.00 s" in said
+    assert "x: misses 20 of 3000 samples (0.67 %) in 1 gap(s); the longest is 0.40 s at t = 2.00 s" in said
     assert "beyond 0.1 s a control loop would have stopped" in said
     assert "a_setpoint, b_setpoint, c_setpoint move up to the bandwidth of 4 rad/s." in said
     assert found.spectrum.inputs == robot.set_points

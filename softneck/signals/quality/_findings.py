@@ -228,7 +228,7 @@ def _dropouts(channel: ChannelQuality, quality: Quality) -> Finding:
     share, seconds = channel.missed_rows / channel.rows, longest.rows * quality.sample_time
     message = (
         f"misses {channel.missed_rows} of {channel.rows} samples ({100 * share:.2g} %) in {len(channel.missed)} "
-        f"stretch(es); the longest is {seconds:.2f} s at t = {longest.time:.2f} s."
+        f"gap(s); the longest is {seconds:.2f} s at t = {longest.time:.2f} s."
     )
     if share > _MANY_MISSED or seconds > gap:
         stop = "" if np.isnan(gap) else f"; beyond {gap:.2g} s a control loop would have stopped"
