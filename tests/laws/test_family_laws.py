@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 import softneck
-from softneck.core import Matrix, silent
+from softneck.core import Matrix, SettingsError, silent
 from softneck.identification.uncertainty._family import Family
+from softneck.robot import Robot
 
 from .worlds import PACES, UNITS, View, World, orders, world
 
@@ -67,3 +69,13 @@ def test_weights_and_bands_are_the_same_at_another_pace_and_in_other_units() -> 
         for output, measured in plain.measured.items():
             # Weights are found by bisection to 1e-6 of themselves.
             np.testing.assert_allclose(found.measured[output].weight, measured.weight, rtol=1e-4)
+
+
+@pytest.mark.parametrize("pace", [0.1, 1.0, 1000.0])
+def test_a_window_is_bounded_by_time_constants(pace: float) -> None:
+    seen = world("finger", View(pace=pace))
+    robot = Robot.from_dict(seen.robot.as_dict() | {"time_constant_s": 0.12 * pace})
+    recording = replace(seen.recording, robot=robot)
+    # 5 time constants, of the neck 1 s.
+    with pytest.raises(SettingsError, match=f"`window` must be between {0.6 * pace:g} and"):
+        softneck.family(recording, window=0.5 * pace, progress=silent)

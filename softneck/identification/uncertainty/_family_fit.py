@@ -182,6 +182,8 @@ def cross_gains(
 _FREQUENCIES = 100
 # [s] of a window: Eq. 22 goes through several of its waves.
 _WINDOW = 8.0
+# Of a window [scaled s]: 5 time constants hold a response, 5,000 several operating points.
+_SHORTEST, _LONGEST = 1.0, 1000.0
 # From a tenth of the neck's slowest time constants.
 _LOWEST = 0.05
 # Local models faster than this are stopped, not found: 40 1/s are 25 ms.
@@ -251,6 +253,9 @@ class FamilySettings:
             check_training(part)
         door = Door.of(whole)
         scaling = door.scaling
+        if self.window is not None:
+            ends = scaling.unscale_seconds(_SHORTEST), scaling.unscale_seconds(_LONGEST)
+            require_between("window", self.window, *ends, "s")
         times = {"window": door.seconds(self.window, _WINDOW), "max_delay": door.seconds(self.max_delay, MAX_DELAY)}
         named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
         if len(named) != len(parts):

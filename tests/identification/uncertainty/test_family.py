@@ -208,6 +208,8 @@ def test_what_cannot_be_made_a_family_is_named(recordings: list[Recording]) -> N
     other = Recording(still.time * 1.05, 0.021, still.channels)
     with pytest.raises(DataError, match=r"different sample times cannot be used together: 0\.02 s and 0\.021 s"):
         FamilySettings().fit([recordings[0], other])
-    for key, value in (("weight_order", 4), ("window", 0.1), ("directions", 0)):
+    with pytest.raises(SettingsError, match=r"`window` must be between 1 and 1000 \[s\]"):
+        FamilySettings(window=0.1).fit(recordings)
+    for key, value in (("weight_order", 4), ("window", -1.0), ("directions", 0)):
         with pytest.raises(SettingsError, match=f"`{key}` must be"):
             FamilySettings(**cast(Any, {key: value}))
