@@ -10,9 +10,9 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
 from softneck.core._repr import ReprMixin
-from softneck.identification.models._directions import NECK_SECONDS
 from softneck.identification.models._linear_systems import weights_of
 from softneck.robot import Robot
+from softneck.robot._scaling import TIME_CONSTANT
 
 if TYPE_CHECKING:
     import control
@@ -57,15 +57,14 @@ class AxisPlant(ReprMixin):
         denominator: (n + 1,) coefficients of A, the first is 1.
         delay: samples beyond the one that B/A has itself.
         sample_time: [s].
-        stretch: by how much it is slower than a neck, where it is another robot's: what is looked for in seconds
-            (frequencies, horizons) is stretched by it.
+        second: how many seconds a scaled second is [s], by which frequencies and horizons are chosen; of the neck 1.
     """
 
     numerator: Vector
     denominator: Vector
     delay: int
     sample_time: float
-    stretch: float = 1.0
+    second: float = 1.0
 
     @property
     def order(self) -> int:
@@ -170,7 +169,7 @@ class AxisPlant(ReprMixin):
         # Markov parameters times the denominator give the numerator.
         markov = np.array([C @ np.linalg.matrix_power(Ad, i) @ Bd for i in range(n)])
         numerator = np.convolve(markov, denominator)[:n]
-        return AxisPlant(numerator, denominator, self.delay * ratio, sample_time, self.stretch)
+        return AxisPlant(numerator, denominator, self.delay * ratio, sample_time, self.second)
 
     def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
         """Return it as a `control.TransferFunction` with `extra_delay` samples more."""
@@ -219,7 +218,7 @@ def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
     delay = min(poles_at_zero, denominator.size - numerator.size - 1)
     A = denominator[: denominator.size - delay]
     B = np.concatenate([np.zeros(A.size - 1 - numerator.size), numerator])
-    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _stretch(model, B, A, float(dt)))
+    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _second(model, B, A, float(dt)))
 
 
 def robot_of(source: Any) -> Robot:
@@ -235,12 +234,10 @@ def directions_of(source: Any) -> Matrix:
     return weights_of(source) if given is None else given
 
 
-def _stretch(model: HasTransferFunctions, numerator: Vector, denominator: Vector, sample_time: float) -> float:
-    """Return by how much a robot is slower than a neck, by its main pole."""
-    if robot_of(model).is_neck:
-        return 1.0
+def _second(model: HasTransferFunctions, numerator: Vector, denominator: Vector, sample_time: float) -> float:
+    """Return how many seconds a scaled second of a robot is, by its time constant or else by its main pole."""
     slow = AxisPlant(numerator, denominator, 0, sample_time).time_constant
-    return max(slow, sample_time) / NECK_SECONDS
+    return (robot_of(model).time_constant_s or max(slow, sample_time)) / TIME_CONSTANT
 
 
 def _check(axis: str, numerator: Vector, denominator: Vector) -> None:

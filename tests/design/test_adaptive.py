@@ -189,7 +189,7 @@ def linear(settings: AdaptiveSettings) -> LinearController:
 
 
 def test_without_learning_it_is_a_linear_controller() -> None:
-    settings = AdaptiveSettings()
+    settings = AdaptiveSettings(reference_time=0.06, lead_limit=0.8)
     block, other = settings.design(neck()).block(), linear(settings).block()
     U = 0.2 * np.random.default_rng(0).standard_normal((200, 10))
     U[:, 8:] = 1.0

@@ -102,7 +102,9 @@ def test_the_formula_for_a_lag_is_right_to_nine_percent(ratio: float) -> None:
 @pytest.mark.parametrize("kind", ["pi", "hinf"])
 def test_what_the_motors_cannot_give_is_refused_in_a_line(kind: str) -> None:
     settings = resolve(KINDS[kind].settings)
-    with pytest.raises(SettingsError, match=r"`rise_s` = 0\.02: within the motors' slew and range no step of 10 deg"):
+    with pytest.raises(
+        SettingsError, match=r"`rise_s` = 0\.02: within the motors' slew and range no step of two ninths"
+    ):
         settings(rise_s=0.02).design(neck(*PLANTS["paper"]))
     with pytest.raises(SettingsError, match="rises in less than"):
         settings(rise_s=0.35).design(neck(*PLANTS["paper"]), robot=neck_within(slew=1.0))

@@ -210,7 +210,7 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
     radius = closed_radius(axis, plant, extra_delay)
     if radius >= 1.0:
         raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
-    w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)
+    w = frequencies(plant.sample_time, lowest=LOWEST / plant.second)
     loop = feedback_response(axis, np.exp(1j * w * plant.sample_time)) * plant.response(w, extra_delay=extra_delay)
     data = (np.abs(loop), np.degrees(np.unwrap(np.angle(loop))), w)
     gain, phase, _, _, crossover, _ = (float(value) for value in control.stability_margins(data))
@@ -230,7 +230,7 @@ def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay
 
 def coarse(plant: AxisPlant) -> Vector:
     """Return frequencies [rad/s] for many samples, 4 % apart, the Nyquist frequency among them."""
-    return frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)[::-_COARSE][::-1]
+    return frequencies(plant.sample_time, lowest=LOWEST / plant.second)[::-_COARSE][::-1]
 
 
 def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:

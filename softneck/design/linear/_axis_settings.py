@@ -15,6 +15,7 @@ from softneck.core import Matrix, SettingsError, require_between
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
 from softneck.robot import Robot
+from softneck.robot._scaling import Scaling
 from softneck.robot._search import find_robot
 
 from ..plants._step_and_load import StepAndLoad
@@ -73,7 +74,7 @@ class AxisSettings(LoopSettings, ABC):
     OVERSHOOT_PCT: ClassVar[float] = DESIGN_OVERSHOOT_IN_LIMITS_PCT
 
     max_sensitivity: float = 2.0
-    reference_time: float | Sequence[float] | None = None
+    reference_time: float | Sequence[float] | str | None = None
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
@@ -286,14 +287,14 @@ def axis_test(plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> St
         position_limit=limits.position_limit / share,
         slew_limit=limits.slew_limit * plant.sample_time / share,
     )
-    if limits.robot.is_neck:
-        return test
-    # As large and as long for this robot as 10 deg, -0.5 rad and 6 s are for a neck, which they take 2 of 9 rad.
+    test = replace(test, load_at=plant.second * test.load_at, duration=plant.second * test.duration)
+    if limits.robot.motors.nominal is not None:
+        scaling = Scaling.of(limits.robot)
+        reference = float(scaling.output_unit.max()) * test.reference
+        return replace(test, reference=reference, load=scaling.motor_unit * test.load, size=test.reference / reference)
+    # As large for this robot as 10 deg and -0.5 rad are for a neck, which they take 2 of 9 rad.
     asked = 2.0 / 9.0 * test.position_limit * abs(plant.static_gain)
-    return replace(
-        test, reference=asked, load=-0.5 / 9.0 * test.position_limit, load_at=plant.stretch * test.load_at,
-        duration=plant.stretch * test.duration, size=test.reference / asked,
-    )  # fmt: skip
+    return replace(test, reference=asked, load=-0.5 / 9.0 * test.position_limit, size=test.reference / asked)
 
 
 def slowest(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:
@@ -313,7 +314,7 @@ def _first_filter(plant: AxisPlant) -> int:
 
 def _slowest_filter(plant: AxisPlant) -> int:
     """Return the slowest reference filter that is tried [samples]: 2 s of a neck at 20 ms."""
-    return _SLOWEST if plant.stretch == 1.0 else max(_SLOWEST, math.ceil(2.0 * plant.stretch / plant.sample_time))
+    return max(_SLOWEST, math.ceil(2.0 * plant.second / plant.sample_time))
 
 
 def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign | None:

@@ -124,7 +124,7 @@ class LinearController(ReprMixin):
             lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
             lines += _findings(item)
             for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
-                if key in item and (title == "as identified" or self.robot.is_neck):
+                if key in item and (title == "as identified" or item[key] != item.get("margins")):
                     lines.append(f"    {title}: {_margins(item[key])}")
         return "\n".join(lines)
 

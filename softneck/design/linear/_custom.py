@@ -64,7 +64,7 @@ class CustomSettings(AxisSettings):
 
     def _around(self, plant: Any, robot: Robot | None) -> LinearController:
         whole: Any = coupled_plant(plant, robot=robot)
-        if whole is None or (whole.robot.is_neck and not self._is_whole()):
+        if whole is None or (whole.robot.directions.names and not self._is_whole()):
             return AxisSettings._around(self, plant, robot)
         if isinstance(self.controller, Mapping):
             raise SettingsError(

@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 
 from softneck.core import SettingsError, require_between, require_one_of
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
-from softneck.robot._neck_default import NeckDefault
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._assembly import AxisController, ReferenceFilter, pi_axis
 from ._axis_loop import LOWEST, loop_margins, sensitivities, unstable_samples
 from ._axis_settings import AxisDesign, AxisSettings, margins_json
+from ._loop_settings import PLANT
 from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
 
 TUNINGS = ("nominal", "samples")
@@ -43,8 +43,8 @@ class PiSettings(AxisSettings):
     tuning: str = "nominal"
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
-    # About the time constant of the paper's neck, 1/5.293 s: what is asked faster only runs into limits.
-    reference_time: float | Sequence[float] | None = NeckDefault(0.2)
+    # As slow as the robot: what is asked faster only runs into limits.
+    reference_time: float | Sequence[float] | str | None = PLANT
 
     def __post_init__(self) -> None:
         AxisSettings.__post_init__(self)
@@ -52,8 +52,10 @@ class PiSettings(AxisSettings):
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
 
-    def _others(self, plant: UncertainPlant) -> dict[str, Any]:
-        return {"reference_time": max(axis.nominal.time_constant for axis in plant.axes.values())}
+    def _defaults(self, plant: UncertainPlant) -> dict[str, Any]:
+        slowest = plant.robot.time_constant_s or max(axis.nominal.time_constant for axis in plant.axes.values())
+        usual = {"reference_time": slowest} if self.reference_time == PLANT else {}
+        return {**AxisSettings._defaults(self, plant), **usual}
 
     def _prepared(self, axis: UncertainAxis) -> UncertainAxis:
         return axis.prepared()
@@ -61,7 +63,7 @@ class PiSettings(AxisSettings):
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         small, extra = self._small(axis), self.extra_delay
         gains = tune_pi(self._family(axis), extra, self.max_sensitivity, self.phase_margin)
-        controller, lowest = pi_axis(gains.gain, gains.integral_time, axis.sample_time), LOWEST / axis.nominal.stretch
+        controller, lowest = pi_axis(gains.gain, gains.integral_time, axis.sample_time), LOWEST / axis.nominal.second
         margins = [margins_json(loop_margins(open_loop(plant, extra, gains), lowest=lowest)) for plant in small]
         lost = unstable_samples(controller, axis.samples, extra)
         notes = {

@@ -97,12 +97,16 @@ class PidSettings(AxisSettings):
         lag = axis.nominal.time_constant
         dead = (axis.nominal.delay + 1 + self.extra_delay) * dt
         judge = _Judge.of(self, axis)
+        # The search sees scaled gains and seconds: its first simplex would differ by the units else.
+        size = judge.sweep.test.gain_unit
+        units = np.array([math.copysign(size, gain), *[axis.nominal.second] * 3])
         best: PidGains | None = None
         for slow in _STARTS:
-            start = np.log([lag / (2.0 * slow * dead) / abs(gain), lag + 0.5 * dead, 0.3 * dead, 0.3 * dt])
-            few = judge.hardest(_gains(start, gain))
-            result = minimize(partial(_cost, few, gain), start, method="Nelder-Mead", options=_OPTIONS)
-            found = judge.kept(_gains(result.x, gain))
+            guess = np.array([lag / (2.0 * slow * dead) / abs(gain), lag + 0.5 * dead, 0.3 * dead, 0.3 * dt])
+            start = np.log(guess / np.abs(units))
+            few = judge.hardest(_gains(start, units))
+            result = minimize(partial(_cost, few, units), start, method="Nelder-Mead", options=_OPTIONS)
+            found = judge.kept(_gains(result.x, units))
             if found is not None and (best is None or judge.load(found) < judge.load(best)):
                 best = found
         if best is None:
@@ -113,9 +117,9 @@ class PidSettings(AxisSettings):
         return best
 
 
-def _gains(x: Vector, sign: float) -> PidGains:
-    K, *times = (float(value) for value in np.exp(np.clip(x, -20.0, 20.0)))
-    return PidGains(math.copysign(K, sign), *times)
+def _gains(x: Vector, units: Vector) -> PidGains:
+    """Return the gains of logarithms `x` (4,) in `units` (4,), of which the first has the sign of K."""
+    return PidGains(*(float(value) for value in units * np.exp(np.clip(x, -20.0, 20.0))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +132,7 @@ class _Judge:
     loops: np.ndarray
     sample_time: float
     static_gain: float
-    stretch: float
+    second: float
 
     @classmethod
     def of(cls, settings: PidSettings, axis: UncertainAxis) -> _Judge:
@@ -136,7 +140,7 @@ class _Judge:
         w = coarse(axis.nominal)
         loops = np.array([plant.response(w, extra_delay=settings.extra_delay) for plant in axis.samples])
         return cls(settings, settings._sweep(axis), np.exp(1j * w * dt), loops, dt, axis.nominal.static_gain,
-                   axis.nominal.stretch)  # fmt: skip
+                   axis.nominal.second)  # fmt: skip
 
     def hardest(self, gains: PidGains) -> _Judge:
         """Return the judge of the samples on which a load is worst under `gains`: the others do not decide."""
@@ -153,7 +157,7 @@ class _Judge:
     def _loads(self, gains: PidGains) -> Vector:
         axis = gains.axis(self.sample_time)
         with np.errstate(over="ignore", invalid="ignore"):
-            return self.sweep.run(axis, _WHILE_SEARCHING * self.stretch, axis.conditioning()).load_rms
+            return self.sweep.run(axis, _WHILE_SEARCHING * self.second, axis.conditioning()).load_rms
 
     def excess(self, gains: PidGains) -> float:
         """Return how far the bounds are broken, 0 if they are kept."""
@@ -172,9 +176,9 @@ class _Judge:
         return None
 
 
-def _cost(judge: _Judge, sign: float, x: Vector) -> float:
-    """Return what the search minimises."""
-    gains = _gains(x, sign)
+def _cost(judge: _Judge, units: Vector, x: Vector) -> float:
+    """Return the cost that the search minimises."""
+    gains = _gains(x, units)
     try:
         return judge.load(gains) + _PENALTY * judge.excess(gains)
     except SettingsError:

@@ -10,12 +10,11 @@ import numpy as np
 
 from softneck.core import SettingsError, Vector, require_between, require_finite, require_positive, to_si
 from softneck.robot import Robot
-from softneck.robot._neck_default import NeckDefault
+from softneck.robot._scaling import MOTOR_RANGE as MAX_MOTOR
+from softneck.robot._scaling import OUTPUT_RANGE as MAX_REFERENCE
+from softneck.robot._scaling import Scaling
 from softneck.runtime import Port
 
-# The neck's inclination stays below 0.7 rad; motors within 6 rad (paper, section 5).
-MAX_REFERENCE = 0.8
-MAX_MOTOR = 6.0
 MAX_SLEW = 1000.0
 _NECK = Robot.preset("neck")
 # A reference that nobody limits: beyond any number in SI that a robot's output has, and a number in files still.
@@ -31,12 +30,14 @@ def limit_ports(starts: tuple[float, float, float, float, float], robot: Robot =
         robot: whose motors they are.
     """
     position, slew, lead, least, common = starts
-    unit, neck = to_si(robot.motors.unit)[1], robot.is_neck
-    smallest = 0.01 if neck else 0.0
+    unit = to_si(robot.motors.unit)[1]
+    largest = nominal_ends(robot)
+    bounded, size = largest is not None, 1.0 if largest is None else largest / MAX_MOTOR
+    smallest = 0.01 if bounded else 0.0
 
     def port(name: str, start: float, low: float, most: float, what: str = "", per: str = "") -> Port:
-        return Port(name=name, unit=unit + per, start=start, minimum=low if neck or low == 0.0 else None,
-                    maximum=most if neck else None, description=what)  # fmt: skip
+        return Port(name=name, unit=unit + per, start=start, minimum=size * low if bounded or low == 0.0 else None,
+                    maximum=size * most if bounded else None, description=what)  # fmt: skip
 
     return (
         port("position_limit", position, smallest, MAX_MOTOR),
@@ -55,7 +56,7 @@ def controller_outputs(robot: Robot = _NECK) -> tuple[Port, ...]:
 
 def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     """Return the inputs: references, outputs, motors and flags."""
-    neck, unit, shown = robot.is_neck, to_si(robot.outputs.unit)[1], robot.outputs.shown
+    unit, shown = to_si(robot.outputs.unit)[1], robot.outputs.shown
     lowest, highest = reference_ranges(robot)
     ranges = motor_ranges(robot, None)
     references = tuple(
@@ -67,11 +68,11 @@ def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
         name="cocontraction_reference", unit=to_si(robot.motors.unit)[1], display_unit=robot.motors.shown,
         minimum=None if ranges is None else float(min(ranges[0])),
         maximum=None if ranges is None else float(max(ranges[1])),
-        description="wanted delta_i (Eq. 11)" if neck else "wanted mean of the motors that moves no output",
+        description=f"wanted {robot.cocontraction_name}, the mean of the motors that moves no output",
     )  # fmt: skip
-    whose = "the neck" if neck else robot.name
     angles = tuple(
-        Port(name=name, unit=unit, description=f"{name} of {whose}", display_unit=shown) for name in robot.outputs.names
+        Port(name=name, unit=unit, description=f"{name} of the robot", display_unit=shown)
+        for name in robot.outputs.names
     )
     motors = _motors(robot, robot.motor_positions, "measured position of motor", ranges)
     flags = (
@@ -98,11 +99,17 @@ def _motors(robot: Robot, names: Sequence[str], what: str, ranges: tuple[Vector,
     )
 
 
+def nominal_ends(robot: Robot) -> float | None:
+    """Return the largest set-point in SI of a robot with a nominal one; None without."""
+    return None if robot.motors.nominal is None else MAX_MOTOR * Scaling.of(robot).motor_unit
+
+
 def motor_ranges(robot: Robot, position: float | None) -> tuple[Vector, Vector] | None:
     """Return the lowest and highest set-points (motors,) in SI; None where neither the robot nor `position` says."""
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
-    if robot.is_neck:
-        return np.full(3, -MAX_MOTOR), np.full(3, MAX_MOTOR)
+    if (largest := nominal_ends(robot)) is not None:
+        most = np.full(len(motors.names), largest)
+        return -most, most
     if motors.setpoint_min is None or motors.setpoint_max is None:
         most = np.full(len(motors.names), 0.0 if position is None else position)
         return None if position is None else (-most, most)
@@ -113,8 +120,9 @@ def motor_ranges(robot: Robot, position: float | None) -> tuple[Vector, Vector] 
 def reference_ranges(robot: Robot) -> tuple[Vector, Vector]:
     """Return the lowest and highest references (outputs,) in SI: what the robot's outputs may be."""
     outputs, factor, size = robot.outputs, to_si(robot.outputs.unit)[0], len(robot.outputs.names)
-    if robot.is_neck:
-        return np.full(size, -MAX_REFERENCE), np.full(size, MAX_REFERENCE)
+    if outputs.nominal is not None:
+        most = MAX_REFERENCE * Scaling.of(robot).output_unit
+        return -most, most
     low = np.full(size, -_UNLIMITED) if outputs.min is None else factor * np.array(outputs.min)
     high = np.full(size, _UNLIMITED) if outputs.max is None else factor * np.array(outputs.max)
     return low, high
@@ -143,15 +151,16 @@ class ControllerLimits:
     robot: Robot = field(default_factory=Robot.preset)
 
     def __post_init__(self) -> None:
-        if not self.robot.is_neck:
-            require_limits({name: getattr(self, name) for name in LIMITS})
+        require_limits({name: getattr(self, name) for name in LIMITS})
+        largest, unit = nominal_ends(self.robot), to_si(self.robot.motors.unit)[1]
+        if largest is not None:
+            least = 0.01 * largest / MAX_MOTOR
+            require_between("position_limit", self.position_limit, least, largest, unit)
+            require_between("lead_limit", self.lead_limit, least, 2.0 * largest, unit)
             for name in LIMITS[3:]:
-                _require_room(name, getattr(self, name), self.position_limit, self.robot.motors.unit)
-            return
-        require_between("position_limit", self.position_limit, 0.01, MAX_MOTOR, "rad")
-        require_between("slew_limit", self.slew_limit, 0.01, MAX_SLEW, "rad/s")
-        require_between("lead_limit", self.lead_limit, 0.01, 2.0 * MAX_MOTOR, "rad")
-        require_taut(self.least_position, self.least_cocontraction, self.position_limit)
+                require_between(name, getattr(self, name), -largest, largest, unit)
+        for name in LIMITS[3:]:
+            _require_room(name, getattr(self, name), self.position_limit, self.robot.motors.unit)
 
     def ports(self) -> tuple[Port, ...]:
         """Return them as parameters of a block."""
@@ -170,81 +179,69 @@ class ControllerLimits:
     def constants(self, sample_time: float) -> Vector:
         """Return the runtime's constants: sample time, of another robot also ranges of set-points, references."""
         ranges = motor_ranges(self.robot, self.position_limit)
-        if self.robot.is_neck or ranges is None:
+        if ranges is None:
             return np.array([sample_time])
         low, high = reference_ranges(self.robot)
+        if (np.abs(ranges) == MAX_MOTOR).all() and (np.abs([low, high]) == MAX_REFERENCE).all():
+            return np.array([sample_time])  # the runtime's own
         return np.array([sample_time, *ranges[0], *ranges[1], *low, ranges[0].min(), *high, ranges[1].max()])
 
     def lines(self, sample_time: float) -> list[str]:
-        """Return some lines for people."""
-        if not self.robot.is_neck:
-            return [self._line_of_robot()]
-        return [
-            f"  limits: |P| <= {self.position_limit:g} rad, slew {self.slew_limit:g} rad/s "
-            f"({self.slew_limit * sample_time:g} rad per sample{self._of_robot()}), lead {self.lead_limit:g} rad "
-            "before the motors",
-            *_taut_lines(self.least_position, self.least_cocontraction),
-        ]
-
-    def _of_robot(self) -> str:
-        """Return by how much more the robot's file would allow: a default that is stricter is said."""
-        most = min(self.robot.motors.rate_limit or (0.0,))
-        return f"; its robot allows {most:g} rad/s" if most > self.slew_limit else ""
-
-    def _line_of_robot(self) -> str:
-        """Return a line in the unit of the robot's files."""
+        """Return some lines for people, in the unit of the motors."""
         unit = self.robot.motors.unit
         factor = to_si(unit)[0]
         ranges = motor_ranges(self.robot, self.position_limit)
-        told = (
-            ""
-            if ranges is None
-            else f"set-points {ranges[0].min() / factor:g} to {ranges[1].max() / factor:g} {unit}, "
-        )
-        return (
-            f"  robot {self.robot.label()}: {told}slew {self.slew_limit / factor:g} {unit}/s, lead "
-            f"{self.lead_limit / factor:g} {unit} before the motors"
-        )
+        ends = "" if ranges is None else (
+            f"set-points {max(ranges[0].min(), -self.position_limit) / factor:g} to "
+            f"{min(ranges[1].max(), self.position_limit) / factor:g} {unit}, "
+        )  # fmt: skip
+        slew, lead = self.slew_limit / factor, self.lead_limit / factor
+        most = min(self.robot.motors.rate_limit or (0.0,))
+        allowed = f"; its robot allows {most:g} {unit}/s" if most > slew * (1.0 + 1e-9) else ""
+        rules = [("no motor below", self.least_position), ("co-contraction at least", self.least_cocontraction)]
+        taut = [f"{rule} {limit / factor:g} {unit}" for rule, limit in rules if limit > -self.position_limit]
+        return [
+            f"  limits: {ends}slew {slew:g} {unit}/s ({slew * sample_time:g} {unit} per sample{allowed}), "
+            f"lead {lead:g} {unit} before the motors",
+            *([f"  tendons kept taut: {', '.join(taut)}"] if taut else []),
+        ]
 
 
 LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "least_cocontraction")
-# Of a neck, where its file allows more: 0.25 rad in 20 ms.
-_NECK_SLEW = 12.5
+# Of scaled set-points, where a file with nominal ones allows more: 0.25 in 20 ms.
+_SLEW = 12.5
 
 
-def limits_of(robot: Robot, *, lead_limit: float, least_cocontraction: float) -> ControllerLimits:
+def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: float | None) -> ControllerLimits:
     """Return the limits of a robot: what its file says of its motors, and two of a controller's own.
 
     Args:
         robot: whose motors they are.
-        lead_limit, least_cocontraction: in the unit of its motors; a `NeckDefault` is of necks: other set-points may
-            run ahead of the motors as far as these go.
+        lead_limit, least_cocontraction: in the unit of its motors; None for no such limit.
 
     Raises:
         SettingsError: a limit that the robot's file does not say.
     """
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
-    given = {"lead_limit": lead_limit, "least_cocontraction": least_cocontraction}
-    if robot.is_neck:
-        position = min((MAX_MOTOR, *(motors.setpoint_max or ())))
-        # Down to the same limit there is no need of a rule.
-        lowest = [low for low in motors.setpoint_min or () if low > -position]
-        return ControllerLimits(
-            robot=robot, position_limit=position, slew_limit=min((_NECK_SLEW, *(motors.rate_limit or ()))),
-            least_position=max((-MAX_MOTOR, *lowest)), **given,
-        )  # fmt: skip
-    ranges = motor_ranges(robot, None)
-    if ranges is None or motors.rate_limit is None:
+    largest, ranges = nominal_ends(robot), motor_ranges(robot, None)
+    if ranges is None or (motors.rate_limit is None and largest is None):
         missing = "setpoint_min` and `setpoint_max" if ranges is None else "rate_limit"
         raise SettingsError(
             f"robot {robot.label()} gives no `motors.{missing}`, which a controller needs; add it to its robot file."
         )
+    rates = [factor * rate for rate in motors.rate_limit or ()]
     most = float(np.abs(ranges).max())
-    own = {name: factor * value for name, value in given.items() if not isinstance(value, NeckDefault)}
-    usual = {"lead_limit": 2.0 * most, "least_cocontraction": -most}
+    least = -most
+    if largest is not None:
+        scaling = Scaling.of(robot)
+        most = min((largest, *(factor * high for high in motors.setpoint_max or ())))
+        # Down to the same limit there is no need of a rule.
+        least = max((-largest, *(factor * low for low in motors.setpoint_min or () if factor * low > -most)))
+        rates.append(_SLEW * scaling.motor_unit / scaling.second)
     return ControllerLimits(
-        robot=robot, position_limit=most, slew_limit=factor * min(motors.rate_limit), least_position=-most,
-        **{**usual, **own},
+        robot=robot, position_limit=most, slew_limit=min(rates), least_position=least,
+        lead_limit=2.0 * most if lead_limit is None else factor * lead_limit,
+        least_cocontraction=-(largest or most) if least_cocontraction is None else factor * least_cocontraction,
     )  # fmt: skip
 
 
@@ -255,26 +252,9 @@ def require_limits(limits: Mapping[str, float]) -> None:
         check(name, value)
 
 
-def require_taut(least_position: float, least_cocontraction: float, position_limit: float) -> None:
-    """Raise SettingsError unless the rule for taut tendons leaves the motors room below their limit."""
-    for name, value in (("least_position", least_position), ("least_cocontraction", least_cocontraction)):
-        require_between(name, value, -MAX_MOTOR, MAX_MOTOR, "rad")
-        _require_room(name, value, position_limit, "rad")
-
-
 def _require_room(name: str, value: float, position_limit: float, unit: str) -> None:
     if value >= position_limit:
         most, got = (number / to_si(unit)[0] for number in (position_limit, value))
         raise SettingsError(
             f"`{name}` must be below `position_limit`, {most:g} {unit}, or no room to tilt is left; got {got:g}."
         )
-
-
-def _taut_lines(least_position: float, least_cocontraction: float) -> list[str]:
-    """Return a line on the rule for taut tendons, none where there is no rule."""
-    parts = []
-    if least_position > -MAX_MOTOR:
-        parts.append(f"no motor below {least_position:g} rad")
-    if least_cocontraction > -MAX_MOTOR:
-        parts.append(f"co-contraction at least {least_cocontraction:g} rad")
-    return [f"  tendons kept taut: {', '.join(parts)}"] if parts else []

@@ -41,11 +41,8 @@ def check_rise(rise: float, plant: AxisPlant, test: StepAndLoad) -> None:
     least = least_rise(plant, test)
     if rise < least:
         raise SettingsError(
-            f"`rise_s` = {rise:g}: within the motors' slew and range no step of "
-            f"{math.degrees(test.reference):.3g} deg rises in less than {least:.2g} s; ask for more."
-            if plant.stretch == 1.0
-            else f"`rise_s` = {rise:g}: within the motors' slew and range no such step rises in less than "
-            f"{least:.2g} s; ask for more."
+            f"`rise_s` = {rise:g}: within the motors' slew and range no step of two ninths of their range rises in "
+            f"less than {least:.2g} s; ask for more."
         )
 
 

@@ -56,7 +56,7 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
     """
     plant = plants[0]
     fine = len(plants) <= _FEW
-    w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch) if fine else coarse(plant)
+    w = frequencies(plant.sample_time, lowest=LOWEST / plant.second) if fine else coarse(plant)
     z = np.exp(1j * w * plant.sample_time)
     # (plants, frequencies)
     G = np.array([item.response(w, extra_delay=extra_delay) for item in plants]) / plant.static_gain
@@ -111,11 +111,11 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
     """
     from scipy.signal import lfilter
 
-    sample_time, stretch = plants[0].sample_time, plants[0].stretch
-    rows = math.ceil(_HORIZON * stretch / sample_time)
+    sample_time, second = plants[0].sample_time, plants[0].second
+    rows = math.ceil(_HORIZON * second / sample_time)
     scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread) if gain_spread > 0.0 else (1.0,)
     steps = [_step_response(plant, extra_delay, gains, rows, scale) for plant in plants for scale in scales]
-    for samples in range(1 + math.ceil(_SLOWEST_FILTER * stretch / sample_time)):
+    for samples in range(1 + math.ceil(_SLOWEST_FILTER * second / sample_time)):
         a = math.exp(-1.0 / samples) if samples else 0.0
         peak = max(float(np.max(lfilter([1.0 - a], [1.0, -a], step))) for step in steps)
         if peak <= 1.0 + overshoot:

@@ -53,7 +53,7 @@ class WholeDesign:
     def worst(self, extra_delay: int) -> float:
         """Return the largest Ms of all samples; inf where one is not stable."""
         nominal = self.samples[0][0]
-        w = frequencies(nominal.sample_time, lowest=LOWEST / nominal.stretch)[::-_COARSE][::-1]
+        w = frequencies(nominal.sample_time, lowest=LOWEST / nominal.second)[::-_COARSE][::-1]
         if any(radius(self.parts, plants, extra_delay) >= 1.0 for plants in self.samples):
             return math.inf
         return max(sensitivity(self.parts, plants, extra_delay, w) for plants in self.samples)

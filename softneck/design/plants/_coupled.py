@@ -11,12 +11,10 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation._axis import AXES
-from softneck.identification.models._directions import NECK_SECONDS
 from softneck.robot import Robot
 from softneck.robot._channels import Motors, Outputs
 from softneck.robot._directions import Directions
-from softneck.robot._redefined import redefinition_of
-from softneck.signals import redefinition_matrix
+from softneck.robot._scaling import TIME_CONSTANT
 
 from ._coupled_axis import CoupledAxis
 from ._uncertain import UncertainAxis
@@ -84,7 +82,7 @@ def coupled_plant(source: Any, *, robot: Robot | None = None) -> CoupledPlant | 
 
     if isinstance(source, control.StateSpace | control.TransferFunction):
         system: Any = control.ss(source)
-        neck = _is_necks(system) if robot is None else robot.is_neck
+        neck = _is_necks(system) if robot is None else robot.input_names == _NECK_INPUTS
         if neck and (system.ninputs == 1 or not _crosses(system)):
             return None
         whose = robot or (Robot.preset() if neck else _robot(system))
@@ -158,30 +156,28 @@ def _coupled(system: Any, robot: Robot, weights: Matrix | None, *, named: bool =
         )
     A, B, C = _sorted(system, robot)
     _check(A, B, C, np.asarray(system.D, dtype=np.float64))
-    if not robot.is_neck and (B.shape[1], len(C)) != (len(robot.motors.names), len(robot.outputs.names)):
+    outputs, motors = len(robot.outputs.names), len(robot.motors.names)
+    if weights is not None and (B.shape[1], len(C)) == (outputs, outputs) != (motors, outputs):
+        B = B @ weights
+    if (B.shape[1], len(C)) != (motors, outputs):
         raise SettingsError(
             f"the plant has {B.shape[1]} input(s) and {len(C)} output(s), robot {robot.label()} "
-            f"{len(robot.motors.names)} motor(s) and {len(robot.outputs.names)}."
+            f"{motors} motor(s) and {outputs}."
         )
-    if B.shape[1] == len(_NECK_INPUTS) < len(robot.motors.names) and robot.is_neck:
-        B = B @ redefinition_matrix()[: len(_NECK_INPUTS)]
     at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
     _require_apart(at_rest, robot)
-    if robot.is_neck:
-        own = redefinition_matrix(), np.linalg.inv(redefinition_matrix())
-    else:
-        found: Any = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True) if weights is None else weights
-        if named:
-            robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, found.tolist()))))
-        own = redefinition_of(found, robot.outputs.names)
+    found: Any = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True) if weights is None else weights
+    if named:
+        robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, found.tolist()))))
+    own = robot.redefinition(found)
     gains = at_rest @ own[1][:, : len(C)]
     turn = gains / np.linalg.norm(gains, axis=1, keepdims=True)
     T, inverse = _turned(own, turn)
     rows = tuple(_row(A, B @ inverse[:, : len(C)], c, axis, float(dt)) for axis, c in enumerate(C))
-    if not robot.is_neck:
-        radius = max(float(np.abs(np.linalg.eigvals(row.A)).max()) for row in rows)
-        slowest = -dt / math.log(radius) if radius > 0.0 else 0.0
-        rows = tuple(replace(row, stretch=max(slowest, float(dt)) / NECK_SECONDS) for row in rows)
+    radius = max(float(np.abs(np.linalg.eigvals(row.A)).max()) for row in rows)
+    slowest = -dt / math.log(radius) if radius > 0.0 else 0.0
+    second = (robot.time_constant_s or max(slowest, float(dt))) / TIME_CONSTANT
+    rows = tuple(replace(row, second=second) for row in rows)
     return CoupledPlant(rows, robot, (T, inverse), turn)
 
 

@@ -21,7 +21,7 @@ class CoupledAxis:
         axis: which of the redefined inputs is its own; at rest it answers to that alone.
         delay: samples beyond the one that A and B have themselves.
         sample_time: [s].
-        stretch: by how much the plant is slower than a neck, where it is another robot's.
+        second: how many seconds a scaled second is [s]; of the neck 1.
     """
 
     A: Matrix
@@ -29,7 +29,7 @@ class CoupledAxis:
     axis: int
     delay: int
     sample_time: float
-    stretch: float = 1.0
+    second: float = 1.0
 
     @property
     def order(self) -> int:
@@ -70,7 +70,7 @@ class CoupledAxis:
         """Return the lag of its slowest pole and static gain, which weights are chosen for: zeros may be slower."""
         pole = float(np.abs(np.linalg.eigvals(self.A)).max(initial=0.0))
         gain = self.static_gain * (1.0 - pole)
-        return AxisPlant(np.array([gain]), np.array([1.0, -pole]), self.delay, self.sample_time, self.stretch)
+        return AxisPlant(np.array([gain]), np.array([1.0, -pole]), self.delay, self.sample_time, self.second)
 
     def faster(self, pole: float) -> CoupledAxis:  # noqa: ARG002 - what is slow in it is no pole of one axis
         """Return itself."""

@@ -9,6 +9,9 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_positive
 
+# Scaled [rad of theta_i].
+_LOAD = -0.5
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepAndLoad:
@@ -22,13 +25,13 @@ class StepAndLoad:
         load_at: from when on [s].
         duration: [s].
         sample_time: [s].
-        size: of another robot, what makes its outputs as large as a neck's: 10 deg over `reference`.
+        size: what scales outputs: 10 deg over `reference`.
     """
 
     reference: float = math.radians(10.0)
     position_limit: float = 6.0
     slew_limit: float = 0.25
-    load: float = -0.5
+    load: float = _LOAD
     load_at: float = 3.5
     duration: float = 6.0
     sample_time: float = 0.02
@@ -39,6 +42,11 @@ class StepAndLoad:
             require_positive(name, getattr(self, name))
         if not self.load_at < self.duration < math.inf:
             raise SettingsError(f"`duration` must be beyond `load_at` {self.load_at:g} s; got {self.duration:g} s.")
+
+    @property
+    def gain_unit(self) -> float:
+        """A scaled gain of 1 from output to input; of the neck 1."""
+        return self.size * self.load / _LOAD
 
     @property
     def rows(self) -> int:

@@ -14,8 +14,7 @@ from softneck.core._repr import ReprMixin
 from softneck.estimation import AxisPlant, LinearNeck, axis_plant
 from softneck.estimation._axis import AXES, directions_of, robot_of
 from softneck.robot import Robot
-from softneck.robot._redefined import redefinition_of
-from softneck.signals import redefinition_matrix
+from softneck.robot._scaling import TIME_CONSTANT
 from softneck.signals.recording._recording import require_same_robot
 
 from ._step_and_load import StepAndLoad
@@ -45,13 +44,18 @@ class Doubts:
     gain_spread: float = 0.2
 
 
-# The paper's own dead time and pole (Eq. 31: 0.08 s, 5.293 1/s); nothing of the kind is known of other robots.
-_OF_NECKS, _OF_OTHERS = Doubts(0.08, 5.293), Doubts(0.0, 0.0)
+# The dead time and the pole of the paper's neck (Eq. 31: 0.08 s, 5.293 1/s), of a robot with tendons whose file gives
+# its time constant in parts of that; nothing of the kind is known of others.
+_LEAST_DELAY, _SMALL_MOVE_POLE = 0.08, 5.293
+_NO_DOUBTS = Doubts(0.0, 0.0)
 
 
 def doubts_of(robot: Robot) -> Doubts:
     """Return what a design allows for where nobody says otherwise."""
-    return _OF_NECKS if robot.is_neck else _OF_OTHERS
+    if robot.time_constant_s is None or robot.tendon_angles is None:
+        return _NO_DOUBTS
+    second = robot.time_constant_s / TIME_CONSTANT
+    return Doubts(_LEAST_DELAY * second, _SMALL_MOVE_POLE / second)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +72,7 @@ class UncertainAxis:
     nominal: AxisPlant
     samples: tuple[AxisPlant, ...]
     test: StepAndLoad | None = None
-    doubts: Doubts = _OF_OTHERS
+    doubts: Doubts = _NO_DOUBTS
 
     @property
     def sample_time(self) -> float:
@@ -109,8 +113,7 @@ class UncertainPlant(ReprMixin):
     Attributes:
         axes: output -> what its axis may be.
         robot: whose plant it is.
-        weights: (outputs, motors) of the motors in the redefined input of each axis; None for a neck, which has theta_i
-            and phi_i.
+        weights: (outputs, motors) of the motors in the redefined input of each axis; None: those that the robot gives.
         doubts: what a design allows for; None for what is usual of the robot.
     """
 
@@ -137,13 +140,11 @@ class UncertainPlant(ReprMixin):
     @property
     def redefinition(self) -> tuple[Matrix, Matrix]:
         """T from motors to the redefined inputs of all axes and co-contraction (Eq. 9-11), and its inverse."""
-        if self.weights is not None:
-            return redefinition_of(self.weights, self.names)
-        return redefinition_matrix(), np.linalg.inv(redefinition_matrix())
+        return self.robot.redefinition(self.weights)
 
     def assumed(self) -> dict[str, float]:
-        """Return what of the paper's neck, and not of this plant, a design takes."""
-        if self.doubts is not None or not self.robot.is_neck:
+        """Return the dead time and the pole that a design assumes where the plant itself has less."""
+        if self.doubts is not None:
             return {}
         found = {}
         for axis in map(self.axis, self.names):
@@ -209,14 +210,14 @@ def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
         )
     robot = robot_of(source)
     joined = _joined({axis: _of_model(source, axis) for axis in robot.outputs.names})
-    return replace(joined, robot=robot, weights=None if robot.is_neck else directions_of(source))
+    return replace(joined, robot=robot, weights=directions_of(source))
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:
     nominal = axis_plant(model, axis)
     samples = model.samples(axis) if callable(getattr(model, "samples", None)) else []
     plants = (_plant(item, axis, f"sample {i} of the family") for i, item in enumerate(samples))
-    return [nominal, *(replace(plant, stretch=nominal.stretch) for plant in plants)]
+    return [nominal, *(replace(plant, second=nominal.second) for plant in plants)]
 
 
 def _of_mapping(source: Mapping[str, Any]) -> UncertainPlant:

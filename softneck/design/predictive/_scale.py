@@ -10,11 +10,10 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
 from softneck.estimation._scaling import plants_scaling
 from softneck.robot import Robot
-from softneck.robot._neck_default import NeckDefault
 from softneck.robot._scaling import MOTOR_RANGE, OUTPUT_RANGE, Scaling
 from softneck.runtime._bundle import sized_name
 
-from ..linear._ports import MAX_MOTOR, ControllerLimits, limits_of, motor_ranges, reference_ranges
+from ..linear._ports import ControllerLimits, limits_of, motor_ranges, reference_ranges
 from ..plants._coupled import CoupledPlant
 from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis
 from ..plants._uncertain import Doubts, UncertainPlant, doubts_of
@@ -103,7 +102,7 @@ def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
     """
     robot, scaling = plant.robot, plant.scaling
     (factor, _), unit, lead = to_si(robot.motors.unit), robot.motors.unit, settings.lead_limit
-    limits = limits_of(robot, lead_limit=lead or 1.0, least_cocontraction=NeckDefault(-MAX_MOTOR))
+    limits = limits_of(robot, lead_limit=lead or 1.0, least_cocontraction=None)
     if lead is None:
         slew = limits.slew_limit * scaling.second / scaling.motor_unit
         limits = replace(limits, lead_limit=max(_LEAD, _LEADING * slew) * scaling.motor_unit)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,7 @@ from softneck.estimation import AxisPlant
 from softneck.estimation._forms import Reach
 from softneck.estimation._reach import linear_reach
 from softneck.robot import Robot
-from softneck.robot._neck_default import NeckDefault
+from softneck.robot._scaling import Scaling
 from softneck.robot._search import find_robot
 from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized_name
@@ -38,7 +38,11 @@ _ADAPT = Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0,
 # Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
 _SIZES = np.geomspace(1e-3, 1.0, 695)
 # The paper's static gain [rad/rad], 27.69 / 5.293 deg/rad (Eq. 31).
-_NECK_GAIN = math.radians(27.69 / 5.293)
+_SCALED_GAIN = math.radians(27.69 / 5.293)
+
+
+# Of the reference filter, in scaled seconds.
+_REFERENCE_TIME = 0.06
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,13 +75,13 @@ class Learning:
     gain_rate: float = 1.0
     leak_time: float = 3.0
 
-    def scaled(self, size: float, stretch: float) -> Learning:
-        """Return them for outputs that go `size` times as far, and a plant that is `stretch` times as slow."""
+    def scaled(self, size: float, second: float) -> Learning:
+        """Return them for outputs that go `size` times as far, where a scaled second is `second` [s]."""
         # Inputs and outputs have the neck's ratio: a covariance goes by 1 / size^2.
         return replace(
             self, start_covariance=self.start_covariance / size**2, covariance_bound=self.covariance_bound / size**2,
-            dead_zone=self.dead_zone * size, excitation=self.excitation * size, band=self.band * stretch**-1.0,
-            gain_rate=self.gain_rate * stretch**-1.0, leak_time=self.leak_time * stretch**1.0,
+            dead_zone=self.dead_zone * size, excitation=self.excitation * size, band=self.band / second,
+            gain_rate=self.gain_rate / second, leak_time=self.leak_time * second,
         )  # fmt: skip
 
 
@@ -89,28 +93,29 @@ class AdaptiveSettings(LoopSettings):
     """Online recursive least squares and a redesign in every sample, with what keeps it safe.
 
     Limits and the order of the loop are those of `LoopSettings`. The nominal plant is taken as late and as quick as
-    small moves of a neck are. The numbers of the learning are in `Learning`: of another robot seconds go by its slowest
-    pole, and what is in rad by how far its outputs go.
+    small moves are (`Doubts`). The numbers of the learning are in `Learning`, in scaled quantities.
 
     Attributes:
         max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
         phase_margin: least phase margin [rad] of it.
         gain_range: the static gain stays within this part of the nominal one, up and down, 0.5 for half to 1.5 times.
-        reference_time: time constant of the reference filter [s].
+        reference_time: time constant of the reference filter [s]; None: 0.3 time constants, of the neck 0.06 s.
     """
+
+    LEAD: ClassVar[float] = 0.8
 
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
     gain_range: float = 0.5
-    reference_time: float = NeckDefault(0.06)
-    lead_limit: float = NeckDefault(0.8)
+    reference_time: float | None = None
 
     def __post_init__(self) -> None:
         LoopSettings.__post_init__(self)
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         require_between("phase_margin", self.phase_margin, 0.1, 1.5, "rad")
         require_between("gain_range", self.gain_range, 0.0, 0.9)
-        require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
+        if self.reference_time is not None:
+            require_between("reference_time", self.reference_time, 0.0, 1e6, "s")
 
     def design(self, model: Any, *, robot: Robot | str | Path | None = None) -> VaryingController:
         """Return the controller that starts from `model`, of one pole and a dead time in each axis.
@@ -127,23 +132,24 @@ class AdaptiveSettings(LoopSettings):
                 f"adaptive control starts from one model or a family; got {len(model)} models. Name one."
             )
         uncertain = uncertain_plant(model, None if robot is None else find_robot(robot))
-        if uncertain.weights is None:
-            return self._designed(uncertain, LEARNING, uncertain.redefinition, np.ones(len(uncertain.names)))
         asked = self.of_robot(uncertain)
         nominal = [axis.nominal for axis in uncertain.axes.values()]
+        second = max(plant.second for plant in nominal)
+        if Scaling.of(uncertain.robot).is_identity and uncertain.robot.motors.nominal is not None:
+            ones = np.ones(len(uncertain.names))
+            return asked._designed(uncertain, LEARNING.scaled(1.0, second), uncertain.redefinition, ones)
         # Inputs in such a unit that every static gain has the neck's size: what learns need not know the robot's units.
-        units = np.array([_NECK_GAIN / abs(plant.static_gain) for plant in nominal])
+        units = np.array([_SCALED_GAIN / abs(plant.static_gain) for plant in nominal])
         T, inverse = uncertain.redefinition
         T, inverse = T.copy(), inverse.copy()
         T[:-1] /= units[:, None]
         inverse[:, :-1] *= units
-        size = linear_reach(nominal, uncertain.robot, uncertain.weights).start / Reach().start
-        learning = LEARNING.scaled(size, max(plant.stretch for plant in nominal))
-        return asked._designed(uncertain, learning, (T, inverse), units)
+        size = linear_reach(nominal, uncertain.robot, np.asarray(uncertain.weights)).start / Reach().start
+        return asked._designed(uncertain, LEARNING.scaled(size, second), (T, inverse), units)
 
-    def _others(self, plant: UncertainPlant) -> dict[str, Any]:
-        stretch = max(axis.nominal.stretch for axis in plant.axes.values())
-        return {"reference_time": float(self.reference_time) * stretch**1.0}
+    def _defaults(self, plant: UncertainPlant) -> dict[str, Any]:
+        second = max(axis.nominal.second for axis in plant.axes.values())
+        return {**LoopSettings._defaults(self, plant), "reference_time": _REFERENCE_TIME * second}
 
     def _designed(
         self, uncertain: UncertainPlant, learning: Learning, redefinition: tuple[Matrix, Matrix], units: Vector
@@ -204,7 +210,7 @@ class AdaptiveSettings(LoopSettings):
     def _box_sensitivity(self, axis: str, plant: AxisPlant, delay: int, kappa: float) -> float:
         """Return the largest Ms of the nominal gains at the corners of the box; refuse an unstable one."""
         a0, b0 = -float(plant.denominator[1]), float(plant.numerator[0])
-        w = frequencies(plant.sample_time, lowest=LOWEST / plant.stretch)
+        w = frequencies(plant.sample_time, lowest=LOWEST / plant.second)
         z = np.exp(1j * w * plant.sample_time)
         worst = 0.0
         low, high, weak, strong = self._box(plant)
@@ -232,7 +238,7 @@ class AdaptiveSettings(LoopSettings):
     def _filters(self, plants: list[AxisPlant]) -> tuple[ReferenceFilter, ...]:
         """Return the reference filters, the last of co-contraction."""
         if self.rise_s is None:
-            return (ReferenceFilter(self.reference_time),) * (len(plants) + 1)
+            return (ReferenceFilter(self.reference_time or 0.0),) * (len(plants) + 1)
         each = [filter_for_lag(self.rise_s, 1.0 / _pole(plant)) for plant in plants]
         return (*each, slowest(each))
 
@@ -361,10 +367,8 @@ def _pole(plant: AxisPlant) -> float:
 
 
 def _line(axis: str, found: dict[str, float], robot: Robot) -> str:
-    gain, unit = math.degrees(found["static_gain"]), "deg/rad"
-    if not robot.is_neck:
-        per, unit = to_si(robot.outputs.display_unit)[0], f"{robot.outputs.display_unit}/{robot.motors.unit}"
-        gain = found["static_gain"] / per * to_si(robot.motors.unit)[0]
+    per, unit = to_si(robot.outputs.display_unit)[0], f"{robot.outputs.display_unit}/{robot.motors.unit}"
+    gain = found["static_gain"] / per * to_si(robot.motors.unit)[0]
     return (
         f"  {axis}: starts from {gain:.3g} {unit}, pole {found['pole']:.3g} 1/s, dead time "
         f"{1e3 * found['dead_time_s']:g} ms; kappa {found['kappa']:.3g}; largest Ms of the nominal gains in the box "
