@@ -105,7 +105,7 @@ def test_references_are_reached_on_the_plant_itself(settings: Any, inputs: int, 
     controller = settings.design(G, robot=robot)
     controller.save(tmp_path / "k.npz")
     block = load(tmp_path / "k.npz").block()
-    assert [port.name for port in block.outputs] == [f"motor_setpoint_{j + 1}" for j in range(inputs)]
+    assert [port.name for port in block.outputs] == [f"p{j}_setpoint" for j in range(inputs)]
     asked = 0.05 * np.arange(1, outputs + 1)
     state, x, u, most = block.initial_state(), np.zeros(len(G.A)), np.zeros(inputs), np.zeros(outputs)
     load_at = 0.1 * np.ones(inputs)
