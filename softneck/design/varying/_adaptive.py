@@ -249,7 +249,7 @@ class AdaptiveSettings(LoopSettings):
         """Return the arrays of the runtime by name."""
         Ts = plants[0].sample_time
         common = assemble(
-            [pi_axis(1.0, 1.0, Ts)] * len(plants),
+            [pi_axis(1.0, plants[0].second, Ts)] * len(plants),
             filters=self._filters(plants),
             redefinition=redefinition,
             constants=limits.constants(Ts),
