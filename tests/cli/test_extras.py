@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from softneck.cli import _new
+from softneck.cli import _projects
 from softneck.cli._main import run
 from softneck.core import SettingsError, _errors
 from softneck.core._errors import EXTRAS, missing_extra
@@ -53,7 +53,7 @@ def test_a_file_without_its_package_is_one_line(tmp_path: Path, monkeypatch: pyt
 def test_a_new_project_says_how_its_test_runs(
     there: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(_new, "find_spec", lambda name: name if there else None)
+    monkeypatch.setattr(_projects, "find_spec", lambda name: name if there else None)
     assert run(["new", str(tmp_path / "p")]) == 0
     said = capsys.readouterr().out
     assert "python identify.py && python design.py && softneck simulate loop.toml\n" in said

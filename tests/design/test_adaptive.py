@@ -176,7 +176,7 @@ def linear(settings: AdaptiveSettings) -> LinearController:
     K, Ti = found["kappa"] / B, TS / (1.0 - POLE)
     plant = AxisPlant(np.array([B]), np.array([1.0, -POLE]), 4, TS)
     axis = following_axis(Gains(K, Ti), plant, 4, _adaptive.LEARNING.leak_time)
-    time = settings.reference_time
+    time = settings.reference_time or 0.0
     arrays = assemble(
         (axis, axis),
         filters=(ReferenceFilter(time),) * 3,

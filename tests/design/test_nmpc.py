@@ -89,7 +89,8 @@ class Asked:
 
 def asked(controller: NmpcController, p: NonlinearProblem, state: State, u: list[float]) -> Asked:
     """Return what `controller.step(state, u)` is asked; bounds and what is missed are worked out here once more."""
-    block, s = controller.block(), controller.settings
+    block = controller.block()
+    s: Any = controller.settings
     f, q = load_functions(block.runtime, compiled=False), state.parameters
     found: list[np.ndarray] = []
     decide = f.nmpc_decide
@@ -348,7 +349,8 @@ def test_a_rise_sets_filter_or_bandwidth(network: Model, tmp_path: Path) -> None
     asked = NmpcSettings(rise_s=0.5, minimum_tautness=0.2).design(network)
     asked.save(tmp_path / "c.npz")
     assert load(tmp_path / "c.npz").settings == asked.settings
-    slow, fast = (NmpcSettings(rise_s=rise).design(network).settings for rise in (0.5, 0.1))
+    both: Any = [NmpcSettings(rise_s=rise).design(network).settings for rise in (0.5, 0.1)]
+    slow, fast = both
     lag = 1.0 / slow.bandwidth
     assert np.log(9.0) * np.hypot(lag, slow.reference_time) == pytest.approx(0.5)
     assert (fast.reference_time, fast.bandwidth) == (0.0, pytest.approx(np.log(9.0) / 0.1))

@@ -400,7 +400,7 @@ class OutputError:
             return {}
         best = min(tried, key=lambda near: near.cost)
         K, p, L = float(best.model.b[0]), float(best.model.a[0]), best.model.delay
-        gain, a, late, b = _NORMAL * deviations(search, runs, best, 1.0)[0]
+        gain, a, late, b = _NORMAL * deviations(search, runs, best)[0]
         found = {"K": [K - b, K + b], "pole": [p - a, p + a], "static_gain": [K / p - gain, K / p + gain]}
         return found if self.delay is not None else {**found, "delay_s": [max(L - late, 0.0), L + late]}
 

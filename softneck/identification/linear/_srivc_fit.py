@@ -20,6 +20,8 @@ _RUNTIME = "softneck.identification.linear._continuous_runtime"
 _ITERATIONS = 40
 # A step that moves the fit by less than this part of the error is rounding.
 _TOLERANCE = 1e-9
+# Errors stay for so long at most, scaled: five time constants.
+_CORRELATED = 1.0
 Runs = Sequence[tuple[Vector, Vector]]
 
 
@@ -276,20 +278,19 @@ def _free_responses(A: Matrix, size: int, sample_time: float) -> Matrix:
     return rows
 
 
-def deviations(search: SrivcFitOptions, runs: Runs, fit: SrivcFit, stretch: float) -> tuple[Vector, float]:
+def deviations(search: SrivcFitOptions, runs: Runs, fit: SrivcFit) -> tuple[Vector, float]:
     """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean.
 
     Args:
         search: how `fit` was found; with one pole.
         runs: that it was fitted to.
         fit: the model and what it leaves over.
-        stretch: by how much the robot is slower than a neck.
     """
     errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
     spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)
     e = np.concatenate(errors)
     # Errors that stay for n samples count as one in n.
-    variance = float(np.mean(e**2)) * _correlation_time(errors, round(stretch / search.sample_time))
+    variance = float(np.mean(e**2)) * _correlation_time(errors, round(_CORRELATED / search.sample_time))
     covariance = variance * np.linalg.pinv(fit.information, hermitian=True)
     p, K = fit.model.a[0], fit.model.b[0]
     slope = np.array([-K / p**2, 1.0 / p, 0.0])

@@ -64,11 +64,6 @@ class Directions:
         """Of the robot as a whole, the geometric mean of its outputs' [s]."""
         return float(np.exp(np.mean(np.log(np.sort(self.seconds)))))  # in one order, whatever that of the outputs
 
-    @property
-    def stretch(self) -> float:
-        """By how much the robot is slower than a neck."""
-        return self.time_constant / NECK_SECONDS
-
     def all_inputs(self, set_points: Matrix) -> Matrix:
         """Return T (motors, motors) with more rows than `redefinition`: how else the set-points (time, motors) move."""
         if self.given is not None and len(self.given) == len(self.given.T) and self.given[-1].any():

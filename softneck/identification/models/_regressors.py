@@ -12,20 +12,6 @@ from softneck.signals import Recording
 
 from ._drive import DriveModel
 
-#: The regressor of Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
-# Rows are (source, channel, lag): 0 own output, 1 u, 2 M.
-PAPER_EQ21 = np.array(
-    [
-        [0, 0, 1],
-        [1, 0, 2], [1, 0, 3],
-        [1, 1, 2], [1, 1, 3],
-        [1, 2, 2], [1, 2, 3],
-        [2, 0, 3], [2, 1, 3], [2, 2, 3],
-    ],
-    dtype=np.float64,
-)  # fmt: skip
-
-
 # Between the samples of u and M in Eq. 21: the neck's sample time, a tenth of its time constant.
 _APART = 0.02
 
@@ -56,6 +42,11 @@ def lag_table(
         + [[2, c, lag] for lag in motors for c in range(sizes[0])]
     )
     return np.array(rows, dtype=np.float64)
+
+
+#: The regressor of Eq. 21: y(k-1); u_i(k-2), u_i(k-3); M_i(k-3).
+# Rows are (source, channel, lag): 0 own output, 1 u, 2 M.
+PAPER_EQ21 = lag_table((1,), (2, 3), (3,))
 
 
 def eq21_table(recording: Recording) -> Matrix:

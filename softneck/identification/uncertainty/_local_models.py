@@ -178,7 +178,7 @@ def fit_local(
     if not there:
         return None
     best = min(there, key=lambda fit: fit.cost)
-    std, percent = deviations(search, runs, best, 1.0)
+    std, percent = deviations(search, runs, best)
     model = best.model
     gain, pole = model.b[0] / model.a[0], model.a[0]
     sure = std[0] < _WORST_GAIN * abs(gain) and std[1] < _WORST_POLE * pole and percent > _LEAST_FIT
