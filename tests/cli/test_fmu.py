@@ -70,7 +70,7 @@ def test_scores_on_data_go_into_the_fmu(call: Call, rls_file: Path, recording: P
     with zipfile.ZipFile("Rls.fmu") as archive:
         page = archive.read("documentation/index.html").decode()
     assert f"on {judged['rows_scored']} rows of neck.csv" in page
-    assert f"<td>free run</td><td>{judged['fits']['model']['inf']['pitch']:.2f}</td>" in page
+    assert f"<td>simulation (free run)</td><td>{judged['fits']['model']['inf']['pitch']:.2f}</td>" in page
 
 
 def test_the_tolerance_that_identify_was_given_is_that_of_the_fmu(call: Call, recording: Path) -> None:
@@ -123,8 +123,8 @@ def test_a_model_of_another_version_is_refused(call: Call, rls_file: Path) -> No
 
 
 def test_what_has_no_block_is_no_fmu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.fmu.describe._describe.opened", lambda _path, **_: object())
-    with pytest.raises(FileFormatError, match="nothing in it can be stepped"):
+    monkeypatch.setattr("softneck.fmu.describe._describe.load_for_robot", lambda _path, **_: object())
+    with pytest.raises(FileFormatError, match="is not a model, observer or controller"):
         open_buildable(tmp_path / "family.npz")
 
 
