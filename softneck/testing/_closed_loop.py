@@ -80,7 +80,7 @@ class Outcome:
     Attributes:
         result: signals, metrics.
         plot: file of the plot of a failure.
-        axis: "pitch" or "roll": the axis of limits without one.
+        axis: the output of limits without one.
     """
 
     result: Result
@@ -145,8 +145,10 @@ def _source(part: str, path: str) -> dict[str, str]:
 
 
 def _axis(setup: LoopSetup) -> str:
-    reference = setup.loop.reference
-    return "roll" if not getattr(reference, "pitch", 1.0) and getattr(reference, "roll", 0.0) else "pitch"
+    """Return the first output whose reference moves, or else the first."""
+    names = setup.loop.robot.outputs.names
+    moved = zip(names, getattr(setup.loop.reference, "values", ()), strict=False)
+    return next((name for name, value in moved if value), names[0])
 
 
 def _number(value: float | None) -> str:

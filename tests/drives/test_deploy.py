@@ -178,7 +178,7 @@ def test_a_neck_that_leans_is_not_zeroed() -> None:
     file, link = default_drives(), virtual()
     link.neck.set(base_tilt_pitch=0.3)
     report = preflight(link, file)
-    with pytest.raises(CheckFailedError, match=r"the neck leans by pitch .* No zero was set"):
+    with pytest.raises(CheckFailedError, match=r"the robot leans by pitch .* No zero was set"):
         zero(link, file, lambda: link.newest, guarding=report.guarding)
     assert not any(drive.axis.homed for drive in link.neck.drives)
 

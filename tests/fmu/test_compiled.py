@@ -167,7 +167,7 @@ def test_a_heavy_fmu_compiles_once_and_says_so_and_a_middling_one_waits_for_it(
     assert _host(paths["heavy"], cache, "sys = __import__('sys'); sys.modules['numba'] = None") == ("False False", "")
     out, told = _host(paths["heavy"], cache)
     assert out == "True False"
-    assert "Lag: compiling its runtime, once on this machine; SOFTNECK_FMU_NUMBA=0 leaves that out." in told
+    assert "Lag: compiling its runtime, once on this machine; SOFTNECK_FMU_NUMBA=0 disables this." in told
     assert _host(paths["heavy"], cache) == ("True False", "")
     assert _host(paths["middling"], cache) == ("True False", "")
     assert _host(paths["light"], cache) == ("False False", "")

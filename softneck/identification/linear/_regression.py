@@ -74,7 +74,7 @@ def functions_found(door: Door, a: Sequence[Vector], b: Sequence[Vector], delays
 def no_base(motors: int = 3, outputs: int = 2) -> dict[str, Matrix]:
     """Return the arrays of a set that stands alone."""
     empty = np.zeros((outputs, 0))
-    return {"redefinition": np.zeros((3, motors)), "a": empty, "b": empty, "delay": np.zeros(outputs)}
+    return {"redefinition": np.zeros((outputs + 1, motors)), "a": empty, "b": empty, "delay": np.zeros(outputs)}
 
 
 def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, least: int = 1) -> None:
@@ -84,7 +84,7 @@ def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, leas
         within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
         within(arrays["delay"][1:], 0, 1, "the source")
         return
-    within(np.array([sizes["c"]]), sizes["outputs"], sizes["motors"] + 1, "the number of redefined inputs")
+    within(np.array([sizes["c"]]), sizes["outputs"], max(sizes["outputs"], sizes["motors"]) + 1, "the number of inputs")
     within(arrays["delay"], 0, sizes["H"] - sizes["nb"], "a dead time")
     within(np.array([sizes["na"]]), least, sizes["H"], "the order")
     within(arrays.get("source", np.zeros(1)), 0, 1, "the source")
