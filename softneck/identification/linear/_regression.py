@@ -84,7 +84,12 @@ def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, leas
         within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
         within(arrays["delay"][1:], 0, 1, "the source")
         return
-    within(np.array([sizes["c"]]), sizes["outputs"], max(sizes["outputs"], sizes["motors"]) + 1, "the number of inputs")
+    within(
+        np.array([sizes["c"]]),
+        sizes["outputs"],
+        max(sizes["outputs"], sizes["motors"]) + 1,
+        "the number of redefined inputs",
+    )
     within(arrays["delay"], 0, sizes["H"] - sizes["nb"], "a dead time")
     within(np.array([sizes["na"]]), least, sizes["H"], "the order")
     within(arrays.get("source", np.zeros(1)), 0, 1, "the source")
