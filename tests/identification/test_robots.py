@@ -125,17 +125,16 @@ def test_networks_take_any_robot(kind: str, name: str, tmp_path: Path) -> None:
     recording = recorded(ROBOTS[name], noise=1e-4, rest=0.3)
     train, test = recording.split(0.7)
     model = identify(kind, train, train=1.0, **NETWORKS[kind])
-    # A dead time that lies between the samples of the regressor costs a network a tenth or two, and
-    # lags over a learned time constant some more: 68.6 % on the bellows, 75 % before.
-    assert min(fit or 0.0 for fit in validate(model, test).fits["inf"].values()) > 65.0
+    # A dead time that lies between the samples of the regressor costs a network a tenth or two.
+    assert min(fit or 0.0 for fit in validate(model, test).fits["inf"].values()) > (75.0 if kind == "nn" else 95.0)
     model.save(tmp_path / "m.npz")
     np.testing.assert_array_equal(load(tmp_path / "m.npz").simulate(recording), model.simulate(recording))
 
 
 # What is simulated for the set, or measured by it; and how far a set over noise of a hundredth gets.
 SETS = {
-    # The paper's form simulates this finger at 24 %; before its lags went by the time constant it was above 40.
-    "paper": ("nlsm", {"epsilon": 3e-3, "output_weight": 3.0}, 20.0),
+    # Its weight of the outputs is chosen: how components range differs from robot to robot.
+    "paper": ("nlsm", {"epsilon": 3e-3}, 40.0),
     "residual": ("nlsm", {"form": "residual", "epsilon": 3e-3, "output_weight": 5.0}, 95.0),
     "chosen": ("nlsm", {"form": "residual"}, 95.0),
 }

@@ -70,6 +70,11 @@ class Door:
                    replace(found, seconds=found.seconds / scaling.second))  # fmt: skip
 
     @property
+    def paced(self) -> bool:
+        """Whether the robot gives its time constant, so that the paper's lags and training suit it."""
+        return self.recording.robot.time_constant_s is not None
+
+    @property
     def has_offset(self) -> bool:
         """Whether set-points or outputs at rest are not zero in SI."""
         return bool(self.scaling.motor_rest.any() or self.scaling.output_rest.any())

@@ -40,7 +40,7 @@ from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_l
 # Of the starts: from hardly any to one that smooths; the hold-out decides between them.
 _DECAYS = (0.03, 0.1, 0.01)
 _HOLD_OUT = 0.2
-# Neurons of the paper; where rows are fewer than their weights so many that each weight has its rows.
+# Neurons of the paper; of a robot whose time constant is learned so many that each weight has its rows.
 _PAPER, _LEAST_NEURONS, _ROWS_EACH = (25, 25), 4, 4
 # A hold-out shorter than this says nothing [rows].
 _LEAST = 75
@@ -59,6 +59,7 @@ class _Problem:
         table: the regressor.
         hints: motions that nobody recorded with what the line says of them; None for none.
         prior: weight of their errors.
+        paced: whether the robot gives its time constant.
     """
 
     train: Recording
@@ -67,6 +68,7 @@ class _Problem:
     table: Matrix
     hints: Recording | None
     prior: float
+    paced: bool
 
     def training(self, axis: int) -> tuple[AxisData, Matrix, Matrix]:
         """Return what is learnt from, with the scales of the record alone."""
@@ -84,7 +86,7 @@ class _Problem:
         if not recording.has_motor_positions:
             logged = dict(zip(recording.robot.motor_positions, motors.T, strict=True))
             recording = recording.with_channels(**logged)
-        return axis_data(recording, motors, axis, self.table, 1.0 / recording.sample_time, scale, weights)
+        return axis_data(recording, motors, axis, self.table, self.paced, scale, weights)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,14 +97,15 @@ class Network:
     kept: on `hold_out`, else on the last fifth of each run, which is then not trained on.
 
     Attributes:
-        hidden: neurons of the two layers; None takes (25, 25), or as many as few rows can tell apart.
+        hidden: neurons of the two layers; None takes (25, 25), of a robot whose time constant is learned no more than
+            its rows tell apart.
         iterations: series-parallel steps of the best start; each other start takes a third.
         refine: steps over windows of 1, 5 and 25 time constants of free run, together; 0 leaves the paper's training.
         starts: random starts for each axis.
         decay: weight of the squared weights beside the squared error of scaled outputs; None tries 0.03, 0.1 and
             0.01 in turn over the starts.
         prior: weight of an error against the line (`oe`) on motions that nobody recorded beside one against the
-            record; 0 leaves them out.
+            record; 0 leaves them out, and so does a robot whose time constant is learned.
         seed: of the starting weights.
     """
 
@@ -149,18 +152,18 @@ class Network:
         """
         door = Door.of(training_recording(recordings, all_motors=True))
         recording, drive = door.data, door.drive
-        # The lags of Eq. 21 suit a robot whose pace is known beforehand.
-        known = door.recording.robot.time_constant_s is not None
-        table = eq21_table(recording) if known else spread_table(recording)
-        sized = self._sized(recording, table)
+        # The paper's lags and training suit a robot whose pace is known beforehand; where it is learned, rows are few
+        # for its time constant or many, and the simulation decides.
+        table = eq21_table(recording) if door.paced else spread_table(recording)
+        sized = self._sized(recording, table, door.paced)
         if hold_out is None:
             train, judge = recording.split(1.0 - _HOLD_OUT)
             if all(len(run) < _LEAST for run in judge.runs()):
                 train, judge = recording, recording
         else:
             train, judge = recording, door.scaled(hold_out)
-        hints = _hints(train, drive) if self.prior > 0.0 else None
-        axes, interrupted = sized._train(_Problem(train, judge, drive, table, hints, self.prior), progress)
+        hints = _hints(train, drive) if self.prior > 0.0 and door.paced else None
+        axes, interrupted = sized._train(_Problem(train, judge, drive, table, hints, self.prior, door.paced), progress)
         names = ("W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale")
         stacked = {name: np.array([axis[name] for axis in axes]) for name in names}
         arrays: dict[str, Matrix] = {
@@ -179,7 +182,7 @@ class Network:
         progress(1.0, "done")
         return door.model("nn", sized, _in_si, arrays=arrays, findings=findings)
 
-    def _sized(self, recording: Recording, table: Matrix) -> Network:
+    def _sized(self, recording: Recording, table: Matrix, paced: bool) -> Network:
         """Return these settings with the numbers of neurons to take.
 
         Raises:
@@ -187,7 +190,7 @@ class Network:
         """
         rows = min(regression(recording, table, axis)[1].size for axis in range(recording.outputs.shape[1]))
         hidden = self.hidden or _PAPER
-        if self.hidden is None and rows < _weights(len(table), _PAPER):
+        if self.hidden is None and not paced:
             sizes = [(n, n) for n in range(_PAPER[0], _LEAST_NEURONS, -1)]
             fitting = (size for size in sizes if _ROWS_EACH * _weights(len(table), size) <= rows)
             hidden = next(fitting, (_LEAST_NEURONS, _LEAST_NEURONS))

@@ -122,14 +122,15 @@ def _rows_of(recording: Recording, table: Matrix, axis: int, count: int) -> np.n
 # How far back the state shows in the inputs: the newest sample of a neck, then about one, two and four time constants
 # of 0.2. Denser or longer ones moved no free run by more than 2 points (virtual neck, `paper`).
 _LOOKS_BACK = (0.02, 0.2, 0.4, 0.8)
-# The longest lag is at most this part of a run, as twice as long the base settles: a robot as slow as its record is
-# long says nothing of what was so long ago.
+# The longest lag is at most this part of a run where the time constant is learned, as twice as long the base settles: a
+# robot as slow as its record is long does not show what was so long ago.
 _RUNS_SHARE = 8
 
 
-def residual_lags(recording: Recording) -> tuple[int, ...]:
+def residual_lags(recording: Recording, paced: bool) -> tuple[int, ...]:
     """Return the lags [samples] of the motors and of the base's outputs for a scaled recording."""
-    most = max(len(run) for run in recording.runs()) // _RUNS_SHARE
+    longest = max(len(run) for run in recording.runs())
+    most = longest if paced else longest // _RUNS_SHARE
     lags = {max(min(round(seconds / recording.sample_time), most), 1) for seconds in _LOOKS_BACK}
     return tuple(sorted(lags))
 

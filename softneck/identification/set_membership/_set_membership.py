@@ -255,11 +255,11 @@ class SetMembership:
         door = Door.of(training_recording(recordings), alike=True)
         recording, robot = door.data, door.recording.robot
         noise = noise_levels(recording)
-        ground = self._ground(recording, fit_drive(recording))
+        ground = self._ground(recording, fit_drive(recording), door.paced)
         data = ground.data(recording)
         # One epsilon in SI, of outputs that have one unit.
         asked = None if self.epsilon is None else self.epsilon / door.scaling.output_unit
-        chosen, tried = self._choose(ground, recording, noise, asked, progress)
+        chosen, tried = self._choose(ground, door, noise, asked, progress)
         scale = chosen.scale
         sets = [(scaled(X, scale), y) for X, y in data]
         # An epsilon that was asked for is kept or refused.
@@ -281,12 +281,12 @@ class SetMembership:
         findings[usual_finding(robot)] = door.shown(usual_widths(sets, gamma, epsilon)).tolist()
         return door.model("nlsm", self, set_in_si, arrays=arrays, findings=findings)
 
-    def _ground(self, recording: Recording, drive: DriveModel) -> Ground:
+    def _ground(self, recording: Recording, drive: DriveModel, paced: bool) -> Ground:
         """Return the set's ground; the base of form `residual` is identified on `recording`."""
         residual = self.form == "residual"
         table = eq21_table(recording)
         if residual:
-            own, sizes = residual_lags(recording), (len(drive.pole), recording.outputs.shape[1])
+            own, sizes = residual_lags(recording, paced), (len(drive.pole), recording.outputs.shape[1])
             table = lag_table(own, (), own, both_outputs=True, sizes=sizes)
         return Ground(
             table=table,
@@ -297,7 +297,7 @@ class SetMembership:
         )
 
     def _choose(
-        self, ground: Ground, recording: Recording, noise: Vector, asked: Vector | None, progress: Progress
+        self, ground: Ground, door: Door, noise: Vector, asked: Vector | None, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
         """Return scale and epsilon, that which was `asked` for where it was, and all that were tried."""
         sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
@@ -305,14 +305,14 @@ class SetMembership:
         if asked is not None and self.output_weight is not None:
             scale = grouped_scale(ground.table, self.output_weight)
             return ScaleTrial(self.output_weight, None, scale, asked, np.nan, np.nan, np.nan, np.nan), []
-        head, tail = recording.split(1.0 - _HOLD_OUT)
+        head, tail = door.data.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
             raise DataError(
                 "the record is too short to choose epsilon and the scale; record longer, or set epsilon and "
                 "output_weight."
             )
         # The drives are known from all rows: they are no part of what is chosen.
-        first = self._ground(head, ground.drive)
+        first = self._ground(head, ground.drive, door.paced)
         hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
         if self.output_weight is not None:
             outputs, motors = (self.output_weight,), ()

@@ -286,7 +286,7 @@ def test_the_residual_form_is_reached_by_its_name_and_says_so(models: dict) -> N
     assert models["residual"].kind == "nlsm"
     assert models["residual"].settings["form"] == "residual"
     assert models["nlsm"].settings["form"] == "paper_eq21"
-    with pytest.raises(DataError, match="too short"):
+    with pytest.raises(DataError, match="every run is too short for form `residual`"):
         SetMembership(form="residual").fit([neck_recording(78, seed=s) for s in (1, 2, 3)])
 
 
