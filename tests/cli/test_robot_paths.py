@@ -99,7 +99,12 @@ def test_bad_imports_are_one_line(call: Call, log: Path, tmp_path: Path) -> None
 def test_commands_that_take_necks_only_say_so_in_a_line(call: Call, log: Path) -> None:
     assert call("import", log, "--robot-out", "robot.toml", "-o", "rec.csv").code == 0
     assert call("identify", "rls", "rec.csv", "-o", "m.npz", "--set", "delay=0.0").code == 0
-    for arguments, why in ((("observer", "m.npz", "-o", "o.npz"), ", from robot.toml) gives no `"),):
+    for arguments, why in (
+        (
+            ("observer", "m.npz", "-o", "o.npz"),
+            ", from robot.toml) gives no `motors.setpoint_min` and `setpoint_max`, which an observer needs",
+        ),
+    ):
         said = call(*arguments)
         assert said.code == 2, (arguments, said)
         assert why in said.error, (arguments, said)

@@ -56,3 +56,19 @@ def test_a_controller_is_the_same_in_every_view(name: str, kind: str) -> None:
         other = answered(*controller_of(name, kind, view))
         # Searches over gains and weights end within 1e-6 of themselves; set-points are compared over their range.
         np.testing.assert_allclose(other, plain, atol=1e-4, err_msg=str(view))
+
+
+def test_a_gain_in_other_units_than_si_is_remarked() -> None:
+    import control
+
+    seen = world("finger", rows=1500)
+    model = softneck.identify("oe", seen.recording, train=1.0, progress=silent)
+    pi = softneck.design_controller("pi", model, any_fit=True)
+    K, Ti, Ts = pi.design["flexion"]["gains"]["K"], pi.design["flexion"]["gains"]["Ti_s"], model.sample_time
+    said = {}
+    for unit, factor in (("Pa/rad", 1.0), ("kPa/deg", 1e-3 * np.pi / 180.0)):
+        gain = control.TransferFunction(factor * K * np.array([1.0 + Ts / Ti, -1.0]), [1.0, -1.0], Ts)
+        said[unit] = softneck.design_controller("custom", model, any_fit=True, controller=gain).summary()
+    assert "is `controller` in SI units" not in said["Pa/rad"]
+    assert "is `controller` in SI units" in said["kPa/deg"]
+    assert f"K {K * np.pi / 180.0 / 1e3:.4g} kPa/deg" in pi.summary()

@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from softneck.core import KINDS, SettingsError, resolve
+from softneck.core import KINDS, DataError, SettingsError, resolve, to_si
 from softneck.core._kinds import kinds_of, make_settings
 
 COMMON = {
@@ -107,18 +107,47 @@ def apply_settings(settings_class: type, assignments: Sequence[str], **more: Any
         key, separator, text = assignment.partition("=")
         if not separator:
             raise SettingsError(f"--set takes KEY=VALUE; got `{assignment}`.")
-        name, value = in_radians(key.strip(), value_of(text.strip()), fields)
+        name, value = in_si(key.strip(), value_of(text.strip()), fields)
         values[name] = value
     values |= {key: value for key, value in more.items() if value is not None and key in fields}
     return make_settings(settings_class, values)
 
 
-def in_radians(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
-    """Return `key` and `value`; an angle may be given as `key_deg` in degrees."""
-    angle = key.removesuffix("_deg")
-    if key in fields or angle not in fields or isinstance(value, bool) or not isinstance(value, int | float):
+# Settings that are times, and those in the unit of the outputs; the others with a unit are angles.
+_TIMES = {
+    "delay",
+    "max_delay",
+    "sensor_delay",
+    "gyro_delay",
+    "window",
+    "reference_time",
+    "fade",
+    "preview",
+    "sample_time",
+}
+_OF_OUTPUTS = {"epsilon", "measurement_noise_std", "disturbance_noise_std"}
+_ANGLES = {"phase_margin", "inclination_step", "angle_limit"}
+
+
+def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
+    """Return setting and value in SI of a key that ends in a unit: `delay_ms`, `phase_margin_deg`, `epsilon_mm`.
+
+    Raises:
+        SettingsError: a unit of another quantity than the setting's.
+    """
+    name, _, unit = key.rpartition("_")
+    if key in fields or name not in _TIMES | _OF_OUTPUTS | _ANGLES or name not in fields:
         return key, value
-    return angle, math.radians(value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise SettingsError(f"`{key}` takes a number; got {value!r}.")
+    try:
+        factor, quantity = to_si(unit)
+    except DataError as error:
+        raise SettingsError(f"`{key}`: {error}") from error
+    wanted = quantity if name in _OF_OUTPUTS else "s" if name in _TIMES else "rad"
+    if quantity != wanted:
+        raise SettingsError(f"`{key}`: `{name}` is in {wanted}, and {unit} is no unit of that.")
+    return name, factor * value
 
 
 def sample_time_of(text: str, option: str) -> float:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, Vector, atomic_write, write_archive
+from softneck.core import Matrix, Vector, atomic_write, to_si, write_archive
 from softneck.core._repr import ReprMixin
 from softneck.identification.models._linear_systems import redefined_input
 from softneck.robot import Robot
@@ -120,13 +120,20 @@ class LinearController(ReprMixin):
         ]
         for axis in self.robot.outputs.names:
             item = self.design.get(axis, {})
-            gains = ", ".join(f"{name} {value:.4g}" for name, value in item.get("gains", {}).items())
+            gains = ", ".join(self._gain(name, value) for name, value in item.get("gains", {}).items())
             lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
             lines += _findings(item)
             for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
                 if key in item and (title == "as identified" or item[key] != item.get("margins")):
                     lines.append(f"    {title}: {_margins(item[key])}")
         return "\n".join(lines)
+
+    def _gain(self, name: str, value: float) -> str:
+        """Return a gain as text; K in the units of the robot's file."""
+        motors, outputs = self.robot.motors.unit, self.robot.outputs.unit
+        if name != "K":
+            return f"{name} {value:.4g}"
+        return f"K {value * to_si(outputs)[0] / to_si(motors)[0]:.4g} {motors}/{outputs}"
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller to one `.npz` file."""
@@ -177,6 +184,8 @@ def _findings(item: Mapping[str, Any]) -> list[str]:
         worst, lost = item.get("worst_sensitivity"), item.get("samples_unstable", 0)
         held = f"stable on all {item['samples']} samples" if not lost else f"NOT stable on {lost} of {item['samples']}"
         lines.append(f"    {held}" + (f", worst Ms {worst:.3g}" if worst is not None else ""))
+    if "remark" in item:
+        lines.append(f"    {item['remark']}")
     if "gamma" in item:
         lines.append(f"    gamma {item['gamma']:.4g}")
     return lines

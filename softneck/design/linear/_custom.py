@@ -16,11 +16,13 @@ from ..plants._coupled import coupled_plant
 from ..plants._coupled_axis import AnyAxes
 from ..plants._uncertain import UncertainAxis, UncertainPlant, doubts_of
 from ._assembly import AxisController
-from ._axis_loop import conditioning_gain, error_feedback, innovations_gain
+from ._axis_loop import coarse, conditioning_gain, error_feedback, feedback_response, innovations_gain
 from ._axis_settings import AxisDesign, AxisSettings
 from ._controller import LinearController
 from ._whole import WholeDesign, whole_controller
 
+# A loop slower than a hundredth of its plant's pole hardly acts: gains in deg or kPa make it 57 or 1,000 times slower.
+_SLOWEST_LOOP = 0.01
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
@@ -32,10 +34,10 @@ class CustomSettings(AxisSettings):
     outputs (from `mixsyn`, say) is taken as it is: `reference_time` is 0 where it is not given, and nothing is reduced.
 
     Attributes:
-        controller: K of `v = K (r - y)`, or a system of two inputs, reference and angle, `v = K (r, y)`; one for
-            both axes, or a mapping of "pitch" and "roll" (or another robot's outputs) to one each, or one system with
-            as many outputs as the robot, from as many errors, or from all references and then all outputs. Inputs
-            named `pitch_reference` and `pitch` are found by name, in any order.
+        controller: K of `v = K (r - y)` in SI units (rad, Pa, m, V), or a system of two inputs, reference and angle,
+            `v = K (r, y)`; one for both axes, or a mapping of "pitch" and "roll" (or another robot's outputs) to one
+            each, or one system with as many outputs as the robot, from as many errors, or from all references and then
+            all outputs. Inputs named `pitch_reference` and `pitch` are found by name, in any order.
     """
 
     KIND: ClassVar[str] = "custom"
@@ -108,7 +110,21 @@ class CustomSettings(AxisSettings):
         K = self._of(name)
         _require_sample_time(K, axis.sample_time)
         made = error_feedback(control.ss(K)) if K.ninputs == 1 else _of_two(K, name)
-        return AxisDesign(made, {}, {"imported": True})
+        return AxisDesign(made, {}, {"imported": True, **_weak(made, axis)})
+
+
+def _weak(controller: AxisController, axis: UncertainAxis) -> dict[str, str]:
+    """Return a remark on a loop far slower than its plant, as gains in another unit than SI make it."""
+    plant = axis.nominal
+    w = coarse(plant)
+    loop = np.abs(feedback_response(controller, np.exp(1j * w * plant.sample_time)) * plant.response(w))
+    crossover = float(w[loop >= 1.0].max(initial=0.0))
+    if crossover * plant.time_constant > _SLOWEST_LOOP:
+        return {}
+    return {
+        "remark": f"the loop's gain is below 1 from {crossover:.2g} rad/s on, where the plant's pole is at "
+        f"{1.0 / plant.time_constant:.2g} rad/s: is `controller` in SI units (rad, Pa, m, V)?"
+    }
 
 
 def _require_sample_time(K: Any, sample_time: float) -> None:
