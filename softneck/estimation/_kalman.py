@@ -31,6 +31,7 @@ from ._kalman_parts_runtime import (
     KalmanArrays,
     kalman_lag,
 )
+from ._kalman_runtime import KalmanFullState
 from ._offline import Estimates, filter_recording
 
 if TYPE_CHECKING:
@@ -166,7 +167,12 @@ class KalmanObserver(ReprMixin):
         Raises:
             DataError: another sample time, or no gyro rates where the form needs them.
         """
-        return filter_recording(self, recording)
+        H, parts = self._named.H, KalmanFullState.parts(self._named)
+
+        def aligned(x: Matrix) -> tuple[Matrix, Matrix]:
+            return x[:, parts["x"]] @ H.T, H @ x[:, parts["P"]].reshape(-1, H.shape[1], H.shape[1]) @ H.T
+
+        return filter_recording(self, recording, parts, aligned)
 
     def summary(self) -> str:
         """Return some lines for people."""
@@ -189,22 +195,10 @@ class KalmanObserver(ReprMixin):
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the observer to one `.npz` file."""
-        block = self.block()
-        header = {
-            "kind": "kalman",
-            "form": self.form,
-            "sample_time": self.sample_time,
-            "noise": dict(zip(self.noise_names, self.noise, strict=True)),
-            "sensor": self.sensor,
-            "order": self.order,
-            "gate_level": self.gate_level,
-            "inputs": [port.name for port in block.inputs],
-            "outputs": [port.name for port in block.outputs],
-            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
-            **({} if self.delay_source == "given" else {"delay_source": self.delay_source}),
-            **self.robot.in_header(),
-        }
-        write_archive(path, header, dict(zip(KalmanArrays.names(), self.arrays, strict=True)), force=force)
+        source = {} if self.delay_source == "given" else {"delay_source": self.delay_source}
+        write_archive(
+            path, {**header_of(self), **source}, dict(zip(KalmanArrays.names(), self.arrays, strict=True)), force=force
+        )
 
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> KalmanObserver:
@@ -220,19 +214,11 @@ class KalmanObserver(ReprMixin):
             raise FileFormatError(f"its array `sources` is not of form {form}; design the observer again.")
         if items["constants"].size != KALMAN_MORE_LAGS + max(outputs - 2, 0):
             raise FileFormatError("its array `constants` has another length; design the observer again.")
-        levels = [float(header["noise"][name]) for name, _ in NOISES[form]]
         try:
             return cls(
-                form=form,
-                sample_time=float(header["sample_time"]),
-                arrays=tuple(items.values()),
-                noise=(levels[0], levels[1], levels[2]),
-                sensor=str(header["sensor"]),
-                order=str(header["order"]),
-                gate_level=float(header["gate_level"]),
-                robot=robot,
-                delay_source=delay_source(header),
-            )
+                form=form, sample_time=float(header["sample_time"]), arrays=tuple(items.values()), robot=robot,
+                **of_header(header, form),
+            )  # fmt: skip
         except SettingsError as error:
             raise FileFormatError(f"{error} Design the observer again.") from error
 
@@ -254,10 +240,32 @@ def filter_lines(gate_level: float, constants: Vector, sample_time: float, sourc
     return lines
 
 
-def delay_source(header: Mapping[str, Any]) -> str:
-    """Return where the sensor's delay comes from; files of earlier versions do not say."""
+def header_of(observer: Any) -> dict[str, Any]:
+    """Return what the files of both kinds of observers say."""
+    block = observer.block()
+    return {
+        "kind": block.kind,
+        "form": observer.form,
+        "sample_time": observer.sample_time,
+        "noise": dict(zip(observer.noise_names, observer.noise, strict=True)),
+        **{name: getattr(observer, name) for name in ("sensor", "order", "gate_level")},
+        "inputs": [port.name for port in block.inputs],
+        "outputs": [port.name for port in block.outputs],
+        "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
+        **observer.robot.in_header(),
+    }
+
+
+def of_header(header: Mapping[str, Any], form: str) -> dict[str, Any]:
+    """Return the fields that both kinds have; files of earlier versions do not say where the sensor's delay is from."""
     source = str(header.get("delay_source", "given"))
-    return source if source in _SOURCES else "given"
+    return {
+        "noise": tuple(float(header["noise"][name]) for name, _ in NOISES[form]),
+        "sensor": str(header["sensor"]),
+        "order": str(header["order"]),
+        "gate_level": float(header["gate_level"]),
+        "delay_source": source if source in _SOURCES else "given",
+    }
 
 
 def observer_ports(form: str, robot: Robot = _NECK) -> tuple[tuple[Port, ...], tuple[Port, ...]]:

@@ -26,11 +26,11 @@ from softneck.signals import Recording
 
 from ._axis import directions_of
 from ._forms import NOISES, noise_units, require_levels
-from ._kalman import delay_source, filter_lines, observer_ports
+from ._kalman import filter_lines, header_of, observer_ports, of_header
 from ._kalman_parts_runtime import KALMAN_LEAD, KALMAN_MORE_LAGS
 from ._nonlinear_parts_runtime import NonlinearArrays
 from ._nonlinear_runtime import NonlinearState
-from ._offline import Estimates, check_recording, measured_angles
+from ._offline import Estimates, check_recording, filter_recording, stepped
 from ._payload_runtime import PayloadArrays, PayloadState
 from ._scaling import slowest_seconds
 
@@ -176,21 +176,9 @@ class NonlinearObserver(ReprMixin):
         Raises:
             DataError: another sample time or another robot.
         """
-        check_recording(self, recording)
-        m, parts = len(self.robot.outputs.names), self._parts
-        told, states = (np.vstack(rows) for rows in zip(*(self._rows(run) for run in recording.runs()), strict=True))
-        accepted = states[:, parts["unheard"]][:, 0] == 0.0
-        return Estimates(
-            time=recording.time,
-            outputs=told[:, :m].copy(),
-            rates=told[:, m : 2 * m].copy(),
-            innovation=told[:, 2 * m].copy(),
-            accepted=accepted,
-            healthy=told[:, 2 * m + 1] > 0.5,
-            judged=accepted | (told[:, 2 * m] > 0.0),
-            aligned=states[:, parts["angles"]] + states[:, parts["disturbance"]],
-            covariance=self._covariance(states),
-            log_det=states[:, parts["log_det"]][:, 0],
+        parts = self._parts
+        return filter_recording(
+            self, recording, parts, lambda x: (x[:, parts["angles"]] + x[:, parts["disturbance"]], self._covariance(x))
         )
 
     def free_run(self, run: Recording) -> tuple[Matrix, Vector]:
@@ -222,15 +210,7 @@ class NonlinearObserver(ReprMixin):
 
     def _rows(self, run: Recording) -> tuple[Matrix, Matrix]:
         """Return outputs (time, outputs) and states (time, states) of a run."""
-        # The set-points of t_k are commanded after the measurement of t_k: the filter knows those before. In a Jacobi
-        # loop they come a sample early, and the filter keeps them for one.
-        late = 0 if self.order == "jacobi" else 1
-        setpoints = run.set_points[np.maximum(np.arange(len(run)) - late, 0)]
-        block, state, kept = self.block(), self.initial_state(), []
-        for row in np.column_stack([setpoints, measured_angles(run), np.ones(len(run))]):
-            state, _ = block.step(state, row)
-            kept.append(state)
-        return np.array([state.outputs for state in kept]), np.array([state.values for state in kept])
+        return stepped(self, run)
 
     def summary(self) -> str:
         """Return some lines for people."""
@@ -256,24 +236,11 @@ class NonlinearObserver(ReprMixin):
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the observer with its model to one `.npz` file."""
-        block, (model, arrays) = self.block(), nested(self.model)
+        model, arrays = nested(self.model)
         header = {
-            "kind": FORM,
-            "form": FORM,
-            "sample_time": self.sample_time,
-            "noise": dict(zip(self.noise_names, self.noise, strict=True)),
-            "start": self.start,
-            **({} if self.slew is None else {"slew": list(self.slew)}),
-            "sensor": self.sensor,
-            "order": self.order,
-            "gate_level": self.gate_level,
-            "inputs": [port.name for port in block.inputs],
-            "outputs": [port.name for port in block.outputs],
-            "units": {port.name: port.unit for port in (*block.inputs, *block.outputs)},
-            "delay_source": self.delay_source,
-            "model": model,
-            **self.robot.in_header(),
-        }
+            **header_of(self), "start": self.start, **({} if self.slew is None else {"slew": list(self.slew)}),
+            "delay_source": self.delay_source, "model": model,
+        }  # fmt: skip
         write_archive(path, header, {**arrays, "constants": self.constants}, force=force)
 
     @classmethod
@@ -283,24 +250,10 @@ class NonlinearObserver(ReprMixin):
         model = nested_model(header["model"], arrays)
         if constants.size != KALMAN_MORE_LAGS + max(len(model.robot.outputs.names) - 2, 0):
             raise FileFormatError("its array `constants` has another length; design the observer again.")
-        levels = [float(header["noise"][name]) for name, _ in NOISES[FORM]]
-        return cls(
-            model=model,
-            noise=(levels[0], levels[1], levels[2]),
-            constants=constants,
-            start=float(header["start"]),
-            slew=_slew(header),
-            sensor=str(header["sensor"]),
-            order=str(header["order"]),
-            gate_level=float(header["gate_level"]),
-            delay_source=delay_source(header),
-        )
-
-
-def _slew(header: Mapping[str, Any]) -> tuple[float, ...] | None:
-    """Return how fast set-points move the model; of files of earlier versions as fast as they come."""
-    found = header.get("slew")
-    return None if found is None else tuple(float(value) for value in found)
+        # Files of earlier versions know no slew: set-points move the model as fast as they come.
+        slew = None if header.get("slew") is None else tuple(float(value) for value in header["slew"])
+        start = float(header["start"])
+        return cls(model=model, constants=constants, start=start, slew=slew, **of_header(header, FORM))
 
 
 def is_nonlinear(model: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +13,6 @@ from softneck.core import DataError, Matrix, Vector
 from softneck.core._repr import ReprMixin
 from softneck.signals import Recording
 from softneck.signals.recording._recording import require_same_robot
-
-from ._kalman_parts_runtime import KalmanArrays
-from ._kalman_runtime import KalmanFullState
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -66,19 +64,30 @@ class Estimates(ReprMixin):
         return self.rates[:, 1]
 
 
-def filter_recording(observer: Any, recording: Recording) -> Estimates:
-    """Return what the filter's runtime makes of each run, sample by sample as in a loop."""
+def stepped(observer: Any, run: Recording) -> tuple[Matrix, Matrix]:
+    """Return what the filter's runtime makes of a run, sample by sample as in a loop: outputs, states (time, ...)."""
+    block, state, kept = observer.block(), observer.initial_state(), []
+    for row in input_rows(observer, run, measured_angles(run)):
+        state, _ = block.step(state, row)
+        kept.append(state)
+    return np.array([state.outputs for state in kept]), np.array([state.values for state in kept])
+
+
+def filter_recording(
+    observer: Any, recording: Recording, parts: Mapping[str, slice], aligned: Callable[[Matrix], tuple[Matrix, Matrix]]
+) -> Estimates:
+    """Return what the filter makes of each run.
+
+    Args:
+        observer: of either kind.
+        recording: of its robot and sample time.
+        parts: where those of its state are.
+        aligned: makes outputs (time, outputs) and their covariance, at the filter's time, of states (time, states).
+    """
     check_recording(observer, recording)
-    block, m = observer.block(), len(observer.robot.outputs.names)
-    parts = KalmanFullState.parts(KalmanArrays(block.arrays))
-    told, states = [], []
-    for run in recording.runs():
-        state = block.initial_state()
-        for row in input_rows(observer, run, measured_angles(run)):
-            state, outputs = block.step(state, row)
-            told.append(outputs)
-            states.append(state.values)
-    H, y, x = KalmanArrays(block.arrays).H, np.array(told), np.array(states)
+    m = len(observer.robot.outputs.names)
+    y, x = (np.vstack(rows) for rows in zip(*(stepped(observer, run) for run in recording.runs()), strict=True))
+    at_filter, covariance = aligned(x)
     accepted = x[:, parts["unheard"]][:, 0] == 0.0
     judged = accepted | (y[:, 2 * m] > 0.0)
     return Estimates(
@@ -89,8 +98,8 @@ def filter_recording(observer: Any, recording: Recording) -> Estimates:
         accepted=accepted,
         healthy=y[:, 2 * m + 1] > 0.5,
         judged=judged,
-        aligned=x[:, parts["x"]] @ H.T,
-        covariance=H @ x[:, parts["P"]].reshape(-1, H.shape[1], H.shape[1]) @ H.T,
+        aligned=at_filter,
+        covariance=covariance,
         log_det=np.where(judged, x[:, parts["log_det"]][:, 0], 0.0),
     )
 
