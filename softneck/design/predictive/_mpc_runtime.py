@@ -14,7 +14,6 @@ from softneck.design.predictive._mpc_state_runtime import (
     MPC_ANGLE_AT,
     MPC_BUDGET,
     MPC_NO_BOUND,
-    MPC_NUMBERS,
     MPC_OPTIMAL,
     MPC_PLAN,
     MPC_ROW_ANGLE_HIGH,
@@ -30,12 +29,11 @@ from softneck.design.predictive._mpc_state_runtime import (
     MpcState,
     MpcTheta,
     mpc_begin,
-    mpc_give,
-    mpc_inputs,
     mpc_limits,
     mpc_parameter,
     mpc_predict,
 )
+from softneck.design.predictive._scaled_runtime import scaled_inputs, scaled_output, scaled_range, scaled_unit
 
 
 def step(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray, outputs: np.ndarray) -> None:
@@ -48,12 +46,13 @@ def step(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray, 
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position [rad]; where set,
     angle limit and least tautness [rad].
     """
-    u = mpc_inputs(p, inputs)
+    u = scaled_inputs(p.constants, p.motors, p.outputs, p.ahead, inputs)
     if mpc_begin(p, x, u):
         mpc_decide(p, mpc_limits(p, x, parameters), x, u)
     # Held or moved: models and past inputs go on with what the motors were told.
     mpc_predict(p, x)
-    mpc_give(p, x, outputs)
+    outputs[:] = x.held
+    outputs *= scaled_unit(p.constants, p.motors, p.outputs)
 
 
 def mpc_bounds(
@@ -77,10 +76,7 @@ def mpc_bounds(
         elif kind == MPC_ROW_POSITION:
             # A motor beyond a limit comes back as fast as its first move may: that can always be done.
             j = int(p.kinds[i, 1])
-            least, most = max(-parameters[0], parameters[3]), parameters[0]
-            if p.numbers > MPC_NUMBERS:
-                least = max(least, p.constants[MPC_NUMBERS + j])
-                most = min(most, p.constants[MPC_NUMBERS + p.motors + j])
+            least, most = scaled_range(p.constants, p.motors, parameters, j)
             low = min(least, held[j] + upper[j]) - free[i]
             high = max(most, held[j] + lower[j]) - free[i]
         elif kind == MPC_ROW_SLACK:
@@ -97,9 +93,8 @@ def mpc_bounds(
 
 
 def mpc_angle(p: MpcArrays, parameters: np.ndarray, axis: int) -> float:
-    """Return the soft limit of an angle, in the unit of its size."""
-    limit = parameters[int(p.constants[MPC_ANGLE_AT])]
-    return limit / p.constants[p.numbers - 2 * p.outputs + axis] if p.numbers > MPC_NUMBERS else limit
+    """Return the scaled soft limit of an angle."""
+    return parameters[int(p.constants[MPC_ANGLE_AT])] / scaled_output(p.constants, p.motors, p.outputs, axis)
 
 
 def mpc_decide(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.ndarray) -> None:
@@ -120,7 +115,7 @@ def mpc_decide(p: MpcArrays, parameters: np.ndarray, x: MpcState, inputs: np.nda
     # z = z0 - H^-1 A' lambda; H is symmetric.
     z = z0 - np.dot(lam, p.AH)
     mpc_take(p, x, theta, z, lam, lower, upper, iterations >= 0)
-    mpc_move(p, x, lower, upper, parameters[0])
+    mpc_move(p, parameters, x, lower, upper)
 
 
 def mpc_take(
@@ -176,7 +171,7 @@ def mpc_residual(
     return worst
 
 
-def mpc_move(p: MpcArrays, x: MpcState, lower: np.ndarray, upper: np.ndarray, position: float) -> None:
+def mpc_move(p: MpcArrays, parameters: np.ndarray, x: MpcState, lower: np.ndarray, upper: np.ndarray) -> None:
     """Move `held` as the plan says for its age, within the bounds of now."""
     for j in range(p.motors):
         move = 0.0
@@ -185,9 +180,6 @@ def mpc_move(p: MpcArrays, x: MpcState, lower: np.ndarray, upper: np.ndarray, po
                 move = x.plan[p.motors * b + j]
         # Bounds of now: a plan of an earlier sample knew others.
         move = min(max(move, lower[j]), upper[j])
-        least, most = -position, position
-        if p.numbers > MPC_NUMBERS:
-            least = max(least, p.constants[MPC_NUMBERS + j])
-            most = min(most, p.constants[MPC_NUMBERS + p.motors + j])
+        least, most = scaled_range(p.constants, p.motors, parameters, j)
         low, high = min(least, x.held[j]), max(most, x.held[j])
         x.held[j] = min(max(x.held[j] + move, low), high)

@@ -5,20 +5,16 @@ the axis, of a coupled plant those of all axes: B and `rest` have n columns for 
 what was measured: `o+ = o + r`, `r+ = a r` with a the plant's slowest pole: what a load at the plant's input makes of
 the angle.
 
-Of another robot than the neck all this is in units in which it has a neck's size (see `_scale`): `mpc_inputs` and
-`mpc_limits` come from SI, `mpc_give` goes back.
+All this is in scaled quantities: `scaled_inputs` and `mpc_limits` come from SI.
 """
 
 import math
 
 import numpy as np
 
+from softneck.design.predictive._scaled_runtime import scaled_listen, scaled_measured, scaled_unit
 from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 
-MPC_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
-MPC_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
-# No neck leans this far; whoever says so measures nothing.
-MPC_PLAUSIBLE = 1.3
 MPC_NO_BOUND = 1e30
 
 # Status of a sample.
@@ -42,8 +38,7 @@ MPC_TOLERANCE = 11
 MPC_COAST = 12  # samples without measurement until the motors are held
 MPC_ANGLE_AT = 13  # places of two parameters; those whose limit is not set are not there
 MPC_TAUT_AT = 14
-# Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
-# units in SI, that of the motors, and one for each output and for each redefined input.
+# Behind them what `_scaled_runtime` says, and the units of the redefined inputs in SI.
 MPC_NUMBERS = 17
 
 # Kinds of rows.
@@ -138,64 +133,20 @@ class MpcTheta(StateVector):
     one = cells("", "1")
 
 
-def mpc_inputs(p: MpcArrays, inputs: np.ndarray) -> np.ndarray:
-    """Return the inputs in the units of the robot's size."""
-    u = inputs.copy()
-    if p.numbers > MPC_NUMBERS:
-        first = p.numbers - 2 * p.outputs  # of the outputs' units; the motors' stands before them
-        flags = 2 * p.outputs + 1 + p.motors
-        for i in range(p.outputs):
-            u[i] /= p.constants[first + i]
-            u[p.outputs + 1 + i] /= p.constants[first + i]
-            if p.ahead > 0:
-                u[flags + 2 + i] /= p.constants[first + i]
-        u[p.outputs] /= p.constants[first - 1]
-        for j in range(p.motors):
-            u[2 * p.outputs + 1 + j] /= p.constants[first - 1]
-    return u
-
-
 def mpc_limits(p: MpcArrays, x: MpcState, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters in the units of the robot's size; each output has one of its own for the angles' limit.
+    """Return the parameters scaled, but for the angles' limit, which each output scales.
 
     A payload that is told adds to the tautness that is wished for.
     """
-    limits = parameters.copy()
-    if p.numbers > MPC_NUMBERS:
-        unit = p.constants[p.numbers - 2 * p.outputs - 1]
-        for i in range(4):
-            limits[i] /= unit
-        taut = int(p.constants[MPC_TAUT_AT])
-        if taut < limits.shape[0]:
-            limits[taut] /= unit
+    limits, taut = parameters.copy(), int(p.constants[MPC_TAUT_AT])
+    unit = scaled_unit(p.constants, p.motors, p.outputs)
+    for i in range(4):
+        limits[i] /= unit
+    if taut < limits.shape[0]:
+        limits[taut] /= unit
     if p.told > 0:
-        limits[int(p.constants[MPC_TAUT_AT])] += p.disturbances[0, p.outputs + 1] * x.payload[1]
+        limits[taut] += p.disturbances[0, p.outputs + 1] * x.payload[1]
     return limits
-
-
-def mpc_give(p: MpcArrays, x: MpcState, outputs: np.ndarray) -> None:
-    """Fill the outputs with the set-points of now in SI."""
-    outputs[:] = x.held
-    if p.numbers > MPC_NUMBERS:
-        for j in range(p.motors):
-            outputs[j] *= p.constants[p.numbers - 2 * p.outputs - 1]
-
-
-def mpc_reference(p: MpcArrays, i: int, asked: float) -> float:
-    """Return a reference within what may be asked for."""
-    if p.numbers > MPC_NUMBERS:
-        low = MPC_NUMBERS + 2 * p.motors + i
-        return min(max(asked, p.constants[low]), p.constants[low + p.outputs + 1])
-    limit = MPC_REFERENCE_LIMIT if i < p.outputs else MPC_MOTOR_LIMIT
-    return min(max(asked, -limit), limit)
-
-
-def mpc_measured(p: MpcArrays, inputs: np.ndarray) -> bool:
-    """Return whether the outputs are numbers, of a neck those that it can have."""
-    for i in range(p.outputs + 1, 2 * p.outputs + 1):
-        if not math.isfinite(inputs[i]) or (p.numbers == MPC_NUMBERS and abs(inputs[i]) >= MPC_PLAUSIBLE):
-            return False
-    return True
 
 
 def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
@@ -206,7 +157,7 @@ def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
             position = inputs[2 * p.outputs + 1 + j]
             x.held[j] = position if math.isfinite(position) else 0.0
     mpc_listen(p, x, inputs)
-    measured = mpc_measured(p, inputs)
+    measured = scaled_measured(p.constants, p.outputs, inputs)
     x.missed = 0.0 if measured else x.missed + 1.0
     active = inputs[flags] > 0.5 and inputs[flags + 1] > 0.5 and x.missed <= p.constants[MPC_COAST]
     if x.started == 0.0 or not active:
@@ -223,24 +174,9 @@ def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
 
 def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
     """Take in references and the payload; one that is not finite leaves what was."""
-    for i in range(p.outputs + 1):
-        if math.isfinite(inputs[i]):
-            x.seen[i] = mpc_reference(p, i, inputs[i])  # pyright: ignore[reportArgumentType]  (a number)
+    scaled_listen(p.constants, p.motors, p.outputs, p.ahead, bool(x.started == 0.0), inputs, x.seen, x.coming)
     # Of the payload in `inputs`: behind the preview, where there is one.
-    first = 2 * p.outputs + 3 + p.motors
-    if p.ahead > 0:
-        coming = first
-        first += p.outputs
-        for axis in range(p.outputs):
-            row = x.coming[axis]
-            # What is to come is not known yet: as now.
-            if x.started == 0.0:
-                row[:] = x.seen[axis]
-            for i in range(p.ahead - 1):
-                row[i] = row[i + 1]
-            value = inputs[coming + axis]
-            if math.isfinite(value):
-                row[p.ahead - 1] = mpc_reference(p, axis, value)  # pyright: ignore[reportArgumentType]
+    first = 2 * p.outputs + 3 + p.motors + (p.outputs if p.ahead > 0 else 0)
     if p.told > 0:
         value = inputs[first]
         x.payload[0] = value if math.isfinite(value) else x.payload[0]

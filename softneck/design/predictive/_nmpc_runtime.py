@@ -11,13 +11,13 @@ import numpy as np
 from softneck.design.linear._rest_runtime import initialise as initialise
 from softneck.design.predictive._dual_runtime import qp_backward, qp_solve
 from softneck.design.predictive._nmpc_state_runtime import (
+    NMPC_ANGLE_LIMIT,
     NMPC_BUDGET,
     NMPC_COAST,
     NMPC_COCONTRACTION,
     NMPC_HOLDING,
     NMPC_MOVE,
     NMPC_NO_BOUND,
-    NMPC_NUMBERS,
     NMPC_OUTPUTS,
     NMPC_SETTLE,
     NMPC_SLACK,
@@ -25,16 +25,18 @@ from softneck.design.predictive._nmpc_state_runtime import (
     NmpcArrays,
     NmpcState,
     nmpc_ahead,
-    nmpc_angle_limit,
     nmpc_asked,
     nmpc_common,
-    nmpc_inputs,
-    nmpc_limits,
-    nmpc_listen,
-    nmpc_measured,
-    nmpc_range,
     nmpc_shift,
     nmpc_take,
+)
+from softneck.design.predictive._scaled_runtime import (
+    scaled_inputs,
+    scaled_listen,
+    scaled_measured,
+    scaled_output,
+    scaled_range,
+    scaled_unit,
 )
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
 
@@ -55,15 +57,16 @@ def step(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray
     outputs: motor_setpoint_1..3.
     parameters: position limit [rad], slew limit [rad/s], lead limit [rad], least position [rad].
     """
-    u = nmpc_inputs(p, inputs)
+    q, unit = p.setup, scaled_unit(p.setup, p.motors, p.outputs)
+    u = scaled_inputs(q, p.motors, p.outputs, p.H, inputs)
     flags = 2 * p.outputs + 1 + p.motors
     first = x.started == 0.0
     if first:
         for j in range(p.motors):
             position = u[2 * p.outputs + 1 + j]
             x.held[j] = position if math.isfinite(position) else 0.0
-    nmpc_listen(p, x, u, first)
-    measured = nmpc_measured(p, u)
+    scaled_listen(q, p.motors, p.outputs, p.H, bool(first), u, x.seen, x.ahead)
+    measured = scaled_measured(q, p.outputs, u)
     x.lost = 0.0 if measured else x.lost + 1.0
     acts = u[flags] > 0.5 and u[flags + 1] > 0.5 and x.lost <= p.setup[NMPC_COAST]
     if first:
@@ -80,13 +83,12 @@ def step(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray
     x.started = 1.0
     x.status = NMPC_HOLDING
     if acts:
-        nmpc_decide(p, nmpc_limits(p, parameters), x, u)
+        nmpc_decide(p, parameters / unit, x, u)
     # In free run, measured or not: what it misses is in `missed`, not in its state.
     nmpc_model(p, x.model, x.held, x.angles)
     nmpc_look(p, x)
     outputs[:] = x.held
-    if p.numbers > NMPC_NUMBERS:
-        outputs *= p.setup[p.numbers - p.outputs - 1]
+    outputs *= unit
 
 
 def nmpc_compare(p: NmpcArrays, x: NmpcState, inputs: np.ndarray, anew: bool) -> None:
@@ -107,13 +109,11 @@ def nmpc_model(p: NmpcArrays, model: np.ndarray, motors: np.ndarray, angles: np.
     u = np.empty(2 * p.motors + p.outputs)
     u[: p.motors] = motors
     u[p.motors :] = np.nan  # NaN: nothing is measured
-    if p.numbers > NMPC_NUMBERS:
-        u[: p.motors] *= p.setup[p.numbers - p.outputs - 1]
+    u[: p.motors] *= scaled_unit(p.setup, p.motors, p.outputs)
     out = np.zeros(int(p.setup[NMPC_OUTPUTS]))
     member_step(p, 0, p.free, model, u, out)
-    angles[:] = out[: p.outputs]
-    if p.numbers > NMPC_NUMBERS:
-        angles /= p.setup[p.numbers - p.outputs :]
+    for axis in range(p.outputs):
+        angles[axis] = out[axis] / scaled_output(p.setup, p.motors, p.outputs, axis)
 
 
 def nmpc_look(p: NmpcArrays, x: NmpcState) -> None:
@@ -140,8 +140,7 @@ def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np
     now, held = x.model.copy(), x.held.copy()
     u, out = np.empty(2 * n + m), np.zeros(int(p.setup[NMPC_OUTPUTS]))
     u[n:] = np.nan
-    # The model's own units, of a neck the same.
-    unit = p.setup[p.numbers - m - 1] if p.numbers > NMPC_NUMBERS else 1.0
+    unit = scaled_unit(p.setup, n, m)  # the model is in SI
     # dx/dz, du/dz, dy/dz: the state of now answers to no move.
     X, U, D = np.zeros((now.shape[0], nz)), np.zeros((2 * n + m, nz)), np.zeros((out.shape[0], nz))
     block = 0
@@ -158,7 +157,7 @@ def nmpc_linear(p: NmpcArrays, x: NmpcState, z: np.ndarray, Y: np.ndarray, S: np
         row = m * (k - p.look)  # what comes before the first has happened: the observer told it
         if row >= 0:
             for axis in range(m):
-                size = p.setup[p.numbers - m + axis] if p.numbers > NMPC_NUMBERS else 1.0
+                size = scaled_output(p.setup, n, m, axis)
                 Y[row + axis] = out[axis] / size
                 S[row + axis, :moved] = D[axis, :moved] / size
 
@@ -224,7 +223,7 @@ def nmpc_bounds(
     for i in range(nz):
         # A motor beyond a limit comes back as fast as its first move may: that can always be done.
         j = i % n
-        least, most = nmpc_range(p, parameters, j)
+        least, most = scaled_range(p.setup, n, parameters, j)
         lower[nz + slacks + i] = min(least, held[j] + upper[j]) - held[j]
         upper[nz + slacks + i] = max(most, held[j] + lower[j]) - held[j]
 
@@ -247,7 +246,7 @@ def nmpc_rows(
     if n > nz:
         below = p.outputs * b  # from limits above to those below
         for axis in range(p.outputs):
-            limit = nmpc_angle_limit(p, axis)
+            limit = p.setup[NMPC_ANGLE_LIMIT] / scaled_output(p.setup, p.motors, p.outputs, axis)
             for c in range(b):
                 end = int(starts[c + 1]) if c + 1 < b else p.N
                 at = p.outputs * (end - 1) + axis  # y of sample k + 1 stands in the rows of k
@@ -368,9 +367,7 @@ def nmpc_decide(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.
     for j in range(p.motors):
         # Bounds of now: a plan of an earlier sample knew others.
         move = min(max(plan[j], lower[j]), upper[j])
-        low, high = -parameters[0], parameters[0]
-        if p.numbers > NMPC_NUMBERS:
-            low, high = nmpc_range(p, parameters, j)
+        low, high = scaled_range(p.setup, p.motors, parameters, j)
         low, high = min(low, held[j]), max(high, held[j])
         held[j] = min(max(held[j] + move, low), high)
     nmpc_shift(p.starts, plan)

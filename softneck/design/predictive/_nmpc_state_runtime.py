@@ -1,18 +1,12 @@
 """What the nonlinear predictive controller remembers, what it is asked for, and what it expects its model to miss.
 
-Of another robot than the neck all but the model's state is in units in which it has a neck's size (see `_scale`).
+All but the model's state is in scaled quantities (see `_scaled_runtime`).
 """
-
-import math
 
 import numpy as np
 
 from softneck.runtime._layout import Arrays, StateVector, array, cells, rest, value
 
-NMPC_REFERENCE_LIMIT = 0.8  # [rad], as the ports' min and max
-NMPC_MOTOR_LIMIT = 6.0  # [rad], the paper's largest rotation (section 3.1)
-# No neck leans this far; whoever says so measures nothing.
-NMPC_PLAUSIBLE = 1.3
 NMPC_NO_BOUND = 1e30
 
 # Status of the last sample.
@@ -39,8 +33,7 @@ NMPC_OUTPUTS = 13  # of the model
 NMPC_TAUT = 14  # least tautness wished for; -NMPC_NO_BOUND for none
 NMPC_LEVER = 15  # motor that one radian of neck takes up [rad/rad]
 NMPC_LOOK = 16  # samples by which what is measured is ahead of the sensor
-# Of another robot behind them: the lowest and highest set-points, and references, in the units of its size; then these
-# units in SI, that of the motors and one for each output.
+# Behind them what `_scaled_runtime` says.
 NMPC_NUMBERS = 17
 
 
@@ -121,80 +114,6 @@ def nmpc_common(p: NmpcArrays, x: NmpcState) -> float:
         # All motors pull by what the loosest tendon lacks, or let go by what it has to spare.
         wanted = max(wanted, np.dot(p.T[p.outputs], x.held) + short)
     return wanted
-
-
-def nmpc_inputs(p: NmpcArrays, inputs: np.ndarray) -> np.ndarray:
-    """Return the inputs in the units of the robot's size."""
-    u = inputs.copy()
-    if p.numbers > NMPC_NUMBERS:
-        first = p.numbers - p.outputs  # of the outputs' units; the motors' stands before them
-        flags = 2 * p.outputs + 1 + p.motors
-        for i in range(p.outputs):
-            u[i] /= p.setup[first + i]
-            u[p.outputs + 1 + i] /= p.setup[first + i]
-            if p.H > 0:
-                u[flags + 2 + i] /= p.setup[first + i]
-        u[p.outputs] /= p.setup[first - 1]
-        for j in range(p.motors):
-            u[2 * p.outputs + 1 + j] /= p.setup[first - 1]
-    return u
-
-
-def nmpc_limits(p: NmpcArrays, parameters: np.ndarray) -> np.ndarray:
-    """Return the parameters in the units of the robot's size."""
-    limits = parameters.copy()
-    if p.numbers > NMPC_NUMBERS:
-        limits /= p.setup[p.numbers - p.outputs - 1]
-    return limits
-
-
-def nmpc_range(p: NmpcArrays, parameters: np.ndarray, j: int) -> tuple[float, float]:
-    """Return the lowest and highest set-point of motor j."""
-    least, most = max(-parameters[0], parameters[3]), parameters[0]
-    if p.numbers > NMPC_NUMBERS:
-        least = max(least, p.setup[NMPC_NUMBERS + j])
-        most = min(most, p.setup[NMPC_NUMBERS + p.motors + j])
-    return least, most
-
-
-def nmpc_angle_limit(p: NmpcArrays, axis: int) -> float:
-    """Return the soft limit of an angle."""
-    limit = p.setup[NMPC_ANGLE_LIMIT]
-    return limit / p.setup[p.numbers - p.outputs + axis] if p.numbers > NMPC_NUMBERS else limit
-
-
-def nmpc_measured(p: NmpcArrays, inputs: np.ndarray) -> bool:
-    """Return whether the outputs are numbers, of a neck those that it can have."""
-    for i in range(p.outputs + 1, 2 * p.outputs + 1):
-        if not math.isfinite(inputs[i]) or (p.numbers == NMPC_NUMBERS and abs(inputs[i]) >= NMPC_PLAUSIBLE):
-            return False
-    return True
-
-
-def nmpc_reference(p: NmpcArrays, i: int, asked: float) -> float:
-    """Return a reference within what may be asked for."""
-    if p.numbers > NMPC_NUMBERS:
-        low = NMPC_NUMBERS + 2 * p.motors + i
-        return min(max(asked, p.setup[low]), p.setup[low + p.outputs + 1])
-    limit = NMPC_REFERENCE_LIMIT if i < p.outputs else NMPC_MOTOR_LIMIT
-    return min(max(asked, -limit), limit)
-
-
-def nmpc_listen(p: NmpcArrays, x: NmpcState, inputs: np.ndarray, first: bool) -> None:
-    """Take in the references; one that is not finite leaves what was."""
-    for i in range(p.outputs + 1):
-        if math.isfinite(inputs[i]):
-            x.seen[i] = nmpc_reference(p, i, inputs[i])  # pyright: ignore[reportArgumentType]  (a number)
-    for axis in range(p.outputs):
-        if p.H > 0:
-            row = x.ahead[axis]
-            if first:
-                row[:] = x.seen[axis]
-            for i in range(p.H - 1):
-                row[i] = row[i + 1]
-            newest = inputs[2 * p.outputs + 3 + p.motors + axis]
-            if math.isfinite(newest):
-                row[p.H - 1] = nmpc_reference(p, axis, newest)  # pyright: ignore[reportArgumentType]
 
 
 def nmpc_asked(p: NmpcArrays, x: NmpcState, target: np.ndarray, asked: np.ndarray) -> None:
