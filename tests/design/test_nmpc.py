@@ -99,12 +99,12 @@ def asked(controller: NmpcController, p: NonlinearProblem, state: State, u: list
     vars(f)["nmpc_decide"] = decide
     values = found[0]
     x = named(controller, values)
-    target, moves = np.empty(2 * s.horizon), np.empty(p.variables)
+    target, moves = np.empty(2 * s.horizon), np.empty(3 * len(p.starts))
     f.nmpc_asked(block.arrays, values, target, moves)
     target -= missing(controller, values)
     held, b = x["held"], len(p.starts)
     step = q[1] * controller.sample_time
-    low, high = np.full(p.variables, -step), np.full(p.variables, step)
+    low, high = np.full(moves.size, -step), np.full(moves.size, step)
     low[:3] = np.clip(np.array(u[5:8]) - q[2] - held, -step, step)
     high[:3] = np.clip(np.array(u[5:8]) + q[2] - held, low[:3], step)
     least = np.minimum(max(-q[0], q[3]), held + high[:3]) - held
@@ -119,11 +119,17 @@ def sums_of(starts: tuple[int, ...]) -> np.ndarray:
     return np.kron(np.tril(np.ones((len(starts), len(starts)))), np.eye(3))
 
 
+def spread(p: NonlinearProblem) -> np.ndarray:
+    """Return (3 N, nz): which moves make the set-points of each sample."""
+    rows = np.array([[float(start <= i) for start in p.starts] for i in range(p.horizon)])
+    return np.kron(rows, np.eye(3))
+
+
 def answers(controller: NmpcController, p: NonlinearProblem, a: Asked, z: np.ndarray) -> np.ndarray:
     """Return the angles (2 N,) that the model itself makes of the plan `z`."""
     plant = controller.model.block()
     rows = np.full((p.horizon, 8), np.nan)
-    rows[:, :3] = a.held + (p.spread() @ z).reshape(-1, 3)
+    rows[:, :3] = a.held + (spread(p) @ z).reshape(-1, 3)
     start = plant.initial_state(use_measurement=0.0)
     return plant.run(State(a.x, start.parameters, start.outputs), rows)[1][:, :2].ravel()
 
@@ -137,7 +143,7 @@ def test_each_sample_is_the_quadratic_program_of_differences(
     settings = NmpcSettings(horizon=12, moves=4, angle_limit=angle_limit)
     controller, plant = settings.design(models[kind]), models[kind].block()
     p, soft = controller.problem(), int(angle_limit is not None)
-    nz = p.variables
+    nz = 3 * len(p.starts)
     state, motors = controller.initial_state(), np.zeros(3)
     x, y = plant.initial_state(use_measurement=0.0), np.zeros(2)
     rng, statuses = np.random.default_rng(0), set()
@@ -152,7 +158,7 @@ def test_each_sample_is_the_quadratic_program_of_differences(
                        for d in h * np.eye(nz)]  # fmt: skip
             S, Y = np.array(columns).T, answers(controller, p, a, a.plan)
             w = p.weights.ravel()
-            common = p.T[2] @ p.spread().reshape(p.horizon, 3, nz)
+            common = p.T[2] @ spread(p).reshape(p.horizon, 3, nz)
             H, f = np.zeros((nz + soft, nz + soft)), np.zeros(nz + soft)
             H[:nz, :nz] = 2.0 * (S.T * w @ S + p.move_weight * np.eye(nz))
             H[:nz, :nz] += 2.0 * p.cocontraction_weight * common.T @ common

@@ -117,7 +117,7 @@ def test_it_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     """The same rows are the same problem, however long a sample takes."""
     found = {"pitch": {"static_gain": 0.16, "pole": 0.1 / sample_time, "delay": 3}}
     model: Any = replace(lag(Robot.preset("antagonist")), sample_time=sample_time)
-    plant = near_rest(model, found, np.array([[1.0, -1.0]]))
+    plant = near_rest(model, found)
     asked = NmpcNumbers().resolved(plant)
     # 10 samples to the pole, as of a neck at 20 ms.
     assert (asked.horizon, asked.moves, asked.window) == (20, 10, 8)

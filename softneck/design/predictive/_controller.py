@@ -21,7 +21,7 @@ from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, cont
 from ..plants._uncertain import held_line
 from . import _mpc_state_runtime as rt
 from ._lti import lti
-from ._program import MpcInfo, MpcPart, explain
+from ._program import MpcInfo, PredictivePart, explain
 from ._scale import runtime_of, units_of
 
 if TYPE_CHECKING:
@@ -109,11 +109,15 @@ class MpcController(ReprMixin):
 
     def info(self, state: State) -> MpcInfo:
         """Return what the sample that led to `state` decided: prediction, active limits, iterations."""
-        return explain(self.arrays, state.values, self.robot.outputs.names)
+        return self.explain(state.values)
 
-    def part(self) -> MpcPart:
+    def explain(self, values: Vector) -> MpcInfo:
+        """Return the same of a state's values."""
+        return explain(self.arrays, values, self.robot.outputs.names)
+
+    def part(self) -> PredictivePart:
         """Return the controller as a part of a loop that tells `info` after each sample."""
-        return MpcPart(self.block())
+        return PredictivePart(self)
 
     def review(self) -> list[str]:
         """Return what is wrong or doubtful with this set-up, one line each; empty if nothing is."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time as clock
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
@@ -29,23 +28,21 @@ from softneck.identification import Model
 from softneck.identification.models._arrays import without_validity
 from softneck.identification.models._linear_systems import weights_of
 from softneck.identification.models._model import nested, nested_model
-from softneck.loop import BlockPart
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 from softneck.runtime._bundle import sized_name
 from softneck.signals import TENDON_ANGLES
 
 from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs
-from ..plants._coupled_axis import AnyAxes
 from ..plants._uncertain import UncertainAxis, UncertainPlant
 from ._nmpc_prepared import BUDGET, SLACK_WEIGHT, NonlinearProblem, controller_arrays
 from ._nmpc_probe import plant_of, probed, require_horizon, risen
 from ._nmpc_state_runtime import NMPC_NUMBERS, NmpcArrays, NmpcState
 from ._predicted import over
-from ._scale import TAUTNESS_LEVER, ScaledPlant, predictive_limits, scale_numbers, scaled_plant
+from ._program import STATUS_NAMES, PredictivePart
+from ._scale import TAUTNESS_LEVER, ScaledPlant, predictive_limits, scaled_plant
 from ._tuning import move_weight, require_given, require_solvable, samples_ahead, spaced_starts
 
-_STATUS_NAMES = ("not started", "optimal", "softened", "previous plan", "holding")
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
 NONLINEAR_KINDS = ("nn", "play", "greybox")
@@ -121,9 +118,9 @@ class NmpcSettings(ReprMixin):
                 f"nonlinear predictive control is over {', '.join(NONLINEAR_KINDS)}; got {got}. "
                 "For a linear model use `softneck design mpc`."
             )
-        robot, directions = model.robot, weights_of(model)
-        found = probed(model, directions, to_si(robot.motors.unit)[0] * max(0.0, self.minimum_tautness or 0.0))
-        plant = near_rest(model, found, directions)
+        robot = model.robot
+        found = probed(model, to_si(robot.motors.unit)[0] * max(0.0, self.minimum_tautness or 0.0))
+        plant = near_rest(model, found)
         limits = predictive_limits(self, plant)
         own = risen(NmpcNumbers.of(self).resolved(plant))
         require_horizon(own, [plant_of(item, model.sample_time) for item in found.values()])
@@ -163,11 +160,11 @@ class NmpcNumbers(NmpcSettings):
         return replace(self, **{name: value for name, value in usual.items() if getattr(self, name) is None})
 
 
-def near_rest(model: Model, found: Mapping[str, Mapping[str, float]], directions: Matrix) -> ScaledPlant:
+def near_rest(model: Model, found: Mapping[str, Mapping[str, float]]) -> ScaledPlant:
     """Return what a model is near rest, in scaled quantities."""
     plants = {name: plant_of(found[name], model.sample_time) for name in model.robot.outputs.names}
     axes = {name: UncertainAxis(plant, (plant,)) for name, plant in plants.items()}
-    return scaled_plant(UncertainPlant(axes, model.robot, directions), identified=True)
+    return scaled_plant(UncertainPlant(axes, model.robot, weights_of(model)), identified=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -198,43 +195,13 @@ def explain(block: Block, values: Vector) -> SampleSolution:
     unit = a.setup[-a.T.shape[0]] if a.setup.size > NMPC_NUMBERS else 1.0
     number = {name: float(values[place.start]) for name, place in parts.items()}
     return SampleSolution(
-        status=_STATUS_NAMES[int(number["status"])],
+        status=STATUS_NAMES[int(number["status"])],
         iterations=int(number["iterations"]),
         residual=number["residual"],
         previous_plan=int(number["shifted"]),
         softened=int(number["softened"]),
         moves=unit * values[parts["plan"]].reshape(-1, a.T.shape[1]),
     )
-
-
-class NmpcPart(BlockPart):
-    """A nonlinear predictive controller that a loop steps; a `softneck.loop.Part` with `info` of its last sample.
-
-    Attributes:
-        took: how long the last sample took [s].
-    """
-
-    def __init__(self, controller: Block) -> None:
-        """Adapt a controller's block; the state comes with `start`."""
-        super().__init__(controller)
-        self.took = math.nan
-
-    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
-        """Return the outputs at the start; unknown parameters raise SettingsError."""
-        self.took = math.nan
-        return super().start(time, parameters)
-
-    def advance(self, time: float, inputs: Vector) -> Vector:
-        """Step once and return the set-points."""
-        begin = clock.perf_counter()
-        outputs = super().advance(time, inputs)
-        self.took = clock.perf_counter() - begin
-        return outputs
-
-    @property
-    def info(self) -> SampleSolution:
-        """What the last sample decided."""
-        return explain(self.block, self._state)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
@@ -290,33 +257,19 @@ class NmpcController(ReprMixin):
         """The limits that can be changed at the start."""
         return self.limits.ports()[:4]
 
-    def plants(self) -> AnyAxes:
-        """Return the linear plants that the model is near rest, in scaled quantities."""
-        return self._near_rest.axes
-
-    @property
-    def directions(self) -> Matrix:
-        """Weights (outputs, motors) of the motors in each output's direction."""
-        return weights_of(self.model)
-
-    @property
-    def motor_factor(self) -> float:
-        """SI of the unit of the robot's motors."""
-        return to_si(self.robot.motors.unit)[0]
-
     @cached_property
-    def _near_rest(self) -> ScaledPlant:
-        return near_rest(self.model, self.found, self.directions)
+    def near_rest(self) -> ScaledPlant:
+        """What the model is near rest, in scaled quantities."""
+        return near_rest(self.model, self.found)
 
     def problem(self) -> NonlinearProblem:
         """Return what is asked, in numbers."""
         s: Any = self.settings
-        plant = self._near_rest
+        plant = self.near_rest
         (T, inverse), scaling, plants = plant.redefinition, plant.scaling, plant.axes
         weights = np.tile([1.0 / item.static_gain**2 for item in plants], (s.horizon, 1))
         # What follows the horizon: an error that dies out as fast as the loop.
         weights[-1] /= 1.0 - math.exp(-2.0 * s.bandwidth * self.sample_time)
-        numbers = scale_numbers(plant, self.limits)
         return NonlinearProblem(
             model=self.model,
             horizon=s.horizon,
@@ -326,9 +279,6 @@ class NmpcController(ReprMixin):
             weights=weights,
             move_weight=1.5 * max(move_weight(item, s.bandwidth * scaling.second) for item in plants),
             cocontraction_weight=1.0,
-            # The redefined inputs' units are no numbers of this runtime.
-            scale=numbers[: len(numbers) - len(plants)] if numbers else (),
-            motor_unit=scaling.motor_unit,
             look=samples_ahead(s.look_ahead, self.sample_time),
         )
 
@@ -346,11 +296,15 @@ class NmpcController(ReprMixin):
 
     def info(self, state: State) -> SampleSolution:
         """Return what the sample that led to `state` decided."""
-        return explain(self._block, state.values)
+        return self.explain(state.values)
 
-    def part(self) -> NmpcPart:
+    def explain(self, values: Vector) -> SampleSolution:
+        """Return the same of a state's values."""
+        return explain(self._block, values)
+
+    def part(self) -> PredictivePart:
         """Return the controller as a part of a loop that tells what each sample decided."""
-        return NmpcPart(self._block)
+        return PredictivePart(self)
 
     def block(self) -> Block:
         """Return the controller as a block of role "controller"."""
@@ -419,7 +373,7 @@ class NmpcController(ReprMixin):
         per_motor, given = to_si(robot.motors.unit)[0], header
         if "position_limit" in settings:  # of versions before 0.3, in the unit of the motors
             given = {name: per_motor * settings.pop(name) for name in LIMITS[:4]}
-        plant = near_rest(model, header["found"], weights_of(model))
+        plant = near_rest(model, header["found"])
         return cls(
             # A file of an earlier version may not say all.
             settings=NmpcNumbers(**settings).resolved(plant), limits=ControllerLimits.from_header(given, robot),

@@ -12,6 +12,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 from softneck.identification import Model
+from softneck.identification.models._linear_systems import weights_of
 from softneck.robot._scaling import TIME_CONSTANT, Scaling
 
 from ..linear._ports import motor_ranges
@@ -28,21 +29,20 @@ _MOST_PREVIEW = 100
 S = TypeVar("S", bound=Any)
 
 
-def probed(model: Model, weights: Matrix, pulled: float = 0.0) -> dict[str, dict[str, float]]:
+def probed(model: Model, pulled: float = 0.0) -> dict[str, dict[str, float]]:
     """Return static gain, pole [1/s] and dead time [samples] of each axis, as the model steps near rest.
 
     Args:
         model: of any robot.
-        weights: (outputs, motors) of the motors in each output's direction.
         pulled: where all motors stand before a step, above rest [SI]: a payload may leave tendons hanging at zero.
 
     Raises:
         SettingsError: an input that does not move its output.
     """
-    robot, inverse, ends = model.robot, model.robot.redefinition(weights)[1], motor_ranges(model.robot, None)
+    robot, weights, ends = model.robot, weights_of(model), motor_ranges(model.robot, None)
     scaling = Scaling.of(robot, set_points=None if ends is None else np.array(ends))
-    sizes = scaling.input_units(weights)
-    moved = [_answer(model, step, scaling.motor_rest + pulled) for step in (sizes * inverse[:, : len(sizes)]).T]
+    sizes, inverse = scaling.input_units(weights), robot.redefinition(weights)[1][:, : len(weights)]
+    moved = [_answer(model, step, scaling.motor_rest + pulled) for step in (sizes * inverse).T]
     answers = [y[:, axis] for axis, y in enumerate(moved)]
     known = Scaling.of(robot, outputs=np.array([[min(0.0, *y), max(0.0, *y)] for y in answers]).T).output_unit
     found = {}

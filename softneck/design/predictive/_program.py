@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import time as clock
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.estimation._axis import AXES
 from softneck.loop import BlockPart
-from softneck.runtime import Block, load_functions
+from softneck.runtime import load_functions
 
 from . import _mpc_state_runtime as rt
 from ._scale import runtime_of, units_of
@@ -31,14 +32,13 @@ class MpcInfo:
             "holding" (disabled or without measurement) or "not started".
         iterations: rows added and dropped by the solver.
         residual: of the KKT conditions.
-        slack: largest violation of a soft limit that is planned, scaled to the limit's unit [rad]; of another
-            robot than the neck as if it had a neck's size.
+        slack: largest violation of a soft limit that is planned, scaled.
         active: names of the active limits.
         set_points: (N, motors) planned motor set-points from the next sample on [rad].
         angles: (N, outputs) pitch and roll that the nominal plant makes of them, each a dead time and a sample later
             [rad].
         reference: (N, outputs) what they are to be then [rad].
-        time: of the solution [s]; NaN where it was not taken.
+        previous_plan, softened: samples so far on which the previous plan went on, and a soft limit was not kept.
     """
 
     status: str
@@ -49,7 +49,8 @@ class MpcInfo:
     set_points: Matrix
     angles: Matrix
     reference: Matrix
-    time: float = float("nan")
+    previous_plan: int
+    softened: int
 
 
 def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = AXES) -> MpcInfo:
@@ -84,6 +85,8 @@ def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = 
         set_points=unit * set_points,
         angles=outputs * angles,
         reference=outputs * reference,
+        previous_plan=int(now["shifted"].item()),
+        softened=int(now["softened"].item()),
     )
 
 
@@ -107,38 +110,31 @@ def _predicted(a: rt.MpcArrays, theta: Vector, set_points: Matrix) -> tuple[Matr
     return angles, reference
 
 
-class MpcPart(BlockPart):
-    """A predictive controller that a loop steps; a `softneck.loop.Part` with `info` of its last sample."""
+class PredictivePart(BlockPart):
+    """A predictive controller that a loop steps; a `softneck.loop.Part` with `info` of its last sample.
 
-    def __init__(self, controller: Block) -> None:
-        """Adapt a controller's block."""
-        super().__init__(controller)
-        self._at = rt.MpcState.parts(rt.MpcArrays(controller.arrays))
-        outputs = rt.MpcArrays(controller.arrays).T.shape[0] - 1
-        self._names = tuple(port.name.removesuffix("_reference") for port in controller.inputs[:outputs])
-        self._took = math.nan
+    Attributes:
+        took: how long the last sample took [s]; NaN before the first.
+    """
+
+    def __init__(self, controller: Any) -> None:
+        """Adapt a controller."""
+        super().__init__(controller.block())
+        self._controller, self.took = controller, math.nan
+
+    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
+        """Return the outputs at the start; unknown parameters raise SettingsError."""
+        self.took = math.nan
+        return super().start(time, parameters)
 
     def advance(self, time: float, inputs: Vector) -> Vector:
         """Step once and return the set-points."""
         begin = clock.perf_counter()
         outputs = super().advance(time, inputs)
-        self._took = clock.perf_counter() - begin
+        self.took = clock.perf_counter() - begin
         return outputs
 
     @property
-    def info(self) -> MpcInfo:
-        """What the last sample decided, and how long it took."""
-        return replace(explain(self.block.arrays, self._state, self._names), time=self._took)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Samples since the start on which the previous plan went on, and on which a soft limit was not kept."""
-        return {
-            "previous_plan": int(self._state[self._at["shifted"]].item()),
-            "softened": int(self._state[self._at["softened"]].item()),
-        }
-
-    def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
-        """Return the outputs at the start; unknown parameters raise SettingsError."""
-        self._took = math.nan
-        return super().start(time, parameters)
+    def info(self) -> Any:
+        """What the last sample decided."""
+        return self._controller.explain(self._state)
