@@ -135,7 +135,7 @@ def observer_command(
 def _fitted(
     observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
 ) -> tuple[FittedObserver, list[str]]:
-    """Return what the recordings make of the observer, and what to say of it."""
+    """Fit the observer to the recordings; return it and the lines to print."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency
     from softneck.estimation._observer import fitted

@@ -152,7 +152,7 @@ def demo(output: Path | None, quick: bool, force: bool, as_json: bool) -> None:
 
 
 def _refuse_foreign(folder: Path, *, force: bool) -> None:
-    """Refuse a folder that holds something, unless it lies under build/ or `force` allows it."""
+    """Raise OutputError for a folder that is not empty, unless it is under build/ or `force` is set."""
     inside = folder.resolve().is_relative_to(Path("build").resolve())
     if not inside and not force and folder.is_dir() and any(folder.iterdir()):
         raise OutputFileError(f"{folder}: is not empty; use --force to replace files in it or choose another folder.")

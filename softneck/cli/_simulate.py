@@ -156,7 +156,7 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
     rows = []
     for row in result.limits:
         value = "-" if row["value"] is None else f"{row['value']:.3f}"
-        rows.append([row["metric"], f"{row['limit']:g}", value, "holds" if row["holds"] else "fails"])
+        rows.append([row["metric"], f"{row['limit']:.4g}", value, "holds" if row["holds"] else "fails"])
     return ["metric", "limit", "value", "verdict"], rows
 
 
@@ -192,14 +192,15 @@ def _page(name: str, result: Result, view: Path | None) -> str:
 def _verdict(result: Result) -> str:
     """Return in one sentence whether the loop keeps its limits, and which it breaks."""
     rows = result.limits
-    broken = [f"{row['metric']} is {_value(row)}, limit {row['limit']:g}" for row in rows if not row["holds"]]
+    broken = [f"{row['metric']} is {_value(row)}, limit {row['limit']:.4g}" for row in rows if not row["holds"]]
     if broken:
         return f"{len(broken)} of {len(rows)} limits broken: {'; '.join(broken)}."
     if not rows:
         return "The loop file states no limits, so nothing was judged."
     upper = [row for row in rows if row["metric"] != "validity.min" and row["limit"]] or rows
     nearest = max(upper, key=lambda row: row["value"] / row["limit"])
-    return f"All {len(rows)} limits hold; nearest: {nearest['metric']}, {_value(nearest)} of {nearest['limit']:g}."
+    hold = f"All {len(rows)} limits hold; nearest" if len(rows) > 1 else "The limit holds"
+    return f"{hold}: {nearest['metric']}, {_value(nearest)} of {nearest['limit']:.4g}."
 
 
 def _value(row: dict[str, Any]) -> str:
@@ -306,7 +307,7 @@ def study_command(
 
 
 def _anew(study: Study, folder: Path, output: Path | None, force: bool) -> bool:
-    """Return whether what is there is replaced: another study under build/, or what --force says."""
+    """Return whether an existing study may be replaced: under build/, or with --force."""
     from softneck.cosim.studies._store import DESCRIPTION, read_description
 
     there = output is None and (folder / DESCRIPTION).is_file()

@@ -241,7 +241,7 @@ def filter_lines(gate_level: float, constants: Vector, sample_time: float, sourc
 
 
 def header_of(observer: Any) -> dict[str, Any]:
-    """Return what the files of both kinds of observers say."""
+    """Return the header that both kinds of observers write."""
     block = observer.block()
     return {
         "kind": block.kind,
@@ -257,7 +257,7 @@ def header_of(observer: Any) -> dict[str, Any]:
 
 
 def of_header(header: Mapping[str, Any], form: str) -> dict[str, Any]:
-    """Return the fields that both kinds have; files of earlier versions do not say where the sensor's delay is from."""
+    """Return the header's fields of both kinds; earlier versions do not name the source of the sensor's delay."""
     source = str(header.get("delay_source", "given"))
     return {
         "noise": tuple(float(header["noise"][name]) for name, _ in NOISES[form]),

@@ -1,4 +1,4 @@
-"""The scaling of a robot by its model, where its file does not say how far and how fast its outputs go."""
+"""The scaling of a robot by its model, where its robot file gives no ranges and no time constant."""
 
 from __future__ import annotations
 

@@ -224,7 +224,7 @@ class KalmanSettings:
         )
 
     def _delays(self, usual: float) -> tuple[float, float]:
-        """Return how late measurements and the gyro's rates are [s], with a `usual` delay where nobody says another."""
+        """Return the delays [s] of the sensor and of the gyro; `usual` where none is set."""
         delay = usual if self.sensor_delay is None else self.sensor_delay
         # Where neither is given: the rates come with the angles.
         shared = delay if self.sensor_delay is None and self.form == "gyro" else 0.0

@@ -215,7 +215,7 @@ def reference_keys(made: object, robot: Robot = _NECK) -> dict[str, float | str]
 
 
 def same_quantity(one: str, other: str) -> bool:
-    """Return whether two keys say the same, perhaps in two units, such as `x_mm` and `x`."""
+    """Return whether two keys set the same quantity, perhaps in two units, such as `x_mm` and `x`."""
     return _stem(one) == _stem(other)
 
 

@@ -27,12 +27,12 @@ _MEANT, _BENDS = (0.0, 120.0, 240.0), 2
 
 
 def has_own_tendons(robot: Robot) -> bool:
-    """Return whether a robot's tendons stand where those of neck files are meant to, which measured them better."""
+    """Return whether a robot's tendons are at 0, 120 and 240 deg, whose measured angles a neck file holds."""
     return robot.directions.angles_deg == _MEANT and len(robot.outputs.names) == _BENDS
 
 
 def tendons_of(robot: Robot, parameters: NeckParameters) -> tuple[float, ...]:
-    """Return where a robot's tendons stand [rad]: as it says, or as its neck file measured."""
+    """Return the tendon angles of a robot [rad]: from the neck file's measurement, else from its robot file."""
     if has_own_tendons(robot):
         return parameters.tendon_angle_1, parameters.tendon_angle_2, parameters.tendon_angle_3
     return tuple(math.radians(angle % 360.0) for angle in robot.directions.angles_deg)

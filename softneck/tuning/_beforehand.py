@@ -60,7 +60,7 @@ def quickest(plant: Any) -> float:
 
 
 def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
-    """Return the rise [s] that is asked by default: of the slowest axis; None where no step is reached."""
+    """Return the default rise time [s], of the slowest axis; None where no step is reached."""
     uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
     limits, size = LoopSettings().limits(uncertain.robot), asked.certificate.si(asked.certificate.sim["size_deg"])
     time, found = asked.certificate.scale.time, []

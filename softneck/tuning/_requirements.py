@@ -171,7 +171,7 @@ def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequir
 
 
 def _for_linear(usual: dict[str, Any]) -> dict[str, Any]:
-    """Return the defaults without simulation models: what they ask of these is asked of the linear plants."""
+    """Return the defaults without simulation models: their requirements apply to the linear plants."""
     require = {re.sub(r"^sim\.", "step.", name): limit for name, limit in usual["require"].items()}
     # Presets are foreign plants, which decide nothing and take half a minute.
     return {**usual, "reserve": {}, "sim": {**usual["sim"], "necks": 0}, "require": require}

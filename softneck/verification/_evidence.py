@@ -170,7 +170,7 @@ def _linear(
 
 
 def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
-    """Return whether the loops are over a preset that nobody asked to decide; a file is the user's own."""
+    """Return whether the loops use a built-in plant that does not count; a file of the user counts."""
     return not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
 
 

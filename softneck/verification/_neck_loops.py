@@ -266,13 +266,13 @@ def no_virtual_plant(robot: Robot, asked: Requirements) -> str:
 
 
 def preset_of(asked: Requirements) -> str:
-    """Return the preset or neck file of the loops: the one that is asked for, else the robot's own."""
+    """Return the preset or neck file of the loops: the given one, else the robot's own."""
     own = asked.own.get("sim", {}).get("preset", asked.robot.neck)
     return str(asked.sim["preset"] if own is None else own)
 
 
 def virtual_plant(robot: Robot, asked: Requirements) -> tuple[str, VirtualNeck]:
-    """Return the virtual plant that is asked for, else the robot's own, and its name."""
+    """Return the given virtual plant, else the robot's own, and its name."""
     given = asked.own.get("sim", {}).get("preset")
     plant = VirtualNeck.of(robot, None if given is None else NeckParameters.preset(str(given)))
     return preset_of(asked), plant

@@ -339,7 +339,8 @@ def _runs(found: Verification) -> Table:
     runs = found.evidence.necks
     names = list(runs[0].metrics)
     rows = [[run.name, *(number(run.metrics[name]) for name in names)] for run in runs]
-    return Table("Each loop", ["plant, payload, direction", *names], rows)
+    shown = [found.requirements.scale.name_of(f"sim.{name}").partition(".")[2] for name in names]
+    return Table("Each loop", ["plant, payload, direction", *shown], rows)
 
 
 def _plants(found: Verification) -> Section:

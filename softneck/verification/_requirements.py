@@ -130,7 +130,7 @@ def with_groups(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track
 
 
 def with_sim(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
-    """Return a requirements table by the names of today: files up to softneck 0.2 say `neck` for `sim`."""
+    """Return a requirements table with today's names: files up to softneck 0.2 use `neck` for `sim`."""
     if "neck" in robot.outputs.names:
         return dict(table)
     found = {sim_name(key): value for key, value in table.items()}

@@ -47,7 +47,7 @@ class Scale:
 
     @classmethod
     def of(cls, robot: Robot, sources: Sequence[UncertainNeck] = ()) -> Scale:
-        """Return it by what the robot gives, else by its ranges and by the plants that stand for it.
+        """Return the scale from the robot file, else from its ranges and plants.
 
         Raises:
             SettingsError: plants of a robot that does not say where its set-points end.
@@ -89,7 +89,7 @@ class Scale:
         if name == "circle_rad_s":
             return 1.0 / self.time
         if name.endswith("_deg") and name not in _ANGLES:
-            # What stands still is no quieter than the sensor.
+            # A steady output is no quieter than its sensor.
             return max(self.size, self.noise) if name == "steady_rms_deg" else self.size
         return self.time if name.endswith(("_s", "_ms")) else 1.0
 

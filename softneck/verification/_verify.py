@@ -315,7 +315,7 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
     return Verdict(item, value, item.holds(value), worst)
 
 
-_FOREIGN = "shown only: a preset does not decide; add a model of your robot, or set `[sim] decides`"
+_FOREIGN = "shown only: this is a built-in plant; add a model of your robot to count it, or set `[sim] decides`"
 # What is about the loop's response, which the data may not reach.
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 

@@ -43,7 +43,7 @@ class PiSettings(AxisSettings):
     tuning: str = "nominal"
     max_sensitivity: float = 1.5
     phase_margin: float = math.radians(60.0)
-    # As slow as the robot: what is asked faster only runs into limits.
+    # As slow as the robot: a faster filter only drives the motors into their limits.
     reference_time: float | Sequence[float] | str | None = PLANT
 
     def __post_init__(self) -> None:

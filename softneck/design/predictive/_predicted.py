@@ -43,7 +43,7 @@ def predicted_plants(settings: Any, plant: ScaledPlant) -> AnyAxes:
 
 
 def taken(settings: Any, asked: Any, plant: ScaledPlant) -> dict[str, float]:
-    """Return what of the doubts on a robot a design takes where nobody `asked` other, and it changes the plant."""
+    """Return the assumed dead time and pole that change the plant, where the settings do not give their own."""
     found: dict[str, float] = {}
     for name in ("least_delay", "small_move_pole", "taut_pole"):
         value, second = float(getattr(settings, name)), plant.scaling.second

@@ -131,7 +131,7 @@ def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
 
 
 def scale_numbers(plant: ScaledPlant, limits: ControllerLimits) -> tuple[float, ...]:
-    """Return what the runtime reads behind its constants: scaled bounds, and units; nothing where they are its own."""
+    """Return the scaled bounds and units that follow the runtime's constants; none where they equal its own."""
     robot, unit, outputs = plant.robot, plant.scaling.motor_unit, plant.scaling.output_unit
     ranges: Any = motor_ranges(robot, limits.position_limit)
     motors, (low, high) = np.array(ranges) / unit, np.array(reference_ranges(robot)) / outputs

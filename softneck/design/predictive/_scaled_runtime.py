@@ -11,7 +11,7 @@ import numpy as np
 SCALED_NUMBERS = 17
 SCALED_REFERENCE = 0.8  # as the ports' min and max
 SCALED_MOTOR = 6.0  # the paper's largest rotation (section 3.1)
-# No neck leans this far; whoever says so measures nothing.
+# No neck leans this far: such a value is not a measurement.
 SCALED_PLAUSIBLE = 1.3
 
 
@@ -64,7 +64,7 @@ def scaled_measured(q: np.ndarray, outputs: int, inputs: np.ndarray) -> bool:
 
 
 def scaled_reference(q: np.ndarray, motors: int, outputs: int, i: int, asked: float) -> float:
-    """Return a reference within what may be asked for."""
+    """Return a reference clipped to its range."""
     if q.shape[0] > SCALED_NUMBERS:
         low = SCALED_NUMBERS + 2 * motors + i
         return min(max(asked, float(q[low])), float(q[low + outputs + 1]))

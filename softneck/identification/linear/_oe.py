@@ -331,7 +331,7 @@ class OutputError:
     def _arrays(
         self, door: Door, found: list[OutputErrorFit], delays: list[int]
     ) -> tuple[dict[str, Matrix], dict[str, Any]]:
-        """Return the arrays that the runtime reads, and what findings must say beside them.
+        """Return the arrays of the runtime, and the findings that belong to them.
 
         A model of one pole starts from its last measured output; one of more poles has a Kalman observer, as the last
         outputs determine a slow state beside a fast one only through their noise. So has one with an offset.

@@ -1,4 +1,4 @@
-"""Which way a robot's motors move its outputs, and how fast: as the robot says, else found from data.
+"""Directions and time constant of a robot: from its robot file, else estimated from data.
 
 Each output is fitted by one low-pass filter with dead time over all motors (least squares for each time constant and
 dead time tried): its weights are the output's direction where the robot gives none, and its time constant is that of
@@ -76,7 +76,7 @@ class Directions:
         return np.vstack([rows, axes.T[::-1] @ across])
 
     def findings(self) -> dict[str, object]:
-        """Return what a model's findings say of it."""
+        """Return the findings of a model about its directions."""
         return {
             "time_constants_s": self.seconds.tolist(),
             "directions": self.weights.tolist(),

@@ -57,7 +57,7 @@ def eq21_table(recording: Recording) -> Matrix:
 
 
 def spread_table(recording: Recording) -> Matrix:
-    """Return a regressor for a scaled recording whose dead time nobody knows: three samples of y and of all u."""
+    """Return a regressor for a scaled recording of unknown dead time: three samples of y and of all u."""
     sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
     lags = [1 + i * max(round(2.0 * _APART / recording.sample_time), 1) for i in range(3)]
     return lag_table(lags, lags, [], sizes=sizes)

@@ -299,7 +299,7 @@ class SetMembership:
     def _choose(
         self, ground: Ground, door: Door, noise: Vector, asked: Vector | None, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
-        """Return scale and epsilon, that which was `asked` for where it was, and all that were tried."""
+        """Return the chosen scale and epsilon (`asked` where it is set), and all candidates."""
         sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
         epsilons = [factor * noise for factor in sigmas] if asked is None else [asked]
         if asked is not None and self.output_weight is not None:
