@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 PACKAGE = Path(__file__).parents[1] / "softneck"
+# Names below this line of a stub are for softneck's own subpackages.
+SHARED = "# isort: split"
 
 
 class PublicName(NamedTuple):
@@ -41,7 +43,8 @@ def subpackages() -> list[str]:
 def names_of(subpackage: str) -> Iterator[PublicName]:
     """Yield the names that a subpackage exports, in the order of its stub; subpackages inside it are not among them."""
     stub = PACKAGE.parent.joinpath(*subpackage.split("."), "__init__.pyi")
-    for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+    documented, _, _ = stub.read_text(encoding="utf-8").partition(SHARED)
+    for node in ast.parse(documented).body:
         if isinstance(node, ast.ImportFrom) and node.module is not None:
             module = importlib.import_module(f"{subpackage}.{node.module}")
             # What the front door lends is documented in its own subpackage.
@@ -85,6 +88,14 @@ def page() -> str:
     return "\n\n".join(parts)
 
 
+def skip_shared(app: Any, what: str, name: str, *_: Any) -> bool | None:
+    """Return True for a member of a subpackage's page that is not documented; None leaves the choice to Sphinx."""
+    page, _, subpackage = app.env.current_document.docname.rpartition("/")
+    if what != "module" or page != "reference/api":
+        return None
+    return None if name in {item.name for item in names_of(f"softneck.{subpackage}")} else True
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Give Sphinx the directive."""
     from sphinx.util.docutils import SphinxDirective
@@ -98,4 +109,5 @@ def setup(app: Any) -> dict[str, bool]:
             return self.parse_text_to_nodes(page(), allow_section_headings=True)
 
     app.add_directive("public-names", PublicNames)
+    app.connect("autodoc-skip-member", skip_shared)
     return {"parallel_read_safe": True}

@@ -61,20 +61,35 @@ def test_a_subpackage_re_exports_lazily_and_does_nothing_else() -> None:
         assert code in (set(), allowed), name_of(subpackage)
 
 
-def public_names() -> list[str]:
-    """Return every name that a subpackage re-exports, with its subpackage."""
+def public_names(shared: bool = False) -> list[str]:
+    """Return every name that a subpackage re-exports, with its subpackage; `shared` adds those for softneck alone."""
     found = []
     for stub in sorted(PACKAGE.rglob("__init__.pyi")):
         subpackage = ".".join(stub.parent.relative_to(ROOT).parts)
-        for node in ast.parse(stub.read_text(encoding="utf-8")).body:
+        text = stub.read_text(encoding="utf-8")
+        for node in ast.parse(text if shared else text.partition("# isort: split")[0]).body:
             if isinstance(node, ast.ImportFrom) and node.module is not None:
                 found += [f"{subpackage}:{alias.name}" for alias in node.names]
     return found
 
 
 def test_public_names_are_there() -> None:
-    for name in public_names():
+    for name in public_names(shared=True):
         assert resolve(name) is not None, name
+
+
+def test_no_subpackage_imports_a_private_module_of_another() -> None:
+    """Names that several subpackages use are in the stub of theirs; the text of runtimes goes into bundles as it is."""
+    problems = []
+    for path in sorted(set(FILES) - set(RUNTIMES)):
+        here = path.relative_to(PACKAGE).parts[0]
+        for module in imports_of(path):
+            parts = module.split(".")
+            private = module.startswith("softneck.") and any(part.startswith("_") for part in parts[1:])
+            runtime = parts[-1].endswith("_runtime") or module == "softneck.runtime._layout"
+            if private and not runtime and parts[1] != here:
+                problems.append(f"{name_of(path)}: {module}")
+    assert problems == []
 
 
 def test_a_runtime_imports_numpy_math_and_other_runtimes_only() -> None:

@@ -14,8 +14,7 @@ from .shared._console import left_out, note, percent, print_json, print_table, p
 from .shared._options import target
 
 if TYPE_CHECKING:
-    from softneck.identification import Choice, Model, Validation
-    from softneck.identification.selection._auto import KindTrial
+    from softneck.identification import Choice, KindTrial, Model, Validation
     from softneck.robot import Robot
 
 
@@ -41,8 +40,7 @@ def identify_auto(
     as_json: bool,
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
-    from softneck.identification._identify import choose_kind, with_fit
-    from softneck.identification.models._validity import with_tolerance
+    from softneck.identification import choose_kind, with_fit, with_tolerance
     from softneck.plots import write_page
     from softneck.signals import read_recording
 
@@ -101,7 +99,7 @@ def _model(choice: Choice) -> Model:
 
 def _others(choice: Choice) -> dict[str, Choice]:
     """Return the choices of the best kinds of other sorts, by their sort."""
-    from softneck.identification.selection._auto import best_others
+    from softneck.identification import best_others
 
     found = best_others(choice.ranking, choice.chosen)
     return {sort: replace(choice, chosen=one) for sort, one in found.items() if one.model is not None}
@@ -116,7 +114,7 @@ def _rows(choice: Choice) -> list[list[str]]:
 
 
 def _row(one: KindTrial, chosen: bool) -> list[str]:
-    from softneck.identification.selection._auto import COLD, HOLD_OUT
+    from softneck.identification import COLD, HOLD_OUT
 
     if one.model is None:
         return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", one.failure[:60]]
@@ -160,7 +158,7 @@ def _facts(choice: Choice, path: Path) -> dict:
 
 def _page(choice: Choice) -> str:
     from softneck.plots import Section, Table, page
-    from softneck.report._validation_page import curves
+    from softneck.report import curves
 
     table = Table(_title(_model(choice).robot), _HEAD, _rows(choice))
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))

@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from softneck.core import KINDS, SettingsError, find_kind, refuse_existing, resolve, to_si
-from softneck.core._kinds import kinds_of
-from softneck.robot._loading import load_for_robot
+from softneck.core import KINDS, SettingsError, find_kind, kinds_of, refuse_existing, resolve, to_si
+from softneck.robot import load_for_robot
 
 from .shared._console import note, print_json, progress
 from .shared._groups import kinds_complete
 from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
 
 if TYPE_CHECKING:
-    from softneck.estimation._fitted import FittedObserver
+    from softneck.estimation import FittedObserver
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 
@@ -52,7 +51,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Design a controller of KIND on identified linear models or a family."""
-    from softneck.design._design import linear_plant
+    from softneck.design import linear_plant
 
     entry = find_kind(kind, "controller")
     path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
@@ -107,7 +106,7 @@ def observer_command(
     one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
     state.
     """
-    from softneck.estimation._observer import designed
+    from softneck.estimation import designed
 
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
@@ -137,8 +136,7 @@ def _fitted(
 ) -> tuple[FittedObserver, list[str]]:
     """Fit the observer to the recordings; return it and the lines to print."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
-    from softneck.estimation import consistency
-    from softneck.estimation._observer import fitted
+    from softneck.estimation import consistency, fitted
     from softneck.signals import read_recording
 
     recordings = [read_recording(path, robot=robot) for path in data]

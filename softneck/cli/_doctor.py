@@ -77,8 +77,7 @@ def _fmu_platform() -> dict[str, str]:
 
 def _compiled_fmus() -> dict[str, str]:
     from softneck.core import FileFormatError
-    from softneck.fmu.compiled._compilers import PLATFORMS
-    from softneck.fmu.compiled._library import platforms_built
+    from softneck.fmu import PLATFORMS, platforms_built
 
     try:
         built, how = platforms_built()

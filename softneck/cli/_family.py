@@ -120,8 +120,7 @@ def _named(numbers: np.ndarray) -> dict[str, float]:
 
 
 def _page(family: Family) -> str:
-    from softneck.plots import Section, Table, page
-    from softneck.plots._charts import cover_chart
+    from softneck.plots import Section, Table, cover_chart, page
 
     outputs, motors = family.robot.outputs, family.robot.motors
     unit, gain = f"{outputs.display_unit}/{motors.unit}", to_si(motors.unit)[0] / to_si(outputs.display_unit)[0]

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import FileFormatError, SettingsError, file_hash, load
-from softneck.fmu.compiled._compilers import PLATFORMS
+from softneck.fmu import PLATFORMS
 
 from .shared._console import note, print_json, progress
 from .shared._options import common_options, output_option, target
 
 if TYPE_CHECKING:
-    from softneck.fmu.describe._describe import Buildable
+    from softneck.fmu import Buildable
     from softneck.identification import Validation
     from softneck.runtime import Block
 
@@ -112,7 +112,7 @@ def command(
 def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bool, as_json: bool) -> None:
     """Write a loop as an SSP archive."""
     from softneck.cosim import load_loop, load_ssp, write_ssp
-    from softneck.loop._loop import System
+    from softneck.loop import System
 
     if file.suffix.lower() not in (".toml", ".ssp"):
         raise SettingsError(f"{file}: an SSP file is made of a loop file (.toml) or of another archive (.ssp).")
@@ -132,8 +132,8 @@ def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bo
 
 def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
     """Return what `source` names: a softneck file of the robot, a neck or a robot by its file or preset."""
-    from softneck.cosim.loops._loop_file import is_loop_file, reference_of
-    from softneck.fmu.describe._describe import buildable
+    from softneck.cosim import is_loop_file, reference_of
+    from softneck.fmu import buildable
 
     return reference_of(Path(source), robot=robot) if is_loop_file(Path(source)) else buildable(source, robot)
 
@@ -144,7 +144,7 @@ def _can_be_fmu(source: str | Path) -> bool:
 
 def _has_sensitivities(block: Block) -> bool:
     """Return whether an FMU of `block` can have them; of a folder the others are built without, which is said."""
-    from softneck.fmu.compiled._build import next_outputs
+    from softneck.fmu import next_outputs
 
     try:
         return bool(next_outputs(block))
@@ -156,7 +156,7 @@ def _has_sensitivities(block: Block) -> bool:
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:
     """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
     from softneck.identification import Model, validate
-    from softneck.signals.recording._files import opened_recording
+    from softneck.signals import opened_recording
 
     if not isinstance(thing, Model):
         return None
@@ -194,7 +194,7 @@ def _inside(folder: Path) -> list[Path]:
 
 def _is_neck(path: Path) -> bool:
     """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
-    from softneck.fmu.describe._describe import has_keys
+    from softneck.fmu import has_keys
     from softneck.plant import NeckParameters
 
     return has_keys(path, {"preset", *NeckParameters.names()})

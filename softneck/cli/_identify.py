@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import KINDS, CheckFailedError, SettingsError, find_kind, refuse_existing, require_positive, resolve
-from softneck.core._kinds import kinds_of
-from softneck.robot._loading import load_for_robot
+from softneck.core import (
+    KINDS,
+    CheckFailedError,
+    SettingsError,
+    find_kind,
+    kinds_of,
+    refuse_existing,
+    require_positive,
+    resolve,
+)
+from softneck.robot import load_for_robot
 
 from ._auto import identify_auto
 from .shared._console import left_out, percent, print_json, progress, useless
@@ -74,9 +82,8 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
-    from softneck.identification._identify import identified
-    from softneck.signals.quality._excitation import poor_excitation, stands_still
-    from softneck.signals.recording._files import opened_recording
+    from softneck.identification import identified
+    from softneck.signals import opened_recording, poor_excitation, stands_still
 
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
@@ -147,7 +154,7 @@ def adapt(
     robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Refit MODEL to the latest data, starting from what it is; write the model, and say what became of it."""
-    from softneck.signals.recording._files import opened_recording
+    from softneck.signals import opened_recording
 
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)

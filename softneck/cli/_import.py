@@ -19,9 +19,7 @@ from .shared._options import columns_options, common_options, sample_time_of, ta
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
-    from softneck.signals import Guess, Layout
-    from softneck.signals.importing._log import ImportResult
-    from softneck.signals.importing._robot_guess import NamedColumns
+    from softneck.signals import Guess, ImportResult, Layout, NamedColumns
 
 
 def is_terminal() -> bool:
@@ -155,12 +153,8 @@ def command(
     Reads text in any encoding, spreadsheets, Parquet, MATLAB files, and ROS 2 bags (.mcap). The .mcap log of
     `softneck drives run --log` needs neither layout nor guess.
     """
-    from softneck.robot import find_robot
-    from softneck.robot._search import robot_file_of
-    from softneck.signals import import_log, read_layout
-    from softneck.signals.importing._robot_guess import NamedColumns
-    from softneck.signals.importing.formats._mcap import is_run_log
-    from softneck.signals.recording._files import recording_suffix, said_robot
+    from softneck.robot import find_robot, robot_file_of
+    from softneck.signals import NamedColumns, import_log, is_run_log, read_layout, recording_suffix, said_robot
 
     named = NamedColumns(motors, outputs, positions) if motors or outputs or positions else None
     asked = guess or layout_file is not None or robot_out is not None or named is not None
@@ -214,15 +208,14 @@ def command(
 
 def _can_guess(robot: Robot) -> bool:
     """Return whether a robot's channels are those that are looked for in a log without titles."""
-    from softneck.signals.recording._channels import OUTPUTS, SET_POINTS
+    from softneck.signals import OUTPUTS, SET_POINTS
 
     return (robot.set_points, robot.outputs.names) == (SET_POINTS, OUTPUTS)
 
 
 def _recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any]]:
     """Return a recording that is to be brought to another sample time."""
-    from softneck.signals import read_recording
-    from softneck.signals.importing._log import ImportResult
+    from softneck.signals import ImportResult, read_recording
 
     before = read_recording(log, robot=robot)
     return ImportResult(before, ()), {"sample_time_before_s": before.sample_time}
@@ -231,7 +224,7 @@ def _recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any
 def _run_log(log: Path) -> tuple[ImportResult, dict[str, Any]]:
     """Return the recording of a run on drives."""
     from softneck.drives import read_run_log  # the drives take a while to import
-    from softneck.signals.importing._log import ImportResult
+    from softneck.signals import ImportResult
 
     run = read_run_log(log)
     notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
@@ -255,8 +248,7 @@ def _finish(
 
 def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
     """Return the import at the sample time that was asked for."""
-    from softneck.signals import resampled
-    from softneck.signals.importing._log import ImportResult
+    from softneck.signals import ImportResult, resampled
 
     if job.sample_time is None:
         return imported
@@ -271,8 +263,8 @@ def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
 
 def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: ImportResult | None) -> str:
     """Return the page that shows the log's columns and what was made of them."""
-    from softneck.plots._import_page import import_page  # the charts take a while to import
-    from softneck.signals.importing._log import read_log
+    from softneck.plots import import_page  # the charts take a while to import
+    from softneck.signals import read_log
 
     return import_page(
         job.log,
@@ -333,8 +325,7 @@ def _of_robot(
     """
     import tomli_w
 
-    from softneck.signals import import_log, layout_toml
-    from softneck.signals.importing._robot_guess import guess_robot, layout_for, robot_of_columns
+    from softneck.signals import guess_robot, import_log, layout_for, layout_toml, robot_of_columns
 
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
@@ -393,7 +384,7 @@ def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: boo
 
 def _one_output(more: dict[str, Any]) -> str:
     """Return what the last line says of a log that was taken for that of a robot with one output."""
-    from softneck.signals.importing._doubts import ONE_AXIS
+    from softneck.signals import ONE_AXIS
 
     taken = [doubt["taken"] for doubt in more.get("doubts", ()) if doubt["about"] == ONE_AXIS]
     return f"; NOT SURE: {taken[0]}, as no column is the other angle" if taken else ""

@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softneck.core import (
+    CERTIFICATE_KINDS,
+    KINDS,
+    MOST_JSON,
     DataError,
     FileFormatError,
     SettingsError,
     file_hash,
+    fitting,
     load,
+    open_zip,
     read_archive,
     read_certificate,
     refuse_existing,
+    require_file,
+    settings_text,
 )
-from softneck.core._budget import MOST_JSON, open_zip, settings_text
-from softneck.core._certificate import CERTIFICATE_KINDS
-from softneck.core._files import require_file
-from softneck.core._kinds import KINDS, fitting
 
 from .shared._console import print_json, progress
 from .shared._options import common_options
@@ -60,14 +63,14 @@ def describe_log(file: Path) -> dict[str, Any]:
 
 
 def _stops(name: str) -> bool:
-    from softneck.drives.master._events import RULES, Reaction
+    from softneck.drives import RULES, Reaction
 
     rule = RULES.get(name)
     return rule is not None and rule.reaction in (Reaction.STOP, Reaction.RETREAT)
 
 
 def _first_error(frames: Sequence[tuple[float, bool, Frame]]) -> str:
-    from softneck.drives.logs._cycle import meaning
+    from softneck.drives import meaning
 
     for time, _, frame in frames:
         emergency = frame.identifier & 0x780 == 0x80 and frame.identifier != 0x80 and any(frame.data[:2])
@@ -116,7 +119,7 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
 def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     match file.suffix.lower():
         case ".csv" | ".parquet":
-            from softneck.signals.recording._files import said_robot
+            from softneck.signals import said_robot
 
             try:
                 return _recording(file, html, force=force, quiet=quiet)
@@ -141,7 +144,7 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
         case ".json":
             return _certificate(file)
         case ".mcap":
-            from softneck.signals.importing.formats._mcap import is_run_log
+            from softneck.signals import is_run_log
 
             return describe_log(file) if is_run_log(file) else _log(file, html, None)
         case _:
@@ -150,7 +153,7 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
 
 def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Return what a recording holds and its quality, and write the page."""
-    from softneck.identification.models._directions import bandwidth_of
+    from softneck.identification import bandwidth_of
     from softneck.signals import assess_quality, read_recording
 
     quick = html is None and file.stat().st_size < _LARGE
@@ -235,8 +238,7 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 def _toml(file: Path) -> dict[str, Any]:
     """Say what a TOML file is: a robot names motors, a loop a plant, a study what varies; else it must be a neck."""
-    from softneck.cosim import load_loop, load_study
-    from softneck.cosim.loops._loop_file import python_of
+    from softneck.cosim import load_loop, load_study, python_of
     from softneck.plant import NeckParameters, VirtualNeck
     from softneck.robot import Robot
     from softneck.signals import read_layout
@@ -293,7 +295,7 @@ def _certificate(file: Path) -> dict[str, Any]:
 def _ssp(file: Path) -> dict[str, Any]:
     """Return the parts of an SSP archive; what `simulate` cannot run is refused with its words."""
     from softneck.cosim import load_ssp
-    from softneck.loop._loop import System
+    from softneck.loop import System
 
     read = load_ssp(file)
     if isinstance(read, System):

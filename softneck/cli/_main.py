@@ -14,8 +14,7 @@ from importlib import import_module
 import click
 
 from softneck import __version__
-from softneck.core import SoftneckError
-from softneck.core._errors import missing_extra
+from softneck.core import SoftneckError, missing_extra
 
 from .shared._groups import NearGroup, now
 

@@ -16,8 +16,7 @@ from .shared._console import Stages, note, print_json, print_table, progress
 from .shared._options import common_options, target
 
 if TYPE_CHECKING:
-    from softneck.report._demo import Demo
-    from softneck.report._project import Project
+    from softneck.report import Demo, Project
 
 # Of a folder that is not empty, in the line that refuses it.
 _MOST_NAMES = 3
@@ -159,7 +158,7 @@ def _refuse_foreign(folder: Path, *, force: bool) -> None:
 
 
 def _print(demo: Demo) -> None:
-    from softneck.report._demo import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
+    from softneck.report import FIT_HEAD, FIT_NOTE, fit_rows, fmu_rows, loop_rows
 
     print_table("Models, ours beside the paper's (fit in %, pitch/roll)", FIT_HEAD, fit_rows(demo.judged, demo.rough))
     click.echo(FIT_NOTE + "\n")
@@ -185,9 +184,18 @@ def paper(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) 
     beside the paper's, like with like. Takes about a minute.
     """
     from softneck.plots import write_page
-    from softneck.report import ReproduceSettings, paper_page, reproduce
-    from softneck.report._paper_page import LINEAR_HEAD, grouped, linear_facts, linear_rows
-    from softneck.report._reproduce import PAPER_HEAD, PAPER_NOTE, paper_entries
+    from softneck.report import (
+        LINEAR_HEAD,
+        PAPER_HEAD,
+        PAPER_NOTE,
+        ReproduceSettings,
+        grouped,
+        linear_facts,
+        linear_rows,
+        paper_entries,
+        paper_page,
+        reproduce,
+    )
 
     if html is not None:
         refuse_existing(html, force=force)

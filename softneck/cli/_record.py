@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import SettingsError, refuse_existing, require_between, require_finite, to_si
-from softneck.robot import Robot, find_robot
-from softneck.robot._loading import load_for_robot
+from softneck.robot import Robot, find_robot, load_for_robot
 from softneck.signals import (
     Excitation,
     SetPointLimits,
@@ -19,17 +18,17 @@ from softneck.signals import (
     multisine_experiments,
     prepare,
     read_recording,
+    require_same_robot,
     signal,
     signal_names,
     write_recording,
 )
-from softneck.signals.recording._recording import require_same_robot
 
 from .shared._console import print_json, print_table, progress
 from .shared._options import common_options, output_option
 
 if TYPE_CHECKING:
-    from softneck.identification.selection._experiment_design import Known
+    from softneck.identification import Known
     from softneck.robot import Robot
     from softneck.signals import SetPointLimits
 
@@ -82,7 +81,7 @@ def command(
 ) -> None:
     """Record SIGNAL on the virtual neck or robot."""
     from softneck.plant import NeckParameters, VirtualNeck, record
-    from softneck.signals.recording._files import recording_suffix
+    from softneck.signals import recording_suffix
 
     recording_suffix(output)
     refuse_existing(output, force=force)
@@ -175,7 +174,7 @@ def record_next(
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the set-points of the next recording, and as outputs what the members of the model expect."""
-    from softneck.identification.selection._experiment_design import Bounds, next_experiment
+    from softneck.identification import Bounds, next_experiment
     from softneck.signals import write_recording
 
     known = _known(source, robot)
@@ -206,8 +205,7 @@ def record_next(
 
 
 def _known(source: Path, robot: str | None) -> Known:
-    from softneck.identification import Model
-    from softneck.identification.selection._experiment_design import Known
+    from softneck.identification import Known, Model
 
     model = load_for_robot(source, robot=robot)
     if not isinstance(model, Model):
@@ -217,8 +215,7 @@ def _known(source: Path, robot: str | None) -> Known:
 
 def _limits(robot: Robot, given: Mapping[str, float | None]) -> SetPointLimits:
     """Return what is asked for, and what the drives of a robot allow where it names them."""
-    from softneck.drives import load_drives
-    from softneck.drives.commissioning._record import drive_limits
+    from softneck.drives import drive_limits, load_drives
     from softneck.signals import SetPointLimits
 
     if robot.drives is not None and robot.folder is not None:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import SettingsError, atomic_write
-from softneck.core._budget import settings_text
+from softneck.core import SettingsError, atomic_write, settings_text
 
 from .shared._console import print_json
 from .shared._groups import NearGroup, now
@@ -71,7 +70,7 @@ def show(file: str | None, as_json: bool) -> None:
 @common_options("force")
 def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
     """Write a preset, or another robot's file, into FILE (robot.toml), to edit."""
-    from softneck.robot._file import PRESETS, preset_text
+    from softneck.robot import PRESETS, preset_text
 
     if file.suffix.lower() != ".toml":
         raise SettingsError(f"{file}: must end in `.toml`, by which softneck recognises the file.")
@@ -90,7 +89,7 @@ def _moved(source: Path, folder: Path) -> str:
     """Return a robot file's text for another folder, from which the files that it names are found as well."""
     import tomli_w
 
-    from softneck.plant._presets import PRESETS
+    from softneck.plant import PRESETS
     from softneck.robot import Robot
 
     Robot.read(source)  # which says what is wrong with it
@@ -106,8 +105,7 @@ def _moved(source: Path, folder: Path) -> str:
 
 
 def _check_files(robot: Robot) -> None:
-    from softneck.plant import NeckParameters, VirtualNeck
-    from softneck.plant._presets import PRESETS
+    from softneck.plant import PRESETS, NeckParameters, VirtualNeck
 
     folder = robot.folder or Path()
     if robot.neck is not None:

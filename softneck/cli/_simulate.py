@@ -24,11 +24,9 @@ from .shared._options import common_options, output_option, target, trust_option
 if TYPE_CHECKING:
     import pandas as pd
 
-    from softneck.cosim import Result
-    from softneck.cosim.studies._study import Study
-    from softneck.drives.logs._log_file import LoggedRun
-    from softneck.drives.master._master import Pilot
-    from softneck.loop._loop import System
+    from softneck.cosim import Result, Study
+    from softneck.drives import LoggedRun, Pilot
+    from softneck.loop import System
 
 # Of the worst runs so many are written as loop files: who wants more reads the table.
 _WORST = 3
@@ -64,14 +62,10 @@ def command(
             raise SettingsError(f"{loop_file}: is replayed, which writes nothing; `softneck import` makes a recording.")
         replay_log(loop_file, as_json=as_json)
         return
-    from softneck.cosim import load_loop, load_ssp
-    from softneck.cosim.loops._loop_file import require_trusted
-    from softneck.cosim.loops._simulate import run_setup
-    from softneck.loop._loop import System
-    from softneck.plots import neck_view, write_page
-    from softneck.plots._neck3d import not_drawn
-    from softneck.signals import write_recording
-    from softneck.signals.recording._files import recording_suffix
+    from softneck.cosim import load_loop, load_ssp, require_trusted, run_setup
+    from softneck.loop import System
+    from softneck.plots import neck_view, not_drawn, write_page
+    from softneck.signals import recording_suffix, write_recording
 
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
     recording_suffix(path)
@@ -122,7 +116,7 @@ def _simulate_system(
     system: System, source: Path, path: Path, certificate: Path | None, html: Path | None, *, force: bool, as_json: bool
 ) -> None:
     """Run FMUs that are no closed loop; the result is a table of all their outputs."""
-    from softneck.cosim.loops._simulate import run_setup
+    from softneck.cosim import run_setup
 
     if certificate is not None or html is not None:
         raise SettingsError(f"{source}: is no closed loop, of which alone there are pages and certificates.")
@@ -162,9 +156,7 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
 
 def _page(name: str, result: Result, view: Path | None) -> str:
     from softneck.core import to_si
-    from softneck.plots import Section, Table, page
-    from softneck.plots._charts import loop_chart
-    from softneck.plots._neck3d import not_drawn
+    from softneck.plots import Section, Table, loop_chart, not_drawn, page
 
     tables = [Table("Metrics", *_metrics(result))]
     if result.limits:
@@ -212,8 +204,7 @@ def replay_log(log: Path, *, as_json: bool) -> None:
 
     A log that is cut is replayed up to the cut, which is said. Nothing is sent to any bus.
     """
-    from softneck.drives import read_run_log, replay
-    from softneck.drives.logs._log_file import changed_files
+    from softneck.drives import changed_files, read_run_log, replay
 
     run = read_run_log(log)
     notes = changed_files(run)
@@ -240,9 +231,7 @@ def _pilot(run: LoggedRun) -> Pilot | None:
     None where the log names none, or the files of the loop are gone.
     """
     from softneck.cosim import load_loop
-    from softneck.drives import Experiment, prepare
-    from softneck.drives.commissioning._jog import jog_pilot
-    from softneck.drives.running._pilot import LoopPilot
+    from softneck.drives import Experiment, LoopPilot, jog_pilot, prepare
 
     try:
         if "jog" in run.facts:
@@ -280,13 +269,9 @@ def study_command(
               worst/         the worst runs as loop files for softneck simulate
     Ctrl-C or a crash loses no finished run: the same command goes on where it was.
     """
-    from softneck.cosim import load_study
-    from softneck.cosim.loops._loop_file import require_trusted
-    from softneck.cosim.studies._run_study import run_study
-    from softneck.cosim.studies._store import read_description, write_worst
+    from softneck.cosim import load_study, read_description, require_trusted, run_study, write_worst
     from softneck.plots import write_page
-    from softneck.report import study_page
-    from softneck.report._study_page import failures, study_head, study_rows
+    from softneck.report import failures, study_head, study_page, study_rows
 
     require_trusted(study_file, trust=trust)
     study = load_study(study_file)
@@ -308,7 +293,7 @@ def study_command(
 
 def _anew(study: Study, folder: Path, output: Path | None, force: bool) -> bool:
     """Return whether an existing study may be replaced: under build/, or with --force."""
-    from softneck.cosim.studies._store import DESCRIPTION, read_description
+    from softneck.cosim import DESCRIPTION, read_description
 
     there = output is None and (folder / DESCRIPTION).is_file()
     return force or (there and read_description(folder).get("digest") != study.digest)
@@ -316,7 +301,7 @@ def _anew(study: Study, folder: Path, output: Path | None, force: bool) -> bool:
 
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:
     from softneck.cosim import pareto_front, rank
-    from softneck.report._study_page import failures
+    from softneck.report import failures
 
     held = runs["holds"].dropna().tolist()
     return {

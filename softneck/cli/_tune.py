@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import CheckFailedError, file_hash
-from softneck.robot._loading import load_for_robot
+from softneck.robot import load_for_robot
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, requirements_option
 
 if TYPE_CHECKING:
-    from softneck.tuning._tune import Tuned
+    from softneck.tuning import Tuned
 
 _PATH = click.Path(path_type=Path)
 # As `softneck.tuning` has it, which is imported when the command runs.
@@ -67,11 +67,9 @@ def command(
     says which requirement stands in the way.
     """
     from softneck.core import SettingsError
-    from softneck.report._tune_files import write_tuned
-    from softneck.report._tune_page import said_of
-    from softneck.tuning import tune
-    from softneck.tuning._tune import task_of
-    from softneck.verification._neck_loops import is_own_plant, named_plants
+    from softneck.report import said_of, write_tuned
+    from softneck.tuning import task_of, tune
+    from softneck.verification import is_own_plant, named_plants
 
     if output.exists() and not output.is_dir():
         raise SettingsError(f"{output}: is a file; name a folder.")
@@ -101,7 +99,7 @@ def command(
 
 
 def _print(found: Tuned, folder: Path) -> None:
-    from softneck.report._tune_page import notes, requirement_rows
+    from softneck.report import notes, requirement_rows
 
     best = found.best
     settings = ", ".join(
@@ -119,8 +117,8 @@ def _print(found: Tuned, folder: Path) -> None:
 
 
 def _why(found: Tuned, folder: Path) -> str:
-    from softneck.report._tune_page import stands_in_the_way
-    from softneck.verification._neck_loops import ALONE
+    from softneck.report import stands_in_the_way
+    from softneck.verification import ALONE
 
     failed = found.verification.failed
     binds = [item.note for item in failed if item.requirement.metric == found.binding]

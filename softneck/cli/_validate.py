@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
-from softneck.robot._loading import load_for_robot
+from softneck.robot import load_for_robot
 
 from .shared._console import print_json, print_table, progress, useless
 from .shared._options import common_options, tolerance_option
@@ -89,7 +89,7 @@ def command(
 
 
 def _print(results: list[Validation]) -> None:
-    from softneck.report._validation_page import fit_table, remarks
+    from softneck.report import fit_table, remarks
 
     table = fit_table(results)
     print_table(table.caption, table.head, table.rows)

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import CheckFailedError, file_hash, refuse_existing, write_certificate
-from softneck.core._certificate import CERTIFICATE_ENDING
-from softneck.loop._loop import ORDERS
-from softneck.robot._loading import load_for_robot
+from softneck.core import CERTIFICATE_ENDING, CheckFailedError, file_hash, refuse_existing, write_certificate
+from softneck.loop import ORDERS
+from softneck.robot import load_for_robot
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, output_option, requirements_option, target
@@ -56,10 +55,8 @@ def command(
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
     """
-    from softneck.estimation._axis import robot_of
-    from softneck.verification import read_requirements, verify
-    from softneck.verification._neck_loops import named_plants, neck_file_of
-    from softneck.verification._requirements import left_to_tune
+    from softneck.estimation import robot_of
+    from softneck.verification import left_to_tune, named_plants, neck_file_of, read_requirements, verify
 
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
@@ -106,7 +103,7 @@ def command(
 
 
 def _print(path: Path, found: Verification, folder: Path) -> None:
-    from softneck.verification._page import verdict_table
+    from softneck.verification import verdict_table
 
     table = verdict_table(found)
     print_table(str(path), table.head, table.rows)

@@ -28,3 +28,38 @@ from ._kinds import find_kind as find_kind
 from ._kinds import load as load
 from ._kinds import resolve as resolve
 from ._units import to_si as to_si
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from ._blas_threads import one_blas_thread as one_blas_thread
+from ._budget import MOST_JSON as MOST_JSON
+from ._budget import MOST_TOML as MOST_TOML
+from ._budget import MOST_UNPACKED as MOST_UNPACKED
+from ._budget import largest_unpacked as largest_unpacked
+from ._budget import open_zip as open_zip
+from ._budget import require_numbers as require_numbers
+from ._budget import require_size as require_size
+from ._budget import require_steps as require_steps
+from ._budget import require_table as require_table
+from ._budget import require_unpacked as require_unpacked
+from ._budget import settings_text as settings_text
+from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
+from ._certificate import CERTIFICATE_KINDS as CERTIFICATE_KINDS
+from ._certificate import certificate_contents as certificate_contents
+from ._certificate import certificate_path as certificate_path
+from ._certificate import required_rows as required_rows
+from ._certificate import sim_name as sim_name
+from ._checks import finite_matrix as finite_matrix
+from ._checks import finite_vector as finite_vector
+from ._errors import did_you_mean as did_you_mean
+from ._errors import missing_extra as missing_extra
+from ._errors import require_package as require_package
+from ._files import as_path as as_path
+from ._files import require_file as require_file
+from ._kinds import fitting as fitting
+from ._kinds import kinds_of as kinds_of
+from ._kinds import make_settings as make_settings
+from ._progress import shown_progress as shown_progress
+from ._repr import ReprMixin as ReprMixin
+from ._repr import percent as percent
+from ._units import SI_BASES as SI_BASES

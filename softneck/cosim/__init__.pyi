@@ -17,3 +17,22 @@ from .studies._store import read_runs as read_runs
 from .studies._store import worst_runs as worst_runs
 from .studies._study import load_study as load_study
 from .studies._study import make_study as make_study
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from .loops._loop_file import LoopSetup as LoopSetup
+from .loops._loop_file import is_loop_file as is_loop_file
+from .loops._loop_file import python_of as python_of
+from .loops._loop_file import reference_of as reference_of
+from .loops._loop_file import require_trusted as require_trusted
+from .loops._loop_parts import read_toml as read_toml
+from .loops._simulate import reach_beyond as reach_beyond
+from .loops._simulate import run_setup as run_setup
+from .studies._executors import Crew as Crew
+from .studies._executors import crew as crew
+from .studies._run_study import run_study as run_study
+from .studies._store import DESCRIPTION as DESCRIPTION
+from .studies._store import pareto_rows as pareto_rows
+from .studies._store import read_description as read_description
+from .studies._store import write_worst as write_worst
+from .studies._study import Study as Study

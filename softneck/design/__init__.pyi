@@ -20,3 +20,18 @@ from .robust._synthesis import mixsyn as mixsyn
 from .robust._weights import makeweight as makeweight
 from .varying._adaptive import AdaptiveSettings as AdaptiveSettings
 from .varying._adaptive import VaryingController as VaryingController
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from ._design import linear_plant as linear_plant
+from .linear._axis_settings import AxisSettings as AxisSettings
+from .linear._axis_settings import axis_test as axis_test
+from .linear._controller import assumed_lines as assumed_lines
+from .linear._loop_settings import LoopSettings as LoopSettings
+from .linear._own import own_attributes as own_attributes
+from .linear._own import own_controller as own_controller
+from .linear._own import own_module as own_module
+from .linear._ports import motor_ranges as motor_ranges
+from .linear._rise import least_rise as least_rise
+from .plants._uncertain import UncertainPlant as UncertainPlant
+from .robust._mu import two_scalars as two_scalars

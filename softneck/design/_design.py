@@ -5,11 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from softneck.core import SettingsError, find_kind, resolve
-from softneck.core._kinds import fitting, make_settings
-from softneck.core._repr import percent
-from softneck.robot import Robot
-from softneck.robot._loading import load_for_robot
+from softneck.core import SettingsError, find_kind, fitting, make_settings, percent, resolve
+from softneck.robot import Robot, load_for_robot
 
 if TYPE_CHECKING:
     from .linear._controller import LinearController

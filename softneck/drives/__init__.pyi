@@ -24,3 +24,46 @@ from .sensing._serial import SerialInclinometer as SerialInclinometer
 from .sensing._sources import CanInclinometer as CanInclinometer
 from .sensing._sources import PythonInclinometer as PythonInclinometer
 from .sensing._sources import open_sensor as open_sensor
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from .bus._link import HARMLESS as HARMLESS
+from .bus._link import VirtualLink as VirtualLink
+from .bus._robot import robot_of as robot_of
+from .commissioning._commission import Commissioned as Commissioned
+from .commissioning._commission import commission as commission
+from .commissioning._commission import require_folder as require_folder
+from .commissioning._commission import write_files as write_files
+from .commissioning._jog import JogResult as JogResult
+from .commissioning._jog import jog_pilot as jog_pilot
+from .commissioning._moves import Guards as Guards
+from .commissioning._record import ExperimentResult as ExperimentResult
+from .commissioning._record import drive_limits as drive_limits
+from .logs._cycle import meaning as meaning
+from .logs._log_file import LoggedRun as LoggedRun
+from .logs._log_file import changed_files as changed_files
+from .logs._run_log import RunLogger as RunLogger
+from .logs._run_log import partial as partial
+from .logs._run_log import require_log_path as require_log_path
+from .logs._run_log import run_facts as run_facts
+from .master._events import RULES as RULES
+from .master._events import Reaction as Reaction
+from .master._gate import Reading as Reading
+from .master._master import Pilot as Pilot
+from .running._bus_loop import Session as Session
+from .running._certified import require_certified as require_certified
+from .running._certified import require_same_again as require_same_again
+from .running._deploy import neck_of as neck_of
+from .running._keyboard import Keyboard as Keyboard
+from .running._pilot import LoopPilot as LoopPilot
+from .running._preflight import OVERRIDES as OVERRIDES
+from .running._preflight import Report as Report
+from .running._preflight import several_devices as several_devices
+from .running._stop import require_reset as require_reset
+from .running._stop import require_stopped as require_stopped
+from .running._virtual import physics_of as physics_of
+from .running._virtual import simulated_plant as simulated_plant
+from .running._virtual import stand_in as stand_in
+from .sensing._sources import LOOK as LOOK
+from .sensing._sources import Sensor as Sensor
+from .sensing._sources import look_at as look_at

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.core._repr import ReprMixin
-from softneck.identification.models._linear_systems import weights_of
-from softneck.robot import Robot
-from softneck.robot._scaling import TIME_CONSTANT
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector
+from softneck.identification import weights_of
+from softneck.robot import TIME_CONSTANT, Robot
 
 if TYPE_CHECKING:
     import control

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import DataError
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, ReprMixin
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.identification.models._fitting import known_rows
+from softneck.identification import known_rows
 from softneck.signals import Recording, concatenate
 
 from ._consistency import look_ahead_error

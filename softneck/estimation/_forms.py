@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
+from softneck.robot import Robot, Scaling
 
 from ._axis import AxisPlant
 from ._kalman_parts_runtime import KalmanArrays

@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, SettingsError, Vector, to_si, write_archive
-from softneck.core._repr import ReprMixin
+from softneck.core import FileFormatError, Matrix, ReprMixin, SettingsError, Vector, to_si, write_archive
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import sized_name
+from softneck.runtime import Block, Port, State, sized_name
 from softneck.signals import Recording
 
 from ._forms import NOISES, STATES, noise_units, require_levels, system

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.runtime import load_functions
-from softneck.runtime._bundle import sized_name
+from softneck.runtime import load_functions, sized_name
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver

@@ -12,15 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
-from softneck.core._repr import ReprMixin
-from softneck.identification import Model
-from softneck.identification.models._arrays import without_validity
-from softneck.identification.models._linear_systems import KINDS as LINEAR
-from softneck.identification.models._model import nested, nested_model
-from softneck.identification.models._ports import payloads
-from softneck.robot import Robot
-from softneck.robot._scaling import TIME_CONSTANT
+from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, to_si, write_archive
+from softneck.identification import KINDS as LINEAR
+from softneck.identification import Model, nested, nested_model, payloads, without_validity
+from softneck.robot import TIME_CONSTANT, Robot
 from softneck.runtime import Block, Port, State
 from softneck.signals import Recording
 

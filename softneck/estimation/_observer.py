@@ -6,12 +6,10 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from softneck.core._kinds import make_settings
+from softneck.core import make_settings
 from softneck.identification import Model
-from softneck.robot import Robot
-from softneck.robot._loading import load_for_robot
-from softneck.signals import Recording
-from softneck.signals.recording._files import RecordingLike, opened_recording
+from softneck.robot import Robot, load_for_robot
+from softneck.signals import Recording, RecordingLike, opened_recording
 
 from ._axis import HasTransferFunctions
 from ._fitted import AnyObserver, FittedObserver, fitted_observer

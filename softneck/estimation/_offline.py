@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector
-from softneck.core._repr import ReprMixin
-from softneck.signals import Recording
-from softneck.signals.recording._recording import require_same_robot
+from softneck.core import DataError, Matrix, ReprMixin, Vector
+from softneck.signals import Recording, require_same_robot
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -9,8 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.identification import Model
-from softneck.robot import Robot
-from softneck.robot._scaling import TIME_CONSTANT, Scaling
+from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 # The neck's outputs run over 46 of the 63 deg that its static gain makes of all motors at their ends.
 _OF_ENDS = 0.73

@@ -11,8 +11,7 @@ import numpy as np
 
 from softneck.core import SettingsError, Vector, require_between, require_one_of, require_positive, to_si
 from softneck.identification import Model
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
+from softneck.robot import Robot, Scaling
 
 from ._axis import HasTransferFunctions, axis_plant, directions_of, robot_of
 from ._forms import FORMS, RATE, START, gyro_form, model_form

@@ -4,3 +4,14 @@ from .describe._describe import fmu_info as fmu_info
 from .python._build import build_fmu as build_fmu
 from .python._zip import unpack as unpack
 from .python._zip import unpacked as unpacked
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from .compiled._build import next_outputs as next_outputs
+from .compiled._compilers import PLATFORMS as PLATFORMS
+from .compiled._library import platforms_built as platforms_built
+from .compiled._model_file import node_of as node_of
+from .describe._describe import Buildable as Buildable
+from .describe._describe import buildable as buildable
+from .describe._describe import has_keys as has_keys
+from .describe._description import with_modelled_drives as with_modelled_drives

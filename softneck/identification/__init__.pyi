@@ -26,3 +26,34 @@ from .validation._validation import Rules as Rules
 from .validation._validation import Validation as Validation
 from .validation._validation import compare as compare
 from .validation._validation import validate as validate
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from ._identify import choose_kind as choose_kind
+from ._identify import identified as identified
+from ._identify import with_fit as with_fit
+from .models._arrays import without_validity as without_validity
+from .models._directions import bandwidth_of as bandwidth_of
+from .models._fitting import known_rows as known_rows
+from .models._linear_systems import KINDS as KINDS
+from .models._linear_systems import continuous_parameters as continuous_parameters
+from .models._linear_systems import moved_through as moved_through
+from .models._linear_systems import redefined_input as redefined_input
+from .models._linear_systems import weights_of as weights_of
+from .models._model import nested as nested
+from .models._model import nested_model as nested_model
+from .models._ports import payloads as payloads
+from .models._validity import farthest as farthest
+from .models._validity import held as held
+from .models._validity import with_tolerance as with_tolerance
+from .selection._auto import COLD as COLD
+from .selection._auto import HOLD_OUT as HOLD_OUT
+from .selection._auto import KindTrial as KindTrial
+from .selection._auto import best_others as best_others
+from .selection._experiment_design import Bounds as Bounds
+from .selection._experiment_design import Known as Known
+from .selection._experiment_design import next_experiment as next_experiment
+from .uncertainty._measured import AxisMeasured as AxisMeasured
+from .uncertainty._measured import response_of as response_of
+from .validation._validation import judge as judge
+from .validation._validation import judged_parts as judged_parts

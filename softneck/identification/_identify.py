@@ -10,16 +10,31 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, file_hash, find_kind, load, require_positive, resolve
-from softneck.core._kinds import make_settings
-from softneck.core._progress import shown_progress
-from softneck.plant._calibration import Calibration
-from softneck.plant._calibration import calibrate as calibrated
+from softneck.core import (
+    DataError,
+    Progress,
+    SettingsError,
+    file_hash,
+    find_kind,
+    load,
+    make_settings,
+    require_positive,
+    resolve,
+    shown_progress,
+)
+from softneck.plant import Calibration
+from softneck.plant import calibrate as calibrated
 from softneck.robot import Robot
-from softneck.signals import Recording, concatenate, signal
-from softneck.signals.quality._excitation import stands_still
-from softneck.signals.recording._files import RecordingLike, names_of, opened_recording
-from softneck.signals.recording._recording import conditions
+from softneck.signals import (
+    Recording,
+    RecordingLike,
+    concatenate,
+    conditions,
+    names_of,
+    opened_recording,
+    signal,
+    stands_still,
+)
 
 from .models._fitting import check_training, payload_of
 from .models._model import Model

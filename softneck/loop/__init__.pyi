@@ -17,3 +17,27 @@ from ._result import check_limits as check_limits
 from ._result import metrics as metrics
 from ._run import LoopRun as LoopRun
 from ._run import run_loop as run_loop
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from ._faults import fault_field as fault_field
+from ._faults import fault_keys as fault_keys
+from ._faults import make_fault as make_fault
+from ._loop import ORDERS as ORDERS
+from ._loop import USE_MOTOR_POSITIONS as USE_MOTOR_POSITIONS
+from ._loop import System as System
+from ._reference_parts import AheadReference as AheadReference
+from ._references import RobotReference as RobotReference
+from ._references import make_reference as make_reference
+from ._references import reference_key as reference_key
+from ._references import reference_keys as reference_keys
+from ._references import same_quantity as same_quantity
+from ._result import SETTLING_BAND as SETTLING_BAND
+from ._result import metric_names as metric_names
+from ._result import shown_unit as shown_unit
+from ._rows import Rows as Rows
+from ._rows import cycle as cycle
+from ._run import StepCallback as StepCallback
+from ._wiring import Link as Link
+from ._wiring import Wiring as Wiring
+from ._wiring import wire as wire

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from softneck.core import SettingsError, require_one_of, require_positive
-from softneck.core._repr import ReprMixin
+from softneck.core import ReprMixin, SettingsError, require_one_of, require_positive
 from softneck.robot import Robot
 
 from ._faults import Fault

@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softneck.core import SettingsError, Vector, require_positive, to_si
-from softneck.core._budget import require_steps
+from softneck.core import SettingsError, Vector, require_positive, require_steps, to_si
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 

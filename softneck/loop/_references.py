@@ -11,6 +11,7 @@ import numpy as np
 from softneck.core import (
     DataError,
     Matrix,
+    ReprMixin,
     SettingsError,
     SoftneckError,
     Vector,
@@ -19,7 +20,6 @@ from softneck.core import (
     require_positive,
     to_si,
 )
-from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
 
 from ._reference_runtime import reference_rotation, reference_row, reference_value

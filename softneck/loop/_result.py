@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, require_one_of, to_si
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, ReprMixin, SettingsError, Vector, require_one_of, to_si
 from softneck.robot import Robot
 
 

@@ -13,9 +13,8 @@ from typing import TypeGuard
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.robot._channels import is_set_point
-from softneck.runtime import load_runtime
-from softneck.runtime._compile import load_linked
+from softneck.robot import is_set_point
+from softneck.runtime import load_linked, load_runtime
 
 from ._disturbed_bus import FaultStages
 from ._part import BlockPart, Part

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
-from softneck.core._budget import require_steps
+from softneck.core import DataError, Matrix, SettingsError, Vector, require_steps, to_si
 from softneck.runtime import Port
 
 from ._disturbed_bus import place_faults

@@ -16,14 +16,14 @@ from softneck.core import (
     DataError,
     Matrix,
     Progress,
+    ReprMixin,
     SettingsError,
     Vector,
     atomic_write,
+    one_blas_thread,
     require_whole,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._repr import ReprMixin
 from softneck.signals import Recording
 
 from ._neck import VirtualNeck, has_own_tendons

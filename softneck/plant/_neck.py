@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, to_si
-from softneck.core._repr import ReprMixin
+from softneck.core import Matrix, ReprMixin, SettingsError, require_between, to_si
 from softneck.robot import Robot
-from softneck.runtime import Block, Port
-from softneck.runtime._bundle import sized_name
+from softneck.runtime import Block, Port, sized_name
 
 from ._parameters import NeckParameters
 from ._presets import PRESETS

@@ -11,9 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, SettingsError, Vector, require_between, require_one_of
-from softneck.core._budget import settings_text
-from softneck.core._repr import ReprMixin
+from softneck.core import (
+    FileFormatError,
+    ReprMixin,
+    SettingsError,
+    Vector,
+    require_between,
+    require_one_of,
+    settings_text,
+)
 from softneck.runtime import Port
 
 from ._presets import PRESETS, SENSORS

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, Vector, require_one_of, to_si
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, ReprMixin, Vector, require_one_of, to_si
 
 from ._style import BLUE, GREY, looks
 

@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, to_si
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
-from softneck.signals import Recording
-from softneck.signals.recording._channels import NECK
+from softneck.robot import Robot, Scaling
+from softneck.signals import NECK, Recording
 
 from ._chart import Chart, Curve, Level, Panel, chart_figure
 from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, ORANGE, RED, SKY, looks, shown

@@ -9,10 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Vector, to_si
-from softneck.signals import Layout, Recording
-from softneck.signals.importing._doubts import Doubt
-from softneck.signals.importing._layout import Source
-from softneck.signals.recording._channels import file_unit, is_held
+from softneck.signals import Doubt, Layout, Recording, Source, file_unit, is_held
 
 from ._chart import Chart, Curve, Panel
 from ._page import Section, Table, page

@@ -13,8 +13,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, to_si
 from softneck.robot import Robot
-from softneck.signals import Recording
-from softneck.signals.recording._channels import file_unit
+from softneck.signals import Recording, file_unit
 
 # The lab's neck (hardware facts): link length and attachment radius [m]; robots of other sizes are drawn alike.
 LINK_LENGTH, ATTACHMENT_RADIUS = 0.107, 0.052

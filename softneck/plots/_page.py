@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from softneck.core import atomic_write
-from softneck.core._repr import ReprMixin
+from softneck.core import ReprMixin, atomic_write
 
 from ._chart import Chart, Curve
 from ._interactive import LICENCE, compressed, draw, library

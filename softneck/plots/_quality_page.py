@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from softneck.core import Vector, to_si
-from softneck.signals import Quality, Recording
-from softneck.signals.recording._channels import file_unit
+from softneck.signals import Quality, Recording, file_unit
 
 from ._chart import Chart, Curve, Panel
 from ._page import Section, Table, page

@@ -7,3 +7,31 @@ from ._reproduce import ReproduceSettings as ReproduceSettings
 from ._reproduce import reproduce as reproduce
 from ._study_page import study_page as study_page
 from ._validation_page import validation_page as validation_page
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from ._demo import FIT_HEAD as FIT_HEAD
+from ._demo import FIT_NOTE as FIT_NOTE
+from ._demo import Demo as Demo
+from ._demo import fit_rows as fit_rows
+from ._demo import fmu_rows as fmu_rows
+from ._demo import loop_rows as loop_rows
+from ._paper_page import LINEAR_HEAD as LINEAR_HEAD
+from ._paper_page import grouped as grouped
+from ._paper_page import linear_facts as linear_facts
+from ._paper_page import linear_rows as linear_rows
+from ._project import Project as Project
+from ._reproduce import PAPER_HEAD as PAPER_HEAD
+from ._reproduce import PAPER_NOTE as PAPER_NOTE
+from ._reproduce import paper_entries as paper_entries
+from ._study_page import failures as failures
+from ._study_page import study_head as study_head
+from ._study_page import study_rows as study_rows
+from ._tune_files import write_tuned as write_tuned
+from ._tune_page import notes as notes
+from ._tune_page import requirement_rows as requirement_rows
+from ._tune_page import said_of as said_of
+from ._tune_page import stands_in_the_way as stands_in_the_way
+from ._validation_page import curves as curves
+from ._validation_page import fit_table as fit_table
+from ._validation_page import remarks as remarks

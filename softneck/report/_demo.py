@@ -15,8 +15,17 @@ from softneck.core import OutputFileError, SettingsError, atomic_write
 from softneck.cosim import Result
 from softneck.identification import INFINITE, Model, Validation
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plots import Chart, Section, Table, neck_view, page, write_page
-from softneck.plots._charts import loop_chart, recording_chart, validation_chart
+from softneck.plots import (
+    Chart,
+    Section,
+    Table,
+    loop_chart,
+    neck_view,
+    page,
+    recording_chart,
+    validation_chart,
+    write_page,
+)
 from softneck.signals import write_recording
 
 from ._packaging import (

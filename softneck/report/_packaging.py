@@ -12,8 +12,7 @@ from softneck.core import Matrix, Progress, atomic_write
 from softneck.cosim import Result, load_loop, simulate, simulate_fmu_free_run
 from softneck.design import LinearController, PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings
-from softneck.fmu import build_fmu, fmu_info
-from softneck.fmu.describe._describe import Buildable
+from softneck.fmu import Buildable, build_fmu, fmu_info
 from softneck.identification import INFINITE, Model, Network, Rls, SetMembership, Validation, validate
 from softneck.loop import default_limits
 from softneck.plant import NeckParameters, VirtualNeck, record

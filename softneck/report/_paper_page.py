@@ -6,11 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from softneck.identification import INFINITE, Model
-from softneck.identification.models._linear_systems import continuous_parameters
-from softneck.plots import Chart, Curve, Panel, Section, Table, page
-from softneck.plots._charts import recording_chart, validation_chart
-from softneck.plots._style import BLUE, ORANGE
+from softneck.identification import INFINITE, Model, continuous_parameters
+from softneck.plots import BLUE, ORANGE, Chart, Curve, Panel, Section, Table, page, recording_chart, validation_chart
 from softneck.signals import Recording, concatenate, redefine
 
 from ._packaging import TESTS

@@ -11,16 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, FileFormatError, Progress, SettingsError, SoftneckError, load, read_archive, silent
-from softneck.core._budget import MOST_JSON, open_zip, settings_text
-from softneck.cosim import Result, load_loop, read_runs, simulate
-from softneck.cosim.loops._loop_file import is_loop_file, python_of
-from softneck.cosim.loops._loop_parts import read_toml
-from softneck.cosim.studies._store import read_description
-from softneck.identification.models._directions import bandwidth_of
-from softneck.robot._search import FILE
-from softneck.signals import Recording, assess_quality, import_log, read_layout, read_recording
-from softneck.signals.importing._layout import doubts_in
+from softneck.core import (
+    KINDS,
+    MOST_JSON,
+    FileFormatError,
+    Progress,
+    SettingsError,
+    SoftneckError,
+    load,
+    open_zip,
+    read_archive,
+    settings_text,
+    silent,
+)
+from softneck.cosim import Result, is_loop_file, load_loop, python_of, read_description, read_runs, read_toml, simulate
+from softneck.identification import bandwidth_of
+from softneck.robot import FILE
+from softneck.signals import Recording, assess_quality, doubts_in, import_log, read_layout, read_recording
 
 # Folders that are no part of a project, beside those whose name begins with a dot.
 _SKIPPED = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")

@@ -8,14 +8,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from softneck.core import Progress, SoftneckError, file_hash, silent
-from softneck.core._certificate import required_rows
+from softneck.core import Progress, SoftneckError, file_hash, required_rows, silent
 from softneck.cosim import Result
-from softneck.identification import INFINITE
-from softneck.identification.validation._validation import Rules, judge, judged_parts
-from softneck.plots import Chart, Section, Table, page
-from softneck.plots._charts import loop_chart, recording_chart, validation_chart
-from softneck.robot._search import FILE
+from softneck.identification import INFINITE, Rules, judge, judged_parts
+from softneck.plots import Chart, Section, Table, loop_chart, page, recording_chart, validation_chart
+from softneck.robot import FILE
 
 from ._project import Project
 from ._study_page import study_sections

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.cosim import grouped, pareto_front, rank, worst_runs
-from softneck.plots import Chart, Section, Table, page
-from softneck.plots._charts import distribution_chart, influence_chart, pareto_chart
+from softneck.plots import Chart, Section, Table, distribution_chart, influence_chart, page, pareto_chart
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,17 +13,14 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from softneck.core import atomic_write, file_hash, write_certificate
-from softneck.loop._result import shown_unit
+from softneck.loop import shown_unit
 from softneck.plots import write_page
-from softneck.verification._plants import nominal_plants
-from softneck.verification._verify import sources_of
-from softneck.verification._worst import write_linear
+from softneck.verification import nominal_plants, sources_of, write_linear
 
 from ._tune_page import tune_page
 
 if TYPE_CHECKING:
-    from softneck.tuning._search import Candidate
-    from softneck.tuning._tune import Tuned
+    from softneck.tuning import Candidate, Tuned
 
 BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificate.json", "loop.toml"
 _LOOP_AT, _LOOP_TAUT = 1.0, 3.0

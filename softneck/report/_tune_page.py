@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from softneck.design.linear._controller import assumed_lines
-from softneck.plots import Chart, Curve, Panel, Section, Table, page
-from softneck.plots._style import GREY, looks
-from softneck.tuning._result import step_response
+from softneck.design import assumed_lines
+from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, looks, page
+from softneck.tuning import step_response
 
 if TYPE_CHECKING:
-    from softneck.tuning._search import Candidate
-    from softneck.tuning._tune import Tuned
+    from softneck.tuning import Candidate, Tuned
 
 _SHOWN = 30
 _STEPS = 6

@@ -8,11 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, to_si
-from softneck.core._repr import percent
+from softneck.core import Matrix, percent, to_si
 from softneck.identification import INFINITE, Validation
-from softneck.plots import Chart, Section, Table, page
-from softneck.plots._charts import residual_chart, validation_chart
+from softneck.plots import Chart, Section, Table, page, residual_chart, validation_chart
 
 VALIDATION_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample: a one-step fit "

@@ -11,9 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, require_one_of
-from softneck.core._budget import settings_text
-from softneck.core._errors import did_you_mean
+from softneck.core import FileFormatError, SettingsError, SoftneckError, did_you_mean, require_one_of, settings_text
 
 from ._channels import Motors, Outputs
 from ._directions import Directions

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_positive
-from softneck.core._repr import ReprMixin
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_positive
 
 from . import _file
 from ._channels import Motors, Outputs, motor_channels, parse_numbered

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from softneck.core import SettingsError
-from softneck.core._files import as_path
+from softneck.core import SettingsError, as_path
 
 from ._file import PRESETS, shortest_path
 from ._robot import Robot

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector
 
 from ._compile import Runtime, load_runtime
 

@@ -24,3 +24,45 @@ from .recording._redefinition import motors_from as motors_from
 from .recording._redefinition import redefine as redefine
 from .recording._redefinition import redefinition_matrix as redefinition_matrix
 from .recording._resampling import resampled as resampled
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from .excitation._limits import Changes as Changes
+from .importing._clocks import pitch_roll as pitch_roll
+from .importing._doubts import ONE_AXIS as ONE_AXIS
+from .importing._doubts import Doubt as Doubt
+from .importing._layout import Source as Source
+from .importing._layout import doubts_in as doubts_in
+from .importing._log import ImportResult as ImportResult
+from .importing._log import read_log as read_log
+from .importing._robot_guess import NamedColumns as NamedColumns
+from .importing._robot_guess import guess_robot as guess_robot
+from .importing._robot_guess import is_of_another_robot as is_of_another_robot
+from .importing._robot_guess import layout_for as layout_for
+from .importing._robot_guess import robot_of_columns as robot_of_columns
+from .importing.formats._mcap import LARGEST_RECORD as LARGEST_RECORD
+from .importing.formats._mcap import is_run_log as is_run_log
+from .importing.formats._mcap import require_chunks as require_chunks
+from .quality._channel_faults import check_channel as check_channel
+from .quality._excitation import BANDWIDTH as BANDWIDTH
+from .quality._excitation import independent_motions as independent_motions
+from .quality._excitation import poor_excitation as poor_excitation
+from .quality._excitation import stands_still as stands_still
+from .recording._channels import NECK as NECK
+from .recording._channels import OUTPUTS as OUTPUTS
+from .recording._channels import file_unit as file_unit
+from .recording._channels import is_held as is_held
+from .recording._channels import known_channels as known_channels
+from .recording._files import RecordingLike as RecordingLike
+from .recording._files import names_of as names_of
+from .recording._files import opened_recording as opened_recording
+from .recording._files import recording_suffix as recording_suffix
+from .recording._files import said_robot as said_robot
+from .recording._labelled import Labelled as Labelled
+from .recording._labelled import dataset as dataset
+from .recording._labelled import signals_figure as signals_figure
+from .recording._labelled import table as table
+from .recording._recording import conditions as conditions
+from .recording._recording import joined as joined
+from .recording._recording import require_same_robot as require_same_robot
+from .recording._scaled import scaled_recording as scaled_recording

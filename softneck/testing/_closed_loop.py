@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SettingsError, atomic_write
-from softneck.cosim import Result, load_loop, make_loop, simulate
-from softneck.cosim.loops._loop_file import LoopSetup
+from softneck.cosim import LoopSetup, Result, load_loop, make_loop, simulate
 from softneck.loop import check_limits
-from softneck.plots import chart_figure
-from softneck.plots._charts import loop_chart
+from softneck.plots import chart_figure, loop_chart
 
 # Settings that are parts of the loop, and those of its [reference].
 _PART_KEYS = ("plant", "observer", "controller")

@@ -8,15 +8,11 @@ from typing import Any
 import numpy as np
 
 from softneck.core import SettingsError
-from softneck.design.linear._axis_settings import axis_test
-from softneck.design.linear._loop_settings import LoopSettings
-from softneck.design.linear._ports import ControllerLimits
-from softneck.design.linear._rise import least_rise
-from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
+from softneck.design import ControllerLimits, LoopSettings, UncertainPlant, axis_test, least_rise, uncertain_plant
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import usual_rise
-from softneck.robot._scaling import TIME_CONSTANT
-from softneck.verification._scale import digits
+from softneck.robot import TIME_CONSTANT
+from softneck.verification import digits
 
 from ._requirements import TuneRequirements, circles
 

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Vector, to_si
-from softneck.loop import Loop, LoopResult, SensorFault, run_loop
-from softneck.loop._references import Reference, RobotReference
+from softneck.loop import Loop, LoopResult, Reference, RobotReference, SensorFault, run_loop
 from softneck.robot import Robot
 from softneck.runtime import Block
-from softneck.verification._neck_loops import OwnPlant, direction, judge_loop, step_at, step_loop
+from softneck.verification import OwnPlant, direction, judge_loop, step_at, step_loop
 
 from ._requirements import Task, TuneRequirements, circles
 

@@ -11,20 +11,28 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, SoftneckError, Vector, resolve
-from softneck.core._kinds import make_settings
-from softneck.design.linear._axis_settings import AxisSettings
-from softneck.design.plants._uncertain import UncertainPlant, uncertain_plant
-from softneck.identification.models._ports import payloads
+from softneck.core import KINDS, SoftneckError, Vector, make_settings, resolve
+from softneck.design import AxisSettings, UncertainPlant, uncertain_plant
+from softneck.identification import payloads
 from softneck.runtime import Block
-from softneck.verification._experiments import crossing_values, crossings
-from softneck.verification._linear import LARGE, SMALL, ControllerUnderTest, judged, margins
-from softneck.verification._linear import judge as under_test
-from softneck.verification._neck_loops import OwnPlant, loops_under_test, own_plant
-from softneck.verification._plants import Plants, all_plants
-from softneck.verification._steps import run_steps
-from softneck.verification._tested import tested_axes
-from softneck.verification._verify import sources_of
+from softneck.verification import (
+    LARGE,
+    SMALL,
+    ControllerUnderTest,
+    OwnPlant,
+    Plants,
+    all_plants,
+    crossing_values,
+    crossings,
+    judged,
+    loops_under_test,
+    margins,
+    own_plant,
+    run_steps,
+    sources_of,
+    tested_axes,
+)
+from softneck.verification import judge as under_test
 
 from ._cases import Case, cases, run_case
 from ._requirements import Task, has_observer

@@ -13,9 +13,8 @@ from typing import Any
 import cloudpickle
 import numpy as np
 
-from softneck.core import FileFormatError, OutputFileError, atomic_write
-from softneck.core._budget import MOST_JSON, settings_text
-from softneck.design.plants._uncertain import uncertain_plant
+from softneck.core import MOST_JSON, FileFormatError, OutputFileError, atomic_write, settings_text
+from softneck.design import uncertain_plant
 
 from ._judge import Judgement
 from ._requirements import Task, has_observer

@@ -12,21 +12,22 @@ from typing import Any
 
 from softneck.core import KINDS, SettingsError, resolve, to_si
 from softneck.identification import Model
-from softneck.loop import default_limits
-from softneck.loop._result import SETTLING_BAND
+from softneck.loop import SETTLING_BAND, default_limits
 from softneck.robot import Robot
-from softneck.verification import Requirements, make_requirements
-from softneck.verification._requirements import (
+from softneck.verification import (
     VERSION,
     Requirement,
+    Requirements,
+    Scale,
     bounds_of,
     check_number,
+    digits,
     kept_back,
+    make_requirements,
     metric_names,
     of_file,
     with_groups,
 )
-from softneck.verification._scale import Scale, digits
 
 _RISE = "sim.rise_s"
 # Standard deviations of noise: of some hundred samples one may be so far off.

@@ -10,14 +10,9 @@ from typing import Any
 import numpy as np
 
 from softneck.core import SoftneckError, Vector
-from softneck.cosim.studies._store import pareto_rows
+from softneck.cosim import pareto_rows
 from softneck.loop import run_loop
-from softneck.verification._linear import LARGE
-from softneck.verification._neck_loops import judge_loop
-from softneck.verification._requirements import Requirement
-from softneck.verification._scale import digits
-from softneck.verification._steps import run_steps
-from softneck.verification._verify import Verdict
+from softneck.verification import LARGE, Requirement, Verdict, digits, judge_loop, run_steps
 
 from ._cases import Case, loop_of
 from ._judge import designed, made_ready, watched

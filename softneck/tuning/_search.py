@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, SoftneckError
-from softneck.cosim.studies._executors import Crew
-from softneck.verification._requirements import Requirement
+from softneck.cosim import Crew
+from softneck.verification import Requirement
 
 from ._judge import LEVELS, Judgement, judge_candidate
 from ._log import Job, Log

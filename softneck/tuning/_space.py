@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, SettingsError, Vector, resolve, to_si
-from softneck.core._kinds import kinds_of
-from softneck.design.linear._axis_settings import AxisSettings
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
+from softneck.core import KINDS, SettingsError, Vector, kinds_of, resolve, to_si
+from softneck.design import AxisSettings
+from softneck.robot import Robot, Scaling
 
 #: Kinds that are searched where nobody names any; `nmpc` needs a nonlinear model of its own and minutes.
 KINDS_SEARCHED = ("pi", "pid", "fopi", "hinf", "lqg", "adaptive", "mpc")

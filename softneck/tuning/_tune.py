@@ -8,21 +8,30 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from softneck.core import CheckFailedError, Progress, SettingsError, require_whole, silent
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._progress import shown_progress
-from softneck.cosim.studies._executors import crew
-from softneck.estimation import KalmanSettings
-from softneck.estimation._axis import directions_of, robot_of
-from softneck.identification.models._ports import payloads
-from softneck.robot import Robot
-from softneck.robot._loading import load_for_robot
-from softneck.robot._scaling import Scaling
-from softneck.signals.recording._recording import require_same_robot
-from softneck.verification import Verification, verify
-from softneck.verification._neck_loops import OwnPlant, is_own_plant, named_plants
-from softneck.verification._scale import Scale
-from softneck.verification._verify import sources_of, standing_for
+from softneck.core import (
+    CheckFailedError,
+    Progress,
+    SettingsError,
+    one_blas_thread,
+    require_whole,
+    shown_progress,
+    silent,
+)
+from softneck.cosim import crew
+from softneck.estimation import KalmanSettings, directions_of, robot_of
+from softneck.identification import payloads
+from softneck.robot import Robot, Scaling, load_for_robot
+from softneck.signals import require_same_robot
+from softneck.verification import (
+    OwnPlant,
+    Scale,
+    Verification,
+    is_own_plant,
+    named_plants,
+    sources_of,
+    standing_for,
+    verify,
+)
 
 from ._beforehand import USUAL_RISE, default_rise, quickest, refuse_impossible
 from ._judge import LEVELS, designed, made_ready, watched

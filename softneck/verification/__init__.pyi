@@ -6,3 +6,46 @@ from ._requirements import read_requirements as read_requirements
 from ._verify import Verification as Verification
 from ._verify import verify as verify
 from ._worst import linear_plant as linear_plant
+
+# isort: split
+# Shared with other subpackages of softneck; not in the reference, and may change.
+from ._experiments import crossing_values as crossing_values
+from ._experiments import crossings as crossings
+from ._linear import LARGE as LARGE
+from ._linear import SMALL as SMALL
+from ._linear import ControllerUnderTest as ControllerUnderTest
+from ._linear import judge as judge
+from ._linear import judged as judged
+from ._linear import margins as margins
+from ._neck_loops import ALONE as ALONE
+from ._neck_loops import OwnPlant as OwnPlant
+from ._neck_loops import direction as direction
+from ._neck_loops import is_own_plant as is_own_plant
+from ._neck_loops import judge_loop as judge_loop
+from ._neck_loops import loops_under_test as loops_under_test
+from ._neck_loops import named_plants as named_plants
+from ._neck_loops import neck_file_of as neck_file_of
+from ._neck_loops import own_plant as own_plant
+from ._neck_loops import step_at as step_at
+from ._neck_loops import step_loop as step_loop
+from ._page import verdict_table as verdict_table
+from ._plants import Plants as Plants
+from ._plants import all_plants as all_plants
+from ._plants import nominal_plants as nominal_plants
+from ._requirements import VERSION as VERSION
+from ._requirements import Requirement as Requirement
+from ._requirements import bounds_of as bounds_of
+from ._requirements import check_number as check_number
+from ._requirements import kept_back as kept_back
+from ._requirements import left_to_tune as left_to_tune
+from ._requirements import metric_names as metric_names
+from ._requirements import of_file as of_file
+from ._requirements import with_groups as with_groups
+from ._scale import Scale as Scale
+from ._scale import digits as digits
+from ._steps import run_steps as run_steps
+from ._tested import tested_axes as tested_axes
+from ._verify import Verdict as Verdict
+from ._verify import sources_of as sources_of
+from ._verify import standing_for as standing_for
+from ._worst import write_linear as write_linear

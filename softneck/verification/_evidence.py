@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Progress, Vector
-from softneck.core._repr import ReprMixin
-from softneck.loop._result import shown_unit
+from softneck.core import Progress, ReprMixin, Vector
+from softneck.loop import shown_unit
 from softneck.runtime import Block
 
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings

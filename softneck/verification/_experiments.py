@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Progress, Vector, silent
-from softneck.loop import BlockPart, Loop, LoopResult, Part, run_loop
-from softneck.loop._result import shown_unit
+from softneck.loop import BlockPart, Loop, LoopResult, Part, run_loop, shown_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 

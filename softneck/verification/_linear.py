@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_one_of
-from softneck.design.robust._mu import two_scalars
-from softneck.estimation._axis import robot_of
-from softneck.loop._loop import ORDERS
+from softneck.design import two_scalars
+from softneck.estimation import robot_of
+from softneck.loop import ORDERS
 from softneck.robot import Robot
 from softneck.runtime import Block
 

@@ -14,14 +14,10 @@ import numpy as np
 
 from softneck.core import DataError, Progress, SettingsError, SoftneckError, to_si
 from softneck.cosim import FmuPart
-from softneck.estimation._axis import robot_of
-from softneck.loop import BlockPart, Loop, LoopResult, Part, metrics, run_loop
-from softneck.loop._references import RobotReference
-from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plant._presets import PRESETS
-from softneck.robot import Robot
-from softneck.robot._loading import load_for_robot
-from softneck.robot._scaling import Scaling
+from softneck.estimation import robot_of
+from softneck.loop import BlockPart, Loop, LoopResult, Part, RobotReference, metrics, run_loop
+from softneck.plant import PRESETS, NeckParameters, VirtualNeck
+from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.runtime import Block
 
 from ._experiments import LoopUnderTest

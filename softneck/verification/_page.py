@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector, to_si
-from softneck.loop._result import shown_unit
-from softneck.plots import Chart, Curve, Level, Panel, Section, Table, page
-from softneck.plots._style import BLUE, GREEN, GREY, ORANGE
+from softneck.loop import shown_unit
+from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel, Section, Table, page
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops

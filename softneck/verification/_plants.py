@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
-from softneck.estimation import AxisPlant, axis_plant
-from softneck.estimation._axis import directions_of, robot_of
-from softneck.identification.uncertainty._measured import AxisMeasured, response_of
+from softneck.estimation import AxisPlant, axis_plant, directions_of, robot_of
+from softneck.identification import AxisMeasured, response_of
 from softneck.robot import Robot
 
 # Halvings of the way to a plant that is excluded: to a thousandth.

@@ -10,11 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from softneck.core import FileFormatError, SettingsError, require_between, require_whole, to_si
-from softneck.core._budget import settings_text
-from softneck.core._certificate import sim_name
-from softneck.core._errors import did_you_mean
-from softneck.core._repr import ReprMixin
+from softneck.core import (
+    FileFormatError,
+    ReprMixin,
+    SettingsError,
+    did_you_mean,
+    require_between,
+    require_whole,
+    settings_text,
+    sim_name,
+    to_si,
+)
 from softneck.loop import default_limits
 from softneck.robot import Robot
 

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from softneck.core import to_si
-from softneck.estimation._forms import Reach
-from softneck.estimation._reach import REACHED, motor_ends
-from softneck.loop._result import shown_unit
-from softneck.robot import Robot
-from softneck.robot._scaling import MOTOR_RANGE, Scaling
+from softneck.estimation import REACHED, Reach, motor_ends
+from softneck.loop import shown_unit
+from softneck.robot import MOTOR_RANGE, Robot, Scaling
 
 from ._plants import UncertainNeck
 

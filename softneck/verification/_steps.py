@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
-from softneck.design.linear._ports import motor_ranges
-from softneck.loop._result import SETTLING_BAND, shown_unit
+from softneck.design import motor_ranges
+from softneck.loop import SETTLING_BAND, shown_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, load_functions
 

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.design.robust._mu import mu_upper
-from softneck.identification.uncertainty._measured import response_of
+from softneck.design import mu_upper
+from softneck.identification import response_of
 
 from ._linear import LinearLaw, inverse, loops, radii
 from ._plants import AxisBox, Plants, UncertainNeck, join, make_plants, measured_plant, mixing

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector
-from softneck.identification.uncertainty._measured import AxisMeasured, response_of
+from softneck.identification import AxisMeasured, response_of
 
 from ._linear import LinearLaw
 

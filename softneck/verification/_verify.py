@@ -11,17 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._certificate import certificate_contents
-from softneck.core._progress import shown_progress
-from softneck.core._repr import ReprMixin
-from softneck.design.linear._own import own_controller
-from softneck.estimation._axis import robot_of
+from softneck.core import (
+    DataError,
+    Progress,
+    ReprMixin,
+    SettingsError,
+    certificate_contents,
+    one_blas_thread,
+    shown_progress,
+)
+from softneck.design import own_controller
+from softneck.estimation import robot_of
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.robot import Robot
-from softneck.robot._loading import load_for_robot
-from softneck.signals.recording._recording import require_same_robot
+from softneck.robot import Robot, load_for_robot
+from softneck.signals import require_same_robot
 
 from ._evidence import Evidence, gather, worst_row
 from ._experiments import crossing_values

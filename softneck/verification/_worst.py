@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
-from softneck.loop._result import shown_unit
+from softneck.loop import shown_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 from softneck.signals import Recording, write_recording

@@ -29,8 +29,7 @@ from ._target import (
 )
 
 if TYPE_CHECKING:
-    from softneck.drives import CanLink, DrivesResult
-    from softneck.drives.running._preflight import Report
+    from softneck.drives import CanLink, DrivesResult, Report
 
 
 @click.group(
@@ -98,14 +97,17 @@ def run_command(
     plant, does the same. Exit code 1 if anything stopped it, or a drive did not confirm that it is off; 143 if SIGTERM
     ended it (to rest, then off).
     """
-    from softneck.cosim import load_loop
-    from softneck.cosim.loops._loop_file import require_trusted
-    from softneck.drives import prepare, run_on_bus, run_simulated
-    from softneck.drives.running._certified import require_certified, require_same_again
-    from softneck.drives.running._deploy import neck_of
-    from softneck.drives.running._keyboard import Keyboard
-    from softneck.signals import write_recording
-    from softneck.signals.recording._files import recording_suffix
+    from softneck.cosim import load_loop, require_trusted
+    from softneck.drives import (
+        Keyboard,
+        neck_of,
+        prepare,
+        require_certified,
+        require_same_again,
+        run_on_bus,
+        run_simulated,
+    )
+    from softneck.signals import recording_suffix, write_recording
 
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
     recording_suffix(path)
@@ -174,8 +176,7 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 @common_options()
 def stop_command(asked: Asked, as_json: bool) -> None:
     """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
-    from softneck.drives import stop
-    from softneck.drives.running._stop import require_stopped
+    from softneck.drives import require_stopped, stop
 
     chosen = asked.target()
     with open_link(chosen, moves=False) as link:
@@ -189,8 +190,7 @@ def stop_command(asked: Asked, as_json: bool) -> None:
 @common_options()
 def reset_command(asked: Asked, as_json: bool) -> None:
     """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
-    from softneck.drives import reset
-    from softneck.drives.running._stop import require_reset
+    from softneck.drives import require_reset, reset
 
     chosen = asked.target()
     with open_link(chosen, moves=False) as link:

@@ -14,15 +14,12 @@ from ..shared._options import common_options
 from ._target import SAMPLE_TIME, Asked, Target, drives_options, leave_if_asked, moving, open_link, require_log
 
 if TYPE_CHECKING:
-    from softneck.drives.commissioning._commission import Commissioned
-    from softneck.drives.commissioning._jog import JogResult
-    from softneck.drives.master._gate import Reading
+    from softneck.drives import Commissioned, JogResult, Reading
 
 
 def scan_step(asked: Asked, *, as_json: bool) -> None:
     """List the nodes on the bus; sends reads only. Fails if none answers, or several devices at one number."""
-    from softneck.drives import default_drives, scan
-    from softneck.drives.running._preflight import several_devices
+    from softneck.drives import default_drives, scan, several_devices
 
     nameless = asked.bus is not None and asked.drives is None
     chosen = Target(default_drives(), asked.bus, False, asked.arm) if nameless else asked.target()
@@ -51,10 +48,7 @@ def _serials(serials: list[int | None]) -> str:
 
 def zero_step(asked: Asked, *, force: bool, as_json: bool) -> None:
     """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
-    from softneck.drives import preflight, zero
-    from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.logs._run_log import run_facts
-    from softneck.drives.sensing._sources import LOOK, look_at
+    from softneck.drives import LOOK, VirtualLink, look_at, preflight, run_facts, zero
 
     chosen = asked.target()
     require_log(asked.log, force=force)
@@ -91,9 +85,8 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
 
     Fails if that is not where the tendon's angle says: nodes swapped, a sign reversed, a tendon that hangs.
     """
-    from softneck.drives import jog
-    from softneck.drives.running._virtual import physics_of
-    from softneck.plant._neck import has_own_tendons, tendons_of
+    from softneck.drives import jog, physics_of
+    from softneck.plant import has_own_tendons, tendons_of
 
     require_log(asked.log, force=force)
     chosen = asked.target()
@@ -177,8 +170,7 @@ def _tendons(
     asked: Asked, motors: tuple[int, ...], travel: float, output: Path | None, *, force: bool, as_json: bool
 ) -> None:
     """Ask who is there, move what is to be moved, and propose files."""
-    from softneck.drives.commissioning._commission import commission, require_folder, write_files
-    from softneck.drives.commissioning._moves import Guards
+    from softneck.drives import Guards, commission, require_folder, write_files
 
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)
     require_log(asked.log, force=force)

@@ -16,7 +16,7 @@ from ..shared._options import common_options, output_option
 from ._target import Asked, drives_options, leave_if_asked, moving, require_log
 
 if TYPE_CHECKING:
-    from softneck.drives.commissioning._record import ExperimentResult
+    from softneck.drives import ExperimentResult
 
 # From rest and out to it [s]: Eq. 22 begins at up to 1.9 rad, which a winch turns in half a second at the least.
 _RAMP = 2.0
@@ -45,10 +45,8 @@ def record_command(
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
-    from softneck.drives import Experiment, record_signal
-    from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.commissioning._record import drive_limits
-    from softneck.signals.recording._files import recording_suffix
+    from softneck.drives import Experiment, VirtualLink, drive_limits, record_signal
+    from softneck.signals import recording_suffix
 
     recording_suffix(output)
     refuse_existing(output, force=force)

@@ -19,21 +19,15 @@ import click
 import platformdirs
 
 from softneck.core import OutputFileError, SettingsError, SoftneckError, require_between
-from softneck.drives.bus._link import HARMLESS
-from softneck.drives.running._preflight import OVERRIDES
+from softneck.drives import HARMLESS, OVERRIDES
 
 from ..shared._console import note
 from ..shared._options import COMMON
 
 if TYPE_CHECKING:
-    from softneck.cosim.loops._loop_file import LoopSetup
-    from softneck.drives import CanLink, DrivesFile
-    from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.logs._run_log import RunLogger
+    from softneck.cosim import LoopSetup
+    from softneck.drives import CanLink, DrivesFile, Keyboard, RunLogger, Sensor, Session, VirtualLink
     from softneck.drives.master import Frame, Tilt
-    from softneck.drives.running._bus_loop import Session
-    from softneck.drives.running._keyboard import Keyboard
-    from softneck.drives.sensing._sources import Sensor
     from softneck.plant import NeckParameters
     from softneck.robot import Robot
 
@@ -160,9 +154,7 @@ def target_of(
 
     A robot that is given may name its drives file.
     """
-    from softneck.drives import default_drives, load_drives, neck_drives
-    from softneck.drives.bus._robot import robot_of
-    from softneck.drives.running._virtual import physics_of, stand_in
+    from softneck.drives import default_drives, load_drives, neck_drives, physics_of, robot_of, stand_in
 
     moved = None if robot is None else robot_of(robot, None)
     if drives_file is None and moved is not None and moved.drives is not None:
@@ -184,9 +176,7 @@ def target_of(
 @contextlib.contextmanager
 def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0) -> Iterator[CanLink | VirtualLink]:
     """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
-    from softneck.drives import open_bus
-    from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.running._virtual import simulated_plant
+    from softneck.drives import VirtualLink, open_bus, simulated_plant
 
     if chosen.simulated:
         yield VirtualLink(simulated_plant(chosen.file, chosen.neck, sample_time=SAMPLE_TIME, homed=homed, seed=seed))
@@ -214,9 +204,7 @@ def moving(
         homed, seed: of simulated drives.
         files: what acts beside the drives file, for the log.
     """
-    from softneck.drives.bus._link import VirtualLink
-    from softneck.drives.running._bus_loop import Session
-    from softneck.drives.running._keyboard import Keyboard
+    from softneck.drives import Keyboard, Session, VirtualLink
 
     with (
         open_link(chosen, moves=True, homed=homed, seed=seed) as link,
@@ -297,7 +285,7 @@ _NONE = "none"
 
 def require_log(log: str | None, *, force: bool) -> None:
     """Raise where a log cannot be written, before anybody is asked to arm anything."""
-    from softneck.drives.logs._run_log import require_log_path
+    from softneck.drives import require_log_path
 
     if log not in (None, _NONE):
         require_log_path(Path(log), force=force)
@@ -316,7 +304,7 @@ def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool)
     Raises:
         OutputFileError: it cannot be written (before anything moves), or is not complete.
     """
-    from softneck.drives.logs._run_log import RunLogger
+    from softneck.drives import RunLogger
 
     own = wanted is None and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
     path = _new_path(command) if own else None if wanted in (None, _NONE) else Path(wanted)
@@ -360,7 +348,7 @@ def log_folder() -> Path:
 
 def _new_path(command: str) -> Path:
     """Return a path that is free; names sort by time."""
-    from softneck.drives.logs._run_log import partial
+    from softneck.drives import partial
 
     stem = f"{command}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
     folder, number = log_folder(), 1

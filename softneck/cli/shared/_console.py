@@ -14,7 +14,7 @@ import click
 
 from softneck.core import Progress, silent
 from softneck.core import Progress as ProgressCallback
-from softneck.core._repr import percent as percent
+from softneck.core import percent as percent
 
 if TYPE_CHECKING:
     from softneck.identification import Validation

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import click
 
-from softneck.core._errors import did_you_mean
+from softneck.core import did_you_mean
 
 # Command, or command and option, as they were -> what to call instead.
 _NOW = {
@@ -88,7 +88,7 @@ def kinds_complete(role: str, *more: str) -> Callable[[click.Context, click.Para
 
     def complete(_ctx: click.Context, _param: click.Parameter, begun: str) -> list[str]:
         # Here, for it imports NumPy: the command line sets the number of its threads first.
-        from softneck.core._kinds import kinds_of
+        from softneck.core import kinds_of
 
         return [name for name in (*kinds_of(role), *more) if name.startswith(begun)]
 

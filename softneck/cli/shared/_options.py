@@ -13,8 +13,7 @@ from typing import Any
 
 import click
 
-from softneck.core import KINDS, DataError, SettingsError, resolve, to_si
-from softneck.core._kinds import kinds_of, make_settings
+from softneck.core import KINDS, DataError, SettingsError, kinds_of, make_settings, resolve, to_si
 
 COMMON = {
     "robot": click.option(

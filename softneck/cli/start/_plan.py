@@ -10,8 +10,7 @@ from enum import Enum
 from math import isclose
 from pathlib import Path
 
-from softneck.core import SettingsError
-from softneck.core._budget import MOST_TOML, settings_text
+from softneck.core import MOST_TOML, SettingsError, settings_text
 from softneck.robot import Robot, find_robot
 
 from ..shared._console import note
@@ -153,8 +152,7 @@ def _robot(source: str) -> Step:
 
 
 def _import(log: str, recording: str, asked: Asked) -> Step:
-    from softneck.signals.importing._robot_guess import is_of_another_robot
-    from softneck.signals.importing.formats._mcap import is_run_log
+    from softneck.signals import is_of_another_robot, is_run_log
 
     layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
     whose = "robot.toml" if asked.robot is not None else robot.as_posix() if robot.is_file() else None
@@ -236,7 +234,7 @@ def nonlinear_model() -> str | None:
 
 
 def _controller(asked: Asked) -> Iterator[Step]:
-    from softneck.tuning._tune import loops_start
+    from softneck.tuning import loops_start
 
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()

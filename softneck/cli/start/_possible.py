@@ -12,11 +12,9 @@ from pathlib import Path
 
 import tomli_w
 
-from softneck.core import OutputFileError, SettingsError, atomic_write, to_si
-from softneck.core._budget import settings_text
-from softneck.robot import Robot
-from softneck.robot._file import KEYS, OPTIONAL
-from softneck.signals.recording._recording import Recording
+from softneck.core import OutputFileError, SettingsError, atomic_write, settings_text, to_si
+from softneck.robot import KEYS, OPTIONAL, Robot
+from softneck.signals import Recording
 
 from ..shared._console import note
 
@@ -90,9 +88,8 @@ def possible(plants: tuple[str, ...]) -> str:
 
 def impossible(plants: tuple[str, ...]) -> dict[str, str]:
     """Return metric -> why no controller keeps what the defaults of `tune` ask of it."""
-    from softneck.tuning._beforehand import refuse_impossible
-    from softneck.tuning._tune import task_of
-    from softneck.verification._neck_loops import named_plants
+    from softneck.tuning import refuse_impossible, task_of
+    from softneck.verification import named_plants
 
     things, refused = named_plants(list(plants)), dict[str, str]()
     while True:
@@ -146,7 +143,7 @@ def propose_sensor(file: Path, recordings: Sequence[Recording]) -> list[str]:
 
 def _noise(robot: Robot, recordings: Sequence[Recording]) -> float:
     """Return the largest noise of an output, in the unit of the robot's outputs."""
-    from softneck.signals.quality._channel_faults import check_channel
+    from softneck.signals import check_channel
 
     levels = []
     for recording in recordings:

@@ -9,8 +9,7 @@ from typing import Any
 
 import tomli_w
 
-from softneck.core import FileFormatError, SettingsError, to_si
-from softneck.core._budget import settings_text
+from softneck.core import FileFormatError, SettingsError, settings_text, to_si
 from softneck.robot import Robot, find_robot
 
 from ._plan import CONTROLLER_FMU, OBSERVER_FMU, PLANT_FMU
@@ -81,7 +80,7 @@ def _sizes(table: dict[str, Any]) -> dict[str, float]:
 
 
 def _study(loop: dict[str, Any], robot: Robot) -> dict[str, Any]:
-    from softneck.loop._result import metric_names
+    from softneck.loop import metric_names
 
     vary: dict[str, Any] = {
         f"reference.{key}": {"grid": [round(part * size, 6) for part in _PARTS_OF_STEP]}

@@ -18,6 +18,7 @@ from typing import Any
 import click
 
 from softneck.core import (
+    MOST_JSON,
     CheckFailedError,
     DataError,
     FileFormatError,
@@ -26,8 +27,8 @@ from softneck.core import (
     SoftneckError,
     atomic_write,
     file_hash,
+    settings_text,
 )
-from softneck.core._budget import MOST_JSON, settings_text
 
 from ..shared._console import note
 from ._plan import STAGES, Step, Unmet

@@ -13,14 +13,15 @@ from typing import Any
 import click
 
 from softneck.core import (
+    MOST_JSON,
     CheckFailedError,
     OutputFileError,
     SettingsError,
     SoftneckError,
     find_kind,
+    require_file,
+    settings_text,
 )
-from softneck.core._budget import MOST_JSON, settings_text
-from softneck.core._files import require_file
 
 from .._import import is_terminal
 from ..shared._console import note, percent, print_json, print_table
@@ -116,8 +117,7 @@ def _require_known(requirements: Path | None, kinds: str | None) -> None:
 
 def _robot_of(log: Path, robot: str | None) -> str | None:
     """Return the robot as commands in another folder name it, None where nothing says whose log it is."""
-    from softneck.robot import find_robot
-    from softneck.robot._file import PRESETS
+    from softneck.robot import PRESETS, find_robot
 
     file = find_robot(robot, beside=log).file  # which says what is wrong with it
     return robot if robot in PRESETS or file is None else str(file.absolute())
@@ -151,8 +151,7 @@ def _before(step: Step, sitting: Sitting, *, guided: bool) -> None:
 
 def _lacks(sitting: Sitting) -> list[str]:
     """Return what the recordings of a sitting cannot teach, where they are imported."""
-    from softneck.signals import read_recording
-    from softneck.signals.quality._excitation import poor_excitation
+    from softneck.signals import poor_excitation, read_recording
 
     files = [Path(key.partition(": ")[2]) for key in sitting.ran if key.startswith("import")]
     found = [(file, line) for file in files if file.is_file() for line in poor_excitation(read_recording(file))]
@@ -255,7 +254,7 @@ def _loosened() -> dict[str, dict[str, float]]:
 
 def _doubts() -> dict[str, list[str]]:
     """Return layout -> what the import was not sure of, and nobody settled since."""
-    from softneck.signals.importing._layout import doubts_in
+    from softneck.signals import doubts_in
 
     files = [*sorted(Path("recordings").glob("*.layout.toml")), *filter(Path.is_file, [Path("robot.toml")])]
     found = {path.as_posix(): doubts_in(path) for path in files}
@@ -281,7 +280,7 @@ def _model(file: str) -> dict[str, Any]:
 
 
 def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
-    from softneck.tuning._result import Loosened
+    from softneck.tuning import Loosened
 
     folder, failed = facts["folder"], [row for row in facts["steps"] if not row["holds"]]
     if as_json:

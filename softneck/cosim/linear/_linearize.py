@@ -19,12 +19,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, require_between
-from softneck.fmu.describe._describe import Buildable, buildable
-from softneck.identification.models._linear_systems import moved_through
+from softneck.fmu import Buildable, buildable
+from softneck.identification import moved_through
 from softneck.loop import BlockPart
-from softneck.runtime import Block, Port, State
-from softneck.runtime._compile import load_tangent
-from softneck.runtime._tangent_activity import TangentError
+from softneck.runtime import Block, Port, State, TangentError, load_tangent
 
 from ..parts._fmu_part import FmuPart
 from ..parts._variables import block_of

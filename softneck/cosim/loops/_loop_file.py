@@ -9,13 +9,16 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash, require_one_of
-from softneck.core._budget import require_steps
-from softneck.core._repr import ReprMixin
-from softneck.loop import Fault, Loop, Part, ReferenceBlock
-from softneck.loop._faults import make_fault
-from softneck.loop._loop import System
-from softneck.loop._reference_parts import AheadReference
+from softneck.core import (
+    FileFormatError,
+    ReprMixin,
+    SettingsError,
+    SoftneckError,
+    file_hash,
+    require_one_of,
+    require_steps,
+)
+from softneck.loop import AheadReference, Fault, Loop, Part, ReferenceBlock, System, make_fault
 from softneck.robot import Robot, find_robot
 
 from ..parts._fmu_part import FmuPart

@@ -14,20 +14,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load
-from softneck.core._budget import settings_text
-from softneck.core._files import require_file
-from softneck.design.linear._own import own_controller
-from softneck.loop import BlockPart, Part, RecordingReference, Reference
-from softneck.loop._reference_parts import AheadReference
-from softneck.loop._references import make_reference
-from softneck.loop._wiring import Link
-from softneck.plant import NeckParameters, VirtualNeck
-from softneck.plant._presets import PRESETS
+from softneck.core import DataError, FileFormatError, SettingsError, file_hash, load, require_file, settings_text
+from softneck.design import own_controller
+from softneck.loop import AheadReference, BlockPart, Link, Part, RecordingReference, Reference, make_reference
+from softneck.plant import PRESETS, NeckParameters, VirtualNeck
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block, Port
-from softneck.signals import read_recording
-from softneck.signals.recording._recording import require_same_robot
+from softneck.signals import read_recording, require_same_robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart

@@ -7,10 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from softneck.core import SettingsError
-from softneck.loop import BlockPart, Loop, Part
-from softneck.loop._faults import fault_field, fault_keys
-from softneck.loop._references import reference_key, reference_keys, same_quantity
-from softneck.loop._wiring import Link
+from softneck.loop import (
+    BlockPart,
+    Link,
+    Loop,
+    Part,
+    fault_field,
+    fault_keys,
+    reference_key,
+    reference_keys,
+    same_quantity,
+)
 from softneck.robot import Robot
 
 from ..parts._fmu_part import FmuPart

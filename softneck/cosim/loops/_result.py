@@ -8,14 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, Vector, to_si
-from softneck.core._certificate import certificate_contents
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, ReprMixin, SettingsError, Vector, certificate_contents, to_si
 from softneck.loop import LoopResult, check_limits, metrics
 from softneck.robot import Robot
-from softneck.signals import Recording
-from softneck.signals.recording._channels import file_unit, known_channels
-from softneck.signals.recording._labelled import dataset, signals_figure, table
+from softneck.signals import Recording, dataset, file_unit, known_channels, signals_figure, table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -106,8 +102,10 @@ class Result(ReprMixin):
 
     def plot(self, title: str = "") -> Figure:
         """Return a matplotlib figure: references, outputs and motors of a closed loop; of others all signals."""
-        from softneck.plots import chart_figure  # matplotlib takes a while to import
-        from softneck.plots._charts import loop_chart
+        from softneck.plots import (
+            chart_figure,  # matplotlib takes a while to import
+            loop_chart,
+        )
 
         time, signals = self.signals.time, self.signals.signals
         if not self.closed:

@@ -10,14 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import SettingsError, Vector, silent, to_si
-from softneck.core._progress import shown_progress
-from softneck.identification.models._validity import farthest, held
+from softneck.core import SettingsError, Vector, shown_progress, silent, to_si
+from softneck.identification import farthest, held
+from softneck.loop import BlockPart, LoopResult, Part, StepCallback, System, run_loop
 from softneck.loop import Loop as Loop  # re-exported by the subpackage
-from softneck.loop import LoopResult, Part, run_loop
-from softneck.loop._loop import System
-from softneck.loop._part import BlockPart
-from softneck.loop._run import StepCallback
 from softneck.robot import Robot
 
 from ._loop_file import LoopSetup, load_loop, load_ssp, make_loop

@@ -14,10 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import FileFormatError, SettingsError
-from softneck.fmu import unpacked
-from softneck.fmu.compiled._model_file import node_of
-from softneck.runtime import Block, Port, bundle
-from softneck.runtime._compile import compiled_name
+from softneck.fmu import node_of, unpacked
+from softneck.runtime import Block, Port, bundle, compiled_name
 
 if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ScalarVariable

@@ -11,13 +11,9 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
-from softneck.core import DataError, OutputFileError, SettingsError, atomic_write, refuse_existing, to_si
-from softneck.core._units import SI_BASES
-from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu, unpacked
-from softneck.fmu.describe._description import with_modelled_drives
-from softneck.loop import BlockPart, Loop, Part, ReferenceBlock
-from softneck.loop._loop import USE_MOTOR_POSITIONS, System
-from softneck.loop._wiring import Link, Wiring, wire
+from softneck.core import SI_BASES, DataError, OutputFileError, SettingsError, atomic_write, refuse_existing, to_si
+from softneck.fmu import FmuInfo, build_compiled_fmu, build_fmu, unpacked, with_modelled_drives
+from softneck.loop import USE_MOTOR_POSITIONS, BlockPart, Link, Loop, Part, ReferenceBlock, System, Wiring, wire
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from softneck.core import DataError, SettingsError, to_si
-from softneck.core._units import SI_BASES
+from softneck.core import SI_BASES, DataError, SettingsError, to_si
 from softneck.runtime import Port
 
 from ._parse import Affine, Binding, Component, Connector, Structure, SystemNode, Unit, Value

@@ -12,8 +12,8 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError
 from softneck.fmu import unpack, unpacked
-from softneck.loop._loop import USE_MOTOR_POSITIONS
-from softneck.robot._channels import is_set_point
+from softneck.loop import USE_MOTOR_POSITIONS
+from softneck.robot import is_set_point
 
 from ..parts._variables import Description, number_of, read_description
 from ._flat import Flat, Line, Ports, flatten

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from softneck.core import SettingsError, SoftneckError
-from softneck.core._errors import require_package
+from softneck.core import SettingsError, SoftneckError, require_package
 
 # One thread each: the processes share the cores already.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}

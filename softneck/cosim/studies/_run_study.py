@@ -16,8 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from softneck.core import OutputFileError, Progress, SettingsError, SoftneckError, silent
-from softneck.core._progress import shown_progress
+from softneck.core import OutputFileError, Progress, SettingsError, SoftneckError, shown_progress, silent
 
 from ..loops._loop_file import make_loop
 from ..loops._loop_table import with_values

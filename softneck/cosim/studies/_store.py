@@ -16,8 +16,17 @@ import numpy as np
 import tomli_w
 
 from softneck import __version__
-from softneck.core import FileFormatError, Matrix, OutputFileError, SettingsError, Vector, atomic_write
-from softneck.core._budget import MOST_JSON, require_table, settings_text
+from softneck.core import (
+    MOST_JSON,
+    FileFormatError,
+    Matrix,
+    OutputFileError,
+    SettingsError,
+    Vector,
+    atomic_write,
+    require_table,
+    settings_text,
+)
 
 from ..loops._loop_parts import OBJECT
 from ._study import Study

@@ -11,12 +11,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, file_hash
-from softneck.core._repr import ReprMixin
-from softneck.design.linear._own import own_attributes, own_controller
-from softneck.loop import Loop, LoopRun
-from softneck.loop._references import reference_key
-from softneck.loop._result import metric_names, shown_unit
+from softneck.core import FileFormatError, ReprMixin, SettingsError, SoftneckError, file_hash
+from softneck.design import own_attributes, own_controller
+from softneck.loop import Loop, LoopRun, metric_names, reference_key, shown_unit
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 

@@ -14,9 +14,7 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, require_between
 from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
-from softneck.robot._search import find_robot
+from softneck.robot import Robot, Scaling, find_robot
 
 from ..plants._step_and_load import StepAndLoad
 from ..plants._uncertain import USUAL_PERIOD, UncertainAxis, UncertainPlant, discrete, uncertain_plant

@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, Vector, atomic_write, to_si, write_archive
-from softneck.core._repr import ReprMixin
-from softneck.identification.models._linear_systems import redefined_input
+from softneck.core import Matrix, ReprMixin, Vector, atomic_write, to_si, write_archive
+from softneck.identification import redefined_input
 from softneck.robot import Robot
-from softneck.runtime import Block, State
-from softneck.runtime._bundle import sized_name
+from softneck.runtime import Block, State, sized_name
 
 from ..plants._uncertain import held_line
 from ._linear_parts_runtime import LinearArrays

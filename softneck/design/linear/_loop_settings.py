@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
 from softneck.core import SettingsError, require_between, require_finite, require_one_of, require_positive, to_si
-from softneck.estimation._settings import ORDERS
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
+from softneck.estimation import ORDERS
+from softneck.robot import Robot, Scaling
 
 from ..plants._uncertain import UncertainPlant
 from ._ports import ControllerLimits, limits_of

@@ -14,11 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_positive
-from softneck.core._repr import ReprMixin
+from softneck.core import Matrix, ReprMixin, SettingsError, require_positive
 from softneck.robot import Robot, find_robot
-from softneck.runtime import Block, Port, bundle
-from softneck.runtime._own import PREFIX, OwnStep, own_of, own_runtime
+from softneck.runtime import PREFIX, Block, OwnStep, Port, bundle, own_of, own_runtime
 
 from ._ports import controller_inputs, controller_outputs
 

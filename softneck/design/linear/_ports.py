@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from softneck.core import SettingsError, Vector, require_between, require_finite, require_positive, to_si
-from softneck.robot import Robot
-from softneck.robot._scaling import MOTOR_RANGE as MAX_MOTOR
-from softneck.robot._scaling import OUTPUT_RANGE as MAX_REFERENCE
-from softneck.robot._scaling import Scaling
+from softneck.robot import MOTOR_RANGE as MAX_MOTOR
+from softneck.robot import OUTPUT_RANGE as MAX_REFERENCE
+from softneck.robot import Robot, Scaling
 from softneck.runtime import Port
 
 MAX_SLEW = 1000.0

@@ -10,11 +10,8 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.estimation._axis import AXES
-from softneck.robot import Robot
-from softneck.robot._channels import Motors, Outputs
-from softneck.robot._directions import Directions
-from softneck.robot._scaling import TIME_CONSTANT
+from softneck.estimation import AXES
+from softneck.robot import TIME_CONSTANT, Directions, Motors, Outputs, Robot
 
 from ._coupled_axis import CoupledAxis
 from ._uncertain import UncertainAxis

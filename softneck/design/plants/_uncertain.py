@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, SoftneckError, require_one_of
-from softneck.core._repr import ReprMixin
-from softneck.estimation import AxisPlant, LinearNeck, axis_plant
-from softneck.estimation._axis import AXES, directions_of, robot_of
-from softneck.robot import Robot
-from softneck.robot._scaling import TIME_CONSTANT
-from softneck.signals.recording._recording import require_same_robot
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, SoftneckError, require_one_of
+from softneck.estimation import AXES, AxisPlant, LinearNeck, axis_plant, directions_of, robot_of
+from softneck.robot import TIME_CONSTANT, Robot
+from softneck.signals import require_same_robot
 
 from ._step_and_load import StepAndLoad
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, Vector, to_si, write_archive
-from softneck.core._repr import ReprMixin
+from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, to_si, write_archive
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from softneck.core import (
     FileFormatError,
     Matrix,
+    ReprMixin,
     SettingsError,
     Vector,
     require_between,
@@ -23,14 +24,9 @@ from softneck.core import (
     to_si,
     write_archive,
 )
-from softneck.core._repr import ReprMixin
-from softneck.identification import Model
-from softneck.identification.models._arrays import without_validity
-from softneck.identification.models._linear_systems import weights_of
-from softneck.identification.models._model import nested, nested_model
+from softneck.identification import Model, nested, nested_model, weights_of, without_validity
 from softneck.robot import Robot
-from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import sized_name
+from softneck.runtime import Block, Port, State, sized_name
 from softneck.signals import TENDON_ANGLES
 
 from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs

@@ -11,9 +11,8 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
-from softneck.identification import Model
-from softneck.identification.models._linear_systems import weights_of
-from softneck.robot._scaling import TIME_CONSTANT, Scaling
+from softneck.identification import Model, weights_of
+from softneck.robot import TIME_CONSTANT, Scaling
 
 from ..linear._ports import motor_ranges
 from ._tuning import samples_ahead

@@ -9,10 +9,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softneck.core import SettingsError, to_si
-from softneck.estimation._scaling import slowest_seconds
-from softneck.identification import Model
-from softneck.identification.models._linear_systems import weights_of
-from softneck.robot._scaling import Scaling
+from softneck.estimation import slowest_seconds
+from softneck.identification import Model, weights_of
+from softneck.robot import Scaling
 
 from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, times
 from ..plants._uncertain import doubts_of

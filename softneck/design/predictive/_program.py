@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.estimation._axis import AXES
+from softneck.estimation import AXES
 from softneck.loop import BlockPart
 from softneck.runtime import load_functions
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_between, to_si
-from softneck.estimation._scaling import plants_scaling
-from softneck.robot import Robot
-from softneck.robot._scaling import MOTOR_RANGE, OUTPUT_RANGE, Scaling
-from softneck.runtime._bundle import sized_name
+from softneck.estimation import plants_scaling
+from softneck.robot import MOTOR_RANGE, OUTPUT_RANGE, Robot, Scaling
+from softneck.runtime import sized_name
 
 from ..linear._ports import ControllerLimits, limits_of, motor_ranges, reference_ranges
 from ..plants._coupled import CoupledPlant

@@ -8,11 +8,18 @@ from typing import Any, Self
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, require_finite, require_one_of, to_si
-from softneck.core._repr import ReprMixin
-from softneck.estimation._settings import ORDERS
-from softneck.robot import Robot
-from softneck.robot._search import find_robot
+from softneck.core import (
+    Matrix,
+    ReprMixin,
+    SettingsError,
+    Vector,
+    require_between,
+    require_finite,
+    require_one_of,
+    to_si,
+)
+from softneck.estimation import ORDERS
+from softneck.robot import Robot, find_robot
 
 from ..linear._ports import LIMITS, ControllerLimits
 from ..plants._coupled import coupled_plant

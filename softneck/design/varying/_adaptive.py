@@ -11,16 +11,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, to_si, write_archive
-from softneck.core._repr import ReprMixin
-from softneck.estimation import AxisPlant
-from softneck.estimation._forms import Reach
-from softneck.estimation._reach import linear_reach
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
-from softneck.robot._search import find_robot
-from softneck.runtime import Block, Port, State
-from softneck.runtime._bundle import sized_name
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_between, to_si, write_archive
+from softneck.estimation import AxisPlant, Reach, linear_reach
+from softneck.robot import Robot, Scaling, find_robot
+from softneck.runtime import Block, Port, State, sized_name
 
 from ..linear._assembly import ReferenceFilter, assemble, pi_axis
 from ..linear._axis_loop import LOWEST, frequencies

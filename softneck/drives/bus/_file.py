@@ -7,10 +7,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from softneck.core import SettingsError, require_between, require_one_of, require_positive, require_whole
-from softneck.core._repr import ReprMixin
+from softneck.core import ReprMixin, SettingsError, require_between, require_one_of, require_positive, require_whole
 from softneck.robot import Robot
-from softneck.signals.recording._channels import NECK
+from softneck.signals import NECK
 
 from ..master import MasterSettings
 from ..master._fieldbus import BusSettings

@@ -10,10 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from softneck.core import DataError, FileFormatError, SettingsError
-from softneck.core._budget import settings_text
+from softneck.core import DataError, FileFormatError, SettingsError, settings_text
 from softneck.robot import Robot
-from softneck.signals.recording._channels import NECK
+from softneck.signals import NECK
 
 from ..master._settings import LimitSettings, RampSettings, WatchSettings, factor_of
 from ..supervision._baseline import load_baseline

@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SettingsError, to_si
-from softneck.plant._neck import has_own_tendons
-from softneck.robot import Robot, find_robot
-from softneck.robot._scaling import Scaling
-from softneck.robot._search import robot_file_of
+from softneck.plant import has_own_tendons
+from softneck.robot import Robot, Scaling, find_robot, robot_file_of
 
 from ..master._settings import ChannelSettings, LimitSettings
 

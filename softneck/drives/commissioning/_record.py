@@ -15,10 +15,17 @@ import numpy as np
 
 from softneck.core import CheckFailedError, DataError, FileFormatError, SettingsError, Vector
 from softneck.robot import Robot
-from softneck.signals import Excitation, Recording, SetPointLimits, prepare, read_recording, signal
-from softneck.signals.excitation._limits import Changes
-from softneck.signals.recording._channels import NECK
-from softneck.signals.recording._recording import require_same_robot
+from softneck.signals import (
+    NECK,
+    Changes,
+    Excitation,
+    Recording,
+    SetPointLimits,
+    prepare,
+    read_recording,
+    require_same_robot,
+    signal,
+)
 
 from ..bus._file import DrivesFile
 from ..logs._rows import experiment_recording

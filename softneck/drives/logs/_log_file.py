@@ -12,13 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SettingsError, Vector, file_hash
-from softneck.core._budget import require_size
+from softneck.core import DataError, FileFormatError, SettingsError, Vector, file_hash, require_size
 from softneck.loop import LoopResult
 from softneck.robot import Robot
-from softneck.signals import Recording
-from softneck.signals.importing.formats._mcap import LARGEST_RECORD, require_chunks
-from softneck.signals.recording._channels import NECK
+from softneck.signals import LARGEST_RECORD, NECK, Recording, require_chunks
 
 from ..master import Frame, MasterSettings
 from ..master._fieldbus import BusSettings

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import CheckFailedError, Matrix
-from softneck.core._repr import ReprMixin
+from softneck.core import CheckFailedError, Matrix, ReprMixin
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
-from softneck.signals import Recording
-from softneck.signals.recording._channels import NECK, known_channels
+from softneck.signals import NECK, Recording, known_channels
 
 from ..master import Event
 

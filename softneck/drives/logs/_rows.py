@@ -15,8 +15,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.robot import Robot
-from softneck.signals import Recording
-from softneck.signals.recording._channels import NECK
+from softneck.signals import NECK, Recording
 
 
 class Motion:

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from softneck.core import require_between, require_whole
-from softneck.core._repr import ReprMixin
+from softneck.core import ReprMixin, require_between, require_whole
 
 from ..supervision._baseline import Baseline
 from ._fieldbus import BusSettings

@@ -6,14 +6,12 @@ import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from softneck.core import CheckFailedError, check_certificate, read_certificate
-from softneck.core._certificate import Certificate, certificate_path
-from softneck.cosim.loops._loop_file import LoopSetup
+from softneck.core import Certificate, CheckFailedError, certificate_path, check_certificate, read_certificate
+from softneck.cosim import LoopSetup
 from softneck.loop import Loop, LoopResult, LoopRun
 from softneck.robot import Robot
-from softneck.signals.recording._channels import NECK
-from softneck.verification import read_requirements
-from softneck.verification._scale import Scale
+from softneck.signals import NECK
+from softneck.verification import Scale, read_requirements
 
 # What `softneck verify` must have shown before a controller gets to drives, each at least as strictly as its defaults
 # ask. What arming asks for later is a line here.

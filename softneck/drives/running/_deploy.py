@@ -8,16 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import CheckFailedError, load
-from softneck.cosim import FmuPart
-from softneck.cosim.loops._loop_file import LoopSetup
-from softneck.cosim.loops._simulate import reach_beyond
+from softneck.cosim import FmuPart, LoopSetup, reach_beyond
 from softneck.loop import BlockPart, Loop, Part
-from softneck.plant import NeckParameters
-from softneck.plant._neck import has_own_tendons
-from softneck.robot import Robot
-from softneck.robot._channels import is_set_point
-from softneck.signals.recording._channels import NECK
-from softneck.signals.recording._recording import require_same_robot
+from softneck.plant import NeckParameters, has_own_tendons
+from softneck.robot import Robot, is_set_point
+from softneck.signals import NECK, require_same_robot
 
 from ..bus._file import DrivesFile
 from ..bus._link import CanLink, VirtualLink

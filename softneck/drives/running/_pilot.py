@@ -9,13 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.loop import Loop, LoopResult
-from softneck.loop._rows import Rows, cycle
+from softneck.loop import Loop, LoopResult, Rows, cycle, wire
 from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP
-from softneck.loop._wiring import wire
 from softneck.robot import Robot
-from softneck.signals.recording._channels import NECK
-from softneck.signals.recording._recording import require_same_robot
+from softneck.signals import NECK, require_same_robot
 
 from ..bus._link import VirtualLink
 from ..logs._result import signal_units

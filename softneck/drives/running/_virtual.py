@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import SettingsError, Vector, to_si
-from softneck.plant import NeckParameters, VirtualNeck, settle
-from softneck.plant._neck import has_own_tendons, tendons_of
+from softneck.plant import NeckParameters, VirtualNeck, has_own_tendons, settle, tendons_of
 from softneck.robot import Robot
 
 from ..bus._file import DrivesFile, Neck, default_drives

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from softneck.core import SoftneckError
-from softneck.signals.importing._clocks import pitch_roll
+from softneck.signals import pitch_roll
 
 from ..bus._link import reason
 from ..master import Frame, Tilt

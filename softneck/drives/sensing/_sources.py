@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from softneck.core import SettingsError
 from softneck.robot import Robot
-from softneck.signals.recording._channels import NECK
+from softneck.signals import NECK
 
 from ..bus._link import Link
 from ..bus._sensor_source import SENSORS, SensorSource, axes_of, turned

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, require_between, require_one_of
-from softneck.core._repr import ReprMixin
+from softneck.core import Matrix, ReprMixin, SettingsError, require_between, require_one_of
 
 from . import _servo_runtime as servo
 from ._axis import Axis

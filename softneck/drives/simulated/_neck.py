@@ -11,8 +11,7 @@ from softneck.core import SettingsError, Vector
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant._neck_runtime import VirtualNeckArrays, VirtualNeckState
 from softneck.robot import Robot
-from softneck.runtime import load_functions
-from softneck.runtime._bundle import sized_name
+from softneck.runtime import load_functions, sized_name
 
 from ._drives import Sample, SimulatedDrives, SimulatedSettings
 from ._servo_runtime import SERVO_GEARING

@@ -9,8 +9,7 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from softneck.core import FileFormatError, SettingsError, atomic_write
-from softneck.core._budget import MOST_JSON, settings_text
+from softneck.core import MOST_JSON, FileFormatError, SettingsError, atomic_write, settings_text
 
 _KIND, _VERSION = "softneck supervision", 3
 _LATER = {"seconds", "tracking"}

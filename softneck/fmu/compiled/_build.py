@@ -11,11 +11,8 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from softneck import __version__
-from softneck.core import SettingsError, atomic_write, refuse_existing
-from softneck.core._files import as_path
-from softneck.runtime import Block, Port, bundle
-from softneck.runtime._tangent import with_tangent
-from softneck.runtime._tangent_activity import TangentError
+from softneck.core import SettingsError, as_path, atomic_write, refuse_existing
+from softneck.runtime import Block, Port, TangentError, bundle, with_tangent
 
 from ..describe._describe import Buildable, FmuInfo, block_and_info, documentation_page
 from ..describe._description import Identity, exported_block, model_description, motor_positions, terminals_file

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, SettingsError
-from softneck.runtime import Block, Port
-from softneck.runtime._bundle import split_members
-from softneck.runtime._own import PREFIX
+from softneck.runtime import PREFIX, Block, Port, split_members
 
 from .translate._kinds import is_known, module_of, ranks_of
 

@@ -10,14 +10,11 @@ from html import escape
 from pathlib import Path
 from typing import Any, Protocol
 
-from softneck.core import FileFormatError, SettingsError
-from softneck.core._budget import settings_text
-from softneck.design.linear._own import own_controller
+from softneck.core import FileFormatError, SettingsError, settings_text
+from softneck.design import own_controller
 from softneck.identification import Validation
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.robot import Robot
-from softneck.robot._file import PRESETS
-from softneck.robot._loading import load_for_robot
+from softneck.robot import PRESETS, Robot, load_for_robot
 from softneck.runtime import Block, Port
 
 

@@ -15,11 +15,10 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from softneck import __version__
-from softneck.core import SettingsError, to_si
-from softneck.core._units import SI_BASES
-from softneck.loop._loop import USE_MOTOR_POSITIONS
+from softneck.core import SI_BASES, SettingsError, to_si
+from softneck.loop import USE_MOTOR_POSITIONS
 from softneck.plant import NeckParameters
-from softneck.robot._channels import is_set_point, motor_positions_among
+from softneck.robot import is_set_point, motor_positions_among
 from softneck.runtime import Block, Port
 
 from ._describe import FmuInfo

@@ -21,11 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import SettingsError, atomic_write, refuse_existing
-from softneck.core._files import as_path
-from softneck.design.linear._own import own_module
-from softneck.runtime import Block, Port, load_runtime
-from softneck.runtime._own import PREFIX
+from softneck.core import SettingsError, as_path, atomic_write, refuse_existing
+from softneck.design import own_module
+from softneck.runtime import PREFIX, Block, Port, load_runtime
 
 from ..describe._describe import HOST_NEEDS, Buildable, FmuInfo, block_and_info, documentation_page
 from ..describe._description import Identity, exported_block, generation_tool, model_description, terminals_file

@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import SettingsError
-from softneck.runtime import _numba_cache, bundle
-from softneck.runtime._bundle import content_name
-from softneck.runtime._compile import COMPILE_OPTIONS, compiled_name
+from softneck.runtime import COMPILE_OPTIONS, _numba_cache, bundle, compiled_name, content_name
 
 from ..describe._describe import MINIMUM_PYTHON
 

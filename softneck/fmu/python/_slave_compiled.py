@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from softneck.runtime._numba_cache import compile_without_failing_cache, numba_cache_name
+from softneck.runtime import compile_without_failing_cache, numba_cache_name
 
 # Environment variable of the host: "0" never, "1" always, else by the cost in the FMU.
 _FMU_SWITCH = "SOFTNECK_FMU_NUMBA"

@@ -16,9 +16,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from softneck.core import FileFormatError, OutputFileError, SettingsError
-from softneck.core._budget import open_zip
-from softneck.core._files import require_file
+from softneck.core import FileFormatError, OutputFileError, SettingsError, open_zip, require_file
 
 # PKWARE's APPNOTE 6.3: local header, entry of the directory, end of the directory.
 _LOCAL, _ENTRY, _END = "<4s5H3L2H", "<4s6H3L5H2L", "<4s4H2LH"

@@ -25,8 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, Matrix, SettingsError, Vector, require_positive
-from softneck.core._blas_threads import one_blas_thread
+from softneck.core import FileFormatError, Matrix, SettingsError, Vector, one_blas_thread, require_positive
 from softneck.signals import Recording, concatenate, signal
 
 from ..models._arrays import check_arrays

@@ -20,13 +20,13 @@ from softneck.core import (
     Progress,
     SettingsError,
     Vector,
+    one_blas_thread,
     require_between,
     require_one_of,
     require_positive,
     require_whole,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording
 
 from ..models._door import Door

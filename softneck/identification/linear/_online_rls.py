@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, SettingsError, Vector, require_positive
-from softneck.core._checks import finite_vector
+from softneck.core import DataError, Matrix, SettingsError, Vector, finite_vector, require_positive
 from softneck.signals import TENDON_ANGLES, redefinition_matrix
 
 from ..models._model import Model

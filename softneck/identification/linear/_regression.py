@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
-from softneck.robot._scaling import Scaling
+from softneck.robot import Scaling
 from softneck.signals import Recording
 
 from ..models._arrays import within

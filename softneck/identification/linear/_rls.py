@@ -11,17 +11,17 @@ from softneck.core import (
     DataError,
     Matrix,
     Progress,
+    ReprMixin,
     SettingsError,
     Vector,
+    finite_vector,
+    one_blas_thread,
     require_between,
     require_one_of,
     require_positive,
     require_whole,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._checks import finite_vector
-from softneck.core._repr import ReprMixin
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 

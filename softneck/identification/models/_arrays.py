@@ -12,8 +12,7 @@ from functools import cache
 import numpy as np
 
 from softneck.core import KINDS, FileFormatError, Matrix, SettingsError, Vector, resolve
-from softneck.runtime import load_runtime
-from softneck.runtime._bundle import layout_of, sized_name
+from softneck.runtime import layout_of, load_runtime, sized_name
 from softneck.runtime._layout import Arrays, StateVector
 
 from ._linear_systems import STATE_SPACE

@@ -19,11 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import DataError, Matrix, Vector
+from softneck.robot import TIME_CONSTANT as NECK_SECONDS
 from softneck.robot import Robot
-from softneck.robot._scaling import TIME_CONSTANT as NECK_SECONDS
-from softneck.signals import Recording, signal
-from softneck.signals.excitation._signals import SAMPLE_TIME
-from softneck.signals.quality._excitation import BANDWIDTH
+from softneck.signals import BANDWIDTH, SAMPLE_TIME, Recording, signal
 
 if TYPE_CHECKING:
     from ._model import Model

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.robot._scaling import Scaling
-from softneck.signals import Recording
-from softneck.signals.recording._scaled import scaled_recording
+from softneck.robot import Scaling
+from softneck.signals import Recording, scaled_recording
 
 from ._directions import NECK_SECONDS, Directions, directions_of
 from ._drive import LoadedDrive, fit_loaded_drive

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.robot._scaling import Scaling
+from softneck.robot import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 

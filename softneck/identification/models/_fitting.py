@@ -13,8 +13,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot
-from softneck.signals import Recording, concatenate
-from softneck.signals.quality._excitation import independent_motions
+from softneck.signals import Recording, concatenate, independent_motions
 
 from ._model import WARM_UP, Model
 from ._ports import MOST_PAYLOAD, trained_set_points

@@ -8,12 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, SettingsError, Vector, require_one_of, require_whole, to_si
-from softneck.core._checks import finite_vector
-from softneck.robot import Robot
-from softneck.robot._channels import is_set_point
-from softneck.runtime import Block, State
-from softneck.runtime._compile import load_tangent
+from softneck.core import Matrix, SettingsError, Vector, finite_vector, require_one_of, require_whole, to_si
+from softneck.robot import Robot, is_set_point
+from softneck.runtime import Block, State, load_tangent
 
 from ._state_space import system_of
 

@@ -15,8 +15,12 @@ from softneck.core import (
     DataError,
     FileFormatError,
     Matrix,
+    ReprMixin,
     SettingsError,
     Vector,
+    finite_matrix,
+    finite_vector,
+    percent,
     require_one_of,
     require_whole,
     resolve,
@@ -24,14 +28,9 @@ from softneck.core import (
     write_archive,
 )
 from softneck.core import load as load_file
-from softneck.core._checks import finite_matrix, finite_vector
-from softneck.core._repr import ReprMixin, percent
 from softneck.robot import Robot
 from softneck.runtime import Block, State
-from softneck.signals import Recording
-from softneck.signals.recording._files import RecordingLike, opened_recording
-from softneck.signals.recording._labelled import Labelled
-from softneck.signals.recording._recording import require_same_robot
+from softneck.signals import Labelled, Recording, RecordingLike, opened_recording, require_same_robot
 
 from . import _linear_systems as _linear
 from . import _ports
@@ -304,7 +303,7 @@ class Model(ReprMixin):
         Raises:
             SettingsError: a kind that searches a set (`nlsm`, or `guarded` over it).
         """
-        from softneck.runtime._casadi_walk import step_function
+        from softneck.runtime import step_function
 
         held = [self.kind, *(kind for kind, _ in members(self.arrays))]
         for kind in held:

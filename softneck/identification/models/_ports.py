@@ -11,8 +11,7 @@ import numpy as np
 from softneck.core import to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
-from softneck.signals import Recording
-from softneck.signals.recording._recording import conditions, joined
+from softneck.signals import Recording, conditions, joined
 
 #: What may hang on the platform [kg], as on the virtual neck's.
 MOST_PAYLOAD = 5.0

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.robot._scaling import Scaling
+from softneck.robot import Scaling
 from softneck.signals import Recording
 
 from ._drive import DriveModel

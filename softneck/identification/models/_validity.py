@@ -14,8 +14,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, Vector, require_positive, to_si
 from softneck.robot import Robot
-from softneck.runtime import Block
-from softneck.runtime._bundle import layout_of
+from softneck.runtime import Block, layout_of
 from softneck.runtime._layout import Arrays
 from softneck.signals import Recording
 

@@ -16,13 +16,13 @@ from softneck.core import (
     Progress,
     SettingsError,
     Vector,
+    one_blas_thread,
     require_between,
     require_positive,
     require_whole,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
-from softneck.robot._scaling import Scaling
+from softneck.robot import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording, concatenate
 

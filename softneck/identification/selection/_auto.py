@@ -9,11 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, DataError, Matrix, Progress, SettingsError, SoftneckError, resolve, silent
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._repr import ReprMixin
-from softneck.signals import Recording
-from softneck.signals.quality._excitation import poor_excitation
+from softneck.core import (
+    KINDS,
+    DataError,
+    Matrix,
+    Progress,
+    ReprMixin,
+    SettingsError,
+    SoftneckError,
+    one_blas_thread,
+    resolve,
+    silent,
+)
+from softneck.signals import Recording, poor_excitation
 
 from ..models._arrays import members
 from ..models._linear_systems import KINDS as LINEAR

@@ -21,9 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_between, silent, to_si
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._repr import ReprMixin
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    ReprMixin,
+    SettingsError,
+    Vector,
+    one_blas_thread,
+    require_between,
+    silent,
+    to_si,
+)
 from softneck.robot import Robot
 from softneck.signals import Excitation, Recording, SetPointLimits, prepare, signal
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import DataError, Matrix, SettingsError, Vector
-from softneck.robot._scaling import Scaling
-from softneck.runtime import load_functions
-from softneck.runtime._compile import have_numba
+from softneck.robot import Scaling
+from softneck.runtime import have_numba, load_functions
 from softneck.signals import Recording
 
 from ..linear._regression import linear_in_si, no_base

@@ -17,16 +17,14 @@ from softneck.core import (
     SettingsError,
     Vector,
     find_kind,
+    one_blas_thread,
     require_one_of,
     require_positive,
     resolve,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
-from softneck.signals import Recording
-from softneck.signals.recording._scaled import scaled_recording
+from softneck.robot import Robot, Scaling
+from softneck.signals import Recording, scaled_recording
 
 from ..models._door import Door
 from ..models._drive import DriveModel, fit_drive

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, Matrix, Progress, Vector, require_whole, silent
-from softneck.core._blas_threads import one_blas_thread
-from softneck.plant._neck import require_tendons
+from softneck.core import DataError, FileFormatError, Matrix, Progress, Vector, one_blas_thread, require_whole, silent
+from softneck.plant import require_tendons
 from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.signals import Recording

@@ -8,9 +8,8 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, Vector, require_positive, require_whole, silent
-from softneck.core._blas_threads import one_blas_thread
-from softneck.robot._scaling import Scaling
+from softneck.core import DataError, Matrix, Progress, Vector, one_blas_thread, require_positive, require_whole, silent
+from softneck.robot import Scaling
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 

@@ -13,16 +13,15 @@ from softneck.core import (
     DataError,
     FileFormatError,
     Matrix,
+    ReprMixin,
     SettingsError,
     Vector,
     require_one_of,
     to_si,
     write_archive,
 )
-from softneck.core._repr import ReprMixin
 from softneck.robot import Robot
-from softneck.signals import Recording
-from softneck.signals.recording._recording import require_same_robot
+from softneck.signals import Recording, require_same_robot
 
 from ..linear._srivc_fit import Continuous
 from ..models._directions import Directions

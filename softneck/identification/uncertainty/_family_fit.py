@@ -14,16 +14,15 @@ from softneck.core import (
     Progress,
     SettingsError,
     Vector,
+    one_blas_thread,
     require_between,
     require_one_of,
     require_positive,
     require_whole,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
-from softneck.robot._scaling import Scaling
-from softneck.signals import Recording, concatenate
-from softneck.signals.recording._recording import conditions
+from softneck.robot import Scaling
+from softneck.signals import Recording, concatenate, conditions
 
 from ..linear._oe import SOURCES
 from ..linear._regression import MAX_DELAY

@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector, require_between, require_one_of, to_si
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector, require_between, require_one_of, to_si
 from softneck.robot import Robot
-from softneck.signals import Recording, concatenate
-from softneck.signals.recording._files import RecordingLike, opened_recording
+from softneck.signals import Recording, RecordingLike, concatenate, opened_recording
 
 from ..linear._oe import SOURCES
 from ._local_polynomial import (
@@ -169,8 +167,7 @@ class FrequencyResponse(ReprMixin):
         Raises:
             DataError: a model that is not linear, or of another sample time.
         """
-        from softneck.plots import chart_figure
-        from softneck.plots._charts import frequency_response_chart
+        from softneck.plots import chart_figure, frequency_response_chart
 
         output = self.outputs[0] if output is None else output
         source = self.own_input(output)

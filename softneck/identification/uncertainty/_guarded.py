@@ -20,13 +20,13 @@ from softneck.core import (
     SoftneckError,
     Vector,
     find_kind,
+    one_blas_thread,
     require_one_of,
     require_positive,
     require_whole,
     resolve,
     silent,
 )
-from softneck.core._blas_threads import one_blas_thread
 from softneck.signals import Recording, concatenate
 
 from ..models._arrays import COMPOSED, memory_of, prefixed_arrays, within

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from softneck.core import Matrix
-from softneck.robot._scaling import TIME_CONSTANT
+from softneck.robot import TIME_CONSTANT
 from softneck.signals import Recording
 
 from ..models._scores import nrmse_fit

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector, to_si
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
+from softneck.robot import Robot, Scaling
 
 from ..models._model import Model
 from ..models._ports import BOUNDED, trained_range

@@ -9,13 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Progress, SettingsError, Vector, require_one_of, resolve, silent
-from softneck.core._blas_threads import one_blas_thread
-from softneck.core._repr import ReprMixin
-from softneck.robot import Robot
-from softneck.robot._loading import load_for_robot
-from softneck.signals import Recording
-from softneck.signals.recording._files import RecordingLike, opened_recording
+from softneck.core import (
+    DataError,
+    Matrix,
+    Progress,
+    ReprMixin,
+    SettingsError,
+    Vector,
+    one_blas_thread,
+    require_one_of,
+    resolve,
+    silent,
+)
+from softneck.robot import Robot, load_for_robot
+from softneck.signals import Recording, RecordingLike, opened_recording
 
 from ..models._model import Model
 from ..models._validity import with_tolerance

@@ -12,10 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of, require_whole, to_si
-from softneck.core._repr import ReprMixin
-from softneck.robot import Robot
-from softneck.robot._scaling import MOTOR_RANGE, TIME_CONSTANT
+from softneck.core import (
+    Matrix,
+    ReprMixin,
+    SettingsError,
+    Vector,
+    require_between,
+    require_one_of,
+    require_whole,
+    to_si,
+)
+from softneck.robot import MOTOR_RANGE, TIME_CONSTANT, Robot
 
 from ..recording._channels import NECK
 

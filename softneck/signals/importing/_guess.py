@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, ReprMixin
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS

@@ -11,10 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from softneck.core import FileFormatError, SettingsError, SoftneckError, to_si
-from softneck.core._budget import settings_text
-from softneck.core._files import require_file
-from softneck.core._repr import ReprMixin
+from softneck.core import FileFormatError, ReprMixin, SettingsError, SoftneckError, require_file, settings_text, to_si
 from softneck.robot import Robot
 
 from ..recording._channels import NECK, known_channels, si_unit

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, SoftneckError, Vector, to_si
-from softneck.core._files import as_path
+from softneck.core import DataError, SettingsError, SoftneckError, Vector, as_path, to_si
 
 from ..recording._channels import may_miss
 from ..recording._files import integers, numbers, read_table

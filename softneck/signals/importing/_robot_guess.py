@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, SettingsError, SoftneckError, to_si
-from softneck.core._errors import did_you_mean
+from softneck.core import DataError, SettingsError, SoftneckError, did_you_mean, to_si
 from softneck.robot import Robot
 
 from ._column_titles import read_title

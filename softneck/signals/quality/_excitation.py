@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, Vector
-from softneck.robot import Robot
-from softneck.robot._scaling import Scaling
+from softneck.robot import Robot, Scaling
 
 from ..recording._recording import Recording
 

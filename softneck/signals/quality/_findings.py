@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, require_positive, to_si
-from softneck.core._repr import ReprMixin
-from softneck.robot import Robot
-from softneck.robot._scaling import TIME_CONSTANT, Scaling
+from softneck.core import Matrix, ReprMixin, require_positive, to_si
+from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 from ..recording._recording import Recording
 from ._channel_faults import ChannelQuality, Stretch, check_channel, count_rows

@@ -14,13 +14,23 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, FileFormatError, SoftneckError, Vector, atomic_write, to_si
-from softneck.core._budget import MOST_TOML, require_numbers, require_size, require_table
-from softneck.core._checks import finite_matrix
-from softneck.core._errors import require_package
-from softneck.core._files import as_path, require_file
-from softneck.robot import Robot, find_robot
-from softneck.robot._search import robot_file_of
+from softneck.core import (
+    MOST_TOML,
+    DataError,
+    FileFormatError,
+    SoftneckError,
+    Vector,
+    as_path,
+    atomic_write,
+    finite_matrix,
+    require_file,
+    require_numbers,
+    require_package,
+    require_size,
+    require_table,
+    to_si,
+)
+from softneck.robot import Robot, find_robot, robot_file_of
 
 from ._channels import column_name, file_unit, known_channels, may_miss, parse_column
 from ._recording import Recording, concatenate, median_step, require_same_robot

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Vector, resolve
-from softneck.core._errors import require_package
+from softneck.core import DataError, Vector, require_package, resolve
 
 if TYPE_CHECKING:
     import pandas as pd

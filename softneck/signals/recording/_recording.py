@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import DataError, Matrix, Vector, require_positive, resolve, to_si
-from softneck.core._checks import finite_matrix
-from softneck.core._repr import ReprMixin
+from softneck.core import DataError, Matrix, ReprMixin, Vector, finite_matrix, require_positive, resolve, to_si
 from softneck.robot import Robot, find_robot
 
 from ._channels import NECK, known_channels, may_miss

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softneck.robot._scaling import Scaling, round_scaled, scaled_robot
+from softneck.robot import Scaling, round_scaled, scaled_robot
 
 from ._recording import Recording
 

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 
-import softneck.tuning._tune  # noqa: F401  (before a test replaces what it imports)
+import softneck.tuning
+import softneck.tuning._tune
 from softneck.cli.start import _plan, _possible, _sitting, _start
 from softneck.cli.start._plan import PI, Asked, Step, Unmet
 from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
-from softneck.tuning import _beforehand
 
 from ..conftest import Call
 from .conftest import facts_of, short_plan
@@ -54,14 +54,14 @@ def test_each_default_that_cannot_be_is_left_out_with_its_reason(
     tmp_path: Path, rls_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_beforehand, "refuse_impossible", refuse)
+    monkeypatch.setattr(softneck.tuning, "refuse_impossible", refuse)
     assert _possible.possible((str(rls_file),)) == " ".join(WHY.values())
     text = Path(_possible.FILE).read_text(encoding="utf-8")
     assert tomllib.loads(text)["require"] == dict.fromkeys(WHY, False)
     assert all(f"# {why}" in text for why in WHY.values())
     # Nothing is left out, and no file made, where all can be.
     Path(_possible.FILE).unlink()
-    monkeypatch.setattr(_beforehand, "refuse_impossible", lambda *_: None)
+    monkeypatch.setattr(softneck.tuning, "refuse_impossible", lambda *_: None)
     assert _possible.possible((str(rls_file),)) == ""
     assert not Path(_possible.FILE).exists()
 
@@ -70,7 +70,7 @@ def test_what_is_no_requirement_s_fault_is_refused(rls_file: Path, monkeypatch: 
     def never(*_: Any) -> None:
         raise SettingsError("the plant cannot be: it is no plant.")
 
-    monkeypatch.setattr(_beforehand, "refuse_impossible", never)
+    monkeypatch.setattr(softneck.tuning, "refuse_impossible", never)
     with pytest.raises(SettingsError, match="it is no plant"):
         _possible.impossible((str(rls_file),))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 
-from softneck.runtime._bundle import ANY_SIZE, layout_of
+from softneck.runtime import ANY_SIZE, layout_of
 from softneck.runtime._layout import Arrays
 
 _NECK_RUNTIMES = (

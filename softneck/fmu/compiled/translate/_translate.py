@@ -12,9 +12,7 @@ from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from functools import cache
 
-from softneck.runtime import bundle
-from softneck.runtime._tangent import with_tangent
-from softneck.runtime._tangent_activity import TangentError
+from softneck.runtime import TangentError, bundle, with_tangent
 
 from ._expressions import Expressions
 from ._kinds import FAST

@@ -8,8 +8,7 @@ import zlib
 from pathlib import Path
 from typing import BinaryIO
 
-from softneck.core import FileFormatError
-from softneck.core._budget import open_zip, require_size, require_table
+from softneck.core import FileFormatError, open_zip, require_size, require_table
 
 #: What a logger's file may be; `text` is all that has no mark of its own.
 FORMATS = ("text", "parquet", "mat", "sheet", "mcap")

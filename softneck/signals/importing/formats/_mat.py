@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SoftneckError
-from softneck.core._budget import largest_unpacked
-from softneck.core._errors import require_package
+from softneck.core import DataError, FileFormatError, SoftneckError, largest_unpacked, require_package
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError
-from softneck.core._budget import MOST_UNPACKED, require_unpacked
-from softneck.core._errors import require_package
+from softneck.core import MOST_UNPACKED, DataError, FileFormatError, require_package, require_unpacked
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from softneck.core import DataError, FileFormatError
-from softneck.core._errors import require_package
+from softneck.core import DataError, FileFormatError, require_package
 
 if TYPE_CHECKING:
     import pandas as pd
