@@ -112,7 +112,7 @@ class AxisPlant(ReprMixin):
         numerator = self.numerator * (1.0 - moved) / (1.0 - a)
         return replace(self, numerator=numerator, denominator=np.convolve(rest, [1.0, -moved]))
 
-    def shown(self) -> AxisPlant:
+    def remove_hidden_poles(self) -> AxisPlant:
         """Return the plant without the poles slower than its main one, each with the zero that hides it; gain kept.
 
         Itself where the main pole is the slowest, or where no zeros hide the others.
@@ -129,7 +129,7 @@ class AxisPlant(ReprMixin):
         scale = self.static_gain * denominator.real.sum() / numerator.real.sum()
         return replace(self, numerator=scale * numerator.real, denominator=denominator.real)
 
-    def delayed(self, least: float) -> AxisPlant:
+    def with_min_delay(self, least: float) -> AxisPlant:
         """Return the same plant with a dead time of at least `least` [s], in whole samples."""
         return replace(self, delay=max(self.delay, round(least / self.sample_time)))
 

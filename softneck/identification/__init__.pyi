@@ -37,8 +37,8 @@ from .models._directions import bandwidth_of as bandwidth_of
 from .models._fitting import known_rows as known_rows
 from .models._linear_systems import KINDS as KINDS
 from .models._linear_systems import continuous_parameters as continuous_parameters
-from .models._linear_systems import moved_through as moved_through
 from .models._linear_systems import redefined_input as redefined_input
+from .models._linear_systems import remove_unreachable_states as remove_unreachable_states
 from .models._linear_systems import weights_of as weights_of
 from .models._model import nested as nested
 from .models._model import nested_model as nested_model

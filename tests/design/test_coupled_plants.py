@@ -195,7 +195,7 @@ def mimo() -> Any:
 def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, mimo: Any) -> None:
     controller = settings.design(mimo.ss())
     plants = taken(mimo.ss()).own_rows
-    late = tuple(row.delayed(0.08 if isinstance(settings, LqgSettings) else 0.1) for row in plants)
+    late = tuple(row.with_min_delay(0.08 if isinstance(settings, LqgSettings) else 0.1) for row in plants)
     made = controller.ss()
     A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)
     assert np.abs(np.linalg.eigvals(A)).max() < 1.0

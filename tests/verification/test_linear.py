@@ -12,7 +12,7 @@ import pytest
 from softneck.design import FopiSettings, PiSettings, mu_upper
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
-from softneck.identification.models._linear_systems import moved_through
+from softneck.identification.models._linear_systems import remove_unreachable_states
 from softneck.verification._linear import LinearLaw, judged, margins, radii
 from softneck.verification._plants import (
     AxisBox,
@@ -114,7 +114,7 @@ def test_python_control_says_the_same_margins(kind: Any) -> None:
     plants = nominal_plants([neck_of_model(linear_neck(), "m", SPREAD)])[0]
     law = LinearLaw.of(kind().design(linear_neck()).ss())
     own = margins(plants, law, W)
-    A, B, C = moved_through(law.A, law.By[:, [0]], law.C[[0]])
+    A, B, C = remove_unreachable_states(law.A, law.By[:, [0]], law.C[[0]])
     K = control.StateSpace(A, B, -C, -law.Dy[[0]][:, [0]], TS)
     # Of the state-space form's response: polynomials of this order are inaccurate.
     response = control.frequency_response(control.ss(_transfer(plants, 0, 0)) * K, judged(TS, 1500)[:-1])

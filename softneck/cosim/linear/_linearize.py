@@ -20,7 +20,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, require_between
 from softneck.fmu import Buildable, buildable
-from softneck.identification import moved_through
+from softneck.identification import remove_unreachable_states
 from softneck.loop import BlockPart
 from softneck.runtime import Block, Port, State, TangentError, load_tangent
 
@@ -187,7 +187,7 @@ def _of_block(block: Block, at: float, given: Mapping[str, float]) -> LinearPoin
         # A step returns the outputs of the next sample; as states of their own they are those of this one.
         A, B = np.block([[A, np.zeros((n, len(C)))], [C, np.zeros((len(C), len(C)))]]), np.vstack([B, D])
         C, D = np.hstack([np.zeros((len(C), n)), np.eye(len(C))]), np.zeros((len(C), m))
-    A, B, C = moved_through(A, B, C)
+    A, B, C = remove_unreachable_states(A, B, C)
     return LinearPoint(
         A,
         B,

@@ -72,7 +72,7 @@ class CustomSettings(AxisSettings):
             raise SettingsError(
                 f"outputs that answer to each other need one `controller` of {' and '.join(whole.names)}."
             )
-        samples = [tuple(row.delayed(doubts_of(whole.robot).least_delay) for row in whole.own_rows)]
+        samples = [tuple(row.with_min_delay(doubts_of(whole.robot).least_delay) for row in whole.own_rows)]
         return self.of_robot(whole)._whole(whole.robot, samples, whole.own_redefinition)
 
     def _period(self, robot: Robot | None) -> float:  # noqa: ARG002

@@ -55,9 +55,9 @@ class LqgSettings(AxisSettings):
     def _whole(self, plant: CoupledPlant) -> LinearController:
         """Return the controller of a coupled plant."""
         doubts = doubts_of(plant.robot)
-        nominal: AnyAxes = tuple(row.delayed(doubts.least_delay) for row in plant.rows)
+        nominal: AnyAxes = tuple(row.with_min_delay(doubts.least_delay) for row in plant.rows)
         spread = {1.0, 1.0 - doubts.gain_spread, 1.0 + doubts.gain_spread}
-        own = tuple(row.delayed(doubts.least_delay) for row in plant.own_rows)
+        own = tuple(row.with_min_delay(doubts.least_delay) for row in plant.own_rows)
         samples = [times(own, gain) for gain in sorted(spread, key=lambda gain: (gain != 1.0, gain))]
         lag = max(row.time_constant + row.delay * row.sample_time for row in nominal)
 

@@ -62,7 +62,7 @@ class CoupledAxis:
         states = np.linalg.solve(z[:, None, None] * np.eye(self.order) - self.A, self.B.astype(complex))
         return states[:, 0, :] * z[:, None] ** (-(self.delay + extra_delay))
 
-    def delayed(self, least: float) -> CoupledAxis:
+    def with_min_delay(self, least: float) -> CoupledAxis:
         """Return the same plant with a dead time of at least `least` [s], in whole samples."""
         return replace(self, delay=max(self.delay, round(least / self.sample_time)))
 

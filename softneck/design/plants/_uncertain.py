@@ -88,7 +88,7 @@ class UncertainAxis:
 
     def prepared(self) -> UncertainAxis:
         """Return it with the least nominal dead time, and the form of small moves as a sample; others stay."""
-        nominal = self.nominal.delayed(self.doubts.least_delay)
+        nominal = self.nominal.with_min_delay(self.doubts.least_delay)
         pole = self.doubts.small_move_pole
         faster = nominal.faster(pole) if pole > 0.0 else nominal
         more = () if faster is nominal else (faster,)
@@ -146,7 +146,7 @@ class UncertainPlant(ReprMixin):
         found = {}
         for axis in map(self.axis, self.names):
             delay, pole, plant = axis.doubts.least_delay, axis.doubts.small_move_pole, axis.nominal
-            if plant.delayed(delay).delay > plant.delay:
+            if plant.with_min_delay(delay).delay > plant.delay:
                 found["least_delay"] = delay
             if plant.faster(pole) is not plant:
                 found["small_move_pole"] = pole

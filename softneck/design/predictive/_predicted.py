@@ -49,7 +49,7 @@ def taken(settings: Any, asked: Any, plant: ScaledPlant) -> dict[str, float]:
         if getattr(asked, name) is not None or value == 0.0:
             continue
         if name == "least_delay":
-            changes = any(axis.delayed(value / second).delay > axis.delay for axis in plant.axes)
+            changes = any(axis.with_min_delay(value / second).delay > axis.delay for axis in plant.axes)
         else:
             changes = any(axis.faster(value * second) is not axis for axis in plant.axes)
         found |= {name: value} if changes else {}
@@ -76,7 +76,7 @@ def _predicted(settings: Any, whole: ScaledPlant, axis: int) -> AnyAxis:
 
 def timed(plant: AnyAxis, timing: Any) -> Any:
     """Return a plant with the dead time that the controller sees: at least so much, less what the observer is ahead."""
-    late = plant.delayed(timing.least_delay)
+    late = plant.with_min_delay(timing.least_delay)
     return replace(late, delay=max(0, late.delay - samples_ahead(timing.look_ahead, plant.sample_time)))
 
 

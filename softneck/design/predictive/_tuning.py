@@ -66,7 +66,7 @@ def move_weight(plant: AnyAxis, bandwidth: float) -> float:
     The error is weighted by one over the squared static gain, so that both count in rad of the input. Of poles that the
     output hardly shows nothing is asked: no weight moves them.
     """
-    plant = plant.lag() if isinstance(plant, CoupledAxis) else plant.shown()
+    plant = plant.lag() if isinstance(plant, CoupledAxis) else plant.remove_hidden_poles()
     low, high = _WEIGHTS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)

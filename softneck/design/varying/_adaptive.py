@@ -180,7 +180,7 @@ class AdaptiveSettings(LoopSettings):
                 f"{name}: adaptive control takes a plant of one pole and a dead time; this one is of order "
                 f"{plant.order}. Identify `rls` or `oe` of order 1."
             )
-        late, pole = plant.delayed(axis.doubts.least_delay), axis.doubts.small_move_pole
+        late, pole = plant.with_min_delay(axis.doubts.least_delay), axis.doubts.small_move_pole
         return late.faster(pole) if pole > 0.0 else late
 
     def _loop(self, plant: AxisPlant, delay: int) -> float:

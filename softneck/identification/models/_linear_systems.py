@@ -345,7 +345,7 @@ def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None, u
     # A step returns the outputs of the next sample; as states of their own they are those of the state's.
     A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
-    A, B, C = moved_through(A, B, C)
+    A, B, C = remove_unreachable_states(A, B, C)
     names = [port.name for port in block.inputs[:motors]], [port.name for port in block.outputs[:-1]]
     return shown_system(model, (A, B, C), names, model.kind, units)
 
@@ -380,7 +380,7 @@ def _rest(model: Any, block: Block, u: Vector) -> State:
     )
 
 
-def moved_through(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+def remove_unreachable_states(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     """Return a system without the states that no input moves, or that no output shows."""
     kept = _reached(A, B) & _reached(A.T, C.T)
     return A[kept][:, kept], B[kept], C[:, kept]
