@@ -129,7 +129,7 @@ def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, s
     told = {
         "asked": [(b.metric, b.bound, b.limit, b.asked) for b in asked.bounds], "track": dict(asked.track),
         "tables": [dict(getattr(asked.certificate, name)) for name in ("uncertainty", "sampling", "step", "sim")],
-        "kinds": list(kinds), "seed": task.seed, "robot": task.robot.hash, "plants": [*task.linear, *task.own],
+        "kinds": list(kinds), "seed": task.seed, "robot": task.robot.as_dict(), "plants": [*task.linear, *task.own],
         "observer": _observer(task, kinds),
         "files": None if files is None else [digest for _, digest in files.values()],
     }  # fmt: skip
@@ -152,8 +152,8 @@ def _plants(task: Task) -> Iterator[bytes]:
         for plant in axis.samples:
             yield np.concatenate([plant.numerator, plant.denominator, [plant.delay, plant.sample_time]]).tobytes()
     for thing in task.linear.values():
-        tested = getattr(thing, "findings", {}).get("tested")
-        yield json.dumps(tested, sort_keys=True, default=str).encode()
+        findings = getattr(thing, "findings", {})
+        yield json.dumps([findings.get("tested"), findings.get("directions")], sort_keys=True, default=str).encode()
     for thing in task.own.values():
         if hasattr(thing, "block"):
             yield from _of_block(thing.block())

@@ -74,11 +74,8 @@ def tuned(name: str, view: View, *, stepping: bool) -> list[float]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "view"), [(name, view) for name, view in VIEWS if not (view.turned_motors or view.turned or view.offset)]
-)
+@pytest.mark.parametrize(("name", "view"), VIEWS)
 def test_a_search_is_the_same_on_linear_plants(name: str, view: View) -> None:
-    """Not where motors are turned or moved: `tune` asks for quicker steps, which the motors' limits share otherwise."""
     plain, seen = (tuned(name, each, stepping=False) for each in (View(), view))
     assert len(plain) > 10
     # As a verdict's; settings are rounded to four digits.
