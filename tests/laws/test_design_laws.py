@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import control
 import numpy as np
 import pytest
 
@@ -58,8 +59,25 @@ def test_a_controller_is_the_same_in_every_view(name: str, kind: str) -> None:
         np.testing.assert_allclose(other, plain, atol=1e-4, err_msg=str(view))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["finger", "joint"])
+def test_a_controller_of_ones_own_is_the_same_in_other_units_and_at_another_pace(name: str) -> None:
+    def custom(view: View) -> Matrix:
+        seen, pi = controller_of(name, "pi", view)
+        (table,) = (pi.design[output] for output in seen.robot.outputs.names)
+        K, Ti, Ts = table["gains"]["K"], table["gains"]["Ti_s"], seen.recording.sample_time
+        gain = control.TransferFunction(K * np.array([1.0 + Ts / Ti, -1.0]), [1.0, -1.0], Ts)
+        model = softneck.identify("oe", seen.recording, train=1.0, progress=silent)
+        return answered(seen, softneck.design_controller("custom", model, any_fit=True, controller=gain))
+
+    plain = custom(_PLAIN)
+    assert np.ptp(plain) > 0.01
+    for view in (*UNITS[name], *PACES):
+        # As the gains that the search found.
+        np.testing.assert_allclose(custom(view), plain, atol=1e-4, err_msg=str(view))
+
+
 def test_a_gain_in_other_units_than_si_is_remarked() -> None:
-    import control
 
     seen = world("finger", rows=1500)
     model = softneck.identify("oe", seen.recording, train=1.0, progress=silent)

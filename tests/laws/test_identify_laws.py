@@ -10,6 +10,7 @@ import pytest
 
 from softneck import identify
 from softneck.identification import Model
+from softneck.identification.selection._auto import choose
 from softneck.robot import Robot
 from softneck.signals import Recording
 
@@ -62,6 +63,16 @@ def check(label: str, name: str, view: View) -> None:
     )
 
 
+@pytest.mark.nightly
+@pytest.mark.parametrize(("name", "view"), [(name, view) for name in ("finger", "joint")
+                                            for view in (*UNITS[name], *PACES)])  # fmt: skip
+def test_members_that_vote_see_the_same(name: str, view: View) -> None:
+    plain, seen = world(name, rows=ROWS), world(name, view, rows=ROWS)
+    one, other = (identify("guarded", w.recording, train=1.0, members=2, workers=1) for w in (plain, seen))
+    # As for the kinds that vote.
+    np.testing.assert_allclose(seen.simulated(other), plain.simulated(one), rtol=0, atol=1e-6)
+
+
 @cache
 def _seeded(name: str, seed: int) -> Model:
     return identify("nn", world(name, rows=ROWS).recording, train=1.0, seed=seed, **SMALL)
@@ -88,6 +99,23 @@ def test_a_cheap_kind_sees_the_same(label: str, name: str, view: View) -> None:
 @pytest.mark.parametrize("label", DEAR)
 def test_every_kind_sees_the_same(label: str, name: str, view: View) -> None:
     check(label, name, view)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["finger", pytest.param("arm", marks=pytest.mark.nightly)])
+def test_auto_chooses_the_same(name: str) -> None:
+    """Scores are fits of models that agree to 1e-6 of the range: to 1e-3 of a point."""
+
+    def chosen(view: View) -> tuple[str, list[tuple[str, float]]]:
+        seen = world(name, view, rows=1500)
+        found = choose(*seen.recording.split(0.7), kinds=("rls", "oe", "nlsm", "play"))
+        return found.chosen.kind, [(row.kind, row.fit) for row in found.ranking]
+
+    kind, ranking = chosen(View())
+    for view in (*UNITS[name], *PACES, View(prefix="other_")):
+        other, rows = chosen(view)
+        assert (other, [row[0] for row in rows]) == (kind, [row[0] for row in ranking]), view
+        np.testing.assert_allclose([row[1] for row in rows], [row[1] for row in ranking], atol=1e-3, err_msg=str(view))
 
 
 def bent(*, pace: float = 1.0, unit: str = "rad") -> Recording:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from softneck import build_fmu
 from softneck.core import Matrix, Vector, to_si
 from softneck.cosim import Result, simulate
 from softneck.cosim.parts._fmu_part import drive_fmu
+from softneck.fmu import build_compiled_fmu
 
 from .models import model_of
 from .worlds import PACES, PLANTS, UNITS, View, World, orders, world
@@ -121,10 +123,10 @@ def test_a_loop_is_the_same(name: str, view: View) -> None:
     check_loop(name, view)
 
 
-def answer(seen: World, folder: Path) -> Matrix:
+def answer(seen: World, folder: Path, build: Callable[..., Any] = build_fmu) -> Matrix:
     """Return outputs (rows, outputs) of the model's FMU under the recording's set-points."""
     model, path = model_of(seen), folder / "Plant.fmu"
-    build_fmu(model, path)
+    build(model, path)
     names = seen.robot.outputs.names
     ports: dict[str, Any] = {
         variable.name: variable for variable in fmpy.read_model_description(str(path)).modelVariables
@@ -137,12 +139,12 @@ def answer(seen: World, folder: Path) -> Matrix:
     return drive_fmu(path, dict(zip(seen.robot.set_points, part.set_points.T, strict=True)), outputs=names)
 
 
-def check_fmu(name: str, view: View, folder: Path) -> None:
+def check_fmu(name: str, view: View, folder: Path, build: Callable[..., Any] = build_fmu) -> None:
     plain, seen = world(name), world(name, view)
     folders = [folder / end for end in ("plain", "seen")]
     for made in folders:
         made.mkdir()
-    one, other = (answer(w, made) for w, made in zip((plain, seen), folders, strict=True))
+    one, other = (answer(w, made, build) for w, made in zip((plain, seen), folders, strict=True))
     # Sixty steps of rounding; outputs are of the size of their range.
     np.testing.assert_allclose(seen.plain_outputs(other) / spans(name)[0], one / spans(name)[0], rtol=0, atol=1e-9)
 
@@ -156,6 +158,14 @@ def test_an_fmu_does_not_depend_on_units_or_order(name: str, view: View, tmp_pat
 @pytest.mark.parametrize(("name", "view"), VIEWS)
 def test_an_fmu_is_the_same(name: str, view: View, tmp_path: Path) -> None:
     check_fmu(name, view, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PLANTS)
+def test_a_compiled_fmu_is_the_same(name: str, tmp_path: Path) -> None:
+    for i, view in enumerate((UNITS[name][-1], PACES[2], orders(name)[1])):
+        (tmp_path / str(i)).mkdir()
+        check_fmu(name, view, tmp_path / str(i), build_compiled_fmu)
 
 
 def test_the_inverse_of_the_map() -> None:
