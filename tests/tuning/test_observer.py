@@ -89,3 +89,10 @@ def test_what_is_never_certified_beside_recordings_is_searched_to_the_end_where_
     # What has no linear form has no Ms: it is not what stands in the way.
     assert found.binding in found.best.metrics
     assert not found.observed
+
+
+def test_another_range_of_the_motors_is_another_search(task: Task) -> None:
+    """Designs and judgements are kept by the digest, and saturate at the robot's limits."""
+    robot = Robot.from_dict(task.robot.as_dict() | {"motors": task.robot.as_dict()["motors"] | {"rate_limit": 1.0}})
+    assert robot.hash == task.robot.hash
+    assert digest_of(replace(task, robot=robot), ("pi",), None) != digest_of(task, ("pi",), None)
