@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ._budget import MOST_JSON, open_zip
 from ._errors import FileFormatError
-from ._files import as_path, atomic_write, require_file
+from ._files import MOST_JSON, as_path, atomic_write, open_zip, require_file
 
 FORMAT_VERSION = 1
 _HEADER_KEY = "header"

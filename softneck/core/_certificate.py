@@ -17,10 +17,9 @@ from typing import Any
 
 from softneck import __version__
 
-from ._budget import MOST_JSON, settings_text
+from ._display import ReprMixin
 from ._errors import CheckFailedError, FileFormatError
-from ._files import atomic_write, file_hash
-from ._repr import ReprMixin
+from ._files import MOST_JSON, atomic_write, file_hash, settings_text
 
 CERTIFICATE_VERSION = 1
 # The commands that write certificates.

@@ -1,23 +1,23 @@
+from ._loading import find_robot as find_robot
 from ._robot import Robot as Robot
-from ._search import find_robot as find_robot
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._channels import Directions as Directions
 from ._channels import Motors as Motors
 from ._channels import Outputs as Outputs
 from ._channels import is_set_point as is_set_point
 from ._channels import motor_positions_among as motor_positions_among
-from ._directions import Directions as Directions
 from ._file import KEYS as KEYS
 from ._file import OPTIONAL as OPTIONAL
 from ._file import PRESETS as PRESETS
 from ._file import preset_text as preset_text
+from ._loading import FILE as FILE
 from ._loading import load_for_robot as load_for_robot
+from ._loading import robot_file_of as robot_file_of
 from ._scaling import MOTOR_RANGE as MOTOR_RANGE
 from ._scaling import OUTPUT_RANGE as OUTPUT_RANGE
 from ._scaling import TIME_CONSTANT as TIME_CONSTANT
 from ._scaling import Scaling as Scaling
 from ._scaling import round_scaled as round_scaled
 from ._scaling import scaled_robot as scaled_robot
-from ._search import FILE as FILE
-from ._search import robot_file_of as robot_file_of

@@ -13,8 +13,7 @@ from typing import Any
 
 from softneck.core import FileFormatError, SettingsError, SoftneckError, did_you_mean, require_one_of, settings_text
 
-from ._channels import Motors, Outputs
-from ._directions import Directions
+from ._channels import Directions, Motors, Outputs
 
 PRESETS = ("neck", "arm", "antagonist", "finger", "trunk4")
 #: Table -> its keys and their types; "" is the top of the file. "each" is one number for all channels, or a list of one

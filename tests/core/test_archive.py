@@ -144,7 +144,7 @@ def test_every_byte_of_the_first_member_may_be_wrong(tmp_path: Path, at: int) ->
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.core._budget.MOST_UNPACKED", 1000)
+    monkeypatch.setattr("softneck.core._files.MOST_UNPACKED", 1000)
     with pytest.raises(FileFormatError, match="unpacks to"):
         read_archive(archive(tmp_path))
 

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import FileFormatError, SettingsError
-from softneck.core._budget import (
+from softneck.core._files import (
     MOST_COLUMNS,
     MOST_LOG,
     MOST_NUMBERS,
@@ -125,7 +125,7 @@ def test_a_line_without_end_and_zero_bytes_are_no_table_wherever_they_stand(tmp_
 
 
 def test_memory_that_is_not_there_is_not_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.core._budget.available_bytes", lambda: 2**26)
+    monkeypatch.setattr("softneck.core._files.available_bytes", lambda: 2**26)
     require_numbers(tmp_path / "a", 2**23 // 10, 10)
     with pytest.raises(FileFormatError, match=r"needs about 80 MB of memory, and 67\.1 MB are free"):
         require_numbers(tmp_path / "a", 10**6, 10)

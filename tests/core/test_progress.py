@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from softneck.core import silent
-from softneck.core._progress import shown_progress
+from softneck.core._display import shown_progress
 
 
 class Terminal(io.StringIO):
@@ -26,7 +26,7 @@ def terminal_of(monkeypatch: pytest.MonkeyPatch) -> Terminal:
 
 def later(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let two seconds have passed."""
-    monkeypatch.setattr("softneck.core._progress._DELAY_S", -1.0)
+    monkeypatch.setattr("softneck.core._display._DELAY_S", -1.0)
 
 
 def test_what_takes_long_has_a_bar(monkeypatch: pytest.MonkeyPatch) -> None:

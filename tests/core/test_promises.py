@@ -13,8 +13,8 @@ import pytest
 
 from softneck.core import CheckFailedError, FileFormatError, check_certificate, read_archive, read_certificate
 from softneck.core._archive import write_archive
-from softneck.core._budget import MOST_UNPACKED
 from softneck.core._certificate import certificate_contents, certificate_path, write_certificate
+from softneck.core._files import MOST_UNPACKED
 
 DIGEST = hashlib.sha256(b"a controller").hexdigest()
 
@@ -81,8 +81,8 @@ def test_two_gibibytes_are_the_most_that_an_archive_may_unpack_to(
 
     assert MOST_UNPACKED == 2 * 2**30
     # What is packed as well as this is a bomb by its ratio; here the sum decides.
-    monkeypatch.setattr("softneck.core._budget._MOST_RATIO", 2**31)
-    monkeypatch.setattr("softneck.core._budget.available_bytes", lambda: None)
+    monkeypatch.setattr("softneck.core._files._MOST_RATIO", 2**31)
+    monkeypatch.setattr("softneck.core._files.available_bytes", lambda: None)
     monkeypatch.setattr(zipfile.ZipFile, "infolist", enormous)
     if refused:
         with pytest.raises(FileFormatError, match="unpacks"):

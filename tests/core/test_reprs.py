@@ -8,7 +8,7 @@ import inspect
 import pytest
 
 from softneck.core import resolve
-from softneck.core._repr import ReprMixin
+from softneck.core._display import ReprMixin
 
 from ..test_layout import public_names
 from ..verification.necks import linear_neck

@@ -15,7 +15,7 @@ from scipy.optimize import linprog
 
 from softneck.core import SettingsError, load, read_archive, write_archive
 from softneck.design import ControllerLimits, LinearController, PiSettings
-from softneck.robot._redefined import redefinition_of
+from softneck.robot._robot import redefinition_of
 from softneck.runtime import load_functions
 from softneck.signals import redefinition_matrix
 

@@ -48,7 +48,7 @@ def test_members_that_reach_out_are_refused(name: str, tmp_path: Path) -> None:
 
 
 def test_an_archive_that_would_fill_the_disk_is_refused(lag_fmu: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.core._budget.MOST_UNPACKED", 1000)
+    monkeypatch.setattr("softneck.core._files.MOST_UNPACKED", 1000)
     with pytest.raises(FileFormatError, match="unpacks to"):
         unpack(lag_fmu)
 

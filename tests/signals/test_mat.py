@@ -210,7 +210,7 @@ def test_version_4_and_two_variables_of_one_name_are_refused(tmp_path: Path) -> 
 
 
 def test_a_small_file_that_unpacks_to_a_huge_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.core._budget.MOST_UNPACKED", 10_000)
+    monkeypatch.setattr("softneck.core._files.MOST_UNPACKED", 10_000)
     savemat(tmp_path / "a.mat", {"log": np.zeros((2000, 6))}, do_compression=True)
     with pytest.raises(FileFormatError, match="a compressed variable is cut off or too large"):
         mat_arrays(tmp_path / "a.mat")
