@@ -130,7 +130,7 @@ def command(
         print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
-    if limits != SetPointLimits() or changes != type(changes)():
+    if any(value is not None for value in bounds.values()) or changes != type(changes)():
         click.echo(f"set-points: {changes}")
 
 
@@ -160,10 +160,8 @@ def _band(text: str | None) -> tuple[float, float] | None:
 
 
 def _allowed(robot: Robot) -> dict[str, float]:
-    """Return the bounds on set-points that a robot gives [rad], [rad/s]; of the neck those of its signals."""
+    """Return the bounds on set-points that a robot gives [rad], [rad/s]."""
     motors, scale = robot.motors, to_si(robot.motors.unit)[0]
-    if not robot.in_header():
-        return {}
     ends = [*(motors.setpoint_min or ()), *(motors.setpoint_max or ())]
     given = {"position": [abs(end) for end in ends], "speed": motors.rate_limit and [min(motors.rate_limit)]}
     return {name: scale * max(values) for name, values in given.items() if values}

@@ -218,9 +218,8 @@ class VirtualNeck(ReprMixin):
 def _ranges(robot: Robot, limit: float) -> Matrix:
     """Return the least and the largest set-point of each motor [rad]; +-`limit` where none is given."""
     scale, motors = to_si(robot.motors.unit)[0], len(robot.motors.names)
-    given = (robot.motors.setpoint_min, robot.motors.setpoint_max) if robot.in_header() else (None, None)
-    low, high = (np.full(motors, end) if side is None else scale * np.array(side)
-                 for side, end in zip(given, (-limit, limit), strict=True))  # fmt: skip
+    given = zip((robot.motors.setpoint_min, robot.motors.setpoint_max), (-limit, limit), strict=True)
+    low, high = (np.full(motors, end) if side is None else scale * np.array(side) for side, end in given)
     return np.column_stack([low, high])
 
 

@@ -102,8 +102,7 @@ def _channels(robot: Robot) -> dict[str, str]:
 
 def _between_samples(robot: Robot, sample_time: float) -> int:
     """Return how many rows go from one sample of the sensor to the next: 1 unless the robot's is slower."""
-    slow = bool(robot.in_header()) and robot.rate_hz is not None
-    return max(1, round(1.0 / (robot.rate_hz * sample_time))) if slow else 1  # pyright: ignore[reportOptionalOperand]
+    return 1 if robot.rate_hz is None else max(1, round(1.0 / (robot.rate_hz * sample_time)))
 
 
 def _inputs(block: Block, set_points: Matrix, payload: float) -> Matrix:
