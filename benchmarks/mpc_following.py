@@ -30,7 +30,7 @@ from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, OutputError
 from softneck.loop import BlockPart, Loop, LoopResult, Reference, StepReference, metrics, run_loop
-from softneck.loop._reference_parts import AheadReference
+from softneck.loop._references import AheadReference
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.plant import record as record_own
 from softneck.runtime import Block

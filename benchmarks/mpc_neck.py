@@ -36,7 +36,7 @@ from softneck.design.predictive._scale import TAUTNESS_LEVER
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Network
 from softneck.loop import BlockPart, Loop, LoopResult, RecordingReference, run_loop
-from softneck.loop._reference_parts import AheadReference
+from softneck.loop._references import AheadReference
 from softneck.plant import VirtualNeck, record
 from softneck.signals import TENDON_ANGLES, redefinition_matrix, signal
 from tests.oracles.neck_table import NeckSteps

@@ -15,8 +15,8 @@ from . import signals as signals
 from . import tuning as tuning
 from . import verification as verification
 from .core._kinds import load as load
-from .cosim.linear._linearize import linearize as linearize
 from .cosim.loops._simulate import simulate as simulate
+from .cosim.parts._linearize import linearize as linearize
 from .cosim.studies._run_study import study as study
 from .design._design import design_controller as design_controller
 from .estimation._observer import observer as observer

@@ -1,14 +1,14 @@
 from .loops._loop_file import load_loop as load_loop
 from .loops._loop_file import load_ssp as load_ssp
 from .loops._loop_file import make_loop as make_loop
-from .loops._result import Result as Result
 from .loops._simulate import Loop as Loop
+from .loops._simulate import Result as Result
 from .loops._simulate import simulate as simulate
+from .loops._write_ssp import write_ssp as write_ssp
 from .parts._fmu_part import FmuError as FmuError
 from .parts._fmu_part import FmuPart as FmuPart
 from .parts._fmu_part import simulate_fmu_free_run as simulate_fmu_free_run
 from .parts._isolated import IsolatedPart as IsolatedPart
-from .ssp._write import write_ssp as write_ssp
 from .studies._run_study import study as study
 from .studies._store import grouped as grouped
 from .studies._store import pareto_front as pareto_front
@@ -28,8 +28,8 @@ from .loops._loop_file import require_trusted as require_trusted
 from .loops._loop_parts import read_toml as read_toml
 from .loops._simulate import reach_beyond as reach_beyond
 from .loops._simulate import run_setup as run_setup
-from .studies._executors import Crew as Crew
-from .studies._executors import crew as crew
+from .studies._run_study import Crew as Crew
+from .studies._run_study import crew as crew
 from .studies._run_study import run_study as run_study
 from .studies._store import DESCRIPTION as DESCRIPTION
 from .studies._store import pareto_rows as pareto_rows

@@ -15,7 +15,7 @@ from softneck.runtime import Port
 
 from ._faults import Fault, MotorFault, NeckFault, SensorFault, with_kind
 from ._faults_runtime import FAULT_ADD, FAULT_DELAY, FAULT_DROPOUT, FAULT_FREEZE, FAULT_SLOW
-from ._part import Part
+from ._loop import Part
 from ._wiring import BusSignal, Tap, Wiring, measured_names
 
 _NECK = Robot.preset("neck")

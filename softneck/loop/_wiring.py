@@ -16,26 +16,14 @@ from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 
-from ._part import Part
+from ._loop import Link, Part
+from ._references import reference_ports
 
 _HEALTHY = (("observer", "healthy"), ("plant", "measurement_valid"))
 _NECK = Robot.preset("neck")
 _USUAL = ("plant", "observer", "controller", "reference")
 # What holds where nobody says otherwise: measurements are valid, controllers enabled.
 _DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
-
-
-def reference_ports(robot: Robot = _NECK) -> tuple[Port, ...]:
-    """Return the outputs of a reference of `robot`."""
-    outputs, motors = robot.outputs, robot.motors
-    unit, motor = to_si(outputs.unit)[1], to_si(motors.unit)[1]
-    common = f"co-contraction {robot.cocontraction_name} (Eq. 11)" if robot.directions.names else "mean of the motors"
-    return (
-        *(Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}", display_unit=outputs.shown)
-          for name in outputs.names),
-        Port(name="cocontraction_reference", unit=motor, description=f"wanted {common}", display_unit=motors.shown),
-        Port(name="enabled", description="whether the controller may move the motors", start=1.0, boolean=True),
-    )  # fmt: skip
 
 
 def measured_names(robot: Robot) -> tuple[str, ...]:
@@ -49,20 +37,6 @@ def _sources(wanted: str, robot: Robot) -> tuple[tuple[str, str], ...]:
         return _HEALTHY
     bare = wanted.removesuffix("_measured")
     return (("plant", wanted), ("plant", bare)) if wanted != bare and bare in measured_names(robot) else ()
-
-
-@dataclass(frozen=True, slots=True)
-class Link:
-    """A connection that says itself what becomes of the value, whatever the units: factor * value + offset.
-
-    Attributes:
-        origin: "part.output".
-        factor, offset: of the value.
-    """
-
-    origin: str
-    factor: float = 1.0
-    offset: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

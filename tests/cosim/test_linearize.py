@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from softneck.core import Matrix, OutputFileError, SettingsError, SoftneckError, Vector, load
-from softneck.cosim.linear._linearize import SavedBlock, linearize, realised
+from softneck.cosim.parts._linearize import SavedBlock, linearize, realised
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.runtime import Block
 from softneck.signals import redefinition_matrix

@@ -14,8 +14,8 @@ from softneck.cli._main import run
 from softneck.core import FileFormatError, SettingsError, SoftneckError
 from softneck.cosim import FmuPart, load_loop, load_ssp, simulate, study, write_ssp
 from softneck.cosim.loops._loop_file import LoopSetup
-from softneck.cosim.structure._flat import Flat, Line, Ports, flatten
-from softneck.cosim.structure._parse import Affine, Binding, Component, Connection, Structure, SystemNode, Value
+from softneck.cosim.ssp._parse import Affine, Binding, Component, Connection, Structure, SystemNode, Value
+from softneck.cosim.ssp._read import Flat, Line, Ports, flatten
 from softneck.loop._loop import System
 from softneck.runtime import Port
 

@@ -19,7 +19,7 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.cosim import FmuPart, load_loop, simulate, write_ssp
-from softneck.cosim.ssp._write import block_without_python
+from softneck.cosim.loops._write_ssp import block_without_python
 from softneck.design import PiSettings
 from softneck.estimation import KalmanSettings
 from softneck.fmu import build_compiled_fmu, build_fmu

@@ -11,7 +11,7 @@ import pytest
 from softneck.core import SettingsError
 from softneck.cosim import load_ssp, make_loop, simulate, write_ssp
 from softneck.cosim.loops._loop_file import reference_of
-from softneck.cosim.ssp._write import Component, system_description
+from softneck.cosim.loops._write_ssp import Component, system_description
 from softneck.design import design_controller
 from softneck.robot import Robot
 from softneck.robot._file import preset_text

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.cosim.studies._vary import StudyPoints, flattened, make_vary
+from softneck.cosim.studies._study import StudyPoints, flattened, make_vary
 
 
 def points(vary: dict[str, Any], runs: int | None = None, seed: int = 0) -> StudyPoints:

@@ -18,7 +18,7 @@ from softneck.design.predictive import _mpc_state_runtime as rt
 from softneck.design.predictive._scale import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.loop import BlockPart, Loop, RotationReference, run_loop
-from softneck.loop._reference_parts import AheadReference
+from softneck.loop._references import AheadReference
 from softneck.runtime import load_functions, load_runtime
 
 from ..oracles.bake_off import bake_off_neck

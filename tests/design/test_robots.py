@@ -21,8 +21,7 @@ from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays
 from softneck.loop._faults import make_fault
-from softneck.loop._reference_parts import AheadReference
-from softneck.loop._references import make_reference
+from softneck.loop._references import AheadReference, make_reference
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.signals import signal

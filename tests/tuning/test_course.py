@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from softneck.cosim.studies._executors import Crew, Here
+from softneck.cosim.studies._run_study import Crew, Here
 from softneck.robot import Robot
 from softneck.tuning import _search
 from softneck.tuning._judge import Judgement

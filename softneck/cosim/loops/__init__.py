@@ -1,5 +1,5 @@
-"""Loop files: a TOML text becomes a loop, runs, and leaves a result.
+"""Loop files: a TOML text becomes a loop, which runs and has a result, or is written as an SSP archive.
 
 Values are checked as they are read, by key.
-May import `cosim.parts`.
+May import `cosim.parts` and `cosim.ssp`.
 """

@@ -23,7 +23,7 @@ from softneck.robot import Robot, find_robot
 
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
-from ..structure._table import StructureTable, read_ssp
+from ..ssp._read import StructureTable, read_ssp
 from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener, links, number, numbers, read_toml, refuse_unknown, tables
 
 

@@ -1,4 +1,4 @@
-"""FMUs as parts of a loop, in this process or in one of their own.
+"""FMUs as parts of a loop, in this process or in one of their own, and linear systems near a moment.
 
 All FMI calls of ours are made here.
 May import `fmu`.

@@ -1,5 +1,5 @@
-"""A loop as an SSP 1.0 archive for other masters.
+"""Read system structures of SSP archives (SSP 1.0 and 2.0) as tables of loop files.
 
-The system structure is written here and nowhere else.
-May import `cosim.parts` and `cosim.loops`.
+An archive from outside is opened as if hostile.
+May import `cosim.parts`.
 """

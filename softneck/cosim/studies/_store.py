@@ -29,8 +29,7 @@ from softneck.core import (
 )
 
 from ..loops._loop_parts import OBJECT
-from ._study import Study
-from ._vary import Vary
+from ._study import Study, Vary
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -24,8 +24,8 @@ from softneck.identification import remove_unreachable_states
 from softneck.loop import BlockPart
 from softneck.runtime import Block, Port, State, TangentError, load_tangent
 
-from ..parts._fmu_part import FmuPart
-from ..parts._variables import block_of
+from ._fmu_part import FmuPart
+from ._variables import block_of
 
 if TYPE_CHECKING:
     import control
@@ -162,7 +162,7 @@ def _opened(
 def _says_role(path: str | Path) -> bool:
     from softneck.fmu import unpacked
 
-    from ..parts._variables import read_description
+    from ._variables import read_description
 
     with unpacked(Path(path)) as folder:
         return bool(read_description(Path(path), folder, {}).annotation.role)

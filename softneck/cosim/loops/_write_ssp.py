@@ -17,10 +17,10 @@ from softneck.loop import USE_MOTOR_POSITIONS, BlockPart, Link, Loop, Part, Refe
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
-from ..loops._loop_file import LoopSetup
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ..parts._variables import python_block, read_description
+from ._loop_file import LoopSetup
 
 _SPACES = {
     "xmlns:ssd": "http://ssp-standard.org/SSP1/SystemStructureDescription",
