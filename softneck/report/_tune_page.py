@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from softneck.design import assumed_lines
 from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, looks, page
 from softneck.tuning import step_response
+from softneck.verification import metric_title
 
 if TYPE_CHECKING:
     from softneck.tuning import Candidate, Tuned
@@ -46,12 +47,14 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
             # Of the loops that only tuning looks at: noise, another dead time.
             value, holds = seen, bool(holds) and item.holds(seen)
         said = "-" if holds is None else "holds" if holds else "fails"
-        rows.append([item.metric, _SIGNS[item.bound], f"{item.limit:g}", _text(value), said, verdict.note])
+        rows.append(
+            [metric_title(item.metric), _SIGNS[item.bound], f"{item.limit:g}", _text(value), said, verdict.note]
+        )
     for item in found.task.asked.bounds:
         if item.metric.startswith("track."):
             value = found.best.metrics.get(item.metric)
             said = "-" if value is None else "holds" if item.holds(value) else "fails"
-            rows.append([item.metric, _SIGNS[item.bound], f"{item.limit:g}", _text(value), said, ""])
+            rows.append([metric_title(item.metric), _SIGNS[item.bound], f"{item.limit:g}", _text(value), said, ""])
     return rows
 
 

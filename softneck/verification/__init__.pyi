@@ -17,6 +17,7 @@ from ._linear import ControllerUnderTest as ControllerUnderTest
 from ._linear import judge as judge
 from ._linear import judged as judged
 from ._linear import margins as margins
+from ._metric_titles import metric_title as metric_title
 from ._neck_loops import ALONE as ALONE
 from ._neck_loops import OwnPlant as OwnPlant
 from ._neck_loops import direction as direction

@@ -13,6 +13,7 @@ from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
+from ._metric_titles import metric_title
 from ._neck_loops import NeckRun, direction
 from ._plants import Plants, mixing
 from ._scale import Scale
@@ -193,7 +194,7 @@ def verdict_table(found: Verification) -> Table:
     axes = found.controller.robot.outputs.names
     rows = [
         [
-            verdict.requirement.metric, number(verdict.value),
+            metric_title(verdict.requirement.metric), number(verdict.value),
             f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _word(verdict),
             _plant(verdict, axes),
         ]
@@ -260,8 +261,8 @@ def _sentence(found: Verification) -> str:
     """Return the verdict: what holds, and what fails where."""
     axes = found.controller.robot.outputs.names
     failed = [
-        f"{v.requirement.metric} is {number(v.value)}, asked {_BOUNDS[v.requirement.bound]} {v.requirement.limit:g} "
-        f"({_plant(v, axes)})"
+        f"{metric_title(v.requirement.metric)} is {number(v.value)}, required {_BOUNDS[v.requirement.bound]} "
+        f"{v.requirement.limit:g} ({_plant(v, axes)})"
         for v in found.failed
     ]
     count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"

@@ -13,7 +13,8 @@ import pytest
 from softneck.core import DataError, SettingsError
 from softneck.core._certificate import required_rows
 from softneck.loop import LoopResult, metrics
-from softneck.verification import make_requirements
+from softneck.robot import Robot
+from softneck.verification import make_requirements, metric_names, metric_title
 from softneck.verification._linear import LinearLaw, classical, judged
 from softneck.verification._plants import all_plants, join, make_plants, neck_of_family, neck_of_model, nominal_plants
 from softneck.verification._requirements import Requirement
@@ -280,3 +281,12 @@ def test_files_of_before_say_neck_for_what_is_sim_now() -> None:
     assert old.sim == new.sim
     rows = required_rows({"requirements": [{"metric": "neck.slack_s", "holds": True}]})
     assert [row["metric"] for row in rows] == ["sim.slack_s"]
+
+
+@pytest.mark.parametrize("robot", ["neck", "arm"])
+def test_every_metric_has_a_plain_name_of_its_own_beside_its_key(robot: str) -> None:
+    metrics = metric_names(Robot.preset(robot), track=True)
+    titles = [metric_title(metric) for metric in metrics]
+    assert all(title.endswith(f" ({metric})") for title, metric in zip(titles, metrics, strict=True))
+    assert len({title.rpartition(" (")[0] for title in titles}) == len(titles)
+    assert metric_title("axes.gain_margin") == "gain margin, worst axis (axes.gain_margin)"
