@@ -21,7 +21,7 @@ from softneck.identification import OutputError, Rls, validate
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 from softneck.signals.importing._clocks import filled
-from softneck.signals.recording._resampling import Samples, gaps, split_at_gaps
+from softneck.signals.recording._resampling import Samples, find_gaps, split_at_gaps
 
 HOLES = (1.02, 1.05, 1.1, 1.15, 1.2, 1.3, 1.5)
 SIZES = (300, 3000)
@@ -75,7 +75,7 @@ def cost(clock: Clock, hole: float, seeds: int) -> tuple[float, float, float]:
 
 
 def _gaps(time: Vector, hole: float) -> np.ndarray:
-    return gaps(Samples(time, np.zeros(time.size, dtype=np.int64), {}), hole)[0]
+    return find_gaps(Samples(time, np.zeros(time.size, dtype=np.int64), {}), hole)[0]
 
 
 def models(seeds: int) -> None:

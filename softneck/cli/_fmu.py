@@ -156,12 +156,12 @@ def _has_sensitivities(block: Block) -> bool:
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:
     """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
     from softneck.identification import Model, validate
-    from softneck.signals import opened_recording
+    from softneck.signals import open_recording
 
     if not isinstance(thing, Model):
         return None
     names = (Path(source).name, ", ".join(path.name for path in data))
-    return validate(thing, opened_recording(data, robot), names=names)
+    return validate(thing, open_recording(data, robot), names=names)
 
 
 def _what(files: tuple[str, ...], output: Path | None, *, force: bool) -> tuple[list[tuple[str | Path, Path]], bool]:

@@ -83,7 +83,7 @@ def command(
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
     from softneck.identification import identified
-    from softneck.signals import opened_recording, poor_excitation, stands_still
+    from softneck.signals import open_recording, poor_excitation, why_at_rest
 
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
@@ -108,7 +108,7 @@ def command(
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    whole = opened_recording(recordings, robot)
+    whole = open_recording(recordings, robot)
     with progress(f"identify {kind}", quiet=as_json) as report:
         model, held_out = identified(estimator, whole, train=train, tolerance=tolerance, progress=report)
     model.save(path, force=replace)
@@ -123,7 +123,7 @@ def command(
         click.echo("\n".join(poor), nl=bool(poor))
     why = None if held_out is None else useless(held_out)
     if why is not None:
-        still = tail and stands_still(tail, whole)
+        still = tail and why_at_rest(tail, whole)
         why, advice = still or why, "" if still or held_out is None else left_out(held_out)
         advice = advice or (poor[0] if poor else _ANOTHER)
         raise CheckFailedError(f"{path}: no model of the rows held out: {why}. {advice}")
@@ -154,7 +154,7 @@ def adapt(
     robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Refit MODEL to the latest data, starting from what it is; write the model, and say what became of it."""
-    from softneck.signals import opened_recording
+    from softneck.signals import open_recording
 
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
@@ -163,7 +163,7 @@ def adapt(
         raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; what is refitted stays what it is.")
     window = float(apply_settings(_Adaptation, settings).window)
     require_positive("window", window, "s")
-    new = old.adapted(opened_recording(recordings, robot), window=window)
+    new = old.adapted(open_recording(recordings, robot), window=window)
     new.save(path, force=replace)
     said = new.findings["adaptation"]
     if as_json:

@@ -154,7 +154,7 @@ def command(
     `softneck drives run --log` needs neither layout nor guess.
     """
     from softneck.robot import find_robot, robot_file_of
-    from softneck.signals import NamedColumns, import_log, is_run_log, read_layout, recording_suffix, said_robot
+    from softneck.signals import NamedColumns, import_log, is_run_log, read_layout, recording_suffix, robot_in_file
 
     named = NamedColumns(motors, outputs, positions) if motors or outputs or positions else None
     asked = guess or layout_file is not None or robot_out is not None or named is not None
@@ -177,7 +177,7 @@ def command(
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
         if robot_out.suffix.lower() != ".toml":
             raise SettingsError(f"{robot_out}: must end in `.toml`, by which softneck recognises the file.")
-        if (said := said_robot(log, log.suffix.lower())) is not None:
+        if (said := robot_in_file(log, log.suffix.lower())) is not None:
             raise SettingsError(f"{log}: is a recording of robot {said.label()} already, which commands take as it is.")
         guess = named is None
     if not alone and named is None and guess == (layout_file is not None):

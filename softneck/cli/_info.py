@@ -119,13 +119,13 @@ def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
 def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     match file.suffix.lower():
         case ".csv" | ".parquet":
-            from softneck.signals import said_robot
+            from softneck.signals import robot_in_file
 
             try:
                 return _recording(file, html, force=force, quiet=quiet)
             except (DataError, FileFormatError) as error:
                 # What says whose recording it is cannot be a logger's table.
-                if said_robot(file, file.suffix.lower()) is not None:
+                if robot_in_file(file, file.suffix.lower()) is not None:
                     raise
                 return _log(file, html, error)
         case ".npz":

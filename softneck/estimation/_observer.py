@@ -9,7 +9,7 @@ from typing import Any
 from softneck.core import make_settings
 from softneck.identification import Model
 from softneck.robot import Robot, load_for_robot
-from softneck.signals import Recording, RecordingLike, opened_recording
+from softneck.signals import Recording, RecordingLike, open_recording
 
 from ._axis import HasTransferFunctions
 from ._fitted import AnyObserver, FittedObserver, fitted_observer
@@ -48,7 +48,7 @@ def observer(
     if data is None:
         return made
     parts = data if isinstance(data, list | tuple) else [data]
-    return fitted(made, [opened_recording(part, robot) for part in parts], settings).observer
+    return fitted(made, [open_recording(part, robot) for part in parts], settings).observer
 
 
 def designed(settings: KalmanSettings, model: Any, robot: Robot | str | Path | None) -> AnyObserver:

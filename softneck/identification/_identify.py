@@ -30,10 +30,10 @@ from softneck.signals import (
     RecordingLike,
     concatenate,
     conditions,
-    names_of,
-    opened_recording,
+    open_recording,
+    recording_names,
     signal,
-    stands_still,
+    why_at_rest,
 )
 
 from .models._fitting import check_training, payload_of
@@ -93,7 +93,7 @@ def _recording(source: Any) -> Recording:
         return _played(source, "the model")
     if isinstance(source, str | Path) and Path(source).suffix == ".npz":
         return _played(load(source, role="model"), source)
-    return opened_recording(source)
+    return open_recording(source)
 
 
 def _played(model: Model, source: str | Path) -> Recording:
@@ -164,7 +164,7 @@ def identify(
     if isinstance(kind, str) and kind == "auto":
         return _best_kind(recording, train=train, robot=robot, tolerance=tolerance, progress=progress, **settings)
     estimator = make_settings(resolve(find_kind(kind, "model").settings), settings)
-    whole = opened_recording(recording, robot)
+    whole = open_recording(recording, robot)
     with shown_progress(f"identify {kind}", progress) as tell:
         return identified(estimator, whole, train=train, tolerance=tolerance, progress=tell)[0]
 
@@ -198,10 +198,10 @@ def _best_kind(
         raise SettingsError(f"`auto` has no setting {next(iter(others))!r}; use seed.")
     listed: Sequence[Any] = recording if isinstance(recording, list | tuple) else [recording]
     with shown_progress("identify auto", progress) as tell:
-        parts = [opened_recording(part, robot) for part in listed]
+        parts = [open_recording(part, robot) for part in listed]
         if not parts:
             raise DataError("`auto` needs at least one recording; got an empty list.")
-        choice = choose_kind(parts, name=names_of(listed)[-1], train=train, seed=seed, progress=tell)
+        choice = choose_kind(parts, name=recording_names(listed)[-1], train=train, seed=seed, progress=tell)
     model = choice.chosen.model
     if model is None:
         raise DataError("the kind chosen by `auto` has no model.")
@@ -218,7 +218,7 @@ def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: in
     """
     head, tail, other = _split_for_choice(parts, train)
     check_training(head)
-    still = stands_still(tail, concatenate(parts))
+    still = why_at_rest(tail, concatenate(parts))
     if still is not None:
         raise DataError(f"{name}: {still}. Record motion to the end, or hold out other rows by `train`.")
     return choose(head, tail, other_excitation=other, seed=seed, progress=progress)
@@ -286,9 +286,9 @@ def family(
     """
     chosen: FamilySettings = make_settings(FamilySettings, settings)
     listed: Sequence[Any] = recordings if isinstance(recordings, list | tuple) else [recordings]
-    parts = [opened_recording(part, robot) for part in listed]
+    parts = [open_recording(part, robot) for part in listed]
     files = [part for part in listed if isinstance(part, str | Path)]
     with shown_progress("family", progress) as tell:
-        found = chosen.fit(parts, names=names_of(listed), progress=tell)
+        found = chosen.fit(parts, names=recording_names(listed), progress=tell)
     found.findings["files"] = {str(source): file_hash(source) for source in files}
     return found

@@ -30,8 +30,8 @@ def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
         y[border] = np.nan
         curves = [Curve(t, y, colour=GREY, width=0.7)]
         for sort, colour in _FAULTS:
-            if stretches := getattr(quality.channels[name], sort)[:_MOST_MARKED]:
-                rows = [np.arange(one.start, one.stop) for one in stretches]
+            if segments := getattr(quality.channels[name], sort)[:_MOST_MARKED]:
+                rows = [np.arange(one.start, one.stop) for one in segments]
                 curves.append(_marked(t, _values(recording, name), rows, sort, colour))
         panels.append(Panel(curves, f"{name.replace('_', ' ')} [{quality.channels[name].unit}]"))
     return Chart(title, panels, "time from the first row [s]", row_height=2.0)
@@ -112,7 +112,7 @@ def _channels(quality: Quality) -> Table:
         shown = channel.as_dict()
         counts = [str(shown[f"{sort}_rows"]) for sort in ("missed", "frozen", "clipped", "outliers")]
         numbers = [_number(shown[key]) for key in ("lowest", "highest")]
-        tail = [_number(shown["quantum"]), "-" if channel.command else _number(shown["noise_std"])]
+        tail = [_number(shown["quantum"]), "-" if channel.is_command else _number(shown["noise_std"])]
         rows.append([name, *numbers, channel.unit, *tail, *counts])
     return Table("Channels: steps and noise in the channel's unit, faults in rows", head, rows)
 

@@ -1,10 +1,10 @@
-from .excitation._limits import SetPointLimits as SetPointLimits
-from .excitation._limits import prepare as prepare
-from .excitation._signals import SAMPLE_TIME as SAMPLE_TIME
-from .excitation._signals import Excitation as Excitation
-from .excitation._signals import multisine_experiments as multisine_experiments
-from .excitation._signals import signal as signal
-from .excitation._signals import signal_names as signal_names
+from ._excitation import SAMPLE_TIME as SAMPLE_TIME
+from ._excitation import Excitation as Excitation
+from ._excitation import SetPointLimits as SetPointLimits
+from ._excitation import multisine_experiments as multisine_experiments
+from ._excitation import prepare as prepare
+from ._excitation import signal as signal
+from ._excitation import signal_names as signal_names
 from .importing._guess import Guess as Guess
 from .importing._guess import guess_layout as guess_layout
 from .importing._layout import Layout as Layout
@@ -27,7 +27,7 @@ from .recording._resampling import resampled as resampled
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
-from .excitation._limits import Changes as Changes
+from ._excitation import Changes as Changes
 from .importing._clocks import pitch_roll as pitch_roll
 from .importing._doubts import ONE_AXIS as ONE_AXIS
 from .importing._doubts import Doubt as Doubt
@@ -47,22 +47,22 @@ from .quality._channel_faults import check_channel as check_channel
 from .quality._excitation import BANDWIDTH as BANDWIDTH
 from .quality._excitation import independent_motions as independent_motions
 from .quality._excitation import poor_excitation as poor_excitation
-from .quality._excitation import stands_still as stands_still
+from .quality._excitation import why_at_rest as why_at_rest
 from .recording._channels import NECK as NECK
 from .recording._channels import OUTPUTS as OUTPUTS
 from .recording._channels import file_unit as file_unit
 from .recording._channels import is_held as is_held
 from .recording._channels import known_channels as known_channels
 from .recording._files import RecordingLike as RecordingLike
-from .recording._files import names_of as names_of
-from .recording._files import opened_recording as opened_recording
+from .recording._files import open_recording as open_recording
+from .recording._files import recording_names as recording_names
 from .recording._files import recording_suffix as recording_suffix
-from .recording._files import said_robot as said_robot
+from .recording._files import robot_in_file as robot_in_file
 from .recording._labelled import Labelled as Labelled
 from .recording._labelled import dataset as dataset
 from .recording._labelled import signals_figure as signals_figure
 from .recording._labelled import table as table
 from .recording._recording import conditions as conditions
-from .recording._recording import joined as joined
+from .recording._recording import merge_conditions as merge_conditions
 from .recording._recording import require_same_robot as require_same_robot
-from .recording._scaled import scaled_recording as scaled_recording
+from .recording._recording import scale_recording as scale_recording

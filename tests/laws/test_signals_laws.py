@@ -10,7 +10,7 @@ import pytest
 
 from softneck.robot import Robot
 from softneck.signals import assess_quality, signal, signal_names
-from softneck.signals.quality._excitation import explained, poor_excitation
+from softneck.signals.quality._excitation import explained_variance, poor_excitation
 
 from .worlds import PACES, PLANTS, UNITS, View, World, orders, without_limits, world
 
@@ -64,7 +64,9 @@ def test_what_motors_explain_is_the_same_without_limits_too(name: str, view: Vie
     plain, seen = (without_limits(world(name, v)) for v in (View(), view))
     order = list(view.outputs or range(len(seen.robot.outputs.names)))
     # Least squares on data that differ by rounding: singular values near the cut are left out on both sides.
-    np.testing.assert_allclose(explained(seen.recording), explained(plain.recording)[order], rtol=1e-6)
+    np.testing.assert_allclose(
+        explained_variance(seen.recording), explained_variance(plain.recording)[order], rtol=1e-6
+    )
     assert len(poor_excitation(seen.recording)) == len(poor_excitation(plain.recording))
 
 

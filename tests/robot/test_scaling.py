@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from softneck.robot import Robot
 from softneck.robot._scaling import Scaling
 from softneck.signals import Recording
-from softneck.signals.recording._scaled import scaled_recording
+from softneck.signals.recording._recording import scale_recording
 
 SIZES = st.floats(1e-6, 1e6)
 
@@ -52,7 +52,7 @@ def test_scaled_data_are_the_same_to_the_bit_in_every_unit(motor: str, shown: st
         # Through the numbers of a file in that unit and back.
         rows = ((U / per[unit]) * per[unit], (Y / out[display]) * out[display])
         recording = Recording.from_arrays(*rows, sample_time=0.01 * slower, robot=robot)
-        return scaled_recording(recording, Scaling.of(robot, set_points=rows[0], outputs=rows[1],
+        return scale_recording(recording, Scaling.of(robot, set_points=rows[0], outputs=rows[1],
                                                       time_constant=0.1 * slower))  # fmt: skip
 
     one, other = scaled("Pa", "rad", 1.0), scaled(motor, shown, 1000.0)

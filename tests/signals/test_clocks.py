@@ -18,7 +18,7 @@ from softneck.signals.importing._guess_units import judge
 from softneck.signals.importing._layout import Source, Term
 from softneck.signals.importing.formats._dates import is_date, seconds
 from softneck.signals.importing.formats._mat import mat_arrays
-from softneck.signals.recording._resampling import Samples, gaps
+from softneck.signals.recording._resampling import Samples, find_gaps
 
 from ..data import neck_recording
 from .log_writers import from_angles
@@ -174,18 +174,18 @@ def test_two_rows_at_once_are_no_gap(tmp_path: Path) -> None:
     k = np.arange(600)
     time = 0.02 * (k + np.where(k % 20 == 7, 0.9, 0.0))
     samples = Samples(time, np.zeros(600, dtype=np.int64), {})
-    assert not gaps(samples)[0].any()
-    assert gaps(samples.rows(k != 300))[0].sum() == 1
+    assert not find_gaps(samples)[0].any()
+    assert find_gaps(samples.rows(k != 300))[0].sum() == 1
 
 
 def test_a_clock_of_exact_steps_has_a_gap_where_one_is_twice_as_long() -> None:
     k = np.delete(np.arange(100), 50)
-    assert gaps(Samples(0.25 * k, np.zeros(99, dtype=np.int64), {}))[0].nonzero()[0].tolist() == [49]
+    assert find_gaps(Samples(0.25 * k, np.zeros(99, dtype=np.int64), {}))[0].nonzero()[0].tolist() == [49]
 
 
 def test_a_pause_of_more_than_four_usual_steps_is_a_gap_on_a_clock_of_steps_of_all_lengths() -> None:
     # Each 1.1 times the one before, none beside another: no hole tells any of them from the others.
     steps = np.ones(400)
     steps[5:165:10] = 1.1 ** np.arange(1, 17)
-    found = gaps(Samples(np.cumsum(steps), np.zeros(400, dtype=np.int64), {}))[0]
+    found = find_gaps(Samples(np.cumsum(steps), np.zeros(400, dtype=np.int64), {}))[0]
     np.testing.assert_array_equal(found, steps[1:] >= 4.0)

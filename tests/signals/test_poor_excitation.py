@@ -8,7 +8,7 @@ import pytest
 from softneck.core import DataError
 from softneck.identification import Network, OutputError, Play
 from softneck.signals import Recording, redefinition_matrix, signal
-from softneck.signals.quality._excitation import explained, independent_motions, poor_excitation, stands_still
+from softneck.signals.quality._excitation import explained_variance, independent_motions, poor_excitation, why_at_rest
 
 from ..data import neck_recording, recording_from
 
@@ -68,7 +68,7 @@ def test_rows_held_out_that_stand_still_are_named() -> None:
     P[50:] = [3.0, -1.0, 0.5]
     step = recording_from(P, noise=0.0)
     _, rest = step.split(0.7)
-    said = stands_still(rest, step)
+    said = why_at_rest(rest, step)
     assert said is not None
     assert said.startswith("the rows held out stand still: pitch moves by ")
     # A motion of a twentieth is enough, whatever its size in degrees.
@@ -76,17 +76,17 @@ def test_rows_held_out_that_stand_still_are_named() -> None:
     pitch[560:] += 0.051 * pitch.std() * np.sqrt(2.0) * np.sin(np.arange(240) * np.pi / 10.0)
     roll = step.channels["roll"] + pitch
     moved = step.with_channels(pitch=pitch, roll=roll)
-    assert stands_still(moved.split(0.7)[1], moved) is None
+    assert why_at_rest(moved.split(0.7)[1], moved) is None
     _, tail = GOOD.split(0.7)
-    assert stands_still(tail, GOOD) is None
+    assert why_at_rest(tail, GOOD) is None
 
 
 def test_what_motors_explain_is_what_is_left_of_the_variance_without_noise() -> None:
     half = float(GOOD.outputs[:, 0].std())
     noisy = GOOD.with_channels(pitch=GOOD.outputs[:, 0] + half * np.random.default_rng(0).standard_normal(len(GOOD)))
-    clean, shared = explained(GOOD)[0], explained(noisy)[0]
+    clean, shared = explained_variance(GOOD)[0], explained_variance(noisy)[0]
     assert clean > 0.9  # the lags are an octave apart: a pole between them is met to a tenth
-    # Noise as large as the motion halves what is explained; 30 coefficients on half of 1,500 rows cost some percent.
+    # Noise as large as the motion halves the explained share; 30 coefficients on half of 1,500 rows cost some percent.
     assert shared == pytest.approx(0.5 * clean, abs=0.08)
 
 
@@ -97,7 +97,7 @@ def test_a_motion_that_hardly_shows_where_it_is_fitted_does_not_hide_that_output
     V = GOOD.set_points @ redefinition_matrix().T
     V[:, 2] = np.sin(0.05 * rows) * np.where(rows * 10 // len(GOOD) % 2 == 1, 1.0, small)
     recording = recording_from(V @ np.linalg.inv(redefinition_matrix()).T, noise=2e-3)
-    assert (explained(recording) > 0.9).all()
+    assert (explained_variance(recording) > 0.9).all()
     assert poor_excitation(recording) == ()
 
 

@@ -202,7 +202,7 @@ def test_another_robot_is_judged_by_its_channels() -> None:
     assert "co-contraction" not in {finding.topic for finding in found.findings}
     unknown = assess_quality(other)
     assert [f.message for f in unknown.findings if f.topic == "excitation"] == [
-        "nothing is known of how fast the outputs follow the motors: the spectrum is not judged."
+        "the bandwidth of the outputs is unknown: the spectrum is not judged."
     ]
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.signals import Recording, assess_quality
-from softneck.signals.quality._channel_faults import ChannelQuality, Stretch
+from softneck.signals.quality._channel_faults import ChannelQuality, Segment
 from softneck.signals.recording._channels import OUTPUTS
 
 from ..data import neck_recording
@@ -23,7 +23,7 @@ def channel(recording: Recording, name: str) -> ChannelQuality:
     return assess_quality(recording).channels[name]
 
 
-def rows(stretches: tuple[Stretch, ...]) -> set[int]:
+def rows(stretches: tuple[Segment, ...]) -> set[int]:
     return {row for stretch in stretches for row in range(stretch.start, stretch.stop)}
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 from softneck.robot import Scaling
-from softneck.signals import Recording, scaled_recording
+from softneck.signals import Recording, scale_recording
 
 from ._directions import NECK_SECONDS, Directions, directions_of
 from ._drive import LoadedDrive, fit_loaded_drive
@@ -62,10 +62,10 @@ class Door:
             scaling = replace(scaling, motor_unit=1.0, motor_rest=zero, output_unit=one, output_rest=0.0 * one)
         if alike:
             scaling = replace(scaling, output_unit=np.full_like(scaling.output_unit, scaling.output_unit.max()))
-        plain = scaled_recording(recording, replace(scaling, second=1.0))
+        plain = scale_recording(recording, replace(scaling, second=1.0))
         found = directions_of(plain, [run.set_points for run in plain.runs()], robot)
         scaling = replace(scaling, second=found.time_constant / NECK_SECONDS)
-        return cls(recording, scaled_recording(recording, scaling), scaling,
+        return cls(recording, scale_recording(recording, scaling), scaling,
                    replace(found, seconds=found.seconds / scaling.second))  # fmt: skip
 
     @property
@@ -106,7 +106,7 @@ class Door:
 
     def scaled(self, recording: Recording) -> Recording:
         """Return another recording of the robot in the same quantities."""
-        return scaled_recording(recording, self.scaling)
+        return scale_recording(recording, self.scaling)
 
     def model(
         self, kind: str, settings: DataclassInstance, in_si: Convert, *, arrays: Mapping[str, Matrix],

@@ -30,7 +30,7 @@ from softneck.core import (
 from softneck.core import load as load_file
 from softneck.robot import Robot
 from softneck.runtime import Block, State
-from softneck.signals import Labelled, Recording, RecordingLike, opened_recording, require_same_robot
+from softneck.signals import Labelled, Recording, RecordingLike, open_recording, require_same_robot
 
 from . import _linear_systems as _linear
 from . import _ports
@@ -237,7 +237,7 @@ class Model(ReprMixin):
             U = finite_matrix("set_points", recording, self._sizes[0])
             recording = Recording.from_arrays(U, sample_time=self.sample_time, robot=self.robot)
         else:
-            recording = opened_recording(recording)
+            recording = open_recording(recording)
         self.check(recording)
         return recording
 

@@ -11,7 +11,7 @@ import numpy as np
 from softneck.core import to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
-from softneck.signals import Recording, conditions, joined
+from softneck.signals import Recording, conditions, merge_conditions
 
 #: What may hang on the platform [kg], as on the virtual neck's.
 MOST_PAYLOAD = 5.0
@@ -91,7 +91,7 @@ def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any
     rows = np.vstack([np.zeros((1, seen[0].shape[1])), *seen])
     found = {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}
     made = [conditions(part) if isinstance(part, Recording) else part.get("conditions", {}) for part in sources]
-    return {_TRAINED: found, "conditions": joined([part for part in made if part])}
+    return {_TRAINED: found, "conditions": merge_conditions([part for part in made if part])}
 
 
 def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:

@@ -24,7 +24,7 @@ from softneck.core import (
     silent,
 )
 from softneck.robot import Robot, Scaling
-from softneck.signals import Recording, scaled_recording
+from softneck.signals import Recording, scale_recording
 
 from ..models._door import Door
 from ..models._drive import DriveModel, fit_drive
@@ -325,7 +325,7 @@ class SetMembership:
 def noise_si(recording: Recording) -> Vector:
     """Return `noise_level` of each output (outputs,) of a recording in SI, in SI."""
     scaling = Scaling.of(recording.robot, set_points=recording.set_points, outputs=recording.outputs)
-    return scaling.output_unit * noise_levels(scaled_recording(recording, replace(scaling, second=1.0)))
+    return scaling.output_unit * noise_levels(scale_recording(recording, replace(scaling, second=1.0)))
 
 
 def noise_levels(recording: Recording) -> Vector:

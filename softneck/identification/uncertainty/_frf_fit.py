@@ -10,7 +10,7 @@ import numpy as np
 
 from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector, require_between, require_one_of, to_si
 from softneck.robot import Robot
-from softneck.signals import Recording, RecordingLike, concatenate, opened_recording
+from softneck.signals import Recording, RecordingLike, concatenate, open_recording
 
 from ..linear._oe import SOURCES
 from ._local_polynomial import (
@@ -270,7 +270,7 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
         >>> found.outputs, found.own_input("pitch")
         (('pitch', 'roll'), 'theta_i')
     """
-    parts = [opened_recording(item) for item in (recordings if isinstance(recordings, list | tuple) else [recordings])]
+    parts = [open_recording(item) for item in (recordings if isinstance(recordings, list | tuple) else [recordings])]
     require_one_of("source", source, SOURCES)
     whole = concatenate(parts)
     robot, sample_time = whole.robot, whole.sample_time

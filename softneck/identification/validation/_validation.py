@@ -22,7 +22,7 @@ from softneck.core import (
     silent,
 )
 from softneck.robot import Robot, load_for_robot
-from softneck.signals import Recording, RecordingLike, opened_recording
+from softneck.signals import Recording, RecordingLike, open_recording
 
 from ..models._model import Model
 from ..models._validity import with_tolerance
@@ -256,7 +256,7 @@ def validate(
         model_name, data_name = (str(of) if isinstance(of, str | Path) else None for of in (model, recording))
         names = (model_name or "model", data_name or "data")
     judged: Model = load_for_robot(model, "model")
-    parts = judged_parts(judged, opened_recording(recording), rules)
+    parts = judged_parts(judged, open_recording(recording), rules)
     return judge(judged, parts, rules, names=names)
 
 

@@ -13,7 +13,7 @@ from softneck.core import DataError, Matrix, Vector, to_si
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, is_held, may_miss
 from ..recording._files import numbers
-from ..recording._resampling import Samples, gaps
+from ..recording._resampling import Samples, find_gaps
 from ._layout import Layout, Source
 from .formats._dates import DATE, EPOCH, seconds
 
@@ -186,7 +186,7 @@ def filled(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Sam
     if not steps.size:
         return samples, ()
     usual = step / float(np.median(steps))
-    gap, lost = gaps(samples)[0], np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
+    gap, lost = find_gaps(samples)[0], np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
     # A clock that jitters loses nothing: its long steps are no whole numbers of usual ones.
     few = gap & (lost >= 1) & (lost <= _FEW) & (np.abs(usual - lost - 1) < _WHOLE)
     seldom = few.sum() < _OFTEN or few.sum() < _NEARLY_ALL * gap.sum() or samples.time.size > _PIECE * few.sum()

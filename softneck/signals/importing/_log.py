@@ -13,7 +13,7 @@ from softneck.core import DataError, SettingsError, SoftneckError, Vector, as_pa
 
 from ..recording._channels import may_miss
 from ..recording._files import integers, numbers, read_table
-from ..recording._recording import Recording, check_rising, median_step, uneven
+from ..recording._recording import Recording, check_rising, median_step, uneven_steps
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
 from ._clocks import clocked, estimate_sample_time, filled, integrated, merged, pitch_roll, time_of, turns
 from ._layout import Column, Layout, Source
@@ -214,7 +214,7 @@ def _sample_time(
 
 def _evened(samples: Samples, nominal: float, notes: tuple[str, ...]) -> tuple[Samples, float, tuple[str, ...]]:
     """Return equidistant samples as they are, and others resampled at their mean step."""
-    if not uneven(samples.time, nominal, samples.run).any():
+    if not uneven_steps(samples.time, nominal, samples.run).any():
         return samples, nominal, notes
     step = 1e3 * np.diff(samples.time)[np.diff(samples.run) == 0]
     sample_time = mean_step(samples)
@@ -233,7 +233,7 @@ def _recounted(
     whose = "the estimated" if layout.estimate else "the layout's"
     if abs(nominal - sample_time) > 1e-3 * sample_time:
         notes += (f"the time column says {1e3 * nominal:g} ms a sample; {whose} {1e3 * sample_time:.4g} ms is used",)
-    if uneven(samples.time, nominal, samples.run).any():
+    if uneven_steps(samples.time, nominal, samples.run).any():
         notes += (f"the time column is uneven, but {whose} sample time counts rows: nothing was resampled",)
     return Samples(_counted(samples.run) * sample_time, samples.run, samples.channels), sample_time, notes
 

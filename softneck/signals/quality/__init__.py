@@ -1,5 +1,5 @@
-"""What is wrong with a recording's channels, and what its inputs can teach a model.
+"""Quality of a recording: faults of its channels, and whether its inputs excite the system.
 
-Numbers first, then findings in the user's words.
+Numbers come first, then findings in plain words.
 May import `signals.recording`.
 """

@@ -1,6 +1,6 @@
-"""What the inputs tell: spectrum against the bandwidth, and correlation.
+"""Excitation of the inputs: spectrum against the bandwidth, correlation, and explained_variance variance.
 
-Inputs are the redefined ones and co-contraction where the robot gives its directions, else the motors' set-points.
+Inputs are the redefined ones and co-contraction if the robot gives its directions, else the motors' set-points.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from softneck.robot import Robot, Scaling
 
 from ..recording._recording import Recording
 
-# The paper's section 3.1: the system's bandwidth [rad/s].
+# [rad/s] Bandwidth of the neck (paper, section 3.1).
 BANDWIDTH = 4.0
-# 41 s at 20 ms: lines 0.15 rad/s apart, and several segments to average over in an identification recording.
-_SEGMENT = 2048
+# 41 s at 20 ms: lines 0.15 rad/s apart, and several Welch segments in an identification recording.
+_WELCH_ROWS = 2048
 _NECK_STEP = 0.02 * BANDWIDTH
-# -20 dB: where a spectral density is below 1 % of its mean up to the bandwidth, a tenth of the amplitude is left.
+# -20 dB: 1 % of the mean density up to the bandwidth, a tenth of the amplitude.
 _REAL_POWER = 0.01
 
 
@@ -30,11 +30,11 @@ class Spectrum:
 
     Attributes:
         inputs: their names, (n,).
-        bandwidth: up to where the outputs follow [rad/s]; NaN where nothing is known of it.
+        bandwidth: of the outputs [rad/s]; NaN if unknown.
         omega: (frequencies,) [rad/s].
         density: (frequencies, n) [rad^2 s/rad, or by the unit of the motors].
         below_bandwidth: (n,) share of the power below the bandwidth.
-        highest: (n,) highest frequency whose density is at least 1 % of the mean up to the bandwidth [rad/s].
+        highest: (n,) highest frequency with at least 1 % of the mean density up to the bandwidth [rad/s].
         crest: (n,) largest deviation from the mean by standard deviation.
         ranges: (n, 2) lowest and highest value [SI].
     """
@@ -49,7 +49,7 @@ class Spectrum:
     ranges: Matrix
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what JSON holds: the numbers of each input, not the curve."""
+        """Return the JSON values: the numbers of each input, without the curve."""
         return {
             name: {
                 "share_below_bandwidth": self.below_bandwidth[i],
@@ -66,16 +66,16 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
 
     names, T = _inputs(recording.robot)
     runs = [run.set_points @ T.T for run in recording.runs()]
-    segment = _SEGMENT
+    segment = _WELCH_ROWS
     if not np.isnan(bandwidth):
-        # As many lines up to the bandwidth as a neck has.
-        segment = max(16, round(_SEGMENT * _NECK_STEP / (bandwidth * recording.sample_time)))
+        # As many lines up to the bandwidth as for a neck.
+        segment = max(16, round(_WELCH_ROWS * _NECK_STEP / (bandwidth * recording.sample_time)))
     size = min(segment, max(len(u) for u in runs))
     density, rows = np.zeros((size // 2 + 1, runs[0].shape[1])), 0
     f = np.fft.rfftfreq(size, recording.sample_time)
     for u in runs:
         if len(u) >= 8:
-            # Runs shorter than a segment are padded with zeros, so that all have the same frequencies.
+            # Runs shorter than a segment are padded with zeros, so that all share the same frequencies.
             length = min(size, len(u))
             density += len(u) * welch(u, 1.0 / recording.sample_time, nperseg=length, nfft=size, axis=0)[1]
             rows += len(u)
@@ -89,12 +89,12 @@ def spectrum(recording: Recording, bandwidth: float) -> Spectrum:
 
 
 def _least_motion(recording: Recording) -> float:
-    """Return the standard deviation of set-points [SI] below which what moves is rounding."""
+    """Return the standard deviation of set-points [SI] below which motion is rounding."""
     return 1e-9 * Scaling.of(recording.robot, set_points=recording.set_points).motor_unit
 
 
 def _inputs(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
-    """Return names and T (inputs, motors) of the inputs."""
+    """Return the names of the inputs and T (inputs, motors)."""
     if robot.weights() is None:
         return robot.set_points, np.eye(len(robot.set_points))
     T = robot.redefinition()[0]
@@ -103,13 +103,13 @@ def _inputs(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
 
 
 def _shares(omega: Vector, density: Matrix, bandwidth: float, least: float) -> tuple[Vector, Vector]:
-    """Return the share of power below the bandwidth and the highest frequency with real power, both (n,)."""
+    """Return the share of power below the bandwidth and the highest excited frequency, both (n,)."""
     inputs = density.shape[1]
     if np.isnan(bandwidth):
         return np.full(inputs, np.nan), np.full(inputs, np.nan)
     low = omega <= bandwidth
     total = density.sum(axis=0)
-    # Below, an input is constant and its density what rounding leaves.
+    # Below this power an input is constant and its density is rounding.
     alive = total * bandwidth > BANDWIDTH * least**2
     share = np.divide(density[low].sum(axis=0), total, out=np.full(inputs, np.nan), where=alive)
     real = density >= _REAL_POWER * density[low].mean(axis=0)
@@ -124,7 +124,7 @@ def _crest(inputs: Matrix, least: float) -> Vector:
 
 
 def correlation(recording: Recording) -> Matrix:
-    """Return the correlation of the set-points, (motors, motors); NaN with a motor that never moves."""
+    """Return the correlation of the set-points, (motors, motors); NaN for a motor that never moves."""
     u = recording.set_points - recording.set_points.mean(axis=0)
     std = u.std(axis=0)
     still = std <= _least_motion(recording)
@@ -132,27 +132,27 @@ def correlation(recording: Recording) -> Matrix:
     return np.clip(z.T @ z / len(z), -1.0, 1.0)
 
 
-# 10 s at 20 ms: fifty time constants of a neck, less than one of Eq. 22's slow waves.
+# 10 s at 20 ms: fifty time constants of a neck, less than one slow wave of Eq. 22.
 _FEW_ROWS = 500
-# Set-points that change in fewer rows are steps that can be counted, and say nothing between.
+# With fewer changes the set-points are a few steps, without excitation between them.
 _FEW_CHANGES = 20
-# Motions [standard deviations] below this part of the largest one are what drives and sensors add to it.
+# Motions [standard deviations] below this share of the largest come from drives and sensors.
 _NO_MOTION = 0.02
-# An output of which the motors explain less than this [R2] follows something else.
-_UNRELATED = 0.2
-_BLOCKS = 10
-# Motions of lagged set-points below this part of the largest are left out of a fit: what hardly moves in the blocks
-# fitted, and moves in those judged, is extrapolated by thousands of times. Which part is small is tried.
-_SINGULAR = (1e-6, 1e-4, 1e-2)
-# By outputs that move by less of what they do in all rows [standard deviations] nothing can be judged: a good model's
-# error, a twentieth of the motion that it was trained on, would read as a fit of 0 %.
-_STANDS = 0.05
-# Lags [samples] over which an output may follow: an octave apart, to 5 s at 20 ms.
+# Smallest R2 of an output by its motors; below it the output depends on something else.
+_MIN_EXPLAINED_SHARE = 0.2
+_BLOCK_COUNT = 10
+# Singular values below this share of the largest are cut in a fit. A motion that is small in the fitted blocks and
+# larger in the judged ones would be extrapolated by thousands of times. Several cuts are tried.
+_SINGULAR_CUTS = (1e-6, 1e-4, 1e-2)
+# Held-out outputs that move by a smaller share of their whole motion [standard deviations] cannot judge a model: the
+# error of a good one, a twentieth of the motion in training, would read as a fit of 0 %.
+_MIN_RELATIVE_MOTION = 0.05
+# Lags [samples] of an output behind its motors: an octave apart, up to 5 s at 20 ms.
 _LAGS = (0, *(2**k for k in range(9)))
 
 
 def poor_excitation(recording: Recording) -> tuple[str, ...]:
-    """Return what there is to say before a model is trained on this recording; empty where nothing is missing."""
+    """Return the weaknesses of a recording as training data, as sentences."""
     said = []
     if len(recording) < _FEW_ROWS:
         seconds = len(recording) * recording.sample_time
@@ -160,52 +160,52 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
     spans, least = np.ptp(recording.set_points, axis=0), _least_motion(recording)
     still = [name for name, span in zip(recording.robot.set_points, spans, strict=True) if span < least]
     if still:
-        said.append(f"{', '.join(still)} never moves: what it does cannot be learned. Move every motor.")
+        said.append(f"{', '.join(still)} never moves: its effect cannot be learned. Move every motor.")
     changes = sum(int((np.diff(run.set_points, axis=0) != 0.0).any(axis=1).sum()) for run in recording.runs())
     if spans.max() >= least and changes < _FEW_CHANGES:
-        said.append(f"the set-points change in {changes} rows only: a model is guesswork between them. Record `mixed`.")
+        said.append(f"the set-points change in {changes} rows only: a model between them is a guess. Record `mixed`.")
     outputs = recording.robot.outputs.names
     if independent_motions(recording) < min(len(outputs), len(spans)):
         said.append(
-            f"the motors move along {independent_motions(recording)} direction(s) for {len(outputs)} outputs: how they "
-            "add up elsewhere cannot be learned. Move all of them independently, as `eq22` and `mixed` do."
+            f"the motors move along {independent_motions(recording)} direction(s) for {len(outputs)} outputs: their "
+            "separate effects cannot be learned. Move all of them independently, as `eq22` and `mixed` do."
         )
     if len(recording) < _FEW_ROWS or changes < _FEW_CHANGES:
-        return tuple(said)  # too little to tell what an output follows
+        return tuple(said)  # too short to tell whether an output follows its motors
     said += [
         f"`{name}` does not follow the motors (they explain {100.0 * max(share, 0.0):.0f} % of its variance): no model "
         "of set-points will predict it. Look for drift, a wrong column, or an output that nothing moves."
-        for name, share in zip(outputs, explained(recording), strict=True)
-        if share < _UNRELATED
+        for name, share in zip(outputs, explained_variance(recording), strict=True)
+        if share < _MIN_EXPLAINED_SHARE
     ]
     return tuple(said)
 
 
-def stands_still(held_out: Recording, whole: Recording) -> str | None:
-    """Return why no model can be judged by `held_out`, a part of `whole`; None if one can."""
+def why_at_rest(held_out: Recording, whole: Recording) -> str | None:
+    """Return why `held_out`, a part of `whole`, cannot judge a model; None if it can."""
     for name, judged, seen in zip(whole.robot.outputs.names, held_out.outputs.T, whole.outputs.T, strict=True):
         there = np.isfinite(judged)
-        if there.any() and np.nanstd(judged) < _STANDS * np.nanstd(seen):
+        if there.any() and np.nanstd(judged) < _MIN_RELATIVE_MOTION * np.nanstd(seen):
             part = 100.0 * float(np.nanstd(judged) / np.nanstd(seen))
             return f"the rows held out stand still: {name} moves by {part:.1f} % of what it does in all rows"
     return None
 
 
 def independent_motions(recording: Recording) -> int:
-    """Return in how many directions the set-points move, each by 2 % of the largest motion at least."""
+    """Count the directions of the set-points whose motion is over 2 % of the largest motion."""
     U = recording.set_points
     sizes = np.linalg.svd(U - U.mean(axis=0), compute_uv=False)
     return int((sizes > _NO_MOTION * sizes[0]).sum()) if sizes[0] > 0.0 else 0
 
 
-def explained(recording: Recording) -> Vector:
-    """Return which share of each output's variance lagged set-points explain on rows not fitted (outputs,).
+def explained_variance(recording: Recording) -> Vector:
+    """Return the share of each output's variance that lagged set-points explain on rows not fitted, (outputs,).
 
-    Least squares on every other of ten blocks, judged on those between, and the other way round: a drift is met by
-    chance where it is fitted, and nowhere else. NaN where an output was hardly measured or never moves.
+    Least squares is fitted on every other of ten blocks and judged on the rest, and the other way round. A drift fits
+    by chance where it is trained, and nowhere else. NaN for an output that was hardly measured or never moves.
     """
-    X = np.concatenate([_lagged(run.set_points) for run in recording.runs()])
-    odd = np.arange(len(X)) * _BLOCKS // len(X) % 2 == 1
+    X = np.concatenate([_lag_set_points(run.set_points) for run in recording.runs()])
+    odd = np.arange(len(X)) * _BLOCK_COUNT // len(X) % 2 == 1
     found = []
     for y in recording.outputs.T:
         parts = [(X[rows] - X[rows].mean(axis=0), y[rows] - y[rows].mean()) for rows in _halves(odd, np.isfinite(y))]
@@ -213,23 +213,23 @@ def explained(recording: Recording) -> Vector:
         if spread <= 1e-18 * float(np.nansum(y**2)) or min(len(y) for _, y in parts) < 2 * X.shape[1]:
             found.append(np.nan)
             continue
-        found.append(1.0 - min(_unexplained(parts, cut) for cut in _SINGULAR) / spread)
+        found.append(1.0 - min(_cross_validated_error(parts, cut) for cut in _SINGULAR_CUTS) / spread)
     return np.array(found)
 
 
-def _unexplained(parts: list[tuple[Matrix, Vector]], cut: float) -> float:
-    """Return the sum of squares that each half leaves when fitted on the other."""
+def _cross_validated_error(parts: list[tuple[Matrix, Vector]], cut: float) -> float:
+    """Return the sum of squared errors of each half by the fit of the other."""
     fits = [np.linalg.lstsq(A, b, rcond=cut)[0] for A, b in parts]
     return sum(float(((b - A @ fit) ** 2).sum()) for (A, b), fit in zip(parts, fits[::-1], strict=True))
 
 
 def _halves(odd: np.ndarray, there: np.ndarray) -> list[np.ndarray]:
-    """Return the numbers of the rows in even and in odd blocks that are there; one row where none is."""
+    """Return the rows present in even and in odd blocks; one row if there is none."""
     return [np.flatnonzero(part & there) if (part & there).any() else np.zeros(1, dtype=int) for part in (odd, ~odd)]
 
 
-def _lagged(U: Matrix) -> Matrix:
-    """Return the set-points of now and before (time, lags * motors), the first where there were none."""
+def _lag_set_points(U: Matrix) -> Matrix:
+    """Return set-points at all lags (time, lags * motors), continued by the first sample."""
     return np.column_stack(
         [np.vstack([np.repeat(U[:1], min(lag, len(U)), axis=0), U[: max(len(U) - lag, 0)]]) for lag in _LAGS]
     )

@@ -1,4 +1,4 @@
-"""The quality report of a recording: faults of its channels, and what its inputs can teach a model."""
+"""The quality report of a recording: findings on its channels and on its excitation."""
 
 from __future__ import annotations
 
@@ -13,35 +13,35 @@ from softneck.core import Matrix, ReprMixin, require_positive, to_si
 from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 from ..recording._recording import Recording
-from ._channel_faults import ChannelQuality, Stretch, check_channel, count_rows
+from ._channel_faults import ChannelQuality, Segment, check_channel, count_rows
 from ._excitation import BANDWIDTH, Spectrum, correlation, independent_motions, spectrum
 
 SEVERITIES = ("ok", "note", "warning")
-# A loop must stop when the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a
-# model may lose as many rows.
+# A loop must stop if the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a model
+# may lose as many rows.
 _LONG_GAP, _MANY_MISSED = 0.1, 0.05
-# Of the scaled co-contraction, which goes from -6 to 6: below, its effect drowns.
+# Of the scaled co-contraction, -6 to 6: the effect of less is lost in noise.
 _LEAST_COCONTRACTION = 0.5
-# Below so many levels in the range a step of the sensor is over 1 % of the motion.
-_COARSE = 100.0
-# Pair correlation: two motors share half and nine tenths of their variance.
-_RELATED, _ALIKE = 0.7, 0.95
-# An input without power beyond half the bandwidth says nothing of the neck's pole at about 5 1/s. It reaches the
-# bandwidth where its power does but for a line of the spectrum, which is 0.15 of the neck's 4 rad/s wide.
-_SLOW, _REACHED = 0.5, 0.95
+# With fewer levels a step of the sensor is over 1 % of the motion.
+_MIN_LEVELS = 100.0
+# Correlation at which two motors share half and nine tenths of their variance.
+_CORRELATED, _COLLINEAR = 0.7, 0.95
+# An input without power beyond half the bandwidth does not excite the neck's pole at about 5 1/s. The power reaches
+# the bandwidth up to one line of the spectrum, which is 0.15 of the neck's 4 rad/s wide.
+_SLOW_SHARE, _REACHED_SHARE = 0.5, 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that the report says.
+    """One finding of the report.
 
     Attributes:
-        severity: ok, note (know it) or warning (fix it, or expect a worse model).
+        severity: ok, note (for information) or warning (fix it, or expect a worse model).
         topic: such as "dropouts" or "excitation".
-        channel: that it is about, or empty.
+        channel: its channel, or empty.
         message: one sentence.
-        advice: what to do; empty where nothing.
-        time: [s] in its run where it is first seen; None where it has no place.
+        advice: what to do; may be empty.
+        time: [s] of the first place in its run; None without a place.
     """
 
     severity: str
@@ -52,7 +52,7 @@ class Finding:
     time: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what JSON holds."""
+        """Return the JSON values."""
         said = asdict(self)
         return {**said, "time_s": said.pop("time")}
 
@@ -63,16 +63,16 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Quality(ReprMixin):
-    """What `assess_quality` found; arrays in SI.
+    """The result of `assess_quality`; arrays in SI.
 
     Attributes:
-        robot: whose recording it is.
+        robot: of the recording.
         rows: of the recording.
         sample_time: [s].
         channels: name -> faults of that channel.
-        spectrum: of a neck's theta_i, phi_i, delta_i; of another robot's set-points.
-        directions: in how many directions the set-points move, as `independent_motions` counts them.
-        correlation: (motors, motors) between the motors' set-points.
+        spectrum: of the redefined inputs, or of the set-points of a robot without directions.
+        directions: number of directions of the set-points, by `independent_motions`.
+        correlation: (motors, motors) of the set-points.
     """
 
     robot: Robot
@@ -85,7 +85,7 @@ class Quality(ReprMixin):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return what there is to say, warnings first."""
+        """Return all findings, warnings first."""
         return findings(self)
 
     @property
@@ -94,7 +94,7 @@ class Quality(ReprMixin):
         return max((finding.severity for finding in self.findings), key=SEVERITIES.index)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `softneck info --json` holds under `quality`."""
+        """Return the JSON values of `softneck info --json` under `quality`."""
         said = self.findings
         return {
             "severity": self.severity,
@@ -107,7 +107,7 @@ class Quality(ReprMixin):
         }
 
     def lines(self) -> tuple[str, ...]:
-        """Return the report as lines: the numbers, then one line for each finding."""
+        """Return the report as lines: the numbers, then the findings."""
         return (*self.numbers(), "", *(str(finding) for finding in self.findings))
 
     def text(self) -> str:
@@ -115,7 +115,7 @@ class Quality(ReprMixin):
         return "\n".join(self.lines())
 
     def numbers(self) -> list[str]:
-        """Return a line on each input, and on noise, correlation and steps."""
+        """Return a line for each input, then noise, correlation and steps."""
         spectrum, unit = self.spectrum, self.robot.outputs.display_unit
         lines = []
         of_input = self.robot.motors.unit
@@ -127,14 +127,14 @@ class Quality(ReprMixin):
             crest = _number(spectrum.crest[i])
             lines.append(f"{name}: {low:+.3g} to {high:+.3g} {of_input}, {judged}crest factor {crest}")
         measured = [self.channels[name] for name in self.robot.outputs.names]
-        noise = ", ".join(f"{channel.name} {channel.shown(channel.noise):.3g} {unit}" for channel in measured)
+        noise = ", ".join(f"{channel.name} {channel.in_file_unit(channel.noise):.3g} {unit}" for channel in measured)
         lines.append(f"noise (standard deviation): {noise}")
         if pairs := _pairs(self):
             names = [name.removeprefix("motor_") for name in self.robot.motors.names]
             which = ", ".join(f"{names[i]}-{names[j]}" for i, j in pairs)
             lines.append(f"correlation of motors {which}: {', '.join(_number(self.correlation[p]) for p in pairs)}")
         steps = [
-            f"{channel.name} {channel.shown(channel.quantum):.3g}"
+            f"{channel.name} {channel.in_file_unit(channel.quantum):.3g}"
             for channel in self.channels.values()
             if channel.quantum is not None
         ]
@@ -144,15 +144,15 @@ class Quality(ReprMixin):
 
 
 def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Quality:
-    """Check a recording's channels and what its inputs can teach; never across the border of two runs.
+    """Assess a recording's channels and the excitation by its inputs; no check crosses the border of two runs.
 
     Args:
         recording: to check.
-        bandwidth: up to where the outputs follow the motors [rad/s]; None: by the robot's time constant, of a neck 4
-            (section 3.1). Without either the spectrum is not judged.
+        bandwidth: of the outputs [rad/s]; None derives it from the robot's time constant (neck: 4, section 3.1).
+            Without either the spectrum is not judged.
 
     Raises:
-        SettingsError: a bandwidth that is not positive.
+        SettingsError: the bandwidth is not positive.
     """
     if bandwidth is None:
         bandwidth = BANDWIDTH * TIME_CONSTANT / (recording.robot.time_constant_s or np.nan)
@@ -170,7 +170,7 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
 
 
 def findings(quality: Quality) -> tuple[Finding, ...]:
-    """Return all that there is to say, warnings first; a topic without fault says "ok" once."""
+    """Return all findings, warnings first; a topic without a fault gives one "ok"."""
     said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality)]
     said += [*_excitation(quality), *_directions(quality), *_ranges(quality), *_correlation(quality)]
     topics = {finding.topic for finding in said if finding.severity != "ok"}
@@ -182,7 +182,7 @@ def findings(quality: Quality) -> tuple[Finding, ...]:
 
 _CLEAN = {
     "dropouts": "no sample is missing.",
-    "frozen": "no channel stands still while its input moves.",
+    "frozen": "no channel is constant while its input moves.",
     "clipping": "no channel has flat tops.",
     "outliers": "no spikes in outputs and motor positions.",
     "quantisation": "every channel has more than 100 levels in its range.",
@@ -194,7 +194,7 @@ _CLEAN = {
 def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
     sample_time, outputs = quality.sample_time, quality.robot.outputs.names
     if channel.missed_rows == channel.rows:
-        advice = "Take it out of the file, or log it."
+        advice = "Remove it from the file, or log it."
         severity = "warning" if channel.name in outputs else "note"
         yield Finding(severity, "dropouts", channel.name, "has no sample at all.", advice)
         return
@@ -202,7 +202,7 @@ def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
         yield _dropouts(channel, quality)
     if channel.lowest == channel.highest and channel.name in (*quality.robot.set_points, *outputs):
         message = f"never leaves {_value(channel, channel.lowest)}."
-        advice = "Move it: nothing about it can be identified."
+        advice = "Move it: no model can be identified from a constant."
         yield Finding("warning", "excitation", channel.name, message, advice)
     if channel.frozen:
         message = (
@@ -215,14 +215,14 @@ def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
         yield _clipping(channel)
     if channel.outliers:
         message = f"has spikes of one or two samples, {_places(channel.outliers)}."
-        advice = "Leave those samples empty; set membership in particular bends its bounds to them."
+        advice = "Leave those samples empty; a single spike widens the bounds of set membership."
         yield Finding("warning", "outliers", channel.name, message, advice, channel.outliers[0].time)
     yield from _resolution(channel, outputs)
 
 
 def _dropouts(channel: ChannelQuality, quality: Quality) -> Finding:
-    gap = _LONG_GAP * BANDWIDTH / quality.spectrum.bandwidth  # of another robot, as long by its time constant
-    longest = max(channel.missed, key=lambda stretch: stretch.rows)
+    gap = _LONG_GAP * BANDWIDTH / quality.spectrum.bandwidth  # scaled by the robot's time constant
+    longest = max(channel.missed, key=lambda segment: segment.rows)
     share, seconds = channel.missed_rows / channel.rows, longest.rows * quality.sample_time
     message = (
         f"misses {channel.missed_rows} of {channel.rows} samples ({100 * share:.2g} %) in {len(channel.missed)} "
@@ -243,7 +243,7 @@ def _clipping(channel: ChannelQuality) -> Finding:
 
 
 def _resolution(channel: ChannelQuality, outputs: tuple[str, ...]) -> Iterator[Finding]:
-    if channel.levels is not None and channel.levels < _COARSE and channel.quantum is not None:
+    if channel.levels is not None and channel.levels < _MIN_LEVELS and channel.quantum is not None:
         message = f"has steps of {_value(channel, channel.quantum)}, only {channel.levels:.0f} in its whole range."
         advice = "Log more digits, or use a finer sensor."
         yield Finding("warning" if channel.name in outputs else "note", "quantisation", channel.name, message, advice)
@@ -257,7 +257,7 @@ def _excitation(quality: Quality) -> Iterator[Finding]:
     common = quality.robot.cocontraction_name
     least = _LEAST_COCONTRACTION * Scaling.of(quality.robot).motor_unit
     if np.isnan(quality.spectrum.bandwidth):
-        message = "nothing is known of how fast the outputs follow the motors: the spectrum is not judged."
+        message = "the bandwidth of the outputs is unknown: the spectrum is not judged."
         yield Finding("note", "excitation", "", message)
     for i in () if np.isnan(quality.spectrum.bandwidth) else range(len(quality.spectrum.inputs)):
         if quality.spectrum.inputs[i] != common:
@@ -271,14 +271,14 @@ def _excitation(quality: Quality) -> Iterator[Finding]:
 def _power(spectrum: Spectrum, i: int) -> Iterator[Finding]:
     name, limit = spectrum.inputs[i], spectrum.bandwidth
     highest, share = spectrum.highest[i], spectrum.below_bandwidth[i]
-    if highest < _REACHED * limit:
+    if highest < _REACHED_SHARE * limit:
         message = f"moves with real power up to {highest:.2g} rad/s only; the robot's bandwidth is "
-        advice = "Add a faster signal (multisine, aprbs, mixed): a model is guesswork beyond."
-        severity = "warning" if highest < _SLOW * limit else "note"
+        advice = "Add a faster signal (multisine, aprbs, mixed): a model is a guess beyond."
+        severity = "warning" if highest < _SLOW_SHARE * limit else "note"
         yield Finding(severity, "excitation", name, f"{message}{limit:.3g} rad/s.", advice)
     elif share < 0.5:
         above = f"{100 * (1 - share):.0f} % of its power above {limit:.3g} rad/s"
-        advice = "Move more slowly, or take the chatter out of the loop that made it."
+        advice = "Move more slowly, or remove the chatter of the loop that made it."
         yield Finding("note", "excitation", name, f"has {above}, where the robot hardly moves.", advice)
 
 
@@ -286,20 +286,20 @@ def _directions(quality: Quality) -> Iterator[Finding]:
     motors = len(quality.robot.set_points)
     if 0 < quality.directions < motors:
         message = f"the motors move along {quality.directions} direction(s) only, of {motors}."
-        advice = "A linear model in the redefined inputs needs no more; others want motors that move independently."
+        advice = "This is enough for a linear model in the redefined inputs; other models need independent motors."
         yield Finding("note", "directions", "", message, advice)
 
 
 def _ranges(quality: Quality) -> Iterator[Finding]:
-    """How much of its range each motor went through."""
+    """Yield the share of its range that each motor visited."""
     motors = quality.robot.motors
     if motors.setpoint_min is None or motors.setpoint_max is None:
         return
-    asked = [quality.channels[name] for name in quality.robot.set_points]
-    ends = zip(asked, motors.setpoint_min, motors.setpoint_max, strict=True)
-    shares = [f"{100 * c.shown(c.highest - c.lowest) / (most - least):.0f} % by {c.name}" for c, least, most in ends]
+    channels = [quality.channels[name] for name in quality.robot.set_points]
+    ends = zip(channels, motors.setpoint_min, motors.setpoint_max, strict=True)
+    shares = [f"{100 * c.in_file_unit(c.highest - c.lowest) / (high - low):.0f} % by {c.name}" for c, low, high in ends]
     message = f"visited of each motor's range: {', '.join(shares)}."
-    yield Finding("ok", "region", "", message, "Models know nothing outside.")
+    yield Finding("ok", "region", "", message, "Models are extrapolating outside.")
 
 
 def _pairs(quality: Quality) -> list[tuple[int, int]]:
@@ -309,21 +309,21 @@ def _pairs(quality: Quality) -> list[tuple[int, int]]:
 def _correlation(quality: Quality) -> Iterator[Finding]:
     for i, j in _pairs(quality):
         r = quality.correlation[i, j]
-        if abs(r) > _RELATED:
+        if abs(r) > _CORRELATED:
             names = [quality.robot.motors.names[k].removeprefix("motor_") for k in (i, j)]
             message = f"motors {names[0]} and {names[1]} move together (correlation {r:.2f})."
-            advice = "Their effects cannot be told apart well; move them independently."
-            yield Finding("warning" if abs(r) > _ALIKE else "note", "correlation", "", message, advice)
+            advice = "Their effects cannot be separated well; move them independently."
+            yield Finding("warning" if abs(r) > _COLLINEAR else "note", "correlation", "", message, advice)
 
 
-def _places(stretches: tuple[Stretch, ...]) -> str:
-    times = ", ".join(f"{stretch.time:.2f}" for stretch in stretches[:3])
-    more = ", ..." if len(stretches) > 3 else ""
-    return f"{len(stretches)} time(s), {count_rows(stretches)} row(s), at t = {times}{more} s"
+def _places(segments: tuple[Segment, ...]) -> str:
+    times = ", ".join(f"{segment.time:.2f}" for segment in segments[:3])
+    more = ", ..." if len(segments) > 3 else ""
+    return f"{len(segments)} time(s), {count_rows(segments)} row(s), at t = {times}{more} s"
 
 
 def _value(channel: ChannelQuality, value: float) -> str:
-    return f"{channel.shown(value):.3g} {channel.unit}"
+    return f"{channel.in_file_unit(value):.3g} {channel.unit}"
 
 
 def _percent(share: float) -> str:

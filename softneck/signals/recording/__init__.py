@@ -1,4 +1,4 @@
-"""The recording: named channels over time, its files, resampling, scaling, trends, and Eq. 9-11.
+"""Recordings: named channels over time, their files, resampling and scaling.
 
 The data type of every other subpackage.
 May import `robot` and below.

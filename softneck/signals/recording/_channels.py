@@ -1,4 +1,4 @@
-"""The channels a recording may have: SI unit inside, unit in files."""
+"""The channels a recording may have: their SI units in arrays and their units in files."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ NECK = Robot.preset("neck")
 SET_POINTS = NECK.set_points
 MOTOR_POSITIONS = NECK.motor_positions
 MOTOR_VELOCITIES = NECK.motor_velocities
-# [rad] The motors stay within 6 rad: two turns are another unit, and in degrees hardly a move.
+# [rad] Motors stay within 6 rad. Two turns mean another unit: in degrees they would be hardly a motion.
 MOTOR_TURNS = 4.0 * math.pi
 OUTPUTS = NECK.outputs.names
 
-# Behind the name of an output: what else a recording may hold of it.
-_OF_OUTPUT = ("", "_measured", "_estimate", "_reference", "_lower", "_upper")
-_OF_RATE = ("_rate", "_rate_measured", "_rate_estimate")
-_OF_ALL = {
+# Suffixes of the channels that belong to an output and to its rate.
+_OUTPUT_SUFFIXES = ("", "_measured", "_estimate", "_reference", "_lower", "_upper")
+_RATE_SUFFIXES = ("_rate", "_rate_measured", "_rate_estimate")
+_COMMON_UNITS = {
     "compression": "m",
     "payload": "kg",
     "payload_estimate": "kg",
@@ -34,14 +34,14 @@ _OF_ALL = {
     "enabled": "1",
     "measurement_valid": "1",
 }
-# Channels that are set, not measured: they hold their value until the next one.
-_HELD = re.compile(r"(motor_setpoint_\d|.*_setpoint|.*_reference|healthy|enabled|measurement_valid|payload)$")
-_COLUMN = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
+# Channels that are commanded or boolean: they hold their value until the next sample.
+_HELD_CHANNELS = re.compile(r"(motor_setpoint_\d|.*_setpoint|.*_reference|healthy|enabled|measurement_valid|payload)$")
+_COLUMN_TITLE = re.compile(r"^(?P<name>[^\[\]]+?)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
 @cache
-def _table(robot: Robot) -> dict[str, str]:
-    """Return channel -> unit in files of all channels that a recording of `robot` may have."""
+def _file_units(robot: Robot) -> dict[str, str]:
+    """Return channel -> unit in files, for all channels that a recording of `robot` may have."""
     unit, shown = robot.motors.unit, robot.outputs.display_unit
     return {
         "time": "s",
@@ -49,48 +49,48 @@ def _table(robot: Robot) -> dict[str, str]:
         **dict.fromkeys(robot.motor_positions, unit),
         **dict.fromkeys(robot.motor_velocities, f"{unit}/s"),
         **{f"tension_{j}": "N" for j in range(1, len(robot.motors.names) + 1)},
-        **{f"{output}{what}": shown for output in robot.outputs.names for what in _OF_OUTPUT},
-        **{f"{output}{what}": f"{shown}/s" for output in robot.outputs.names for what in _OF_RATE},
+        **{f"{output}{what}": shown for output in robot.outputs.names for what in _OUTPUT_SUFFIXES},
+        **{f"{output}{what}": f"{shown}/s" for output in robot.outputs.names for what in _RATE_SUFFIXES},
         "cocontraction_reference": unit,
-        **_OF_ALL,
+        **_COMMON_UNITS,
     }
 
 
 def known_channels(robot: Robot = NECK) -> tuple[str, ...]:
     """Return the names of all channels a recording of `robot` may have, `time` included."""
-    return tuple(_table(robot))
+    return tuple(_file_units(robot))
 
 
 def file_unit(channel: str, robot: Robot = NECK) -> str:
     """Return the unit in which files carry `channel`."""
-    return _table(robot)[channel]
+    return _file_units(robot)[channel]
 
 
 def si_unit(channel: str, robot: Robot = NECK) -> str:
     """Return the SI unit in which arrays carry `channel`."""
-    return to_si(_table(robot)[channel])[1]
+    return to_si(_file_units(robot)[channel])[1]
 
 
 def column_name(channel: str, robot: Robot = NECK) -> str:
     """Return the column title of `channel`, such as `pitch [deg]`."""
-    return f"{channel} [{_table(robot)[channel]}]"
+    return f"{channel} [{_file_units(robot)[channel]}]"
 
 
 def may_miss(channel: str, robot: Robot = NECK) -> bool:
-    """Return whether a sample of `channel` may be missing: an empty cell is one that the sensor missed."""
+    """Return whether samples of `channel` may be missing; files leave such a cell empty."""
     measured = (*robot.outputs.names, *robot.motor_positions, *robot.motor_velocities, "compression", "tension")
     return channel.startswith(measured) and not channel.endswith("_reference")
 
 
 def is_held(channel: str) -> bool:
-    """Return whether `channel` is set or true-or-false, so that it holds its value between samples."""
-    return bool(_HELD.match(channel))
+    """Return whether `channel` holds its value between samples: it is a command or a flag."""
+    return bool(_HELD_CHANNELS.match(channel))
 
 
 def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
-    """Return (channel, factor to SI) of a column title such as `pitch [deg]`; motors by number or by name."""
-    table = _table(robot)
-    match = _COLUMN.match(title.strip())
+    """Return (channel, factor to SI) of a column title such as `pitch [deg]`; a motor may have its number or name."""
+    table = _file_units(robot)
+    match = _COLUMN_TITLE.match(title.strip())
     if match is None:
         name = title.strip()
         hint = f"write `{column_name(name, robot)}`" if name in table else "use `softneck import` with a layout"
@@ -98,9 +98,8 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
     name, unit = robot.own(match["name"]), match["unit"].strip()
     if name not in table:
         raise DataError(
-            f"column `{name}` is not a channel of a recording of robot {robot.label()} "
-            f"(those are {', '.join(table)}, run); "
-            "rename or drop it, or use `softneck import` with a layout."
+            f"column `{name}` is not a channel of a recording of robot {robot.label()} (those are {', '.join(table)}, "
+            "run); rename or drop it, or use `softneck import` with a layout."
         )
     factor, unit_si = to_si(unit)
     if unit_si != si_unit(name, robot):

@@ -38,28 +38,28 @@ from ._recording import Recording, concatenate, median_step, require_same_robot
 if TYPE_CHECKING:
     import pandas as pd
 
-# All that a table of numbers is made of; a file with anything else is left to pandas.
-_CHARACTERS = "0123456789+-.eE,\n"
-# Beyond this pandas is faster, import included.
-_LARGEST = 20_000_000
+# Characters of a plain table of numbers; pandas reads files with any other.
+_CSV_CHARACTERS = "0123456789+-.eE,\n"
+# [bytes] pandas is faster on larger files, its import included.
+_MAX_PLAIN_BYTES = 20_000_000
 
 
 def read_plain_csv(source: Path) -> dict[str, Vector] | None:
-    """Return title -> column of a CSV file of plain numbers, an empty cell as NaN; None where it is anything else.
+    """Return title -> column of a CSV file of plain numbers, or None for any other file.
 
-    The numbers are those that pandas reads: both round a decimal to the nearest double.
+    An empty cell is NaN. Numbers equal those of pandas: both round a decimal to the nearest double.
     """
     try:
-        if source.stat().st_size > _LARGEST:
+        if source.stat().st_size > _MAX_PLAIN_BYTES:
             return None
         head, _, body = source.read_text(encoding="utf-8").replace("\r\n", "\n").partition("\n")
-        if head.startswith("# "):  # whose recording it is
+        if head.startswith("# "):  # the line that names the robot
             head, _, body = body.partition("\n")
     except (OSError, UnicodeDecodeError):
         return None
     require_numbers(source, 1, 1 + head.count(","))
     titles = head.split(",")
-    if body.strip(_CHARACTERS) or not all(titles) or len(set(titles)) < len(titles) or '"' in head:
+    if body.strip(_CSV_CHARACTERS) or not all(titles) or len(set(titles)) < len(titles) or '"' in head:
         return None
     rows = [line.split(",") for line in body.split("\n") if line]
     if not rows or any(len(row) != len(titles) for row in rows):
@@ -73,14 +73,14 @@ def read_plain_csv(source: Path) -> dict[str, Vector] | None:
     return dict(zip(titles, columns, strict=True))
 
 
-# What the first line of a recording of another robot than the neck begins with; its tables follow as JSON.
+# Start of the first line of a recording whose robot is not the neck; the robot follows as JSON.
 ROBOT_LINE = "# robot "
-# The delimiter that means any number of blanks or tabs.
+# The delimiter that stands for any number of blanks or tabs.
 WHITESPACE = "whitespace"
 
 
 def write_recording(path: str | Path, recording: Recording, *, force: bool = False) -> None:
-    """Write a `.csv` or `.parquet` recording; a missing sample becomes an empty cell.
+    """Write a `.csv` or `.parquet` recording; a missing sample is an empty cell.
 
     Raises:
         OutputFileError: the file exists (and not `force`) or cannot be written.
@@ -93,18 +93,18 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
         require_package("pyarrow")
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
-            _write_csv(_titled(recording), temporary, _robot_line(recording.robot))
+            _write_csv(_columns_by_title(recording), temporary, _robot_line(recording.robot))
         else:
             recording_frame(recording).to_parquet(temporary, index=False)
 
 
 def _robot_line(robot: Robot) -> str:
-    """Return the line that names the robot of a recording; a file of the preset `neck` has none."""
+    """Return the line that names the robot; the preset `neck` needs none."""
     return f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n" if robot.in_header() else ""
 
 
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path, before: str) -> None:
-    """Write a table of numbers with the shortest digits that read back the same; NaN becomes an empty cell."""
+    """Write a table with the shortest digits that read back to the same number; NaN is an empty cell."""
     head = before + ",".join(columns) + "\n"
     rows = zip(*(column.tolist() for column in columns.values()), strict=True)
     lines = (",".join("" if cell != cell else repr(cell) for cell in row) + "\n" for row in rows)
@@ -112,17 +112,17 @@ def _write_csv(columns: Mapping[str, np.ndarray], path: Path, before: str) -> No
 
 
 def recording_frame(recording: Recording) -> pd.DataFrame:
-    """Return the recording as a table whose columns say their unit, as in its file."""
+    """Return the recording as a table with the columns of its file."""
     import pandas as pd
 
-    frame = pd.DataFrame(_titled(recording))
+    frame = pd.DataFrame(_columns_by_title(recording))
     if recording.robot.in_header():
         frame.attrs["robot"] = recording.robot.as_dict()
     return frame
 
 
-def _titled(recording: Recording) -> dict[str, np.ndarray]:
-    """Return title, which says the unit, -> column in that unit."""
+def _columns_by_title(recording: Recording) -> dict[str, np.ndarray]:
+    """Return title with unit -> column in that unit."""
     robot = recording.robot
     columns: dict[str, np.ndarray] = {column_name("time"): recording.time}
     for name in known_channels(robot):
@@ -134,16 +134,16 @@ def _titled(recording: Recording) -> dict[str, np.ndarray]:
 
 
 def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None) -> Recording:
-    """Read a recording that `write_recording` wrote or that follows its form.
+    """Read a recording in the format of `write_recording`.
 
     Args:
         path: a `.csv` or `.parquet` file.
-        robot: whose it is: a robot, a preset's name or a robot file; None takes `robot.toml` beside the file or above
-            it, else what the recording says, else the neck.
+        robot: a robot, a preset's name or a robot file. None takes `robot.toml` beside the file or above it, else the
+            robot named in the file, else the neck.
 
     Raises:
         FileFormatError: no such file, or no table.
-        DataError: columns, units, numbers or times are not those of a recording of that robot; the line says which.
+        DataError: columns, units, numbers or times do not fit the robot; the message names the problem.
 
     Example:
         >>> import softneck
@@ -162,29 +162,29 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
     suffix = recording_suffix(source)
     if source.is_file():
         require_size(source)
-    said = said_robot(source, suffix)
+    said = robot_in_file(source, suffix)
     columns: Mapping[str, pd.Series | Vector] | None = read_plain_csv(source) if suffix == ".csv" else None
     if columns is None:
         columns = _columns(read_table(source, suffix, TextForm(skip=0 if said is None else 1)))
     try:
-        return _from_columns(columns, _whose(source, said, robot))
+        return _from_columns(columns, _resolve_robot(source, said, robot))
     except SoftneckError as error:
         raise DataError(f"{source}: {error}") from error
 
 
-#: What stands for a recording: itself, its file, a table with units in its titles, an array in SI, or several.
+#: A recording, its file, a table with units in its titles, an array in SI, or a list of these.
 RecordingLike: TypeAlias = (
     "Recording | str | Path | pd.DataFrame | Mapping[str, ArrayLike] | np.ndarray | Sequence[RecordingLike]"
 )
 
 
-def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> Recording:
-    """Return the recording that `thing` is or stands for, several as runs of one.
+def open_recording(thing: object, robot: Robot | str | Path | None = None) -> Recording:
+    """Return `thing` as a recording; several become runs of one.
 
     Args:
         thing: a recording, its file, a DataFrame or a dict of columns with units in their titles, an array (time,
             motors and outputs, or motors alone) in SI at the robot's sample time, or a list of them.
-        robot: whose it is, as `read_recording` takes it; an array needs one.
+        robot: as in `read_recording`; an array needs one.
     """
     if isinstance(thing, str | Path):
         return read_recording(thing, robot=robot)
@@ -195,7 +195,7 @@ def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> 
     if isinstance(thing, Mapping) or hasattr(thing, "columns"):
         return from_frame(thing, robot)
     if isinstance(thing, list | tuple):
-        return concatenate([opened_recording(item, robot) for item in thing], names=names_of(thing))
+        return concatenate([open_recording(item, robot) for item in thing], names=recording_names(thing))
     if isinstance(thing, np.ndarray) and robot is not None:
         whose = find_robot(robot)
         motors = len(whose.set_points)
@@ -206,8 +206,8 @@ def opened_recording(thing: object, robot: Robot | str | Path | None = None) -> 
     raise DataError(f"a recording, its file, a DataFrame, a dict of columns or a list of them is needed; {hint}.")
 
 
-def names_of(things: Sequence[object]) -> list[str]:
-    """Return what recordings are called: their files, else their number."""
+def recording_names(things: Sequence[object]) -> list[str]:
+    """Return names of recordings for messages: their files, else their number."""
     return [str(item) if isinstance(item, str | Path) else f"recording {k}" for k, item in enumerate(things, start=1)]
 
 
@@ -225,8 +225,8 @@ def from_frame(frame: object, robot: Robot | str | Path | None = None) -> Record
     return _from_columns(_columns(table), find_robot(Robot.from_dict(said) if robot is None and said else robot))
 
 
-def said_robot(source: Path, suffix: str) -> Robot | None:
-    """Return the robot that a file says it is of, or None."""
+def robot_in_file(source: Path, suffix: str) -> Robot | None:
+    """Return the robot that a file names, or None."""
     said: object = None
     try:
         if suffix == ".parquet" and source.is_file():
@@ -236,7 +236,7 @@ def said_robot(source: Path, suffix: str) -> Robot | None:
             try:
                 attributes = (read_schema(source).metadata or {}).get(b"PANDAS_ATTRS", b"{}")
             except (ValueError, OSError, ArrowException):
-                return None  # what is wrong with it the reader of the table says
+                return None  # the reader of the table reports the damage
             said = json.loads(attributes).get("robot")
         elif suffix == ".csv" and source.is_file():
             with source.open(encoding="utf-8", errors="replace") as file:
@@ -247,8 +247,8 @@ def said_robot(source: Path, suffix: str) -> Robot | None:
         raise DataError(f"{source}: does not say whose recording it is ({error}).") from error
 
 
-def _whose(source: Path, said: Robot | None, given: str | Path | Robot | None) -> Robot:
-    """Return the robot of a file: the one given, else that of `robot.toml`, else what it says, else the neck."""
+def _resolve_robot(source: Path, said: Robot | None, given: str | Path | Robot | None) -> Robot:
+    """Return the given robot, else that of `robot.toml`, else the one the file names, else the neck."""
     found = find_robot(given, beside=source) if given is not None or robot_file_of(source) is not None else said
     found = Robot.preset("neck") if found is None else found
     if said is not None and said.hash != found.hash:
@@ -258,7 +258,7 @@ def _whose(source: Path, said: Robot | None, given: str | Path | Robot | None) -
 
 @dataclass(frozen=True, slots=True)
 class TextForm:
-    """How a text is a table; as it stands here, that of a recording."""
+    """Format of a text table; the defaults are those of a recording."""
 
     header: bool = True
     delimiter: str = ","
@@ -269,7 +269,7 @@ class TextForm:
 
 
 def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
-    """Read a table as text-free columns of floats where they are numbers."""
+    """Read a table; columns of numbers are floats."""
     import pandas as pd
 
     require_file(source)
@@ -278,7 +278,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
     require_table(source, zeros=form.encoding.startswith("utf-16") or form.encoding == "utf-32")
     try:
         with warnings.catch_warnings():
-            # pandas only warns of rows that are longer than the header; their cells cannot be told apart.
+            # pandas only warns of rows longer than the header, whose cells cannot be assigned to columns.
             warnings.simplefilter("error", pd.errors.ParserWarning)
             return pd.read_csv(
                 source,
@@ -294,7 +294,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
                 encoding=form.encoding,
             )
     except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
-        raise _no_table(source, error) from error
+        raise _table_error(source, error) from error
 
 
 def _read_parquet(source: Path) -> pd.DataFrame:
@@ -304,19 +304,19 @@ def _read_parquet(source: Path) -> pd.DataFrame:
     try:
         file = ParquetFile(source)
         require_numbers(source, file.metadata.num_rows, file.metadata.num_columns)
-        # Without pandas' own remarks, which fail in any way where damaged; an index is a column like others.
+        # Without the metadata of pandas, which may be damaged; an index is an ordinary column.
         return file.read().to_pandas(ignore_metadata=True)
     except (ValueError, OSError, ArithmeticError, MemoryError, ArrowException) as error:
-        raise _no_table(source, error) from error
+        raise _table_error(source, error) from error
 
 
-def _no_table(source: Path, error: Exception) -> FileFormatError:
+def _table_error(source: Path, error: Exception) -> FileFormatError:
     reason = (str(error).splitlines() or [""])[0][:120]
     return FileFormatError(f"{source}: cannot be read as a table ({reason}).")
 
 
 def _columns(frame: pd.DataFrame) -> dict[str, pd.Series]:
-    """Return title -> column, without the empty one that a delimiter at the end of each line makes."""
+    """Return title -> column; drop the empty column that a delimiter at the end of each line makes."""
     import pandas as pd
 
     columns = {str(title): pd.Series(frame[title]) for title in frame.columns}
@@ -332,7 +332,7 @@ def _from_columns(columns: Mapping[str, pd.Series | Vector], robot: Robot) -> Re
         if title.strip() == "run":
             run = integers(cells)
             continue
-        # Of two equal titles pandas calls the second `pitch [deg].1`.
+        # pandas renames the second of two equal titles to `pitch [deg].1`.
         name, factor = parse_column(re.sub(r"\]\.\d+$", "]", title), robot)
         if name in channels:
             raise DataError(f"channel `{name}` stands in two columns; drop one.")
@@ -346,14 +346,11 @@ def _from_columns(columns: Mapping[str, pd.Series | Vector], robot: Robot) -> Re
 
 
 def require_samples(recording: Recording) -> None:
-    """Raise DataError where a channel that models are made from has no sample at all."""
+    """Raise DataError if an output or motor position has no sample at all."""
     for name in (*recording.robot.outputs.names, *recording.robot.motor_positions):
         if name in recording.channels and np.isnan(recording.channels[name]).all():
-            hint = (
-                "Leave the column out"
-                if name in recording.robot.motor_positions
-                else "A recording needs it; record it again"
-            )
+            keep = name not in recording.robot.motor_positions
+            hint = "A recording needs it; record it again" if keep else "Leave the column out"
             raise DataError(
                 f"channel `{name}` has no sample in any of its {len(recording)} rows; is its sensor connected? {hint}."
             )
@@ -364,12 +361,14 @@ def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: 
 
     Args:
         column: of a table.
-        name: of the column, for the error.
+        name: of the column, for the message.
         missing: whether samples may be missing.
         nan_words: whether a missing sample may be written as `NaN`, as MATLAB and numpy write it.
     """
     if isinstance(column, np.ndarray):
-        return _numbers_only(column, name, missing=missing)
+        if not missing and np.isnan(column).any():
+            raise _number_error(name, "an empty cell", int(np.argmax(np.isnan(column))), missing=missing)
+        return column
     import pandas as pd
 
     values = np.asarray(pd.to_numeric(column, errors="coerce"), dtype=np.float64)
@@ -383,26 +382,19 @@ def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: 
         row = int(np.argmax(bad))
         said = " ".join(str(column.iloc[row]).split())[:60]  # a cell in quotes may hold lines
         cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{said}`"
-        raise _no_number(name, cell, row, missing=missing)
+        raise _number_error(name, cell, row, missing=missing)
     return values
 
 
-def _numbers_only(values: Vector, name: str, *, missing: bool) -> Vector:
-    """Return a column of numbers; NaN stands for an empty cell."""
-    if not missing and np.isnan(values).any():
-        raise _no_number(name, "an empty cell", int(np.argmax(np.isnan(values))), missing=missing)
-    return values
-
-
-def _no_number(name: str, cell: str, row: int, *, missing: bool) -> DataError:
+def _number_error(name: str, cell: str, row: int, *, missing: bool) -> DataError:
     hint = "A missing sample is an empty cell." if missing else "Fix the log or cut it before that row."
     return DataError(f"column `{name}` holds {cell} at row {row} (the first is 0), where a number is needed. {hint}")
 
 
 def integers(column: pd.Series | Vector) -> np.ndarray:
-    """Return the column `run`; raise DataError where it holds no integers."""
+    """Return the column `run`; raise DataError unless it holds integers."""
     values = numbers(column, "run", missing=False)
-    # Beyond 2^53 a float names no single integer.
+    # Not every integer beyond 2^53 is a float.
     if not (np.abs(values) < 2**53).all() or not np.array_equal(values, np.round(values)):
         raise DataError("column `run` must hold integers.")
     return values.astype(np.int64)

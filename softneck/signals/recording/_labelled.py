@@ -1,4 +1,4 @@
-"""Results that know their time, channels and units, and are arrays all the same."""
+"""Result arrays that carry their time, channels and units."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Labelled(np.ndarray):
-    """Channels over time (time, channels) in SI; what is computed from it, or cut out of it, has no labels.
+    """Channels over time (time, channels) in SI; a computed result or a slice has no labels.
 
     Attributes:
         time: (time,) [s].
@@ -56,7 +56,7 @@ class Labelled(np.ndarray):
         return tuple(self.units) if hasattr(self, "units") else ()
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return a table over time [s], a column for each channel in SI; `attrs["units"]` has their units."""
+        """Return a table over time [s] with a column in SI for each channel; `attrs["units"]` holds the units."""
         return table(*self._parts())
 
     def to_xarray(self) -> xarray.Dataset:
@@ -64,7 +64,7 @@ class Labelled(np.ndarray):
         return dataset(*self._parts())
 
     def plot(self, title: str = "") -> Figure:
-        """Return a matplotlib figure of all channels, those of one unit together; angles in degrees."""
+        """Return a matplotlib figure with one panel for each unit; angles in degrees."""
         return signals_figure(*self._parts(), title)
 
     def __repr__(self) -> str:
@@ -76,7 +76,7 @@ class Labelled(np.ndarray):
 
     def _parts(self) -> tuple[Vector, dict[str, Vector], Mapping[str, str]]:
         if not self.channels:
-            raise DataError("this is a part of a result, without its labels; ask the whole result.")
+            raise DataError("this is a part of a result, without its labels; use the whole result.")
         return self.time, {name: self[name] for name in self.channels}, self.units
 
 
@@ -99,6 +99,6 @@ def dataset(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str
 
 
 def signals_figure(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str], title: str) -> Figure:
-    """Draw channels, those of one unit in one panel; angles, by whatever time, in degrees."""
-    # The plots stand above the signals: by their names, as the kinds are.
+    """Draw channels over time, one panel for each unit; angles in degrees."""
+    # Plots are a layer above signals, so that they are resolved by name.
     return resolve("softneck.plots._chart:signals_figure")(time, columns, units, title)

@@ -1,4 +1,4 @@
-"""The recording: named channels over time, in SI, as several runs that are never joined."""
+"""The recording: named channels over time, in SI, in one or more separate runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import DataError, Matrix, ReprMixin, Vector, finite_matrix, require_positive, resolve, to_si
-from softneck.robot import Robot, find_robot
+from softneck.robot import Robot, Scaling, find_robot, round_scaled, scaled_robot
 
 from ._channels import NECK, known_channels, may_miss
 
@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-# A logger's jitter; above it the samples are not equidistant and a discrete-time fit would be wrong.
+# Share of the sample time that a logger's jitter may reach; a discrete-time fit needs equidistant samples.
 MAX_JITTER = 0.02
-# [s]; rounding of printed times is no jitter.
-_ROUNDING = 1e-9
+# [s] Rounding of printed times.
+_TIME_ROUNDING_S = 1e-9
 
 
-def uneven(time: Vector, sample_time: float, run: np.ndarray) -> np.ndarray:
-    """Return (time - 1,) which steps inside a run are off `sample_time` [s] by more than a logger's jitter."""
-    off = np.abs(np.diff(time) - sample_time) > max(MAX_JITTER * sample_time, _ROUNDING)
+def uneven_steps(time: Vector, sample_time: float, run: np.ndarray) -> np.ndarray:
+    """Return (time - 1,) the steps inside a run that differ from `sample_time` [s] by more than a logger's jitter."""
+    off = np.abs(np.diff(time) - sample_time) > max(MAX_JITTER * sample_time, _TIME_ROUNDING_S)
     return off & (np.diff(run) == 0)
 
 
 def check_times(time: Vector, sample_time: float, run: np.ndarray) -> None:
-    """Raise DataError where `time` (time,) [s] runs backwards or jumps inside a run."""
+    """Raise DataError if `time` (time,) [s] falls or jumps inside a run."""
     check_rising(time, run)
     step = np.diff(time)
-    jump = uneven(time, sample_time, run)
+    jump = uneven_steps(time, sample_time, run)
     if jump.any():
         row = int(np.argmax(jump)) + 1
         raise DataError(
@@ -47,7 +47,7 @@ def check_times(time: Vector, sample_time: float, run: np.ndarray) -> None:
 
 
 def check_rising(time: Vector, run: np.ndarray, *, may_stand: bool = False) -> None:
-    """Raise DataError where `time` (time,) is not finite or falls inside a run, or stands still there."""
+    """Raise DataError if `time` (time,) is not finite or does not rise inside a run (`may_stand`: falls)."""
     if not np.isfinite(time).all():
         raise DataError(f"`time` is not finite at row {int(np.argmax(~np.isfinite(time)))}.")
     step = np.diff(time)
@@ -61,7 +61,7 @@ def check_rising(time: Vector, run: np.ndarray, *, may_stand: bool = False) -> N
 
 
 def median_step(time: Vector, run: np.ndarray) -> float:
-    """Return the sample time [s] of a time column: the mean step of its longest regular part."""
+    """Return the sample time [s] of a time column: the mean of its regular steps."""
     if time.size < 2:
         raise DataError(f"a recording needs at least 2 rows; got {time.size}.")
     step = np.diff(time)
@@ -71,13 +71,13 @@ def median_step(time: Vector, run: np.ndarray) -> float:
         raise DataError("`time` never increases; it must rise by the sample time from row to row.")
     typical = float(np.median(positive))
     near = positive[np.abs(positive - typical) < 0.5 * typical]
-    # The mean removes the rounding of printed times; ten digits are more than any clock has.
+    # The mean averages the rounding of printed times; no clock has more than ten digits.
     return float(f"{near.mean():.10g}")
 
 
-# [s] Where neither the caller nor the robot says.
-_SAMPLE_TIME = 0.02
-_FILES = "softneck.signals.recording._files"  # which reads recordings: by its name, as no two files import each other
+# [s] Used if neither the caller nor the robot gives one.
+_DEFAULT_SAMPLE_TIME_S = 0.02
+_FILES_MODULE = "softneck.signals.recording._files"  # resolved by name: `_files` imports this module
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -86,11 +86,11 @@ class Recording(ReprMixin):
 
     Attributes:
         time: (time,) [s], equidistant within each run; may restart at a new run.
-        sample_time: [s].
+        time: (time,) [s], equidistant within each run; may restart with a new run.
         channels: name -> (time,) in SI; the set-points and the outputs are always there. NaN: sample missed.
-        run: (time,) integers, constant over each experiment; 0 everywhere when not given.
+        channels: name -> (time,) in SI; set-points and outputs are required. NaN is a missed sample.
         robot: whose channels these are; the paper's neck when not given.
-
+        robot: the paper's neck if not given.
     Example:
         >>> import numpy as np
         >>> import softneck
@@ -136,14 +136,14 @@ class Recording(ReprMixin):
 
         Args:
             set_points: (time, motors).
-            outputs: (time, outputs), NaN where a sample was missed; None: nothing was measured.
-            motor_positions: (time, motors), if they were logged.
+            outputs: (time, outputs), NaN for missed samples; None: not measured.
+            motor_positions: (time, motors), if logged.
             sample_time: [s]; the robot's, or 0.02, if not given.
             run: (time,) numbers of the runs; one run if not given.
             robot: a robot, its file or a preset; the paper's neck if not given.
 
         Raises:
-            DataError: shapes that do not fit each other or the robot.
+            DataError: shapes do not fit each other or the robot.
         """
         whose = find_robot(robot)
         names = (whose.set_points, whose.outputs.names, whose.motor_positions)
@@ -158,25 +158,25 @@ class Recording(ReprMixin):
         numbers = np.zeros(len(U), dtype=np.int64) if run is None else np.asarray(run)
         if numbers.shape != (len(U),) or numbers.dtype.kind not in "iu":
             raise DataError(f"`run` must be integers of shape {(len(U),)}; got {numbers.dtype} {numbers.shape}.")
-        step = (whose.sample_time_s or _SAMPLE_TIME) if sample_time is None else sample_time
+        step = (whose.sample_time_s or _DEFAULT_SAMPLE_TIME_S) if sample_time is None else sample_time
         begins = np.maximum.accumulate(np.where(np.diff(numbers, prepend=numbers[:1] - 1) != 0, np.arange(len(U)), 0))
         return cls((np.arange(len(U)) - begins) * step, step, channels, numbers, whose)
 
     @classmethod
     def from_pandas(cls, frame: pd.DataFrame, *, robot: Robot | str | Path | None = None) -> Recording:
-        """Return the recording of a table whose columns say their unit, as in a file: `time [s]`, `pitch [deg]`, ...
+        """Return the recording of a table in the format of a file: `time [s]`, `pitch [deg]`, ...
 
         Raises:
-            DataError: columns, units, numbers or times are not those of a recording of the robot.
+            DataError: columns, units, numbers or times do not fit the robot.
         """
-        return resolve(f"{_FILES}:from_frame")(frame, robot)
+        return resolve(f"{_FILES_MODULE}:from_frame")(frame, robot)
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return a table whose columns say their unit, as in its file; `from_pandas` reads it."""
-        return resolve(f"{_FILES}:recording_frame")(self)
+        """Return a table in the format of a file; `from_pandas` reads it."""
+        return resolve(f"{_FILES_MODULE}:recording_frame")(self)
 
     def plot(self, title: str = "") -> Figure:
-        """Return a matplotlib figure of set-points and outputs, in the units that people see."""
+        """Return a matplotlib figure of set-points and outputs in display units."""
         chart, figure = (
             resolve(f"softneck.plots.{name}") for name in ("_charts:recording_chart", "_chart:chart_figure")
         )
@@ -186,7 +186,7 @@ class Recording(ReprMixin):
         return self.time.size
 
     def summary(self) -> str:
-        """Return two lines on what is in it."""
+        """Return two lines that summarise the recording."""
         runs = np.count_nonzero(np.diff(self.run)) + (len(self) > 0)
         names = [name for name in self.channels if name not in self.robot.set_points]
         return (
@@ -196,7 +196,7 @@ class Recording(ReprMixin):
 
     @property
     def set_points(self) -> Matrix:
-        """(time, motors) set-points in SI: of the neck (time, 3) [rad]."""
+        """(time, motors) set-points in SI; of the neck (time, 3) [rad]."""
         return np.column_stack([self.channels[name] for name in self.robot.set_points])
 
     @property
@@ -211,13 +211,13 @@ class Recording(ReprMixin):
 
     @property
     def motor_positions(self) -> Matrix:
-        """(time, motors) measured motor positions in SI; the set-points where none were logged."""
+        """(time, motors) measured motor positions in SI; the set-points if none were logged."""
         if not self.has_motor_positions:
             return self.set_points
         return np.column_stack([self.channels[name] for name in self.robot.motor_positions])
 
     def runs(self) -> tuple[Recording, ...]:
-        """Return each experiment as a recording of its own."""
+        """Return each run as a recording of its own."""
         borders = np.flatnonzero(np.diff(self.run)) + 1
         edges = [0, *borders.tolist(), len(self)]
         return tuple(self.rows(start, stop) for start, stop in itertools.pairwise(edges))
@@ -287,9 +287,9 @@ class Recording(ReprMixin):
 
 
 def concatenate(recordings: Sequence[Recording], *, names: Sequence[str] = ()) -> Recording:
-    """Put recordings of one sample time behind each other as separate runs; channels that all have are kept.
+    """Return recordings of one sample time as separate runs of one; only channels of all are kept.
 
-    One without the channel `payload` bore none where another has it. Errors call the recordings by their `names`.
+    If some have the channel `payload`, the payload of the others is 0. Messages use `names`.
 
     Raises:
         DataError: none given, or sample times or robots differ.
@@ -323,7 +323,7 @@ def concatenate(recordings: Sequence[Recording], *, names: Sequence[str] = ()) -
 
 
 def require_same_robot(one: Robot, other: Robot, what: str) -> None:
-    """Raise DataError where `what` are of two robots whose numbers mean different things; `other` is named first."""
+    """Raise DataError if two robots differ in anything that changes the meaning of their numbers."""
     if one.hash != other.hash:
         raise DataError(f"{what} of two robots cannot be used together: {other.label()} and {one.label()}.")
 
@@ -332,19 +332,43 @@ Conditions = dict[str, list[float]]
 
 
 def conditions(recording: Recording) -> Conditions:
-    """Return least and largest payload [kg] and co-contraction [the motors' SI unit], the mean of the set-points.
-
-    A recording without the channel `payload` had none.
-    """
+    """Return the range of payload [kg], 0 if not recorded, and of co-contraction, the mean of the set-points [SI]."""
     payload = recording.channels.get("payload", np.zeros(1))
     mean = recording.set_points.mean(axis=1)
-    return {"payload_kg": _ends(payload), "cocontraction": _ends(mean)}
+    return {"payload_kg": _min_max(payload), "cocontraction": _min_max(mean)}
 
 
-def joined(parts: Sequence[Conditions]) -> Conditions:
-    """Return the conditions from the least to the largest of all parts."""
-    return {name: _ends(np.concatenate([part[name] for part in parts])) for name in parts[0]} if parts else {}
+def merge_conditions(parts: Sequence[Conditions]) -> Conditions:
+    """Return the range over all parts of each condition."""
+    return {name: _min_max(np.concatenate([part[name] for part in parts])) for name in parts[0]} if parts else {}
 
 
-def _ends(values: np.ndarray) -> list[float]:
+def _min_max(values: np.ndarray) -> list[float]:
     return [float(np.nanmin(values)), float(np.nanmax(values))]
+
+
+# Dimensionless channels and loads: scaling leaves them as they are.
+_UNSCALED_CHANNELS = ("payload", "compression", "healthy", "enabled", "measurement_valid")
+
+
+def scale_recording(recording: Recording, scaling: Scaling) -> Recording:
+    """Return the recording in scaled quantities, of a robot without units; identity scaling returns it unchanged."""
+    if scaling.is_identity:
+        return recording
+    robot = recording.robot
+    channels = {name: values for name, values in recording.channels.items() if name in _UNSCALED_CHANNELS}
+    for names, scale in (
+        (robot.set_points, scaling.scale_motors),
+        (robot.motor_positions, scaling.scale_motors),
+        (robot.outputs.names, scaling.scale_outputs),
+    ):
+        if all(name in recording.channels for name in names):
+            values = round_scaled(scale(np.column_stack([recording.channels[name] for name in names])))
+            channels |= dict(zip(names, values.T, strict=True))
+    return replace(
+        recording,
+        time=recording.time / scaling.second,
+        sample_time=recording.sample_time / scaling.second,
+        channels=channels,
+        robot=scaled_robot(robot, scaling),
+    )

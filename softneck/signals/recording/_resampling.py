@@ -1,4 +1,4 @@
-"""Logged samples at irregular times become equidistant ones; gaps split a run and are never bridged."""
+"""Resampling of logs with irregular times; gaps split a run and are never bridged."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from softneck.core import DataError, Vector, require_positive
 from ._channels import is_held
 from ._recording import Recording
 
-# A step of 1.5 usual ones lacks a sample, unless the clock's own steps reach so far: no hole of 1.15 times between
-# them, chosen by leaving out clocks (benchmarks/clock_gaps.py). Beyond 4 usual ones it is a pause of any clock.
-_GAP, _HOLE, _PAUSE = 1.5, 1.15, 4.0
-# Lags of 2 to 4 and a delay of as much again: a shorter piece gives a model not one row to learn from.
+# A step of 1.5 median ones lacks a sample, unless the clock's own steps reach that length without a jump of 1.15 times
+# between them; leaving out single clocks chose these (benchmarks/clock_gaps.py). Beyond 4 it is a pause in any clock.
+_GAP_STEPS, _LENGTH_JUMP, _PAUSE_STEPS = 1.5, 1.15, 4.0
+# With lags of 2 to 4 and as much delay, a shorter piece gives no row to train on.
 SHORTEST = 10
-# Of the new Nyquist frequency, what is passed; damping beyond it [dB].
-_PASSED, _DAMPING = 0.7, 60.0
-# An instant that is this close to a logged one, in sample times, is that one: rounding of sums of steps.
-_SAME = 1e-6
+# Passband as a share of the new Nyquist frequency; stopband attenuation [dB].
+_PASSBAND, _ATTENUATION_DB = 0.7, 60.0
+# Instants closer than this many sample times are equal: sums of steps are rounded.
+_TIME_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class Samples:
 
 
 def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tuple[str, ...]]:
-    """Return one row for each time stamp of a run, by the layout's rule `first` or `last`, and a note."""
+    """Keep the `first` or `last` row of each time stamp of a run, by the layout's rule, and return a note."""
     same = (np.diff(samples.time) == 0) & (np.diff(samples.run) == 0)
     if not same.any():
         return samples, ()
@@ -64,11 +64,11 @@ def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tup
     return samples.rows(keep), (note,)
 
 
-def gaps(samples: Samples, hole: float = _HOLE) -> tuple[np.ndarray, float]:
-    """Return (time - 1,) whether rows are missing between one and the next, and beyond how many seconds they are.
+def find_gaps(samples: Samples, hole: float = _LENGTH_JUMP) -> tuple[np.ndarray, float]:
+    """Return (time - 1,) whether rows are missing after each row, and the shortest gap [s].
 
-    A stamp that came late is made up for by a short step beside it: what counts is a step with the shorter of its
-    neighbours. A clock that jitters has long steps of all lengths; those behind a hole in their lengths are gaps.
+    A late stamp is followed by a short step, so each step is judged together with its shorter neighbour. A clock that
+    jitters has long steps of all lengths; only steps beyond a jump in the sorted lengths are gaps.
     """
     step = np.diff(samples.time)
     inside = np.diff(samples.run) == 0
@@ -80,39 +80,39 @@ def gaps(samples: Samples, hole: float = _HOLE) -> tuple[np.ndarray, float]:
     length = (step + np.where(np.isfinite(shorter), shorter, usual)) / usual - 1.0
     long = np.sort(length[inside & (length > 1.0)])
     behind = long[1:][long[1:] > hole * long[:-1]] if long.size else long
-    behind = behind[behind > _GAP]
-    if long.size and long[0] > _GAP:  # all others are alike
+    behind = behind[behind > _GAP_STEPS]
+    if long.size and long[0] > _GAP_STEPS:  # all long steps are gaps
         behind = long
-    bound = min(float(behind[0]) if behind.size else np.inf, _PAUSE)
+    bound = min(float(behind[0]) if behind.size else np.inf, _PAUSE_STEPS)
     return inside & (length >= bound), bound * usual
 
 
 def jitter(time: Vector) -> tuple[float, float, float] | None:
-    """Return the shortest, longest and median step where some are as long as gaps are and yet none; None elsewhere.
+    """Return the shortest, longest and median step of a clock that jitters; None if its long steps are gaps.
 
-    A time that goes back is a new run, and rows of one stamp count once.
+    A time that goes back starts a new run; rows of one stamp count once.
     """
     time = time[np.append(True, np.diff(time) != 0)]
     run = np.cumsum(np.append(False, np.diff(time) < 0))
     step, inside = np.diff(time), np.diff(run) == 0
     if not inside.any():
         return None
-    usual, steps = float(np.median(step[inside])), step[inside & ~gaps(Samples(time, run, {}))[0]]
-    if not (steps > (_GAP + _SAME) * usual).any():
+    usual, steps = float(np.median(step[inside])), step[inside & ~find_gaps(Samples(time, run, {}))[0]]
+    if not (steps > (_GAP_STEPS + _TIME_TOLERANCE) * usual).any():
         return None
     return float(steps.min()), float(steps.max()), usual
 
 
 def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
-    """Return the samples with a new run after each gap, and notes; pieces shorter than 10 samples are dropped."""
+    """Start a new run after each gap and return notes; drop pieces shorter than 10 samples."""
     step = np.diff(samples.time)
     inside = np.diff(samples.run) == 0
-    gap, bound = gaps(samples)
+    gap, bound = find_gaps(samples)
     if not gap.any():
         return samples, ()
     number = np.concatenate([[0], np.cumsum(gap | ~inside)])
     size = np.bincount(number)
-    # Only pieces that a gap cut off are judged: a short experiment is the user's.
+    # Only pieces beside a gap are dropped: a short experiment is the user's choice.
     cut = np.zeros(size.size, dtype=bool)
     cut[number[:-1][gap]] = True
     cut[number[1:][gap]] = True
@@ -135,23 +135,22 @@ def split_at_gaps(samples: Samples) -> tuple[Samples, tuple[str, ...]]:
 
 
 def mean_step(samples: Samples) -> float:
-    """Return the mean step inside the runs [s], to ten digits: jitter averages out."""
+    """Return the mean step inside the runs [s] to ten digits, which averages jitter out."""
     step = np.diff(samples.time)[np.diff(samples.run) == 0]
     return float(f"{step.mean():.10g}")
 
 
 def resampled(recording: Recording, sample_time: float) -> Recording:
-    """Return a recording at another sample time [s], run by run; at its own it comes back to the bit.
+    """Return a recording at another sample time [s], run by run; at its own time it is returned unchanged.
 
-    A model is of one sample time; this brings other recordings there. Measured channels follow a monotone cubic, as an
-    import makes uneven times even. Before they go to a slower sample time, what that cannot hold is filtered out
-    without a delay (`low_pass`). Set-points and flags hold their last value.
+    Measured channels are interpolated by a monotone cubic. Before a slower sample time they pass an anti-aliasing
+    filter without delay (`low_pass`). Set-points and flags hold their last value.
 
     Raises:
         DataError: a run is shorter than the new sample time.
     """
     require_positive("sample_time", sample_time, "s")
-    if abs(sample_time - recording.sample_time) <= _SAME * recording.sample_time:
+    if abs(sample_time - recording.sample_time) <= _TIME_TOLERANCE * recording.sample_time:
         return recording
     shortest = min(len(run) for run in recording.runs())
     if (shortest - 1) * recording.sample_time < sample_time:
@@ -167,7 +166,7 @@ def resampled(recording: Recording, sample_time: float) -> Recording:
 
 
 def _without_aliases(samples: Samples, ratio: float) -> Samples:
-    """Return the samples with measured channels low-passed for a sample time `ratio` times as long, run by run."""
+    """Low-pass the measured channels of each run for a sample time `ratio` times as long."""
     channels = dict(samples.channels)
     for name, values in samples.channels.items():
         if not is_held(name):
@@ -176,21 +175,21 @@ def _without_aliases(samples: Samples, ratio: float) -> Samples:
 
 
 def low_pass(values: Vector, ratio: float) -> Vector:
-    """Return values (time,) without what a sample time `ratio` times as long would fold down to lower frequencies.
+    """Low-pass values (time,) for a sample time `ratio` times as long, without delay.
 
-    A sinc in a Kaiser window of 60 dB (Kaiser 1974), symmetric and so without delay, that passes all below 0.7 of the
-    new Nyquist frequency and ends at it. Both ends are continued by their reflection in the last value, which keeps
-    straight lines straight. Lines stand in for missed samples, which stay missed.
+    The filter is a sinc in a Kaiser window of 60 dB (Kaiser 1974); it passes 0.7 of the new Nyquist frequency and stops
+    at it. Both ends are continued by point reflection, which keeps straight lines straight. Missed samples are bridged
+    for the filter and stay missed.
     """
     seen = np.isfinite(values)
     if values.size < 3 or seen.sum() < 2:
         return values
     stop = np.pi / ratio
-    width = (1.0 - _PASSED) * stop
-    # A run shorter than the window gets a shorter one, whose edge is less steep.
-    half = min(int(np.ceil((_DAMPING - 7.95) / (2.285 * width) / 2.0)), values.size - 1)
+    width = (1.0 - _PASSBAND) * stop
+    # A run shorter than the window gets a shorter window, whose edge is less steep.
+    half = min(int(np.ceil((_ATTENUATION_DB - 7.95) / (2.285 * width) / 2.0)), values.size - 1)
     k = np.arange(-half, half + 1)
-    weights = np.sinc((stop - width / 2.0) / np.pi * k) * np.kaiser(2 * half + 1, 0.1102 * (_DAMPING - 8.7))
+    weights = np.sinc((stop - width / 2.0) / np.pi * k) * np.kaiser(2 * half + 1, 0.1102 * (_ATTENUATION_DB - 8.7))
     whole = np.interp(np.arange(values.size), np.flatnonzero(seen), values[seen])
     ends = 2.0 * whole[0] - whole[half:0:-1], 2.0 * whole[-1] - whole[-2 : -half - 2 : -1]
     filtered = np.convolve(np.concatenate([ends[0], whole, ends[1]]), weights / weights.sum(), mode="valid")
@@ -198,23 +197,23 @@ def low_pass(values: Vector, ratio: float) -> Vector:
 
 
 def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:
-    """Return the samples at multiples of `sample_time` [s] from each run's first, and the largest shift [s].
+    """Return the samples at multiples of `sample_time` [s] from the start of each run, and the largest shift [s].
 
-    Measured channels follow a monotone cubic (PCHIP, Fritsch and Carlson 1980) through the samples that were not
-    missed; an instant next to a missed sample is missed. Set-points and flags keep the last value before an instant.
-    The shift is the distance from an instant to the nearest logged sample.
+    Measured channels are interpolated by PCHIP (Fritsch and Carlson 1980) through the samples present; an instant next
+    to a missed sample is missed. Set-points and flags hold their last value. The shift is the distance from an instant
+    to the nearest logged sample.
     """
     parts: list[Samples] = []
     shift = 0.0
     for rows in samples.runs():
         t = samples.time[rows]
-        count = int(np.floor((t[-1] - t[0]) / sample_time + _SAME)) + 1
+        count = int(np.floor((t[-1] - t[0]) / sample_time + _TIME_TOLERANCE)) + 1
         grid = t[0] + sample_time * np.arange(count)
-        before = np.clip(np.searchsorted(t, grid + _SAME * sample_time, side="right") - 1, 0, t.size - 1)
-        after = np.minimum(before + (np.abs(grid - t[before]) > _SAME * sample_time), t.size - 1)
+        before = np.clip(np.searchsorted(t, grid + _TIME_TOLERANCE * sample_time, side="right") - 1, 0, t.size - 1)
+        after = np.minimum(before + (np.abs(grid - t[before]) > _TIME_TOLERANCE * sample_time), t.size - 1)
         shift = max(shift, float(np.minimum(np.abs(grid - t[before]), np.abs(t[after] - grid)).max()))
         channels = {
-            name: c[rows][before] if is_held(name) else _measured(t, c[rows], grid, before, after)
+            name: c[rows][before] if is_held(name) else _interpolate(t, c[rows], grid, before, after)
             for name, c in samples.channels.items()
         }
         parts.append(Samples(grid, np.full(count, samples.run[rows.start]), channels))
@@ -224,18 +223,18 @@ def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:
     return Samples(time, run, joined), shift
 
 
-def _measured(t: Vector, x: Vector, grid: Vector, before: np.ndarray, after: np.ndarray) -> Vector:
-    """Return x (time,) at `grid` (instants,) between its samples `before` and `after`."""
+def _interpolate(t: Vector, x: Vector, grid: Vector, before: np.ndarray, after: np.ndarray) -> Vector:
+    """Interpolate x (time,) at `grid` (instants,) between its samples `before` and `after`."""
     from scipy.interpolate import PchipInterpolator
 
     seen = np.isfinite(x)
     missed = ~(seen[before] & seen[after])
     values = x[before]
-    # Two points make a line; fewer leave nothing between samples.
+    # Fewer than two points cannot be interpolated.
     if seen.sum() > 1:
         try:
             values = PchipInterpolator(t[seen], x[seen])(grid)
-        except ValueError as error:  # slopes between damaged numbers are not finite
+        except ValueError as error:  # damaged numbers have slopes that are not finite
             largest = float(np.abs(x[seen]).max())
             raise DataError(
                 f"a channel reaches {largest:.3g} within {np.ptp(t):.3g} s and cannot be resampled; is the log damaged?"
