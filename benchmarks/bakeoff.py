@@ -16,7 +16,7 @@ from typing import Any
 
 from softneck.core import SoftneckError, load
 from softneck.design import FopiSettings, HinfSettings, LqgSettings, PidSettings, PiSettings
-from softneck.design.plants._step_and_load import StepAndLoadResult
+from softneck.design.plants._uncertain import StepAndLoadResult
 from tests.oracles.bake_off import bake_off_neck, bake_off_samples, block_stepper, exact, neck_within, run_bake_off
 
 # What issue 11 asks of one controller: worst overshoot [%], nominal settling [s], worst rms under the load [deg].

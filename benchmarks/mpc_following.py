@@ -25,7 +25,7 @@ import numpy as np
 
 from softneck.core import Vector, load
 from softneck.design import MpcController
-from softneck.design.linear._rise import rise_time
+from softneck.design.linear._axis_loop import rise_time
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings, NonlinearObserver
 from softneck.identification import Family, FamilySettings, GreyBox, OutputError

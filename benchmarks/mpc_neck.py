@@ -32,7 +32,7 @@ from scipy.ndimage import gaussian_filter1d
 from softneck.core import Matrix, Vector
 from softneck.design import PiSettings
 from softneck.design.predictive._nmpc import NmpcNumbers
-from softneck.design.predictive._scale import TAUTNESS_LEVER
+from softneck.design.predictive._plant import TAUTNESS_LEVER
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Network
 from softneck.loop import BlockPart, Loop, LoopResult, RecordingReference, run_loop

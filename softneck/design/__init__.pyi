@@ -14,9 +14,9 @@ from .predictive._nmpc import NmpcController as NmpcController
 from .predictive._nmpc import NmpcSettings as NmpcSettings
 from .predictive._settings import MpcSettings as MpcSettings
 from .robust._hinf import HinfSettings as HinfSettings
+from .robust._hinf import hinfsyn as hinfsyn
+from .robust._hinf import mixsyn as mixsyn
 from .robust._mu import mu_upper as mu_upper
-from .robust._synthesis import hinfsyn as hinfsyn
-from .robust._synthesis import mixsyn as mixsyn
 from .robust._weights import makeweight as makeweight
 from .varying._adaptive import AdaptiveSettings as AdaptiveSettings
 from .varying._adaptive import VaryingController as VaryingController
@@ -24,14 +24,14 @@ from .varying._adaptive import VaryingController as VaryingController
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._design import linear_plant as linear_plant
-from .linear._axis_settings import AxisSettings as AxisSettings
-from .linear._axis_settings import axis_test as axis_test
+from .linear._axis_loop import least_rise as least_rise
 from .linear._controller import assumed_lines as assumed_lines
-from .linear._loop_settings import LoopSettings as LoopSettings
 from .linear._own import own_attributes as own_attributes
 from .linear._own import own_controller as own_controller
 from .linear._own import own_module as own_module
 from .linear._ports import motor_ranges as motor_ranges
-from .linear._rise import least_rise as least_rise
+from .linear._settings import AxisSettings as AxisSettings
+from .linear._settings import LoopSettings as LoopSettings
+from .linear._settings import axis_test as axis_test
 from .plants._uncertain import UncertainPlant as UncertainPlant
 from .robust._mu import two_scalars as two_scalars

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from softneck.core import SettingsError, load
 from softneck.design import AdaptiveSettings, LinearController, VaryingController, uncertain_plant
-from softneck.design.linear._assembly import AxisController, ReferenceFilter, assemble
-from softneck.design.linear._tuning import Gains
+from softneck.design.linear._controller import AxisController, ReferenceFilter, assemble
+from softneck.design.linear._pi import Gains
 from softneck.design.varying import _adaptive
 from softneck.design.varying._adaptive_runtime import AdaptiveArrays, AdaptiveState
 from softneck.estimation import AxisPlant, LinearNeck

@@ -11,7 +11,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.design import PiSettings
-from softneck.design.plants._step_and_load import StepAndLoad
+from softneck.design.plants._uncertain import StepAndLoad
 from softneck.estimation import AxisPlant
 
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, run_bake_off

@@ -12,10 +12,9 @@ import pytest
 
 from softneck.core import FileFormatError, SettingsError, load, read_archive
 from softneck.design import CustomSettings, LqgSettings, MpcController, MpcSettings, PidSettings, makeweight, mixsyn
+from softneck.design.linear._axis_loop import rise_time
 from softneck.design.linear._linear_parts_runtime import LinearArrays
-from softneck.design.linear._rise import rise_time
-from softneck.design.plants._coupled import CoupledPlant, _coupled, coupled_plant
-from softneck.design.plants._coupled_axis import closed, responses, times
+from softneck.design.plants._coupled import CoupledPlant, _coupled, closed, coupled_plant, responses, times
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record

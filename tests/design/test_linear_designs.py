@@ -12,7 +12,6 @@ from scipy.linalg import solve_discrete_are
 
 from softneck.core import SettingsError
 from softneck.design import HinfSettings, LqgSettings, PidSettings, PiSettings, fopi
-from softneck.design.linear._assembly import AxisController
 from softneck.design.linear._axis_loop import (
     axis_margins,
     conditioning_gain,
@@ -20,9 +19,10 @@ from softneck.design.linear._axis_loop import (
     feedback_response,
     make_sweep,
 )
+from softneck.design.linear._controller import AxisController
 from softneck.design.linear._fopi import FractionalPi
 from softneck.design.linear._pid import PidGains
-from softneck.design.plants._step_and_load import StepAndLoad
+from softneck.design.plants._uncertain import StepAndLoad
 
 from ..oracles.bake_off import bake_off_neck, bake_off_plant, bake_off_plants, block_stepper, exact, run_bake_off
 

@@ -183,7 +183,7 @@ def test_a_slow_pole_that_hides_behind_a_zero_is_asked_nothing_of_by_mpc() -> No
 
 def test_what_the_output_shows_is_the_plant_without_the_pole_that_hides() -> None:
     plain, with_it = (axis_plant(_hiding(pole, zero), "pitch") for pole, zero in ((0.0, 0.0), (HIDDEN, HIDES)))
-    assert plain.shown() is plain
-    shown = with_it.shown()
+    assert plain.remove_hidden_poles() is plain
+    shown = with_it.remove_hidden_poles()
     assert shown.static_gain == pytest.approx(with_it.static_gain, rel=1e-9)
     np.testing.assert_allclose(np.roots(shown.denominator), [math.exp(-3.0 * 0.02)], atol=1e-9)

@@ -15,7 +15,7 @@ from softneck.core import DataError, FileFormatError
 from softneck.design import MpcController, MpcSettings
 from softneck.design.plants._uncertain import uncertain_plant
 from softneck.design.predictive import _mpc_state_runtime as rt
-from softneck.design.predictive._scale import scaled_plant
+from softneck.design.predictive._plant import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.loop import BlockPart, Loop, RotationReference, run_loop
 from softneck.loop._references import AheadReference

@@ -10,8 +10,7 @@ import pytest
 from softneck.core import SettingsError
 from softneck.design import MpcSettings
 from softneck.design.plants._uncertain import uncertain_plant
-from softneck.design.predictive._predicted import predicted_plants
-from softneck.design.predictive._scale import scaled_plant
+from softneck.design.predictive._plant import predicted_plants, scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 
 from ..oracles.bake_off import bake_off_neck

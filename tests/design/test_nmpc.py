@@ -12,9 +12,9 @@ import pytest
 from softneck.core import DataError, SettingsError, load
 from softneck.design import NmpcController, NmpcSettings
 from softneck.design.predictive._nmpc import NmpcNumbers
-from softneck.design.predictive._nmpc_prepared import SLACK_WEIGHT, NonlinearProblem, disturbance_ahead, estimate_gains
+from softneck.design.predictive._nmpc_problem import SLACK_WEIGHT, NonlinearProblem, disturbance_ahead, estimate_gains
 from softneck.design.predictive._nmpc_state_runtime import NmpcArrays, NmpcState
-from softneck.design.predictive._scale import TAUTNESS_LEVER
+from softneck.design.predictive._plant import TAUTNESS_LEVER
 from softneck.estimation import LinearNeck
 from softneck.identification import GreyBox, Model, Network, Play, Rls
 from softneck.plant import NeckParameters, VirtualNeck, record

@@ -10,7 +10,7 @@ import pytest
 from softneck.core import SettingsError
 from softneck.design import MpcSettings, NmpcSettings
 from softneck.design.predictive._nmpc import NmpcNumbers
-from softneck.design.predictive._predicted import _gain, taut_from
+from softneck.design.predictive._plant import _gain, taut_from
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings
 from softneck.identification import GreyBox, Model

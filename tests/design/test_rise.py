@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from softneck.core import KINDS, SettingsError, Vector, resolve
-from softneck.design.linear._rise import LAG, check_rise, filter_for_lag, least_rise
-from softneck.design.plants._step_and_load import StepAndLoad
-from softneck.design.plants._uncertain import uncertain_plant
+from softneck.design.linear._axis_loop import LAG, check_rise, filter_for_lag, least_rise
+from softneck.design.plants._uncertain import StepAndLoad, uncertain_plant
 from softneck.estimation import LinearNeck, axis_plant
 from softneck.robot import Robot
 

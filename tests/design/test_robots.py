@@ -16,7 +16,7 @@ from softneck.cosim import make_loop, simulate
 from softneck.cosim.loops._loop_table import check_key
 from softneck.design import PiSettings, design_controller
 from softneck.design.plants._uncertain import uncertain_plant
-from softneck.design.predictive._scale import scaled_plant
+from softneck.design.predictive._plant import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Model
 from softneck.identification.models._state_space import lss_arrays

@@ -23,8 +23,7 @@ from softneck.design import (
     PiSettings,
     uncertain_plant,
 )
-from softneck.design.plants._step_and_load import StepAndLoad
-from softneck.design.plants._uncertain import UncertainPlant
+from softneck.design.plants._uncertain import StepAndLoad, UncertainPlant
 from softneck.estimation import LinearNeck
 from softneck.signals import redefinition_matrix
 

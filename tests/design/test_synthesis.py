@@ -11,8 +11,8 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.design import hinfsyn, makeweight, mixsyn
-from softneck.design.robust import _synthesis
-from softneck.design.robust._synthesis import Synthesis
+from softneck.design.robust import _hinf
+from softneck.design.robust._hinf import Synthesis
 
 from ..oracles.bake_off import bake_off_plant
 
@@ -37,7 +37,7 @@ def by_slycot(P: Any, nmeas: int, ncon: int, *, above: float = 1.05) -> Synthesi
 def mixsyn_by_slycot(*given: Any) -> Synthesis:
     """Return `mixsyn` of the same generalised plant."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_synthesis, "hinfsyn", by_slycot)
+        patch.setattr(_hinf, "hinfsyn", by_slycot)
         return mixsyn(*given)
 
 

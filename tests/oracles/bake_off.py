@@ -12,8 +12,14 @@ import control
 import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_one_of
-from softneck.design.plants._step_and_load import StepAndLoad, StepAndLoadResult, judge
-from softneck.design.plants._uncertain import Doubts, UncertainPlant, uncertain_plant
+from softneck.design.plants._uncertain import (
+    Doubts,
+    StepAndLoad,
+    StepAndLoadResult,
+    UncertainPlant,
+    judge,
+    uncertain_plant,
+)
 from softneck.estimation import AxisPlant, LinearNeck
 from softneck.estimation._axis import AXES
 from softneck.robot import Robot

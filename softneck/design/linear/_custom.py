@@ -12,13 +12,11 @@ import numpy as np
 from softneck.core import DataError, Matrix, SettingsError
 from softneck.robot import Robot
 
-from ..plants._coupled import coupled_plant
-from ..plants._coupled_axis import AnyAxes
+from ..plants._coupled import AnyAxes, coupled_plant
 from ..plants._uncertain import UncertainAxis, UncertainPlant, doubts_of
-from ._assembly import AxisController
 from ._axis_loop import coarse, conditioning_gain, error_feedback, feedback_response, innovations_gain
-from ._axis_settings import AxisDesign, AxisSettings
-from ._controller import LinearController
+from ._controller import AxisController, LinearController
+from ._settings import AxisDesign, AxisSettings
 from ._whole import WholeDesign, whole_controller
 
 # A loop slower than a hundredth of its plant's pole hardly acts: gains in deg or kPa make it 57 or 1,000 times slower.

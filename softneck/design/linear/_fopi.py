@@ -14,7 +14,7 @@ from softneck.estimation import AxisPlant
 
 from ..plants._uncertain import UncertainAxis
 from ._axis_loop import error_feedback
-from ._axis_settings import AxisDesign, AxisSettings
+from ._settings import AxisDesign, AxisSettings
 
 if TYPE_CHECKING:
     import control

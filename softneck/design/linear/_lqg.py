@@ -10,13 +10,11 @@ import numpy as np
 from softneck.core import Matrix, SettingsError, require_between
 from softneck.robot import Robot
 
-from ..plants._coupled import CoupledPlant, coupled_plant
-from ..plants._coupled_axis import AnyAxes, realised, times
+from ..plants._coupled import AnyAxes, CoupledPlant, coupled_plant, realised, times
 from ..plants._uncertain import UncertainAxis, doubts_of, scaled
-from ._assembly import AxisController
 from ._axis_loop import delayed_form
-from ._axis_settings import AxisDesign, AxisSettings
-from ._controller import LinearController
+from ._controller import AxisController, LinearController
+from ._settings import AxisDesign, AxisSettings
 from ._whole import WholeDesign, fastest, whole_controller
 
 

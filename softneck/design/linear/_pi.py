@@ -1,21 +1,25 @@
-"""PI control of both axes: as much integral action as the asked robustness allows."""
+"""PI control: the largest integral action within bounds on Ms and phase margin, and the reference filter."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from softneck.core import SettingsError, require_between, require_one_of
+import numpy as np
+
+from softneck.core import Matrix, SettingsError, Vector, require_between, require_one_of
+from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._assembly import AxisController, ReferenceFilter, pi_axis
-from ._axis_loop import LOWEST, loop_margins, sensitivities, unstable_samples
-from ._axis_settings import AxisDesign, AxisSettings, margins_json
-from ._loop_settings import PLANT
-from ._tuning import Gains, Plants, open_loop, reference_time, tune_pi
+from ._axis_loop import LOWEST, coarse, frequencies, loop_margins, sensitivities, unstable_samples
+from ._controller import AxisController, ReferenceFilter, pi_axis
+from ._settings import PLANT, AxisDesign, AxisSettings, margins_json
+
+if TYPE_CHECKING:
+    import control
 
 TUNINGS = ("nominal", "samples")
 
@@ -97,3 +101,157 @@ class PiSettings(AxisSettings):
         pole = plant.doubts.small_move_pole
         faster = plant.nominal.faster(pole) if pole > 0.0 else plant.nominal
         return plant.samples[: 1 if faster is plant.nominal else 2]
+
+
+# Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
+_SIZES = np.geomspace(1e-2, 1e2, 190)
+_REFINEMENTS = 6
+# Integral times that are tried, in units of the plant's lag and delay together.
+_TIMES = np.geomspace(0.2, 3.0, 40)
+# A step response is judged over this long [s]; slower than any neck settles.
+_HORIZON = 4.0
+# Up to so many plants are judged on the fine grid and all at once; more of them 4 % apart, the deciding ones alone.
+_FEW = 3
+# A reference filter slower than this [s] would be no answer to overshoot.
+_SLOWEST_FILTER = 2.0
+
+Plants = tuple[AxisPlant, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """PI gains of `v = K (e + 1/Ti int e)`.
+
+    Attributes:
+        gain: K [rad/rad].
+        integral_time: Ti [s].
+    """
+
+    gain: float
+    integral_time: float
+
+
+def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_margin: float) -> Gains:
+    """Return the gains with the largest K/Ti that keep Ms and the phase margin [rad] on all `plants`.
+
+    The plants share sample time and the sign of their gain; times and gains are tried around the first. Of many
+    plants, those that decide are found by adding the worst under the gains so far until none breaks a bound.
+
+    Raises:
+        SettingsError: none do.
+    """
+    plant = plants[0]
+    fine = len(plants) <= _FEW
+    w = frequencies(plant.sample_time, lowest=LOWEST / plant.second) if fine else coarse(plant)
+    z = np.exp(1j * w * plant.sample_time)
+    # (plants, frequencies)
+    G = np.array([item.response(w, extra_delay=extra_delay) for item in plants]) / plant.static_gain
+    if len(plants) <= _FEW:
+        return _tuned(G, z, plant, extra_delay, (max_sensitivity, phase_margin))
+    # A bound kept between frequencies too: the coarse grid misses 0.2 % of a peak.
+    bounds = (max_sensitivity / 1.002, phase_margin)
+    deciding = [0]
+    while True:
+        found = _tuned(G[deciding], z, plant, extra_delay, bounds)
+        loops = found.gain * plant.static_gain * G * (1.0 + plant.sample_time / found.integral_time / (z - 1.0))
+        broken = [
+            i
+            for i in range(len(plants))
+            if i not in deciding and not _keeps(loops[i : i + 1], max_sensitivity, phase_margin)
+        ]
+        if not broken:
+            return found
+        deciding.append(min(broken, key=lambda i: float(np.min(np.abs(1.0 + loops[i])))))
+
+
+def _tuned(G: np.ndarray, z: np.ndarray, plant: AxisPlant, extra_delay: int, bounds: tuple[float, float]) -> Gains:
+    """Return the best gains for the responses G (plants, frequencies) at z, in units of the plant's static gain."""
+    max_sensitivity, phase_margin = bounds
+    lag = plant.time_constant + (plant.delay + 1 + extra_delay) * plant.sample_time
+    best, best_rate = Gains(0.0, lag), 0.0
+    for integral_time in lag * _TIMES:
+        shape = G * (1.0 + plant.sample_time / integral_time / (z - 1.0))
+        size = _largest(shape, max_sensitivity, phase_margin)
+        if size / integral_time > best_rate:
+            best, best_rate = Gains(size / plant.static_gain, float(integral_time)), size / integral_time
+    if best_rate == 0.0:
+        raise SettingsError(
+            f"no PI gains keep Ms <= {max_sensitivity:g} and a phase margin of {math.degrees(phase_margin):g} deg; "
+            "ask for less."
+        )
+    return best
+
+
+def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_spread: float, overshoot: float) -> float:
+    """Return the least time constant [s] of a reference filter with which no plant overshoots by more.
+
+    Args:
+        plants: what the axis may be.
+        extra_delay: samples added to their delay.
+        gains: of the PI.
+        gain_spread: relative; the gain of each plant is taken at both ends and in the middle.
+        overshoot: part of the step.
+
+    Raises:
+        SettingsError: none does that is fast enough.
+    """
+    from scipy.signal import lfilter
+
+    sample_time, second = plants[0].sample_time, plants[0].second
+    rows = math.ceil(_HORIZON * second / sample_time)
+    scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread) if gain_spread > 0.0 else (1.0,)
+    steps = [_step_response(plant, extra_delay, gains, rows, scale) for plant in plants for scale in scales]
+    for samples in range(1 + math.ceil(_SLOWEST_FILTER * second / sample_time)):
+        a = math.exp(-1.0 / samples) if samples else 0.0
+        peak = max(float(np.max(lfilter([1.0 - a], [1.0, -a], step))) for step in steps)
+        if peak <= 1.0 + overshoot:
+            return samples * sample_time
+    raise SettingsError("no reference filter keeps the overshoot; lower `max_sensitivity` or `gain_spread`.")
+
+
+def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.TransferFunction:
+    """Return the discrete open loop of a PI with the plant, its delay exact."""
+    import control
+
+    rate = plant.sample_time / gains.integral_time
+    pi = control.TransferFunction([gains.gain, gains.gain * (rate - 1.0)], [1.0, -1.0], plant.sample_time)
+    return pi * plant.tf(extra_delay=extra_delay)
+
+
+def _largest(shape: Matrix, max_sensitivity: float, phase_margin: float) -> float:
+    """Return the largest size up to which all loops size * shape (plants, frequencies) keep both bounds, or 0.
+
+    A small loop around a stable plant is stable, and one that keeps Ms all the way up has never crossed -1;
+    a search by halves alone could end beyond the border of stability.
+    """
+    low = 0.0
+    for size in _SIZES:
+        if not _keeps(size * shape, max_sensitivity, phase_margin):
+            break
+        low = float(size)
+    else:
+        return low
+    high = float(size)
+    for _ in range(_REFINEMENTS if low > 0.0 else 0):
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if _keeps(middle * shape, max_sensitivity, phase_margin) else (low, middle)
+    return low
+
+
+def _keeps(loops: Matrix, max_sensitivity: float, phase_margin: float) -> bool:
+    """Return whether the responses of all loops keep both bounds."""
+    if np.min(np.abs(1.0 + loops)) * max_sensitivity < 1.0:
+        return False
+    below = np.abs(loops) < 1.0
+    crossing = loops[:, 1:][~below[:, :-1] & below[:, 1:]]
+    return bool(np.all(np.abs(np.angle(-crossing)) >= phase_margin))
+
+
+def _step_response(plant: AxisPlant, extra_delay: int, gains: Gains, rows: int, scale: float) -> Vector:
+    """Return the closed loop's step response (rows,), the plant's gain scaled, without limits."""
+    from scipy.signal import lfilter
+
+    loop = open_loop(plant, extra_delay, gains)
+    numerator, denominator = scale * np.asarray(loop.num[0][0]), np.asarray(loop.den[0][0])
+    padded = np.concatenate([np.zeros(denominator.size - numerator.size), numerator])
+    return np.asarray(lfilter(padded, denominator + padded, np.ones(rows)))

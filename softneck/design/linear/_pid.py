@@ -12,9 +12,9 @@ import numpy as np
 from softneck.core import SettingsError, Vector, require_between
 
 from ..plants._uncertain import UncertainAxis
-from ._assembly import AxisController
 from ._axis_loop import Sweep, coarse, conditioning_gain
-from ._axis_settings import AxisDesign, AxisSettings
+from ._controller import AxisController
+from ._settings import AxisDesign, AxisSettings
 
 # While gains are searched the reference is filtered this slowly [s]: only the load is judged.
 _WHILE_SEARCHING = 0.3

@@ -11,13 +11,10 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError
 
-from ..plants._coupled_axis import AnyAxes, closed, radius, sensitivity
-from ._assembly import ReferenceFilter, assemble_whole
-from ._axis_loop import LOWEST, frequencies
-from ._axis_settings import AxisSettings, _slowest_filter
-from ._controller import LinearController
-from ._loop_settings import reference_numbers
-from ._rise import rise_time
+from ..plants._coupled import AnyAxes, closed, radius, sensitivity
+from ._axis_loop import LOWEST, frequencies, rise_time
+from ._controller import LinearController, ReferenceFilter, assemble_whole
+from ._settings import AxisSettings, _slowest_filter, reference_numbers
 
 # Steps are looked at for so many times the slowest time constant, dead time and filter.
 _LONG = 8.0

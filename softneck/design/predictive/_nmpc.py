@@ -31,13 +31,20 @@ from softneck.signals import TENDON_ANGLES
 
 from ..linear._ports import LIMITS, ControllerLimits, controller_inputs, controller_outputs
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._nmpc_prepared import BUDGET, SLACK_WEIGHT, NonlinearProblem, controller_arrays
-from ._nmpc_probe import plant_of, probed, require_horizon, risen
+from ._controller import STATUS_NAMES, PredictivePart
+from ._nmpc_problem import (
+    BUDGET,
+    SLACK_WEIGHT,
+    NonlinearProblem,
+    controller_arrays,
+    plant_of,
+    probed,
+    require_horizon,
+    risen,
+)
 from ._nmpc_state_runtime import NMPC_NUMBERS, NmpcArrays, NmpcState
-from ._predicted import over
-from ._program import STATUS_NAMES, PredictivePart
-from ._scale import TAUTNESS_LEVER, ScaledPlant, predictive_limits, scaled_plant
-from ._tuning import move_weight, require_given, require_solvable, samples_ahead, spaced_starts
+from ._plant import TAUTNESS_LEVER, ScaledPlant, over, predictive_limits, samples_ahead, scaled_plant
+from ._tuning import move_weight, require_given, require_solvable, spaced_starts
 
 _RUNTIME = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.

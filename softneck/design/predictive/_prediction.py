@@ -9,7 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 
-from ..plants._coupled_axis import AnyAxis, CoupledAxis, inputs_of
+from ..plants._coupled import AnyAxis, CoupledAxis, inputs_of
 from . import _mpc_state_runtime as rt
 
 # Rounding of a Cholesky factor; beyond it H has no inverse worth the name.

@@ -22,16 +22,25 @@ from softneck.estimation import ORDERS
 from softneck.robot import Robot, find_robot
 
 from ..linear._ports import LIMITS, ControllerLimits
-from ..plants._coupled import coupled_plant
-from ..plants._coupled_axis import AnyAxes, radius, sensitivity
+from ..plants._coupled import AnyAxes, coupled_plant, radius, sensitivity
 from ..plants._uncertain import USUAL_PERIOD, discrete, uncertain_plant
-from ._arrays import Tuning, assemble, observer_bandwidth, with_filter, with_gains, with_sample_time
+from ._arrays import Tuning, assemble, observer_bandwidth, system, with_filter, with_gains, with_sample_time
 from ._controller import MpcController
-from ._lti import system
 from ._mpc_state_runtime import MpcArrays
-from ._predicted import HIDDEN, families, over, predicted_plants, sample_pairs, taken
+from ._plant import (
+    HIDDEN,
+    TAUTNESS_LEVER,
+    ScaledPlant,
+    families,
+    over,
+    predicted_plants,
+    predictive_limits,
+    sample_pairs,
+    scale_numbers,
+    scaled_plant,
+    taken,
+)
 from ._prediction import Problem, matrices
-from ._scale import TAUTNESS_LEVER, ScaledPlant, predictive_limits, scale_numbers, scaled_plant
 from ._tuning import (
     FULL_TRUST,
     filter_for_rise,

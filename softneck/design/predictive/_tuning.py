@@ -12,9 +12,8 @@ from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.estimation import AxisPlant
 
 from ..linear._axis_loop import frequencies
-from ..plants._coupled_axis import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
-from ._arrays import with_filter, with_gains
-from ._lti import system
+from ..plants._coupled import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
+from ._arrays import system, with_filter, with_gains
 
 # One plant for each output.
 Pair = AnyAxes
@@ -53,11 +52,6 @@ def require_given(settings: Any, units: Mapping[str, str]) -> None:
     for name, unit in units.items():
         if getattr(settings, name) is not None:
             require_positive(name, getattr(settings, name), unit)
-
-
-def samples_ahead(look_ahead: float, sample_time: float) -> int:
-    """Return the whole samples of a look-ahead [s]: dead time counted too long costs speed, too short stability."""
-    return math.floor(look_ahead / sample_time + 1e-9)  # of rounding
 
 
 def move_weight(plant: AnyAxis, bandwidth: float) -> float:

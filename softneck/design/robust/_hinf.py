@@ -1,4 +1,4 @@
-"""H-infinity mixed sensitivity as a kind of controller."""
+"""H-infinity synthesis (`mixsyn`, `hinfsyn`) by two Riccati equations, and its kind of controller."""
 
 from __future__ import annotations
 
@@ -7,16 +7,322 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from softneck.core import SettingsError, require_between, require_positive
+from softneck.core import Matrix, SettingsError, require_between, require_positive
 
 from ..linear._axis_loop import error_feedback
-from ..linear._axis_settings import AxisDesign, AxisSettings
+from ..linear._settings import AxisDesign, AxisSettings
 from ..plants._uncertain import UncertainAxis
-from ._synthesis import mixsyn
-from ._weights import makeweight
+from ._weights import makeweight, to_continuous, to_discrete, weight_image
 
 if TYPE_CHECKING:
     import control
+
+# The optimal controller has a pole near infinity (3e9 rad/s); a little above gamma it is an ordinary one.
+_ABOVE = 1.05
+# |T_zw| found on a grid may exceed gamma by rounding of the synthesis, not more.
+_SLACK = 1e-3
+# A weight below this at infinity counts as strictly proper.
+_LEAST_DIRECT = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Synthesis:
+    """A controller and what it was found to do.
+
+    Attributes:
+        controller: K for negative feedback, `u = K (r - y)`, with the plant's dt and names.
+        gamma: the least possible norm.
+        achieved: the norm with this controller, on a grid of frequencies.
+    """
+
+    controller: control.StateSpace
+    gamma: float
+    achieved: float
+
+
+def mixsyn(
+    G: Any,
+    W1: Any = None,
+    W2: Any = None,
+    W3: Any = None,
+    *,
+    above: float = _ABOVE,
+) -> Synthesis:
+    """Return the controller that keeps `|W1 S; W2 K S; W3 T|` small (Skogestad and Postlethwaite 2005, sec. 9.3.6).
+
+    Args:
+        G: plant of any number of inputs and outputs; a discrete one, dead time as poles at zero, is taken exactly
+            through the bilinear map.
+        W1, W2, W3: None, numbers or stable systems, continuous or of the plant's dt: of as many inputs as the plant
+            has outputs (W1, W3) or inputs (W2), or scalar ones, which weigh each of the signals alike. Continuous
+            weights of a discrete plant act at `2/Ts tan(w Ts/2)`.
+        above: the controller is built at this factor above the least gamma.
+
+    Raises:
+        SettingsError: no weight, one that cannot be solved for, another dt, or no controller.
+    """
+    dt = _dt_of(G)
+    outputs, inputs = G.noutputs, G.ninputs
+    sized = (("W1", W1, outputs), ("W2", W2, inputs), ("W3", W3, outputs))
+    weights = [weight_image(W, dt, name, size) for name, W, size in sized]
+    if all(W is None for W in weights):
+        raise SettingsError("`mixsyn` needs at least one weight.")
+    if not any(W is not None and np.abs(np.asarray(W.D)).max() > _LEAST_DIRECT for W in weights[1:]):
+        raise SettingsError(
+            "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
+            "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
+        )
+    found = hinfsyn(_augmented(to_continuous(G), weights), outputs, inputs, above=above)
+    K = to_discrete(found.controller, dt) if dt else found.controller
+    return Synthesis(controller=_named(K, G, dt), gamma=found.gamma, achieved=found.achieved)
+
+
+def hinfsyn(P: Any, nmeas: int, ncon: int, *, above: float = _ABOVE) -> Synthesis:
+    """Return the H-infinity controller of the generalised plant P, built at `above` times the least gamma.
+
+    What makes the search hang is refused (D12 or D21 of less than full rank), and what comes out is verified: a stable
+    loop and its norm. A discrete P gives a controller of its dt.
+
+    Raises:
+        SettingsError: as said, or no controller exists.
+    """
+    import control
+
+    require_between("above", above, 1.001, 100.0)
+    dt = _dt_of(P)
+    image: Any = to_continuous(P)
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (image.A, image.B, image.C, image.D))
+    plant = partition(A, B, C, D, nmeas=nmeas, ncon=ncon)
+    gamma = least_gamma(plant)
+    parts = solve_at(plant, above * gamma)
+    if parts is None:
+        raise SettingsError(f"no controller at {above:g} times gamma {gamma:.4g}; scale the weights.")
+    K = control.StateSpace(*parts, 0)
+    closed: Any = image.lft(K)
+    return Synthesis(
+        controller=to_discrete(K, dt) if dt else K,
+        gamma=gamma,
+        achieved=_verified(closed, above * gamma),
+    )
+
+
+def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
+    """Return P from (r, u) to (W1 e, W2 u, W3 y, e) with e = r - G u (python-control's `augw`, which warns)."""
+    import control
+
+    n, ny, nu = G.nstates, G.noutputs, G.ninputs
+    one = control.StateSpace([], [], [], np.eye(ny), 0)
+    blocks = [(W, part) for W, part in zip(weights, ("e", "u", "y"), strict=True) if W is not None]
+    A, B, C, D = (np.asarray(part, dtype=np.float64) for part in (G.A, G.B, G.C, G.D))
+    rows = {
+        "e": (-C, np.hstack([np.eye(ny), -D])),
+        "u": (np.zeros((nu, n)), np.hstack([np.zeros((nu, ny)), np.eye(nu)])),
+        "y": (C, np.hstack([np.zeros((ny, ny)), D])),
+    }
+    states, inputs = A, np.hstack([np.zeros((n, ny)), B])
+    outputs, direct = [], []
+    for W, part in [*blocks, (one, "e")]:
+        before = states.shape[0]
+        row, gain = rows[part]
+        row = np.hstack([row, np.zeros((len(row), before - row.shape[1]))])
+        Aw, Bw, Cw, Dw = (np.asarray(item, dtype=np.float64) for item in (W.A, W.B, W.C, W.D))
+        states = np.block([[states, np.zeros((before, Aw.shape[0]))], [Bw @ row, Aw]])
+        inputs = np.vstack([inputs, Bw @ gain])
+        outputs.append(np.hstack([Dw @ row, Cw]))
+        direct.append(Dw @ gain)
+    wide = [np.hstack([row, np.zeros((len(row), states.shape[0] - row.shape[1]))]) for row in outputs]
+    return control.StateSpace(states, inputs, np.vstack(wide), np.vstack(direct), 0)
+
+
+def _verified(closed: Any, bound: float) -> float:
+    """Return the norm of the closed loop on a grid; raise where it is not stable or beyond `bound`."""
+    largest = float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf))
+    if largest >= 0.0:
+        raise SettingsError(
+            f"the result is not stable (a pole at {largest:.3g} rad/s): the problem is near singular. Weigh the "
+            "control effort more (W2), or build further `above` gamma."
+        )
+    response = np.moveaxis(np.asarray(closed(1j * np.geomspace(1e-4, 1e5, 400), squeeze=False)), -1, 0)
+    size = float(np.linalg.norm(response, 2, axis=(1, 2)).max())
+    if size > (1.0 + _SLACK) * bound:
+        raise SettingsError(f"the result has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
+    return size
+
+
+def _dt_of(system: Any) -> float:
+    import control
+
+    if not isinstance(system, control.StateSpace | control.TransferFunction):
+        raise SettingsError(f"a control.StateSpace or TransferFunction is needed; got {type(system).__name__}.")
+    if system.dt is None or system.dt is True:
+        raise SettingsError("the system must say its sample time: give it dt = 0 (continuous) or dt in seconds.")
+    return float(system.dt)
+
+
+def _named(K: Any, G: Any, dt: float) -> control.StateSpace:
+    """Return K, from the plant's outputs to its inputs by name."""
+    import control
+
+    parts: list[Matrix] = [np.asarray(part) for part in (K.A, K.B, K.C, K.D)]
+    return control.StateSpace(*parts, dt, inputs=list(G.output_labels), outputs=list(G.input_labels))
+
+
+# Gamma is found to 0.01 %: what is built is 5 % above it.
+_CLOSENESS = 1e-4
+_LARGEST = 1e8
+# An eigenvalue of the Hamiltonian this close to the axis (relative to the largest) counts as on it.
+_ON_AXIS = 1e-13
+# X and Y may come out negative by rounding: relative to their size.
+_NEGATIVE = 1e-7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Partition:
+    """A generalised plant with D12 = [0; I], D21 = [0 I] and D22 = 0, after scaling of its signals.
+
+    Attributes:
+        A, B1, B2, C1, C2: as usual.
+        D11: (p1, m1).
+        left, right: K of the original plant is `left @ K @ right`.
+        D22: what was taken away.
+    """
+
+    A: Matrix
+    B1: Matrix
+    B2: Matrix
+    C1: Matrix
+    C2: Matrix
+    D11: Matrix
+    left: Matrix
+    right: Matrix
+    D22: Matrix
+
+
+def partition(A: Matrix, B: Matrix, C: Matrix, D: Matrix, *, nmeas: int, ncon: int) -> Partition:
+    """Return the plant scaled to the form of Zhou, Doyle and Glover (1996), sec. 17.1.
+
+    Raises:
+        SettingsError: D12 without full column rank, or D21 without full row rank; both make solvers hang or lie.
+    """
+    m1, p1 = B.shape[1] - ncon, C.shape[0] - nmeas
+    D11, D12, D21, D22 = D[:p1, :m1], D[:p1, m1:], D[p1:, :m1], D[p1:, m1:]
+    U, s, Vh = np.linalg.svd(D12)
+    if p1 < ncon or s.min(initial=np.inf) < 1e-9 * max(1.0, s.max(initial=0.0)):
+        raise SettingsError(
+            "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
+            "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
+        )
+    V, t, Wh = np.linalg.svd(D21)
+    if m1 < nmeas or t.min(initial=np.inf) < 1e-9 * max(1.0, t.max(initial=0.0)):
+        raise SettingsError("the measurement has no input of its own (D21 has not full rank); add sensor noise to it.")
+    # z = Uz z', u = left u', y' = right y, w = Ww w'.
+    Uz = np.hstack([U[:, ncon:], U[:, :ncon]])
+    left = Vh.T / s
+    Ww = np.hstack([Wh[nmeas:].T, Wh[:nmeas].T])
+    right = (V / t).T
+    return Partition(
+        A, B[:, :m1] @ Ww, B[:, m1:] @ left, Uz.T @ C[:p1], right @ C[p1:], Uz.T @ D11 @ Ww, left, right, D22
+    )
+
+
+def least_gamma(plant: Partition) -> float:
+    """Return the least gamma for which a controller exists, 0.01 % above at most.
+
+    Raises:
+        SettingsError: none up to 1e8.
+    """
+    low, high = 0.0, 1.0
+    while solve_at(plant, high) is None:
+        low, high = high, 4.0 * high
+        if high > _LARGEST:
+            raise SettingsError(
+                "no controller exists for any gamma: the plant cannot be stabilised, or a weight is not stable."
+            )
+    while high - low > _CLOSENESS * high:
+        middle = 0.5 * (low + high) if low > 0.0 else 0.25 * high
+        if solve_at(plant, middle) is None:
+            low = middle
+        else:
+            high = middle
+        if high < 1e-8:
+            break
+    return high
+
+
+def solve_at(plant: Partition, gamma: float) -> tuple[Matrix, Matrix, Matrix, Matrix] | None:
+    """Return A, B, C, D of the central controller whose closed loop is below `gamma`, or None where none exists.
+
+    Zhou, Doyle and Glover (1996), Theorem 17.1.
+    """
+    from scipy.linalg import cholesky
+
+    A, B1, B2, C1, C2, D11 = plant.A, plant.B1, plant.B2, plant.C1, plant.C2, plant.D11
+    n, m1, m2, p1, p2 = A.shape[0], B1.shape[1], B2.shape[1], C1.shape[0], C2.shape[0]
+    a, b = p1 - m2, m1 - p2
+    D1111, D1112, D1121, D1122 = D11[:a, :b], D11[:a, b:], D11[a:, :b], D11[a:, b:]
+    if gamma <= max(_size(D11[:a]), _size(D11[:, :b])):
+        return None
+    g2 = gamma * gamma
+    B, C = np.hstack([B1, B2]), np.vstack([C1, C2])
+    D_row = np.hstack([D11, np.vstack([np.zeros((a, m2)), np.eye(m2)])])
+    D_column = np.vstack([D11, np.hstack([np.zeros((p2, b)), np.eye(p2)])])
+    R, S = D_row.T @ D_row, D_column @ D_column.T
+    R[:m1, :m1] -= g2 * np.eye(m1)
+    S[:p1, :p1] -= g2 * np.eye(p1)
+    X = _riccati(A, B, C1.T @ C1, R, C1.T @ D_row)
+    Y = None if X is None else _riccati(A.T, C.T, B1 @ B1.T, S, B1 @ D_column.T)
+    if X is None or Y is None or np.abs(np.linalg.eigvals(X @ Y)).max(initial=0.0) >= g2:
+        return None
+    F = -np.linalg.solve(R, D_row.T @ C1 + B.T @ X)
+    L = -np.linalg.solve(S, D_column @ B1.T + C @ Y).T
+    F12, F2 = F[b:m1], F[m1:]
+    L12, L2 = L[:, a:p1], L[:, p1:]
+    inner = g2 * np.eye(a) - D1111 @ D1111.T
+    D11h = -D1121 @ D1111.T @ np.linalg.solve(inner, D1112) - D1122
+    other = g2 * np.eye(b) - D1111.T @ D1111
+    D12h = cholesky(np.eye(m2) - D1121 @ np.linalg.solve(other, D1121.T), lower=True)
+    D21h = cholesky(np.eye(p2) - D1112.T @ np.linalg.solve(inner, D1112), lower=False)
+    Z = np.linalg.inv(np.eye(n) - Y @ X / g2)
+    B2h, C2h = Z @ (B2 + L12) @ D12h, -D21h @ (C2 + F12)
+    B1h = -Z @ L2 + B2h @ np.linalg.solve(D12h, D11h)
+    C1h = F2 + D11h @ np.linalg.solve(D21h, C2h)
+    Ah = A + B @ F + B1h @ np.linalg.solve(D21h, C2h)
+    return _restored(plant, Ah, B1h, C1h, D11h)
+
+
+def _restored(plant: Partition, A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Undo the scaling, and put D22 back: K (I + D22 K)^-1."""
+    B, C, D = B @ plant.right, plant.left @ C, plant.left @ D @ plant.right
+    E = np.linalg.inv(np.eye(D.shape[0]) + D @ plant.D22)
+    C, D_new = E @ C, E @ D
+    return A - B @ plant.D22 @ C, B - B @ plant.D22 @ D_new, C, D_new
+
+
+def _riccati(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix | None:
+    """Return the stabilising X >= 0 of A'X + XA + Q - (XB + S) R^-1 (B'X + S') = 0, R of any sign; None if none is."""
+    from scipy.linalg import schur, solve
+
+    n = A.shape[0]
+    RB, RS = solve(R, B.T, assume_a="sym"), solve(R, S.T, assume_a="sym")
+    H = np.block([[A - B @ RS, -B @ RB], [-Q + S @ RS, -(A - B @ RS).T]])
+    values = np.linalg.eigvals(H)
+    if np.abs(values.real).min(initial=np.inf) <= _ON_AXIS * max(1.0, np.abs(values).max(initial=0.0)):
+        return None
+    ordered: Any = schur(H, output="real", sort="lhp")
+    _, U, stable = ordered
+    if stable != n:
+        return None
+    try:
+        X = np.linalg.solve(U[:n, :n].T, U[n:, :n].T).T
+    except np.linalg.LinAlgError:
+        return None
+    X = 0.5 * (X + X.T)
+    lowest = float(np.linalg.eigvalsh(X).min(initial=0.0))
+    return X if lowest >= -_NEGATIVE * max(1.0, float(np.abs(X).max(initial=0.0))) else None
+
+
+def _size(D: Matrix) -> float:
+    return float(np.linalg.norm(D, 2)) if D.size else 0.0
 
 
 # Gain of W1 at rest: its pole lies this far below the bandwidth and becomes an integrator afterwards.

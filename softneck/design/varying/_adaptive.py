@@ -16,14 +16,11 @@ from softneck.estimation import AxisPlant, Reach, linear_reach
 from softneck.robot import Robot, Scaling, find_robot
 from softneck.runtime import Block, Port, State, sized_name
 
-from ..linear._assembly import ReferenceFilter, assemble, pi_axis
-from ..linear._axis_loop import LOWEST, frequencies
-from ..linear._axis_settings import slowest
-from ..linear._controller import robot_in
+from ..linear._axis_loop import LOWEST, filter_for_lag, frequencies
+from ..linear._controller import ReferenceFilter, assemble, pi_axis, robot_in
 from ..linear._linear_parts_runtime import LinearArrays
-from ..linear._loop_settings import LoopSettings
 from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
-from ..linear._rise import filter_for_lag
+from ..linear._settings import LoopSettings, slowest
 from ..plants._uncertain import UncertainPlant, scaled, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
 
