@@ -32,7 +32,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.estimation import KalmanSettings, NonlinearObserver, fit_noise
 from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE, KALMAN_LEAD, KALMAN_REJECTIONS
-from softneck.estimation._noise import SETTLE, outliers
+from softneck.estimation._noise import SETTLE, find_outliers
 from softneck.estimation._offline import measured_angles
 from softneck.identification import GreyBox, Model
 from softneck.runtime import Block, Port, State, load_runtime
@@ -84,7 +84,7 @@ def likeliest(model: Model, recording: Recording) -> Levels:
     constants[KALMAN_GATE] = constants[KALMAN_REJECTIONS] = np.inf
     constants[KALMAN_FROZEN] = constants[KALMAN_LEAD] = 0.0
     z = measured_angles(recording)
-    z[outliers(z)] = math.nan
+    z[find_outliers(z)] = math.nan
     rows, step, given = inputs(recording, z), runtime.step, tuple(arrays)
 
     @njit

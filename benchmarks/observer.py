@@ -31,7 +31,7 @@ import numpy as np
 from softneck.core import Matrix
 from softneck.estimation import KalmanSettings
 from softneck.estimation._axis import axis_plant
-from softneck.estimation._fitted import AnyObserver, fitted_observer
+from softneck.estimation._observer import AnyObserver, fit_levels_and_delays
 from softneck.identification import GreyBox, Model, OutputError
 from softneck.runtime import Block
 from softneck.signals import Recording, redefinition_matrix, signal
@@ -124,8 +124,8 @@ def row(neck: str, seed: int) -> dict[str, tuple[float, float]]:
         "default": observer,
         "look-ahead": KalmanSettings(sensor_delay=0.05).design(model),
         "greybox": over,
-        "data": fitted_observer(observer, [log]).observer,
-        "fitted": fitted_observer(over, [log]).observer,
+        "data": fit_levels_and_delays(observer, [log]).observer,
+        "fitted": fit_levels_and_delays(over, [log]).observer,
     }
     scores = {name: error(item, runs) for name, item in found.items()}
     return {**scores, "peer": errors_deg(runs, [peer(model, run.recording) for run in runs])}
@@ -193,7 +193,7 @@ def unseen(neck: str, seed: int) -> str:
     motion = signal("mixed", duration=UNSEEN_S, seed=UNSEEN_SEED)
     other = logged(spoiled(block, motion, 1000 * seed + 20).recording)
     usual = KalmanSettings().design(GreyBox().fit(log))
-    fit = fitted_observer(usual, [other])
+    fit = fit_levels_and_delays(usual, [other])
     held = [math.degrees(fit.checks[name]) for name in ("default", fit.kept)]
     true = [error(item, runs)[0] for item in (usual, fit.observer)]
     return f"{neck:10}{seed:3}{fit.kept:>18}" + "".join(f"{value:9.3f}" for value in (*held, *true))

@@ -106,22 +106,31 @@ def observer_command(
     one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
     state.
     """
-    from softneck.estimation import designed
+    from softneck.estimation import design_observer
 
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     chosen = apply_settings(resolve(kind.settings), settings)
-    observer = designed(chosen, model, robot)
+    observer = design_observer(chosen, model, robot)
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
         named = {setting.partition("=")[0].strip() for setting in settings}
         found, lines = _fitted(observer, data, robot, named)
         observer, fit = found.observer, found.fit
-        told = {"fit": {"rows": fit.rows, "outliers": fit.outliers, "log_likelihood": list(fit.log_likelihood),
-                        "at_bound": list(fit.at_bound), "not_told": list(found.untold), "held_out": found.checks,
-                        "kept": found.kept != "default", "what": found.kept}}  # fmt: skip
+        told = {
+            "fit": {
+                "rows": fit.rows,
+                "outliers": fit.outliers,
+                "log_likelihood": list(fit.log_likelihood),
+                "at_bound": list(fit.at_bound),
+                "not_told": list(found.not_identifiable),
+                "held_out": found.checks,
+                "kept": found.kept != "default",
+                "what": found.kept,
+            }
+        }
     observer.save(path, force=replace)
     if as_json:
         noise = dict(zip(observer.noise_names, observer.noise, strict=True))
@@ -136,19 +145,19 @@ def _fitted(
 ) -> tuple[FittedObserver, list[str]]:
     """Fit the observer to the recordings; return it and the lines to print."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
-    from softneck.estimation import consistency, fitted
+    from softneck.estimation import consistency, fit_observer
     from softneck.signals import read_recording
 
     recordings = [read_recording(path, robot=robot) for path in data]
-    found = fitted(observer, recordings, named)
+    found = fit_observer(observer, recordings, named)
     unit = observer.robot.outputs.display_unit
     before, after = found.fit.log_likelihood
     lines = [
         f"  noise from {found.fit.rows} measurements, {found.fit.outliers} outliers left out; "
         f"log likelihood of each {before:.2f} -> {after:.2f}"
     ]
-    if found.untold:
-        lines.append(f"  not told by the data: {', '.join(found.untold)}")
+    if found.not_identifiable:
+        lines.append(f"  not told by the data: {', '.join(found.not_identifiable)}")
     errors = ", ".join(f"{name} {error / to_si(unit)[0]:.3f}" for name, error in found.checks.items())
     verdict = "no better, so the defaults are kept" if found.kept == "default" else f"{found.kept} kept"
     lines.append(f"  error [{unit}] of the look ahead on {found.rows} rows held out: {errors}: {verdict}")

@@ -1,16 +1,17 @@
-"""One axis of an identified linear model: a strictly proper part behind a pure delay."""
+"""One axis of an identified linear model, and the scaling of a robot whose file gives no ranges."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector
-from softneck.identification import weights_of
-from softneck.robot import TIME_CONSTANT, Robot
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector, to_si
+from softneck.identification import Model, weights_of
+from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 if TYPE_CHECKING:
     import control
@@ -20,7 +21,7 @@ AXES = ("pitch", "roll")
 
 
 class HasTransferFunctions(Protocol):
-    """Any linear model: an identified one, a family, or a `LinearNeck`; it may say its `robot`."""
+    """Any linear model: an identified one, a family, or a `LinearNeck`; it may have a `robot`."""
 
     def tf(self, output: str, /) -> Any:
         """Return the discrete transfer function to an output from its redefined input: to "pitch" from theta_i."""
@@ -29,7 +30,7 @@ class HasTransferFunctions(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LinearNeck(ReprMixin):
-    """Two transfer functions of one's own as a model of the neck, dead time as poles at zero.
+    """A neck model from two given transfer functions, with the dead time as poles at zero.
 
     Attributes:
         pitch: discrete `control.TransferFunction` from theta_i [rad] to pitch [rad] (Eq. 9).
@@ -55,7 +56,7 @@ class AxisPlant(ReprMixin):
         denominator: (n + 1,) coefficients of A, the first is 1.
         delay: samples beyond the one that B/A has itself.
         sample_time: [s].
-        second: how many seconds a scaled second is [s], by which frequencies and horizons are chosen; of the neck 1.
+        second: length of a scaled second [s]; frequencies and horizons are chosen by it. 1 for the neck.
     """
 
     numerator: Vector
@@ -92,19 +93,19 @@ class AxisPlant(ReprMixin):
 
     @property
     def time_constant(self) -> float:
-        """Of the main pole [s]."""
+        """Time constant of the main pole [s]."""
         poles, main = main_pole(self.numerator, self.denominator)
         return -self.sample_time / math.log(max(float(np.abs(poles[main])), 1e-9))
 
-    def faster(self, pole: float) -> AxisPlant:
-        """Return the same plant with its main pole moved to `pole` [1/s], gain and delay kept; itself if faster.
+    def with_faster_pole(self, pole: float) -> AxisPlant:
+        """Return the plant with its main pole moved to `pole` [1/s], at the same gain and delay.
 
-        A complex pair is left as it is, and so is a slower pole that the output hardly shows: moved away from the zero
-        that hides it, it would multiply the gain of quick motions.
+        The plant is returned unchanged if it is faster already or if the main pole is complex. Slower poles that a zero
+        nearly cancels stay: without their zero they would multiply the gain at high frequency.
         """
         poles, main = main_pole(self.numerator, self.denominator)
         slow, moved = complex(poles[main]), float(np.exp(-pole * self.sample_time))
-        # 1e-9: the same pole, but for the rounding of its root.
+        # 1e-9: rounding of the root.
         if abs(slow.imag) > 0.0 or slow.real <= moved + 1e-9:
             return self
         a = float(slow.real)
@@ -113,9 +114,9 @@ class AxisPlant(ReprMixin):
         return replace(self, numerator=numerator, denominator=np.convolve(rest, [1.0, -moved]))
 
     def remove_hidden_poles(self) -> AxisPlant:
-        """Return the plant without the poles slower than its main one, each with the zero that hides it; gain kept.
+        """Return the plant without the poles slower than its main one and the zeros nearest to them, at the same gain.
 
-        Itself where the main pole is the slowest, or where no zeros hide the others.
+        The plant is returned unchanged if the main pole is the slowest, or if there are too few zeros.
         """
         poles, main = main_pole(self.numerator, self.denominator)
         zeros = np.roots(self.numerator)
@@ -125,18 +126,18 @@ class AxisPlant(ReprMixin):
             zeros = np.delete(zeros, np.argmin(np.abs(zeros - pole)))
         numerator, denominator = np.atleast_1d(np.poly(zeros)), np.atleast_1d(np.poly(poles[main:]))
         if max(np.abs(numerator.imag).max(), np.abs(denominator.imag).max()) > 0.0:
-            return self  # a pair of which one alone is hidden
+            return self  # only one pole of a complex pair would go
         scale = self.static_gain * denominator.real.sum() / numerator.real.sum()
         return replace(self, numerator=scale * numerator.real, denominator=denominator.real)
 
-    def with_min_delay(self, least: float) -> AxisPlant:
-        """Return the same plant with a dead time of at least `least` [s], in whole samples."""
-        return replace(self, delay=max(self.delay, round(least / self.sample_time)))
+    def with_min_delay(self, minimum: float) -> AxisPlant:
+        """Return the plant with a dead time of `minimum` [s] or more, in whole samples."""
+        return replace(self, delay=max(self.delay, round(minimum / self.sample_time)))
 
-    def resampled(self, sample_time: float) -> AxisPlant:
-        """Return the same plant, between whose samples the input is held, at a shorter `sample_time` [s].
+    def resample(self, sample_time: float) -> AxisPlant:
+        """Return the zero-order-hold plant at a shorter `sample_time` [s].
 
-        The augmented matrix [A B; 0 I] to the power of the ratio (Van Loan 1978); at the old instants both agree.
+        It is the augmented matrix [A B; 0 I] to the power of the ratio (Van Loan 1978). Both agree at the old instants.
 
         Raises:
             SettingsError: the new sample time does not divide the old one, or a pole has no real root.
@@ -156,8 +157,8 @@ class AxisPlant(ReprMixin):
         poles = np.linalg.eigvals(A)
         if np.any((np.abs(poles.imag) < 1e-12) & (poles.real <= 1e-12)):
             raise SettingsError(
-                f"the model has a pole at {poles.real.min():.3g}, which no plant has whose input is held: it cannot "
-                f"be taken to {sample_time:g} s. Identify it at that sample time."
+                f"the model has a pole at {poles.real.min():.3g}, which no plant with a held input has: it cannot "
+                f"be resampled to {sample_time:g} s. Identify it at that sample time."
             )
         whole = np.block([[A, B[:, None]], [np.zeros((1, A.shape[0])), np.ones((1, 1))]])
         part = np.real(np.asarray(fractional_matrix_power(whole, 1.0 / ratio)))
@@ -170,7 +171,7 @@ class AxisPlant(ReprMixin):
         return AxisPlant(numerator, denominator, self.delay * ratio, sample_time, self.second)
 
     def tf(self, *, extra_delay: int = 0) -> control.TransferFunction:
-        """Return it as a `control.TransferFunction` with `extra_delay` samples more."""
+        """Return a `control.TransferFunction` with `extra_delay` samples more."""
         import control
 
         denominator = np.concatenate([self.denominator, np.zeros(self.delay + extra_delay)])
@@ -178,21 +179,20 @@ class AxisPlant(ReprMixin):
 
 
 def main_pole(numerator: Vector, denominator: Vector) -> tuple[np.ndarray, int]:
-    """Return the poles of B/A, the slowest first, and which of them makes most of where a step ends.
+    """Return the poles of B/A, slowest first, and the index of the pole with the largest part in the static gain.
 
-    B(p)/(A'(p) (1 - p)) is the part of the pole p in the sum that is the static gain (Kailath 1980, sec. 2.2); of two
-    that are nearly alike it is larger for the slower one.
+    The part of a pole p is B(p)/(A'(p) (1 - p)) (Kailath 1980, sec. 2.2).
     """
     poles = np.roots(denominator)
     poles = poles[np.argsort(-np.abs(poles), kind="stable")]
     with np.errstate(divide="ignore", invalid="ignore"):
         part = np.polyval(numerator, poles) / (np.polyval(np.polyder(denominator), poles) * (1.0 - poles))
-    # A pole that is double to the last bit has no part of its own.
+    # An exactly double pole has no part of its own.
     return poles, int(np.argmax(np.nan_to_num(np.abs(part), nan=np.inf)))
 
 
 def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
-    """Return `axis` ("pitch", "roll" or another robot's output) of a linear model, its dead time split off.
+    """Return one output ("pitch", "roll" or another robot's) of a linear model, its dead time split off.
 
     Raises:
         SettingsError: the model is not linear, not discrete, or not stable.
@@ -210,35 +210,37 @@ def axis_plant(model: HasTransferFunctions, axis: str) -> AxisPlant:
         raise SettingsError(f"the model's {axis} must be discrete; its dt is {dt}. Use control.sample_system.")
     numerator = np.trim_zeros(np.asarray(system.num[0][0], dtype=np.float64), "f")
     denominator = np.trim_zeros(np.asarray(system.den[0][0], dtype=np.float64), "f")
-    _check(axis, numerator, denominator)
+    _require_stable(axis, numerator, denominator)
     poles_at_zero = denominator.size - np.trim_zeros(denominator, "b").size
     # One sample stays with B/A, so that it is strictly proper.
     delay = min(poles_at_zero, denominator.size - numerator.size - 1)
     A = denominator[: denominator.size - delay]
     B = np.concatenate([np.zeros(A.size - 1 - numerator.size), numerator])
-    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _second(model, B, A, float(dt)))
+    return AxisPlant(B / A[0], A / A[0], delay, float(dt), _seconds_per_scaled_second(model, B, A, float(dt)))
 
 
 def robot_of(source: Any) -> Robot:
-    """Return whose plant a linear model is; one that does not say is a neck's."""
+    """Return the robot of a linear model; the built-in neck if the model has none."""
     return getattr(source, "robot", Robot.preset())
 
 
 def directions_of(source: Any) -> Matrix:
-    """Return the weights (outputs, motors) of the motors in each axis: a family has its own, a model its findings'."""
+    """Return the weights (outputs, motors) of the motors in each output; a model has them in its findings."""
     own, given = getattr(source, "directions", None), robot_of(source).weights()
     if own is not None:
         return np.asarray(own)
     return weights_of(source) if given is None else given
 
 
-def _second(model: HasTransferFunctions, numerator: Vector, denominator: Vector, sample_time: float) -> float:
-    """Return how many seconds a scaled second of a robot is, by its time constant or else by its main pole."""
+def _seconds_per_scaled_second(
+    model: HasTransferFunctions, numerator: Vector, denominator: Vector, sample_time: float
+) -> float:
+    """Return the length of a robot's scaled second [s], from its time constant or else from the main pole."""
     slow = AxisPlant(numerator, denominator, 0, sample_time).time_constant
     return (robot_of(model).time_constant_s or max(slow, sample_time)) / TIME_CONSTANT
 
 
-def _check(axis: str, numerator: Vector, denominator: Vector) -> None:
+def _require_stable(axis: str, numerator: Vector, denominator: Vector) -> None:
     if not (np.isfinite(numerator).all() and np.isfinite(denominator).all()):
         raise DataError(f"the model's {axis} has coefficients that are not finite; identify it again.")
     if numerator.size == 0 or denominator.size <= numerator.size:
@@ -248,3 +250,76 @@ def _check(axis: str, numerator: Vector, denominator: Vector) -> None:
         raise SettingsError(
             f"the model's {axis} is not stable (spectral radius {radius:.4f}); identify it on a longer recording."
         )
+
+
+# The neck's outputs span 46 deg; the static gain times the motors' full range is 63 deg.
+SPAN_OF_STATIC_GAIN = 0.73
+# Random motor levels that show the output range of a nonlinear model.
+_RANDOM_LEVELS, _SAMPLES_PER_LEVEL = 60, 50
+
+
+def plants_scaling(robot: Robot, plants: Sequence[Any], weights: Matrix, what: str) -> Scaling:
+    """Return the scaling of a robot with a linear plant for each output.
+
+    Args:
+        robot: the plants' robot; ranges in its file take precedence.
+        plants: with `static_gain`, `time_constant` and `sample_time`.
+        weights: (outputs, motors) of the motors in each output.
+        what: such as "an observer", for the message.
+
+    Raises:
+        SettingsError: the robot gives no range of its set-points.
+    """
+    seconds = max(max(plant.time_constant, plant.sample_time) for plant in plants)
+    if robot.motors.nominal is not None:
+        return Scaling.of(robot, time_constant=seconds)
+    ends = np.array(motor_ends(robot, what))
+    most = np.abs(weights) @ (0.5 * (ends[1] - ends[0]))
+    spans = SPAN_OF_STATIC_GAIN * np.array([abs(plant.static_gain) for plant in plants]) * most
+    return Scaling.of(robot, set_points=ends, outputs=np.array([-spans, spans]), time_constant=seconds)
+
+
+def model_scaling(model: Model) -> Scaling:
+    """Return the scaling of a model's robot from its training set-points and a simulation over them."""
+    robot, seconds = model.robot, slowest_seconds(model)
+    if robot.motors.nominal is not None:
+        return Scaling.of(robot, time_constant=seconds)
+    ports = model.block().inputs[: len(robot.motors.names)]
+    ends = np.array([[getattr(port, end) for port in ports] for end in ("minimum", "maximum")], dtype=np.float64)
+    return Scaling.of(robot, set_points=ends, outputs=_simulate_random_levels(model, ends), time_constant=seconds)
+
+
+def slowest_seconds(model: Model) -> float:
+    """Return the time constant of a model's robot [s], else the slowest one identified."""
+    return model.robot.time_constant_s or max(model.findings.get("time_constants_s", [TIME_CONSTANT]))
+
+
+def _simulate_random_levels(model: Model, ends: Matrix) -> Matrix:
+    """Simulate random levels between `ends` (2, motors); return the outputs (time, outputs)."""
+    block, motors = model.block(), ends.shape[1]
+    rows = np.full((_RANDOM_LEVELS * _SAMPLES_PER_LEVEL, len(block.inputs)), np.nan)
+    levels = np.random.default_rng(0).uniform(ends[0], ends[1], (_RANDOM_LEVELS, motors))
+    rows[:, :motors] = np.repeat(levels, _SAMPLES_PER_LEVEL, axis=0)
+    return block.run(block.initial_state(), rows)[1][:, : len(model.robot.outputs.names)]
+
+
+def motor_ends(robot: Robot, what: str) -> tuple[Vector, Vector]:
+    """Return the lowest and highest set-points (motors,) in SI; raise SettingsError if the robot gives none."""
+    motors, factor = robot.motors, to_si(robot.motors.unit)[0]
+    if motors.setpoint_min is None or motors.setpoint_max is None:
+        raise SettingsError(
+            f"robot {robot.label()} gives no `motors.setpoint_min` and `setpoint_max`, which {what} needs to "
+            "know how far its outputs go; add them."
+        )
+    return factor * np.array(motors.setpoint_min), factor * np.array(motors.setpoint_max)
+
+
+# The paper's neck reaches 40 deg of those 63 deg.
+REACH_OF_STATIC_GAIN = 0.64
+
+
+def linear_reach(plants: Sequence[AxisPlant], robot: Robot, weights: Matrix) -> float:
+    """Return the largest output [SI] that linear plants reach over the range of the motors."""
+    low, high = motor_ends(robot, "an observer")
+    most = np.abs(weights) @ (0.5 * (high - low))
+    return max(REACH_OF_STATIC_GAIN * abs(plant.static_gain) * float(v) for plant, v in zip(plants, most, strict=True))

@@ -1,4 +1,4 @@
-"""The forms of the filter: what its states are, what drives them, which noises it has."""
+"""The forms of the filter: its states, its inputs and its noise levels."""
 
 from __future__ import annotations
 
@@ -15,34 +15,25 @@ from ._axis import AxisPlant
 from ._kalman_parts_runtime import KalmanArrays
 
 FORMS = ("model", "gyro", "nonlinear")
-# Name and unit of the noise levels (standard deviations): of the measurement, then of the two process noises;
-# a nonlinear model's second is a part of its motion.
+# Name and unit of the standard deviations: measurement noise, then two process noises. The second of a nonlinear model
+# is a ratio to its motion.
 NOISES: dict[str, tuple[tuple[str, str], ...]] = {
     "model": (("measurement_noise_std", "rad"), ("model_noise_std", "rad"), ("disturbance_noise_std", "rad")),
     "gyro": (("measurement_noise_std", "rad"), ("gyro_noise_std", "rad/s"), ("bias_noise_std", "rad/s")),
     "nonlinear": (("measurement_noise_std", "rad"), ("rest_noise_std", "rad"), ("motion_noise_ratio", "")),
 }
 STATES = {"model": "model and disturbance", "gyro": "angle and gyro bias"}
-
-
-#: Scaled standard deviations: of the first output when nothing is known, as outputs reach some 40 deg (paper, section
-#: 5), and of what a rate may be when nothing tells it, as they move by up to 0.8 deg in 20 ms.
-START, RATE = math.radians(40.0), math.radians(40.0)
-# Of a gyro that was not zeroed, up to some deg/s (MPU-9250 data sheet: 5); of redefined inputs that may be held.
-_BIAS, _HELD_INPUT = math.radians(5.0), 2.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reach:
-    """How far a robot's outputs go when nothing is known [SI]; for `varying` and `verification` until they scale."""
-
-    start: float = START
+#: Scaled standard deviations before the first measurement: of an output, as outputs reach some 40 deg (paper, section
+#: 5), and of a rate, as outputs move by up to 0.8 deg in 20 ms.
+NECK_REACH, RATE_STD = math.radians(40.0), math.radians(40.0)
+# Scaled standard deviations of the bias of a gyro that was not zeroed (MPU-9250 data sheet: 5 deg/s), and of inputs.
+_GYRO_BIAS, _HELD_INPUT = math.radians(5.0), 2.0
 
 
 def noise_units(form: str, robot: Robot) -> tuple[tuple[str, str], ...]:
     """Return name and SI unit of the noise levels of a form for a robot's outputs."""
     unit = to_si(robot.outputs.unit)[1]
-    return tuple((name, told.replace("rad", unit)) for name, told in NOISES[form])
+    return tuple((name, own.replace("rad", unit)) for name, own in NOISES[form])
 
 
 def require_levels(form: str, robot: Robot, noise: Sequence[float]) -> tuple[float, float, float]:
@@ -62,8 +53,8 @@ class FilterMatrices:
         B: (n, outputs) of the inputs.
         H: (outputs, n) angles.
         first_noise, second_noise: (n, n) unit covariances of the process noises.
-        start: (n, n) covariance when nothing is known.
-        forced: (n, n) added before a measurement is taken in by force.
+        start: (n, n) initial covariance.
+        forced: (n, n) added before a measurement that passes without the gate.
     """
 
     F: Matrix
@@ -75,13 +66,13 @@ class FilterMatrices:
     forced: Matrix
 
     def arrays(self, sources: Matrix, constants: Vector) -> tuple[Matrix, ...]:
-        """Return what the runtime reads."""
+        """Return the arrays in the order of `KalmanArrays`."""
         items = (self.F, self.B, self.H, self.first_noise, self.second_noise, self.start, self.forced)
         return (*items, sources, constants)
 
 
 def model_form(plants: Sequence[AxisPlant], scaling: Scaling, input_units: Vector) -> FilterMatrices:
-    """Return model states and an output disturbance that walks, on each axis.
+    """Return the matrices of the model's states and a random-walk output disturbance for each output.
 
     Args:
         plants: of each output.
@@ -93,35 +84,35 @@ def model_form(plants: Sequence[AxisPlant], scaling: Scaling, input_units: Vecto
     axes: list[tuple[Matrix, ...]] = []
     for plant, input_unit, output_unit in zip(plants, input_units.tolist(), scaling.output_unit.tolist(), strict=True):
         A, b, c = plant.observable_form()
-        F = _diagonal(A, np.eye(1))
+        F = _block_diagonal(A, np.eye(1))
         QM, QW = np.zeros_like(F), np.zeros_like(F)
         QM[0, 0] = QW[-1, -1] = 1.0
-        # The model's spread under a white input, scaled to what an input does that is held for long.
+        # The spread under a white input, scaled to the steady state under a constant input.
         spread = np.asarray(solve_discrete_lyapunov(A, np.outer(b, b)))
         spread *= (_HELD_INPUT * input_unit * plant.static_gain) ** 2 / spread[0, 0]
-        P0 = _diagonal(0.5 * (spread + spread.T), (START * output_unit) ** 2 * np.eye(1))
+        P0 = _block_diagonal(0.5 * (spread + spread.T), (NECK_REACH * output_unit) ** 2 * np.eye(1))
         axes.append((F, np.append(b, 0.0)[:, None], np.append(c, 1.0)[None, :], QM, QW, P0, P0))
-    return _all(axes)
+    return _join_axes(axes)
 
 
 def gyro_form(sample_time: float, scaling: Scaling) -> FilterMatrices:
-    """Return angle and gyro bias: the angle rises by what the gyro says minus its bias (Lefferts 1982)."""
+    """Return the matrices of angle and gyro bias: the angle is the integral of rate minus bias (Lefferts 1982)."""
     T, axes = sample_time, []
     for unit in scaling.output_unit.tolist():
         F = np.array([[1.0, -T], [0.0, 1.0]])
-        P0 = np.diag([(START * unit) ** 2, (_BIAS * unit / scaling.second) ** 2])
-        # A measurement taken in by force moves the angle; the bias is none the worse for it.
-        forced = np.diag([(START * unit) ** 2, 0.0])
+        P0 = np.diag([(NECK_REACH * unit) ** 2, (_GYRO_BIAS * unit / scaling.second) ** 2])
+        # A measurement that passes without the gate moves the angle, not the bias.
+        forced = np.diag([(NECK_REACH * unit) ** 2, 0.0])
         Q = np.diag([T * T, 0.0]), np.diag([0.0, 1.0])
         axes.append((F, np.array([[T], [0.0]]), np.array([[1.0, 0.0]]), *Q, P0, forced))
-    return _all(axes)
+    return _join_axes(axes)
 
 
-def _all(axes: Sequence[tuple[Matrix, ...]]) -> FilterMatrices:
-    return FilterMatrices(*(_diagonal(*(axis[i] for axis in axes)) for i in range(7)))
+def _join_axes(axes: Sequence[tuple[Matrix, ...]]) -> FilterMatrices:
+    return FilterMatrices(*(_block_diagonal(*(axis[i] for axis in axes)) for i in range(7)))
 
 
-def _diagonal(*blocks: Matrix) -> Matrix:
+def _block_diagonal(*blocks: Matrix) -> Matrix:
     from scipy.linalg import block_diag
 
     return np.asarray(block_diag(*blocks), dtype=np.float64)

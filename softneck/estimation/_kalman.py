@@ -1,4 +1,4 @@
-"""The Kalman observer: a numpy runtime in loops, FMUs and over recordings, checked against filterpy."""
+"""The Kalman observer: one runtime in loops, FMUs and over recordings; tests compare it with filterpy."""
 
 from __future__ import annotations
 
@@ -36,14 +36,18 @@ if TYPE_CHECKING:
     from filterpy.kalman import KalmanFilter
 
 
-_RUNTIME = "softneck.estimation._kalman_runtime"
+_KALMAN_RUNTIME = "softneck.estimation._kalman_runtime"
 _NECK = Robot.preset("neck")
-# Of a level that is as small as others' lowest.
-_LEAST = 1e-3
-# Where the sensor's delay comes from, as the summary says it.
-_SOURCES = {"given": "as given", "sensor": "of the sensor", "robot": "of the robot's file; set-points and angles alone "
-            "tell only the sum of drive and sensor delay", "gyro": "behind the gyro's rates",
-            "motor positions": "the most that motor positions allow"}  # fmt: skip
+# Lowest noise level, as a part of a small one.
+_MIN_LEVEL_FACTOR = 1e-3
+# Sources of the sensor's delay, and their text in the summary.
+_DELAY_SOURCES = {
+    "given": "as given",
+    "sensor": "of the sensor",
+    "robot": "of the robot's file; set-points and angles alone give only the sum of drive and sensor delay",
+    "gyro": "from the gyro's rates",
+    "motor positions": "the upper bound from motor positions",
+}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -55,11 +59,10 @@ class KalmanObserver(ReprMixin):
         sample_time: [s].
         arrays: those of `KalmanArrays`.
         noise: standard deviations, named as `noise_names`, in SI.
-        sensor: name of the preset, "none" where the noise was given, "data" where it was estimated, "robot" where the
-            robot's file says it.
-        order: of the loop it is for.
+        sensor: name of the preset, or the source of its noise: "none" (given), "data" (estimated), "robot" (its file).
+        order: of the loop that it runs in.
         gate_level: chi-square level of the gate.
-        robot: whose outputs it estimates.
+        robot: of the outputs that it estimates.
         delay_source: where the sensor's delay comes from: "given", "sensor", "robot", "gyro", "motor positions".
     """
 
@@ -83,7 +86,7 @@ class KalmanObserver(ReprMixin):
 
     @property
     def delays(self) -> tuple[int, ...]:
-        """Samples that set-points need to act on each output, beyond the first; 0 where they do not act."""
+        """Dead time from set-points to each output, beyond the first sample [samples]; 0 without set-points."""
         acts, axes = self.form == "model", range(len(self.robot.outputs.names))
         return tuple(int(kalman_lag(self._named.constants, axis)) if acts else 0 for axis in axes)
 
@@ -99,22 +102,22 @@ class KalmanObserver(ReprMixin):
 
     @property
     def constants(self) -> Vector:
-        """See KALMAN_* of `_kalman_parts_runtime`."""
+        """The constants KALMAN_* of `_kalman_parts_runtime`."""
         return self._named.constants
 
     @property
     def directions(self) -> Matrix:
-        """Weights (outputs, sources) of what drives it: of the motors, or of the gyro's rates."""
+        """Weights (outputs, inputs) of the filter's inputs: motors, or rates of the gyro."""
         return self._named.sources
 
     def with_constants(self, constants: Vector) -> KalmanObserver:
-        """Return the same filter with other constants; gains do not depend on delays."""
+        """Return the filter with other constants; its gains do not depend on the delays."""
         names = KalmanArrays.names()
         place = names.index("constants")
         return dataclasses.replace(self, arrays=(*self.arrays[:place], constants, *self.arrays[place + 1 :]))
 
     def with_noise(self, noise: Sequence[float], *, sensor: str = "none") -> KalmanObserver:
-        """Return the same filter with other noise levels."""
+        """Return the filter with other noise levels."""
         levels = require_levels(self.form, self.robot, noise)
         return dataclasses.replace(self, noise=levels, sensor=sensor)
 
@@ -125,13 +128,13 @@ class KalmanObserver(ReprMixin):
         return Block(
             kind="kalman",
             role="observer",
-            runtime=sized_name(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            runtime=sized_name(_KALMAN_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=self.arrays,
             inputs=inputs,
             outputs=outputs,
             parameters=tuple(
-                Port(name=name, unit=unit, start=value, minimum=min(1e-9, _LEAST * value),
+                Port(name=name, unit=unit, start=value, minimum=min(1e-9, _MIN_LEVEL_FACTOR * value),
                      maximum={"rad": math.pi, "rad/s": 1e3}.get(unit), description="standard deviation")
                 for (name, unit), value in levels
             ),
@@ -146,10 +149,10 @@ class KalmanObserver(ReprMixin):
         return self.block().step(state, inputs)
 
     def filterpy(self) -> KalmanFilter:
-        """Return a configured `filterpy.kalman.KalmanFilter`, an input and a measurement for each output.
+        """Return the configured `filterpy.kalman.KalmanFilter`, with an input and a measurement for each output.
 
-        Give `predict(u)` the inputs that act, (outputs, 1): delayed theta_i and phi_i, or rates of the gyro; and
-        `update(None)` where nothing was measured: a NaN in `update` would stay in its state for good.
+        Give `predict(u)` the delayed inputs (outputs, 1): theta_i and phi_i, or rates of the gyro. Call `update(None)`
+        for a missing measurement: NaN would stay in its state.
         """
         from filterpy.kalman import KalmanFilter
 
@@ -167,15 +170,19 @@ class KalmanObserver(ReprMixin):
         """
         H, parts = self._named.H, KalmanFullState.parts(self._named)
 
-        def aligned(x: Matrix) -> tuple[Matrix, Matrix]:
+        def align(x: Matrix) -> tuple[Matrix, Matrix]:
             return x[:, parts["x"]] @ H.T, H @ x[:, parts["P"]].reshape(-1, H.shape[1], H.shape[1]) @ H.T
 
-        return filter_recording(self, recording, parts, aligned)
+        return filter_recording(self, recording, parts, align)
 
     def summary(self) -> str:
-        """Return some lines for people."""
+        """Return a text of some lines."""
         n, c = len(self._named.F), self._named.constants
-        acts = f"; set-points act after {_and(d + 1 for d in self.delays)} samples" if self.form == "model" else ""
+        acts = (
+            f"; set-points act after {_join_with_and(d + 1 for d in self.delays)} samples"
+            if self.form == "model"
+            else ""
+        )
         shown, si = to_si(self.robot.outputs.display_unit)
         levels = [
             f"{name.removesuffix('_noise_std')} {value / shown:.3g} "
@@ -185,9 +192,9 @@ class KalmanObserver(ReprMixin):
         lines = [
             f"kalman observer, {self.sample_time * 1e3:g} ms, {self.order} order, sensor {self.sensor}",
             f"  {self.form} form, gains from the covariance",
-            f"  {n} states: {STATES[self.form]} of {_and(self.robot.outputs.names)}{acts}",
+            f"  {n} states: {STATES[self.form]} of {_join_with_and(self.robot.outputs.names)}{acts}",
             f"  noise: {', '.join(levels)}",
-            *filter_lines(self.gate_level, c, self.sample_time, self.delay_source),
+            *gate_and_timing_lines(self.gate_level, c, self.sample_time, self.delay_source),
         ]
         return "\n".join(lines)
 
@@ -195,7 +202,10 @@ class KalmanObserver(ReprMixin):
         """Write the observer to one `.npz` file."""
         source = {} if self.delay_source == "given" else {"delay_source": self.delay_source}
         write_archive(
-            path, {**header_of(self), **source}, dict(zip(KalmanArrays.names(), self.arrays, strict=True)), force=force
+            path,
+            {**file_header(self), **source},
+            dict(zip(KalmanArrays.names(), self.arrays, strict=True)),
+            force=force,
         )
 
     @classmethod
@@ -204,7 +214,7 @@ class KalmanObserver(ReprMixin):
         form = str(header["form"])
         gone = "form kinematic" if form == "kinematic" else "constant gains" if "gain" in arrays else ""
         if gone:
-            raise FileFormatError(f"{gone} went after softneck 0.2.0, which still reads the file; design it again.")
+            raise FileFormatError(f"{gone} was removed after softneck 0.2.0, which reads the file; design it again.")
         items = KalmanArrays.read(arrays)
         robot = Robot.from_dict(header["robot"]) if "robot" in header else _NECK
         outputs, motors = len(robot.outputs.names), len(robot.motors.names)
@@ -215,31 +225,31 @@ class KalmanObserver(ReprMixin):
         try:
             return cls(
                 form=form, sample_time=float(header["sample_time"]), arrays=tuple(items.values()), robot=robot,
-                **of_header(header, form),
+                **fields_from_header(header, form),
             )  # fmt: skip
         except SettingsError as error:
             raise FileFormatError(f"{error} Design the observer again.") from error
 
 
-def filter_lines(gate_level: float, constants: Vector, sample_time: float, source: str) -> list[str]:
-    """Return what a summary says of the gate, of health and of the sensor's timing."""
+def gate_and_timing_lines(gate_level: float, constants: Vector, sample_time: float, source: str) -> list[str]:
+    """Return the summary's lines on the gate, health and the timing of the sensor."""
     c = constants
     lines = [
         f"  gate: chi-square level {gate_level:g} (innovation <= {c[KALMAN_GATE]:.3g}); "
-        f"by force after {c[KALMAN_REJECTIONS]:g} rejections",
+        f"off after {c[KALMAN_REJECTIONS]:g} rejections in a row",
         f"  healthy until {c[KALMAN_TIMEOUT] * sample_time * 1e3:g} ms without an accepted measurement"
         + (f" or {c[KALMAN_FROZEN]:g} identical ones" if c[KALMAN_FROZEN] > 0 else ""),
     ]
     if c[KALMAN_DIVIDER] > 1 or c[KALMAN_LEAD] > 0:
         lines.append(
             f"  measured every {c[KALMAN_DIVIDER] * sample_time * 1e3:g} ms, late by "
-            f"{c[KALMAN_LEAD] * sample_time * 1e3:g} ms ({_SOURCES[source]})"
+            f"{c[KALMAN_LEAD] * sample_time * 1e3:g} ms ({_DELAY_SOURCES[source]})"
         )
     return lines
 
 
-def header_of(observer: Any) -> dict[str, Any]:
-    """Return the header that both kinds of observers write."""
+def file_header(observer: Any) -> dict[str, Any]:
+    """Return the file header that both kinds of observers share."""
     block = observer.block()
     return {
         "kind": block.kind,
@@ -254,15 +264,15 @@ def header_of(observer: Any) -> dict[str, Any]:
     }
 
 
-def of_header(header: Mapping[str, Any], form: str) -> dict[str, Any]:
-    """Return the header's fields of both kinds; earlier versions do not name the source of the sensor's delay."""
+def fields_from_header(header: Mapping[str, Any], form: str) -> dict[str, Any]:
+    """Return the fields in the header of either kind; earlier versions have no source of the sensor's delay."""
     source = str(header.get("delay_source", "given"))
     return {
         "noise": tuple(float(header["noise"][name]) for name, _ in NOISES[form]),
         "sensor": str(header["sensor"]),
         "order": str(header["order"]),
         "gate_level": float(header["gate_level"]),
-        "delay_source": source if source in _SOURCES else "given",
+        "delay_source": source if source in _DELAY_SOURCES else "given",
     }
 
 
@@ -294,7 +304,7 @@ def observer_ports(form: str, robot: Robot = _NECK) -> tuple[tuple[Port, ...], t
     return (*u, *y, valid, *(rates if form == "gyro" else ())), outputs
 
 
-def _and(items: Iterable[object]) -> str:
+def _join_with_and(items: Iterable[object]) -> str:
     *most, last = (str(item) for item in items)
     return f"{', '.join(most)} and {last}" if most else last
 
@@ -302,7 +312,7 @@ def _and(items: Iterable[object]) -> str:
 def _require_covariance(name: str, P: Matrix) -> None:
     """Raise SettingsError unless `P` is symmetric and no direction has a negative variance."""
     largest = float(np.abs(P).max(initial=0.0))
-    # 1e-9 of the largest: what rounding leaves of a zero eigenvalue.
+    # 1e-9 of the largest: rounding of a zero eigenvalue.
     if not np.isfinite(P).all() or not np.allclose(P, P.T, rtol=0.0, atol=1e-9 * largest):
         raise SettingsError(f"the covariance `{name}` must be finite and symmetric.")
     least = float(np.linalg.eigvalsh(P).min())

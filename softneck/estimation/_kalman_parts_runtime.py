@@ -1,4 +1,4 @@
-"""What both Kalman runtimes share: which measurements count, lines of past inputs, the step from filter time to now."""
+"""Shared by both Kalman runtimes: checks of measurements, delay lines of inputs, the prediction to the present."""
 
 import math
 
@@ -10,24 +10,24 @@ from softneck.runtime._layout import Arrays, StateVector, array, cells, value
 # Places in `constants`.
 KALMAN_LAG = 0  # and 1: samples that inputs of the first two axes need to act; parts of a sample are interpolated
 KALMAN_GATE = 2  # largest normalised innovation squared
-KALMAN_REJECTIONS = 3  # in a row, then the next measurement is taken in by force
-KALMAN_TIMEOUT = 4  # samples without an accepted measurement until unhealthy
+KALMAN_REJECTIONS = 3  # in a row, then the next measurement passes without the gate
+KALMAN_TIMEOUT = 4  # samples without an accepted measurement, then unhealthy
 KALMAN_PERIOD = 5  # sample time [s]
-KALMAN_LEAD = 6  # samples from the filter's time to now: how late measurements are
+KALMAN_LEAD = 6  # samples from the filter's time to now: the delay of measurements
 KALMAN_DIVIDER = 7  # samples of the filter per sample of the sensor
 KALMAN_FROZEN = 8  # identical measurements that mean a frozen sensor; 0: never
 KALMAN_GYRO = 9  # 1: the sources are the gyro's rates, 0: the set-points
-KALMAN_GAP = 10  # what an output may do unseen in a sample without gyro [rad]
+KALMAN_GAP = 10  # standard deviation of an output's motion in a sample without gyro [rad]
 KALMAN_MORE_LAGS = 11  # those of further axes
-# Memory of the mean square: some 20 samples, as many as a frozen sensor needs to be told.
+# Memory of the mean square: some 20 samples, as many as show a frozen sensor.
 KALMAN_KEEP = 0.95
-# A sensor that scatters by less than a tenth of its stated noise is a simulated one, and may well stand still.
+# A sensor with less than a tenth of its stated noise is simulated: equal values do not show that it is frozen.
 KALMAN_STILL = 0.1
 
 
 def kalman_line_length(c: np.ndarray) -> int:
     """Return how many past inputs each axis keeps."""
-    # One sample more where a lag lies between two: a straight line needs both ends.
+    # One sample more for a fractional lag: linear interpolation needs both ends.
     longest = max(c[KALMAN_LAG], c[KALMAN_LAG + 1])
     for i in range(KALMAN_MORE_LAGS, c.shape[0]):
         longest = max(longest, c[i])
@@ -62,7 +62,7 @@ class KalmanArrays(Arrays):
 
 
 class KalmanCounters(StateVector):
-    """What a filter remembers of its sensor, whatever it knows of the neck."""
+    """The part of the state on the sensor, common to all filters."""
 
     samples = cells("", "seen so far")
     rejected = cells("", "measurements refused in a row")
@@ -75,7 +75,7 @@ class KalmanCounters(StateVector):
 
 
 class KalmanState(KalmanCounters):
-    """Counters, the estimate, and what the sources said."""
+    """Counters, the estimate, and past inputs."""
 
     rates = cells("outputs", "last of the gyro [rad/s]")
     x = cells("n", "estimate at the filter's time")
@@ -83,19 +83,19 @@ class KalmanState(KalmanCounters):
 
 
 def kalman_clear(c: np.ndarray, x: KalmanCounters) -> None:
-    """Set the counters of a state that is zero: nothing came yet."""
+    """Set the counters of a zero state: there was no measurement yet."""
     x.unheard = c[KALMAN_TIMEOUT]
     x.repeats = -1.0
 
 
 def kalman_usable(c: np.ndarray, x: KalmanCounters, y: np.ndarray, valid: float, noise: float) -> bool:
-    """Return whether the outputs `y` are a new measurement of a sensor that lives.
+    """Return whether the outputs `y` are a new measurement of a working sensor.
 
-    A slower sensor's sample is often held: within its period an unchanged value is the old one.
+    A slower sensor's sample is often held: an unchanged value within its period is the old one.
     """
     x.age += 1.0
     m = y.shape[0]
-    # A measurement is of all axes; a sensor that says NaN is as good as one that says invalid.
+    # A measurement has all outputs; NaN counts as invalid.
     if not valid > 0.5:
         return False
     came = bool(x.repeats >= 0.0)
@@ -111,7 +111,7 @@ def kalman_usable(c: np.ndarray, x: KalmanCounters, y: np.ndarray, valid: float,
         x.repeats += 1.0
     else:
         if came:
-            # Mean of all axes; of a neck that stands still it is twice the noise's variance.
+            # Mean over the outputs; at rest it is twice the noise's variance.
             change = 0.0
             for i in range(m):
                 change += (y[i] - x.measured[i]) ** 2
@@ -123,38 +123,38 @@ def kalman_usable(c: np.ndarray, x: KalmanCounters, y: np.ndarray, valid: float,
 
 
 def kalman_frozen(c: np.ndarray, x: KalmanCounters, noise: float) -> bool:
-    """Return whether a sensor that used to scatter repeats itself to the last bit."""
+    """Return whether a noisy sensor repeats exactly the same values."""
     still = KALMAN_STILL * noise
     # `repeats` does not count the first of equal ones, hence the - 1.
     return bool(c[KALMAN_FROZEN] > 0.0 and x.repeats >= c[KALMAN_FROZEN] - 1.0 and x.scatter > still * still)
 
 
 def kalman_forced(c: np.ndarray, x: KalmanCounters) -> bool:
-    """Return whether so many measurements were refused that the next is taken in whatever it says."""
+    """Return whether the next measurement passes without the gate, after too many rejections."""
     return bool(x.rejected >= c[KALMAN_REJECTIONS])
 
 
 def kalman_count(c: np.ndarray, x: KalmanCounters, judged: bool, accepted: bool) -> None:
     """Count rejections in a row and samples without an accepted measurement."""
-    # No measurement is no refusal: a gap in the data forces nothing.
+    # A missing measurement is not a rejection.
     if judged:
         x.rejected = 0.0 if accepted else x.rejected + 1.0
     x.unheard = 0.0 if accepted else min(x.unheard + 1.0, c[KALMAN_TIMEOUT])
 
 
 def kalman_healthy(c: np.ndarray, x: KalmanCounters, noise: float) -> bool:
-    """Return whether a measurement was accepted in time, of a sensor that lives."""
+    """Return whether a measurement of a working sensor was accepted in time."""
     return bool(x.unheard < c[KALMAN_TIMEOUT] and not kalman_frozen(c, x, noise))
 
 
 def kalman_first(p: KalmanArrays, inputs: np.ndarray) -> int:
-    """Return where the measured outputs begin among the inputs: behind the set-points."""
+    """Return the index of the first measured output among the inputs, after the set-points."""
     behind = 2 * p.outputs + 1 if p.constants[KALMAN_GYRO] > 0.5 else p.outputs + 1
     return inputs.shape[0] - behind
 
 
 def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarray) -> bool:
-    """Put what the sources say now into the lines, fill `u` with what acts; return whether a gyro said nothing."""
+    """Push the inputs into the delay lines, fill `u` with the delayed ones; return whether a gyro rate is missing."""
     T, c = p.sources, p.constants
     lost = False
     if c[KALMAN_GYRO] > 0.5:
@@ -164,11 +164,11 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
             rate = inputs[valid + 1 + i]
             lost = lost or not math.isfinite(rate)
             held = held and bool(rate == x.rates[i])
-        # Behind an invalid measurement an unchanged rate is one that the plant holds.
+        # With an invalid measurement, an unchanged rate is an old one that is held.
         lost = lost or bool(inputs[valid] < 0.5 and x.samples > 0.0 and held)
         if not lost:
             x.rates[:] = inputs[valid + 1 :]
-        # Lost rates leave the last ones; `step` widens P by what the angle may do meanwhile.
+        # Missing rates leave the last ones; `step` increases P for the angle's motion in between.
         for i in range(p.outputs):
             u[i] = kalman_row(T, i, x.rates)
     else:
@@ -179,7 +179,7 @@ def kalman_push(p: KalmanArrays, x: KalmanState, inputs: np.ndarray, u: np.ndarr
     for axis in range(p.outputs):
         line = x.lines[axis]
         if x.samples == 0.0:
-            # Nothing is known of the past: the sources stood still.
+            # The past is unknown: the inputs were constant.
             line[:] = u[axis]
         line[newest] = u[axis]
         u[axis] = kalman_lagged(line, newest, kalman_lag(c, axis))
@@ -195,12 +195,12 @@ def kalman_row(T: np.ndarray, i: int, u: np.ndarray) -> float:
 
 
 def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
-    """Return the input `lag` samples ago, between samples by a straight line; of the future the newest known."""
+    """Return the input `lag` samples ago, interpolated linearly; the newest one for a negative lag."""
     if lag <= 0.0:
         return float(line[newest])
     whole = int(lag)
     part = lag - whole
-    # A ring: what is older than the newest stands before it, round the end.
+    # A ring buffer: older samples are before the newest, with wrap-around.
     value = line[(newest - whole) % line.shape[0]]
     if part > 0.0:
         value = (1.0 - part) * value + part * line[(newest - whole - 1) % line.shape[0]]
@@ -208,7 +208,7 @@ def kalman_lagged(line: np.ndarray, newest: int, lag: float) -> float:
 
 
 def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarray) -> None:
-    """Carry the estimate from the filter's time to now; fill all outputs but the innovation."""
+    """Predict from the filter's time to now; fill all outputs but the innovation."""
     F, B, H, c = p.F, p.B, p.H, p.constants
     m = p.outputs
     newest = int(x.samples) % p.length
@@ -217,7 +217,7 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
     now = x.x
     u, before = np.empty(m), np.empty(m)
     for i in range(whole + 1):
-        # What carries the estimate from i samples after its time to i + 1: newer by i + 1 than the last that acted.
+        # The input from i to i + 1 samples after the filter's time: newer by i + 1 than the last one.
         for axis in range(m):
             u[axis] = kalman_lagged(x.lines[axis], newest, kalman_lag(c, axis) - 1.0 - i)
         if i == whole:
@@ -225,9 +225,9 @@ def kalman_tell(p: KalmanArrays, x: KalmanState, noise: float, outputs: np.ndarr
         now = kalman_ahead(F, now, B, u)
     y = kalman_dot(H, now)
     for axis in range(m):
-        # Between samples by a straight line, whose slope is the rate.
+        # Linear interpolation between samples; the rate is its slope.
         outputs[axis] = before[axis] + part * (y[axis] - before[axis])
-        # The model's own rate over that sample, not a difference of noisy estimates.
+        # The model's rate over that sample, not a difference of noisy estimates.
         outputs[m + axis] = (y[axis] - before[axis]) / c[KALMAN_PERIOD]
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, noise) else 0.0
 

@@ -28,13 +28,13 @@ from softneck.runtime._rest_runtime import REST
 
 
 class KalmanFullState(KalmanState):
-    """The estimate and how uncertain it is."""
+    """The estimate and its covariance."""
 
     P = cells("n, n", "covariance of x")
 
 
 def initialise(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, outputs: np.ndarray) -> None:
-    """Start at rest, uncertain by P0, with no measurement accepted yet."""
+    """Start at rest with covariance P0, without an accepted measurement."""
     x[:] = 0.0
     x.P[:] = p.P0.reshape(p.n * p.n)
     kalman_clear(p.constants, x)
@@ -42,10 +42,10 @@ def initialise(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, outp
 
 
 def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Predict with the inputs that acted until now, then take in the measurement where there is a credible one.
+    """Predict with the delayed inputs, then correct if there is a measurement that passes the gate.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid; with gyro pitch_rate_measured,
-    roll_rate_measured. The outputs of another robot stand for pitch and roll.
+    roll_rate_measured. Another robot has its own outputs instead of pitch and roll.
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
     parameters: measurement noise and two process noises (standard deviations).
     """
@@ -62,10 +62,10 @@ def step(p: KalmanArrays, parameters: np.ndarray, x: KalmanFullState, inputs: np
         # In the gyro form `first_noise` is diag(T^2, 0): by its largest entry it is 1 on the angles.
         P += c[KALMAN_GAP] * c[KALMAN_GAP] * p.first_noise / p.first_noise.max()
     if x.samples < p.length:
-        # Inputs from before the start are still on their way: the model has no say.
+        # Inputs from before the start still act and are unknown.
         P += p.P0
     elif forced:
-        # Wide enough for the measurement to have its way.
+        # Large enough for the estimate to jump to the measurement.
         P += p.PF
     innovation, accepted = 0.0, False
     if usable:
@@ -95,7 +95,7 @@ def kalman_predict(p: KalmanArrays, parameters: np.ndarray, x: np.ndarray, P: np
 def kalman_correct(
     p: KalmanArrays, noise: float, x: KalmanFullState, P: np.ndarray, measured: np.ndarray, forced: bool
 ) -> tuple[float, bool]:
-    """Take the measurement into x and P unless the gate refuses; return e' S^-1 e and whether it was taken in."""
+    """Correct x and P unless the gate rejects the measurement; return e' S^-1 e and whether it was accepted."""
     e = measured - kalman_dot(p.H, x.x)
     r = float(noise * noise)
     PH = kalman_columns(P, p.H)
@@ -105,11 +105,11 @@ def kalman_correct(
     else:
         innovation, log_det = kalman_more(S, e, r)
     x.log_det = log_det
-    # The gate; x and P stay as predicted where it refuses.
+    # The gate; x and P stay as predicted if it rejects.
     if not (forced or innovation <= p.constants[KALMAN_GATE]):
         return innovation, False
     K = kalman_columns(PH, S)  # P H' S^-1, which is its own transpose
-    estimate = x.x  # numba would copy the stretch for `x.x[:] +=`
+    estimate = x.x  # numba would copy the slice for `x.x[:] +=`
     estimate += kalman_dot(K, e)
     kalman_joseph(P, K, p.H, r)
     return innovation, True
@@ -118,12 +118,12 @@ def kalman_correct(
 def kalman_two(S: np.ndarray, e: np.ndarray, r: float) -> tuple[float, float]:
     """Add R to H P H' of two outputs, replace it by its inverse S^-1; return e' S^-1 e and log det S.
 
-    Written out: made symmetric, its inverse by the determinant.
+    Written out with the symmetric part and the determinant.
     """
     e0, e1 = float(e[0]), float(e[1])
     s00, s01, s11 = float(S[0, 0]) + r, 0.5 * float(S[0, 1] + S[1, 0]), float(S[1, 1]) + r
     determinant = s00 * s11 - s01 * s01
-    # e' S^-1 e, the NIS: chi-square with 2 degrees of freedom if the filter is true.
+    # e' S^-1 e, the NIS: chi-square with 2 degrees of freedom for a consistent filter.
     innovation = (s11 * e0 * e0 - 2.0 * s01 * e0 * e1 + s00 * e1 * e1) / determinant
     S[0, 0] = s11 / determinant
     S[1, 1] = s00 / determinant
@@ -132,7 +132,7 @@ def kalman_two(S: np.ndarray, e: np.ndarray, r: float) -> tuple[float, float]:
 
 
 def kalman_more(S: np.ndarray, e: np.ndarray, r: float) -> tuple[float, float]:
-    """Do what `kalman_two` does for any number of outputs, by the factor S = L L' (Golub and Van Loan, sec. 4.2)."""
+    """Invert S for any number of outputs as `kalman_two` does, by S = L L' (Golub and Van Loan, sec. 4.2)."""
     m = S.shape[0]
     L, inverse = np.zeros((m, m)), np.zeros((m, m))
     log_det, innovation = 0.0, 0.0
@@ -162,7 +162,7 @@ def kalman_more(S: np.ndarray, e: np.ndarray, r: float) -> tuple[float, float]:
 
 
 def kalman_joseph(P: np.ndarray, K: np.ndarray, H: np.ndarray, r: float) -> None:
-    """Replace `P` by (I - K H) P (I - K H)' + r K K', which no rounding makes indefinite."""
+    """Replace `P` by (I - K H) P (I - K H)' + r K K', which stays positive semidefinite under rounding."""
     n = P.shape[0]
     if not COMPILED:
         J = np.dot(K, H)
@@ -208,12 +208,12 @@ def kalman_sandwich(A: np.ndarray, P: np.ndarray) -> None:
     W = np.zeros((n, n))
     for i in range(n):
         for k in range(n):
-            # Axes do not meet but in the gate: half of F and of I - K H is zero.
+            # The axes are coupled only by the gate: half of F and of I - K H is zero.
             if A[i, k] != 0.0:
                 for j in range(n):
                     W[i, j] += A[i, k] * P[k, j]
     for i in range(n):
-        # Half is computed and mirrored: P stays symmetric to the last bit.
+        # Half is computed and mirrored: P stays exactly symmetric.
         for j in range(i + 1):
             total = 0.0
             for k in range(n):

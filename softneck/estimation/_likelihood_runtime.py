@@ -14,12 +14,12 @@ def kalman_cost(
 ) -> tuple[float, int]:
     """Return sum of log det S + e' S^-1 e over the measurements from row `start` on, and their number.
 
-    The arrays' gate must be open: with a gate, no noise at all would be the best fit to what is left.
+    The arrays' gate must be open: with a gate, zero noise would fit the remaining measurements best.
     """
     outputs = np.zeros(2 * p.outputs + 2)
     total, count = 0.0, 0
     for k in range(inputs.shape[0]):
-        # A step that judges no measurement leaves it.
+        # A step without a measurement leaves it.
         x.log_det = np.nan
         step(p, parameters, x, inputs[k], outputs)
         if k >= start and not math.isnan(x.log_det):

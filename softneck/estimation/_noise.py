@@ -1,30 +1,30 @@
-"""Noise levels from recordings: those under which the filter's innovations are most likely."""
+"""Noise levels by maximum likelihood, and checks of a filter by its innovations."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, SettingsError, Vector
+from softneck.core import DataError, Matrix, ReprMixin, SettingsError, Vector
 from softneck.runtime import load_functions, sized_name
 from softneck.signals import Recording
 
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE, KALMAN_REJECTIONS, KalmanArrays
 from ._nonlinear import NonlinearObserver
-from ._offline import check_recording, input_rows, measured_angles
+from ._offline import check_recording, input_rows, measured_angles, measured_names
 
-# Rows at the start of each run that are not scored: there the filter is still uncertain of everything.
+# Rows at the start of each run that are not scored: the filter has not converged there.
 SETTLE = 50
-# An outlier is further than so many robust standard deviations from the median of its neighbours and itself.
-_OUTLIER = 6.0
-# Levels are searched within two powers of ten of where the search starts: smooth data would like none at all, and a
-# filter without noise trusts one measurement for good.
-_DECADES = 2.0
-_STEP = 0.15
-# Measured rows below which three levels cannot be told apart.
+# An outlier is further than this from the median of itself and its two neighbours [robust standard deviations].
+_OUTLIER_DEVIATIONS = 6.0
+# Levels are searched within two decades of the start: smooth data would drive them to zero, and a filter without noise
+# stops correcting itself.
+_SEARCH_DECADES = 2.0
+_FIRST_STEP_DECADES = 0.15
+# Fewer measured rows do not determine three levels.
 _LEAST_ROWS = 200
 
 
@@ -40,7 +40,7 @@ class NoiseFit:
         log_likelihood: per measurement, before and after.
         rows: measurements used.
         outliers: measurements left out.
-        at_bound: names of levels that ran to the end of their range: the data do not tell them.
+        at_bound: names of levels at the end of their range: the data do not determine them.
     """
 
     observer: KalmanObserver | NonlinearObserver
@@ -62,11 +62,11 @@ def fit_noise(
     """Return the noise levels of greatest likelihood (Schweppe 1965; Anderson and Moore 1979, sec. 10.3).
 
     The cost is the sum of log det S_k + e_k' S_k^-1 e_k over the innovations, minimised over the logarithms of the
-    three levels by the simplex of Nelder and Mead. Outliers are taken out beforehand (Hampel 1974), since a gate
-    inside the search would reward a filter that refuses everything.
+    three levels by the simplex of Nelder and Mead. Outliers are removed beforehand (Hampel 1974): a gate inside the
+    search would reward a filter that rejects everything.
 
-    Where the model is wrong its error is not white, and the likeliest levels may leave the measurement no noise at all:
-    then hold that of the sensor.
+    The errors of a wrong model are not white, and the likelihood may then leave no measurement noise: fix the sensor's
+    level in this case.
 
     Args:
         observer: the filter, with the levels to start from.
@@ -77,7 +77,7 @@ def fit_noise(
         SettingsError: a name in `fixed` that is not a level, or all of them.
         DataError: another sample time, missing channels, or fewer than 200 measurements.
     """
-    free = _free(observer.noise_names, fixed)
+    free = _levels_to_estimate(observer.noise_names, fixed)
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     runs = [run for recording in given for run in recording.runs()]
     for run in runs:
@@ -89,7 +89,7 @@ def fit_noise(
             f"got {cost.rows}. Record longer."
         )
     start = np.log10(observer.noise)
-    found, least, at_bound = _likeliest(cost, start, free)
+    found, least, at_bound = _maximise_likelihood(cost, start, free)
     noise = np.array(observer.noise)
     noise[free] = 10.0 ** found[free]
     levels = (float(noise[0]), float(noise[1]), float(noise[2]))
@@ -105,8 +105,8 @@ def fit_noise(
     )
 
 
-def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
-    """Return which levels are estimated (3,); refuse an unknown name, and nothing left to estimate."""
+def _levels_to_estimate(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
+    """Return which levels are estimated (3,); raise SettingsError for an unknown name or none left."""
     unknown = sorted(set(fixed) - set(names))
     if unknown or len(set(fixed)) == len(names):
         what = f"`{unknown[0]}` is not a noise level" if unknown else "no noise level is left to estimate"
@@ -114,24 +114,24 @@ def _free(names: Sequence[str], fixed: Sequence[str]) -> np.ndarray:
     return np.array([name not in fixed for name in names])
 
 
-def _likeliest(cost: Cost | WalkCost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
+def _maximise_likelihood(cost: Cost | WalkCost, start: Vector, free: np.ndarray) -> tuple[Vector, float, np.ndarray]:
     """Return the decadic logarithms of the levels, their cost, and which ran to the end of their range (3,)."""
     from scipy.optimize import minimize
 
-    bounds = [(level - _DECADES, level + _DECADES) for level in start[free]]
+    bounds = [(level - _SEARCH_DECADES, level + _SEARCH_DECADES) for level in start[free]]
 
     def of(levels: Vector) -> float:
         whole = start.copy()
         whole[free] = levels
         return cost.of(whole)
 
-    # A first step of its own: scipy's is a part of the logarithm, none at all for a level of 1.
-    simplex = np.vstack([start[free], start[free] + _STEP * np.eye(int(free.sum()))])
+    # scipy's own first step is a part of the logarithm: zero for a level of 1.
+    simplex = np.vstack([start[free], start[free] + _FIRST_STEP_DECADES * np.eye(int(free.sum()))])
     options = {"xatol": 1e-3, "fatol": 1e-5, "initial_simplex": simplex}
     found = minimize(of, start[free], method="Nelder-Mead", bounds=bounds, options=options)
     whole, at_bound = start.copy(), np.zeros(start.size, dtype=bool)
     whole[free] = found.x
-    # A hundredth of a decade: where the simplex stops.
+    # The simplex stops within a hundredth of a decade.
     at_bound[free] = [min(x - low, high - x) < 0.01 for x, (low, high) in zip(found.x, bounds, strict=True)]
     return whole, float(found.fun), at_bound
 
@@ -150,7 +150,7 @@ class Cost:
         self._told = 2 * outputs + 2
         arrays = dict(zip(KalmanArrays.names(), observer.arrays, strict=False))  # without steady gains
         arrays["constants"] = constants = arrays["constants"].copy()
-        # No gate, no force, no frozen sensor: the likelihood is of all that was measured.
+        # The gate and the frozen-sensor test are off: the likelihood uses all measurements.
         constants[KALMAN_GATE] = constants[KALMAN_REJECTIONS] = np.inf
         constants[KALMAN_FROZEN] = 0.0
         self._arrays = tuple(arrays.values())
@@ -158,13 +158,13 @@ class Cost:
         self._tables: list[Matrix] = []
         self.outliers = 0
         for run in runs:
-            z, spoilt = _without_outliers(run)
+            z, spoilt = _measurements_without_outliers(run)
             self.outliers += spoilt
             self._tables.append(input_rows(observer, run, z))
         self.rows = sum(self._run(table, observer.noise)[1] for table in self._tables)
 
     def of(self, levels: Vector) -> float:
-        """Return minus twice the log likelihood per measurement at 10 to the power of `levels`, but for a constant."""
+        """Return minus twice the log likelihood per measurement, up to a constant; `levels` are log10."""
         noise = tuple(float(level) for level in 10.0**levels)
         return sum(self._run(table, noise)[0] for table in self._tables) / self.rows
 
@@ -174,16 +174,16 @@ class Cost:
         return self._functions.kalman_cost(self._arrays, parameters, state, table, SETTLE)
 
 
-def _without_outliers(run: Recording) -> tuple[Matrix, int]:
+def _measurements_without_outliers(run: Recording) -> tuple[Matrix, int]:
     """Return the measured outputs (time, outputs) with NaN for outliers, and how many there were."""
     z = measured_angles(run)
-    spoilt = outliers(z)
+    spoilt = find_outliers(z)
     z[spoilt] = np.nan
     return z, int(spoilt.sum())
 
 
 class WalkCost:
-    """The same over a nonlinear model, which runs free: once, and what it misses is judged as a walk."""
+    """The cost over a nonlinear model: it is simulated once, and its error is a random walk."""
 
     def __init__(self, observer: NonlinearObserver, runs: Sequence[Recording]) -> None:
         self._cost = load_functions("softneck.estimation._walk_likelihood_runtime").walk_cost
@@ -191,14 +191,14 @@ class WalkCost:
         self._tables: list[tuple[Matrix, np.ndarray, Vector]] = []
         self.outliers = 0
         for run in runs:
-            z, spoilt = _without_outliers(run)
+            z, spoilt = _measurements_without_outliers(run)
             self.outliers += spoilt
-            angles, fastest = observer.free_run(run)
+            angles, fastest = observer.simulate(run)
             self._tables.append((z - angles, np.asarray(np.isfinite(z).all(axis=1)), fastest))
         self.rows = sum(int(came[SETTLE:].sum()) for _, came, _ in self._tables)
 
     def of(self, levels: Vector) -> float:
-        """Return minus twice the log likelihood per measurement at 10 to the power of `levels`, but for a constant."""
+        """Return the cost as `Cost.of` does."""
         noise, rest, ratio = (float(level) for level in 10.0**levels)
         costs = (
             self._cost(missed, came, rest**2 + (ratio * fastest) ** 2, noise**2, self._start, SETTLE)
@@ -207,8 +207,8 @@ class WalkCost:
         return float(sum(costs)) / self.rows
 
 
-def outliers(z: Matrix) -> np.ndarray:
-    """Return which measurements (time,) stand apart from both neighbours that came."""
+def find_outliers(z: Matrix) -> np.ndarray:
+    """Return which measurements (time,) are far from both neighbours (Hampel 1974)."""
     spoilt = np.zeros(len(z), dtype=bool)
     came = np.flatnonzero(np.isfinite(z).all(axis=1))
     if came.size < 3:
@@ -216,8 +216,119 @@ def outliers(z: Matrix) -> np.ndarray:
     y = z[came]
     middle = np.median(np.stack([y[:-2], y[1:-1], y[2:]]), axis=0)
     distance = np.abs(y[1:-1] - middle)
-    # Scale from the changes between neighbours: 1.4826 times a median is a normal standard deviation. A noise-free
-    # recording has none, and no outliers.
+    # 1.4826 times the median change between neighbours is a normal standard deviation.
     scale = 1.4826 * np.median(np.abs(np.diff(y, axis=0)), axis=0)
-    spoilt[came[1:-1]] = (distance > _OUTLIER * np.maximum(scale, 1e-12)).any(axis=1)
+    spoilt[came[1:-1]] = (distance > _OUTLIER_DEVIATIONS * np.maximum(scale, 1e-12)).any(axis=1)
     return spoilt
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Consistency(ReprMixin):
+    """Normalised innovation squared (NIS) e' S^-1 e of the accepted measurements of a recording.
+
+    It is chi-square for a consistent filter, with one degree of freedom for each output.
+
+    Attributes:
+        level: of the bands.
+        taken: number of accepted measurements.
+        inside: share of them within the band of one value; `level` is expected.
+        mean: the number of outputs is expected; a larger mean shows too small a covariance.
+        mean_band: interval of `level` for the mean of independent values (Bar-Shalom 2001, sec. 5.4.2).
+        rejected: measurements that the gate rejected; 1 - `gate_level` of good ones is expected.
+    """
+
+    level: float
+    taken: int
+    inside: float
+    mean: float
+    mean_band: tuple[float, float]
+    rejected: int
+
+    def summary(self) -> str:
+        """Return some lines for people."""
+        low, high = self.mean_band
+        return (
+            f"NIS: {100 * self.inside:.1f} % of {self.taken} in the {100 * self.level:g} % band; "
+            f"mean {self.mean:.2f}, expected {low:.2f} to {high:.2f}\nrejected by the gate: {self.rejected}"
+        )
+
+
+def consistency(
+    observer: KalmanObserver | NonlinearObserver, recording: Recording, *, level: float = 0.95, settle: int = 50
+) -> Consistency:
+    """Return the normalised innovations of a filter against their chi-square bounds.
+
+    Args:
+        observer: the filter.
+        recording: of its sample time.
+        level: of the bands.
+        settle: rows at the start of each run that are ignored.
+
+    Raises:
+        DataError: no measurements are left, or what `observer.estimate` raises.
+    """
+    from scipy.stats import chi2
+
+    if not 0.0 < level < 1.0:
+        raise DataError(f"`level` must be between 0 and 1; got {level:g}.")
+    estimates = observer.estimate(recording)
+    counts = np.concatenate([np.arange(len(run)) >= settle for run in recording.runs()])
+    rows = np.flatnonzero(counts & estimates.judged)
+    nis = estimates.innovation[rows[estimates.accepted[rows]]]
+    if nis.size < 2:
+        raise DataError(f"no measurements are left after the first {settle} rows of each run; record longer.")
+    tails, degrees = np.array([0.5 - 0.5 * level, 0.5 + 0.5 * level]), len(recording.robot.outputs.names)
+    low, high = chi2.ppf(tails, degrees)
+    mean_low, mean_high = chi2.ppf(tails, degrees * nis.size) / nis.size
+    return Consistency(
+        level=level,
+        taken=nis.size,
+        inside=float(np.mean((nis >= low) & (nis <= high))),
+        mean=float(np.mean(nis)),
+        mean_band=(float(mean_low), float(mean_high)),
+        rejected=rows.size - nis.size,
+    )
+
+
+# Five samples of every 25 are withheld: 0.1 s of 0.5 s at 20 ms.
+_GAP_PERIOD, _GAP_LENGTH = 25, 5
+
+
+def look_ahead_error(
+    observer: KalmanObserver | NonlinearObserver, recording: Recording, late: float | None = None
+) -> float:
+    """Return the RMS [SI] between the estimates and what the late sensor measures of the same instants.
+
+    Five of every 25 samples are withheld from the filter. Likelihood favours levels that trust every measurement where
+    the model is wrong; the gaps and the prediction over the sensor's delay show the price. Outliers are not compared.
+
+    Args:
+        observer: the filter.
+        recording: of its sample time, preferably rows that its noise levels were not fitted to.
+        late: delay of the sensor [s]; None for that of the filter.
+
+    Raises:
+        DataError: no gap fits into the runs.
+    """
+    late = (observer.lead if late is None else late) / observer.sample_time
+    names = measured_names(recording)
+    squares = []
+    for run in recording.runs():
+        row = np.arange(len(run))
+        gap = (row >= SETTLE) & (row % _GAP_PERIOD >= _GAP_PERIOD - _GAP_LENGTH)
+        z = np.column_stack([run.channels[name] for name in names])
+        spoilt = find_outliers(z)
+        hidden = {name: np.where(gap, np.nan, run.channels[name]) for name in names}
+        estimates = observer.estimate(replace(run, channels={**run.channels, **hidden})).outputs
+        clean = np.where(spoilt[:, None], np.nan, z)
+        # The measurement `late` samples later, interpolated linearly.
+        whole, part = int(late), late - int(late)
+        ahead = [np.vstack([clean[n:], np.full((n, clean.shape[1]), np.nan)])[: len(clean)] for n in (whole, whole + 1)]
+        error = estimates - (ahead[0] if part == 0.0 else (1.0 - part) * ahead[0] + part * ahead[1])
+        # Without a delay the filter has seen every measurement outside the gaps.
+        counted = (gap if late < 1.0 else row >= SETTLE) & np.isfinite(error).all(axis=1)
+        squares.append(error[counted] ** 2 if gap.any() else error[:0])
+    judged = np.concatenate(squares)
+    if not judged.size:
+        raise DataError(f"runs of more than {SETTLE + _GAP_PERIOD} rows are needed to check a filter; record longer.")
+    return float(np.sqrt(judged.mean()))

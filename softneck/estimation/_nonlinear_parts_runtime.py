@@ -1,4 +1,4 @@
-"""What observers over nonlinear models share: the model in free run, and the way from the filter's time to now."""
+"""Shared by observers over nonlinear models: simulation of the model, and the prediction to the present."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from softneck.estimation._kalman_parts_runtime import KALMAN_LEAD, KALMAN_PERIOD
 from softneck.runtime._layout import Arrays, array, value
 from softneck.runtime._members_runtime import member_initialise, member_step
 
-# Places in `setup`; the model's outputs are more than those that are measured.
+# Places in `setup`; the model has more outputs than the measured ones.
 NONLINEAR_MOTORS = 0
 NONLINEAR_OUTPUTS = 1
 NONLINEAR_TOLD = 2
@@ -17,7 +17,7 @@ NONLINEAR_SLEW = 6  # one a motor
 
 
 class NonlinearArrays(Arrays):
-    """Those of the model follow."""
+    """The observer's own arrays; those of the model follow."""
 
     setup = array(
         "places",
@@ -34,7 +34,7 @@ class NonlinearArrays(Arrays):
 def nonlinear_settle(
     p: NonlinearArrays, free: np.ndarray, model: np.ndarray, motors: np.ndarray, angles: np.ndarray
 ) -> None:
-    """Bring the model to where it had been, had the motors stood there for ever; fill its `angles`."""
+    """Bring the model to its steady state under `motors`; fill its `angles`."""
     member_initialise(p, 0, free, model, np.zeros(int(p.setup[NONLINEAR_TOLD])))
     for _ in range(int(p.setup[NONLINEAR_SETTLE])):
         nonlinear_move(p, free, model, motors, angles)
@@ -43,7 +43,7 @@ def nonlinear_settle(
 def nonlinear_move(
     p: NonlinearArrays, free: np.ndarray, model: np.ndarray, motors: np.ndarray, angles: np.ndarray
 ) -> None:
-    """Move the model on in free run under `motors` and fill its `angles`; `free` are its parameters."""
+    """Simulate the model for one sample under `motors` and fill its `angles`; `free` are its parameters."""
     u = np.empty(2 * p.motors + p.outputs)
     u[: p.motors] = motors
     u[p.motors :] = np.nan  # NaN: nothing is measured
@@ -53,14 +53,14 @@ def nonlinear_move(
 
 
 def nonlinear_slew(p: NonlinearArrays, reached: np.ndarray, motors: np.ndarray) -> None:
-    """Bring `reached`, the set-points that move the model, towards `motors`: a drive takes its time over a jump."""
+    """Move `reached`, the model's set-points, towards `motors` at the rate limit of the drives."""
     for j in range(p.motors):
         most = p.setup[NONLINEAR_SLEW + j]
         reached[j] += min(max(motors[j] - reached[j], -most), most)
 
 
 def nonlinear_faster(p: NonlinearArrays, fastest: float, angles: np.ndarray, before: np.ndarray) -> float:
-    """Return the fastest motion of late, from what it was and the outputs of now and of the sample before."""
+    """Return the recent motion: a maximum that decays, updated with the change over the last sample."""
     motion = p.setup[NONLINEAR_KEEP] * fastest
     for i in range(p.outputs):
         motion = max(motion, abs(angles[i] - before[i]))
@@ -77,9 +77,9 @@ def nonlinear_tell(
     motors: np.ndarray,
     outputs: np.ndarray,
 ) -> None:
-    """Carry the estimate from the filter's time to now, under the newest set-points; fill angles and rates.
+    """Predict from the filter's time to now under the newest set-points; fill angles and rates.
 
-    `model`, `angles` and `reached` are spent.
+    `model`, `angles` and `reached` are overwritten.
     """
     c, m = p.constants, p.outputs
     whole = int(c[KALMAN_LEAD])
@@ -90,6 +90,6 @@ def nonlinear_tell(
         nonlinear_slew(p, reached, motors)
         nonlinear_move(p, free, model, reached, angles)
     for i in range(m):
-        # Between samples by a straight line, whose slope is the rate.
+        # Linear interpolation between samples; the rate is its slope.
         outputs[i] = before[i] + part * (angles[i] - before[i]) + disturbance[i]
         outputs[m + i] = (angles[i] - before[i]) / c[KALMAN_PERIOD]

@@ -1,7 +1,7 @@
-"""A nonlinear model in free run, and a disturbance of its outputs that walks: more the faster the model moves.
+"""Simulation of a nonlinear model, and a random-walk disturbance of its outputs whose step grows with the motion.
 
-Member 0 is the model. Nothing corrects its state: what it misses is the disturbance, so that whatever a measurement
-says it stays where such a model can be, and one without derivatives will do. What a model misses it misses in motion.
+Member 0 is the model. Its state is not corrected, so it stays reachable, and the model needs no derivatives. The
+disturbance is the model's error, which is large in motion.
 """
 
 import math
@@ -32,7 +32,7 @@ from softneck.runtime._members_runtime import member_size
 
 
 class NonlinearState(KalmanCounters):
-    """Counters, what the model says and misses; its own state follows."""
+    """Counters, outputs of the model and the disturbance; the model's state follows."""
 
     variance = cells("", "of each output's disturbance")
     fastest = cells("", "motion of the model in a sample, of late")
@@ -49,7 +49,7 @@ def state_size(p: NonlinearArrays) -> int:
 
 
 def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, outputs: np.ndarray) -> None:
-    """Start where nothing is known; the first sample tells where the motors stand."""
+    """Start with an unknown output; the first sample sets the motors."""
     x[:] = 0.0
     kalman_clear(p.constants, x)
     outputs[:] = 0.0
@@ -58,11 +58,11 @@ def initialise(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, ou
 def step(
     p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
-    """Move the model on, then take in the measurement where there is a credible one.
+    """Simulate one sample, then correct if there is a measurement that passes the gate.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid.
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy.
-    parameters: measurement noise, the disturbance's at rest (standard deviations), and what of a motion it may be.
+    parameters: standard deviations of measurement and disturbance at rest, ratio of the disturbance to the motion.
     """
     c, n, m = p.constants, p.motors, p.outputs
     asked, measured = inputs[:n], inputs[n : n + m]
@@ -76,13 +76,13 @@ def step(
     forced = kalman_forced(c, x)
     nonlinear_predict(p, parameters, x, asked)
     if forced:
-        # Wide enough for the measurement to have its way.
+        # Large enough for the estimate to jump to the measurement.
         x.variance += start * start
     innovation, accepted = 0.0, False
     if usable:
         innovation, accepted = nonlinear_correct(p, parameters[0], x, measured, forced)
     kalman_count(c, x, usable, accepted)
-    # Copies: the filter's own model stays at the time of the measurement.
+    # Copies: the filter's model stays at the time of the measurement.
     nonlinear_tell(p, p.free, x.model.copy(), x.angles.copy(), x.disturbance, x.reached.copy(), asked, outputs)
     outputs[2 * m] = innovation
     outputs[2 * m + 1] = 1.0 if kalman_healthy(c, x, parameters[0]) else 0.0
@@ -90,7 +90,7 @@ def step(
 
 
 def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearState, asked: np.ndarray) -> None:
-    """Move the model on under what acted since the last sample, and widen what it may miss by how far it went."""
+    """Simulate one sample, and increase the disturbance's variance by the model's motion."""
     before = x.angles.copy()
     if p.constants[KALMAN_LAG] > 0.5:
         nonlinear_slew(p, x.reached, x.held)
@@ -105,7 +105,7 @@ def nonlinear_predict(p: NonlinearArrays, parameters: np.ndarray, x: NonlinearSt
 def nonlinear_correct(
     p: NonlinearArrays, noise: float, x: NonlinearState, measured: np.ndarray, forced: bool
 ) -> tuple[float, bool]:
-    """Take the measurement into the disturbance unless the gate refuses; return the NIS and whether it was taken in."""
+    """Correct the disturbance unless the gate rejects the measurement; return the NIS and whether it was accepted."""
     S = x.variance + noise * noise
     x.log_det = p.outputs * math.log(S)
     innovation = 0.0

@@ -1,4 +1,4 @@
-"""The filter over recordings, by the runtime that loops and FMUs step."""
+"""The filter over recordings, with the runtime of loops and FMUs."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from softneck.signals import Recording, require_same_robot
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Estimates(ReprMixin):
-    """What the filter made of a recording, row by row; angles of another robot are its outputs, in SI.
+    """The filter's estimates of a recording, row by row; the units are for a neck, those of other robots are SI.
 
     Attributes:
         time: (time,) [s].
         outputs: (time, outputs) estimates at the time of the row: of a neck pitch and roll [rad].
         rates: (time, outputs) [rad/s].
-        innovation: (time,) normalised innovation squared; 0 where nothing was measured.
-        accepted: (time,) bool, whether the measurement was taken in.
+        innovation: (time,) normalised innovation squared; 0 without a measurement.
+        accepted: (time,) bool, whether the measurement passed the gate.
         healthy: (time,) bool.
-        judged: (time,) bool, whether there was a measurement to judge.
+        judged: (time,) bool, whether there was a measurement.
         aligned: (time, outputs) at the instant of the measurement; differs where the sensor is late.
         covariance: (time, outputs, outputs) of `aligned` [rad^2].
-        log_det: (time,) log det of the innovation's covariance; 0 where nothing was measured.
+        log_det: (time,) log det of the innovation's covariance; 0 without a measurement.
     """
 
     time: Vector
@@ -62,8 +62,8 @@ class Estimates(ReprMixin):
         return self.rates[:, 1]
 
 
-def stepped(observer: Any, run: Recording) -> tuple[Matrix, Matrix]:
-    """Return what the filter's runtime makes of a run, sample by sample as in a loop: outputs, states (time, ...)."""
+def run_filter(observer: Any, run: Recording) -> tuple[Matrix, Matrix]:
+    """Step the filter through a run as a loop does; return its outputs and states (time, ...)."""
     block, state, kept = observer.block(), observer.initial_state(), []
     for row in input_rows(observer, run, measured_angles(run)):
         state, _ = block.step(state, row)
@@ -72,20 +72,20 @@ def stepped(observer: Any, run: Recording) -> tuple[Matrix, Matrix]:
 
 
 def filter_recording(
-    observer: Any, recording: Recording, parts: Mapping[str, slice], aligned: Callable[[Matrix], tuple[Matrix, Matrix]]
+    observer: Any, recording: Recording, parts: Mapping[str, slice], align: Callable[[Matrix], tuple[Matrix, Matrix]]
 ) -> Estimates:
-    """Return what the filter makes of each run.
+    """Return the estimates of a recording; each run starts anew.
 
     Args:
         observer: of either kind.
         recording: of its robot and sample time.
-        parts: where those of its state are.
-        aligned: makes outputs (time, outputs) and their covariance, at the filter's time, of states (time, states).
+        parts: slices of its state by name.
+        align: returns outputs (time, outputs) and their covariance at the filter's time, from states (time, states).
     """
     check_recording(observer, recording)
     m = len(observer.robot.outputs.names)
-    y, x = (np.vstack(rows) for rows in zip(*(stepped(observer, run) for run in recording.runs()), strict=True))
-    at_filter, covariance = aligned(x)
+    y, x = (np.vstack(rows) for rows in zip(*(run_filter(observer, run) for run in recording.runs()), strict=True))
+    at_filter, covariance = align(x)
     accepted = x[:, parts["unheard"]][:, 0] == 0.0
     judged = accepted | (y[:, 2 * m] > 0.0)
     return Estimates(
@@ -114,15 +114,15 @@ def measured_names(run: Recording) -> list[str]:
 
 
 def input_rows(observer: Any, run: Recording, z: Matrix) -> Matrix:
-    """Return the runtime's inputs row by row, as a loop would give them, with the measured outputs `z`."""
+    """Return the runtime's inputs (time, inputs) as in a loop, with the measured outputs `z`."""
     valid = np.ones((len(run), 1))
     if observer.form == "gyro":
         rates = np.column_stack([_rate(run, axis) for axis in run.robot.outputs.names])
         lost = np.asarray(~np.isfinite(rates).all(axis=1))
         none = np.zeros((len(run), len(run.robot.motors.names)))
         return np.hstack([none, z, valid, np.where(lost[:, None], np.nan, rates)])
-    # The set-points of t_k are commanded after the measurement of t_k: the filter knows those before. In a Jacobi loop
-    # they come a sample early, and the filter keeps them for one.
+    # The set-points of t_k are commanded after the measurement of t_k, so the filter gets those before. In a Jacobi
+    # loop they come a sample early, and the filter keeps them for one.
     late = 0 if observer.order == "jacobi" else 1
     return np.hstack([run.set_points[np.maximum(np.arange(len(run)) - late, 0)], z, valid])
 

@@ -1,8 +1,8 @@
-"""The observer over a model that knows payloads: the payload is estimated beside what the model misses.
+"""The observer over a model with a payload parameter: it estimates the payload and the disturbance of the outputs.
 
-Two copies of the model run free, one under the payload that is thought, one under a little more: their difference is
-how the outputs go with it, and Kalman's filter has the payload as one more state that walks (a recursive prediction
-error, Ljung and Soderstrom 1983, sec. 3.3). It is kept between the payloads of the model's recordings.
+Two copies of the model are simulated, one with the estimated payload and one with a little more. Their difference is
+the derivative of the outputs, and the Kalman filter has the payload as a further random-walk state (a recursive
+prediction error method, Ljung and Soderstrom 1983, sec. 3.3). It is kept within the payloads of the recordings.
 """
 
 import math
@@ -35,18 +35,18 @@ from softneck.runtime._members_runtime import member_size
 PAYLOAD_LEAST = 0
 PAYLOAD_MOST = 1
 PAYLOAD_WALK = 2
-# The second copy bears so much more [kg]: far above rounding, far below what bends the curve.
+# Difference of the payload between both copies [kg]: far above rounding, and small beside the curvature.
 PAYLOAD_STEP = 0.02
 
 
 class PayloadArrays(NonlinearArrays):
-    """Behind those without payload; the model's last parameter is the payload."""
+    """The arrays of `NonlinearArrays` and the payload's; the model's last parameter is the payload."""
 
     load = array("3", "least and most payload [kg], standard deviation of its walk in a sample [kg]")
 
 
 class PayloadState(KalmanCounters):
-    """Counters, what is estimated and how uncertain it is; both copies' own states follow."""
+    """Counters, the estimates and their covariance; the states of both copies follow."""
 
     fastest = cells("", "motion of the model in a sample, of late")
     payload = cells("", "estimated [kg]")
@@ -65,7 +65,7 @@ def state_size(p: PayloadArrays) -> int:
 
 
 def initialise(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, outputs: np.ndarray) -> None:
-    """Start where nothing is known; the first sample tells where the motors stand."""
+    """Start with an unknown output; the first sample sets the motors."""
     x[:] = 0.0
     kalman_clear(p.constants, x)
     outputs[:] = 0.0
@@ -73,11 +73,11 @@ def initialise(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, output
 
 
 def step(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Move both copies on, then take in the measurement where there is a credible one.
+    """Simulate both copies, then correct if there is a measurement that passes the gate.
 
     inputs: motor_setpoint_1..3, pitch_measured, roll_measured, measurement_valid.
     outputs: pitch, roll, pitch_rate, roll_rate, innovation, healthy, payload.
-    parameters: measurement noise, the disturbance's at rest (standard deviations), and what of a motion it may be.
+    parameters: standard deviations of measurement and disturbance at rest, ratio of the disturbance to the motion.
     """
     c, n, m = p.constants, p.motors, p.outputs
     asked, measured = inputs[:n], inputs[n : n + m]
@@ -88,7 +88,7 @@ def step(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, inputs: np.n
     forced = kalman_forced(c, x)
     payload_predict(p, parameters, x, asked)
     if forced:
-        # Wide enough for the measurement to have its way.
+        # Large enough for the estimate to jump to the measurement.
         for i in range(m):
             x.P[i, i] += start * start
     innovation, accepted = 0.0, False
@@ -96,7 +96,7 @@ def step(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, inputs: np.n
         innovation, accepted = payload_correct(p, parameters[0], x, measured, forced)
     kalman_count(c, x, usable, accepted)
     models = x.models
-    # Copies: the filter's own model stays at the time of the measurement.
+    # Copies: the filter's model stays at the time of the measurement.
     nonlinear_tell(
         p,
         payload_free(p, x.payload),
@@ -114,16 +114,17 @@ def step(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, inputs: np.n
 
 
 def payload_free(p: PayloadArrays, payload: float) -> np.ndarray:
-    """Return the model's parameters in free run under a payload."""
+    """Return the model's parameters in simulation with a payload."""
     free = p.free.copy()
     free[free.shape[0] - 1] = payload
     return free
 
 
 def payload_start(p: PayloadArrays, x: PayloadState, asked: np.ndarray) -> None:
-    """Start at the heaviest payload, as unsure of it as the range is wide.
+    """Start at the heaviest payload, with the range as standard deviation.
 
-    A controller keeps tendons taut for what is told; those that hang do not move the neck, and so nothing would tell.
+    A controller keeps tendons taut for the estimate. Too light an estimate leaves them slack, and a slack neck does not
+    show its payload.
     """
     start, models, size = p.setup[NONLINEAR_START], x.models, member_size(p, 0)
     x.payload = p.load[PAYLOAD_MOST]
@@ -138,7 +139,7 @@ def payload_start(p: PayloadArrays, x: PayloadState, asked: np.ndarray) -> None:
 
 
 def payload_predict(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, asked: np.ndarray) -> None:
-    """Move both copies on under what acted since the last sample, and widen what may be missed."""
+    """Simulate both copies for one sample, and increase the covariance."""
     models, size, before, more = x.models, member_size(p, 0), x.angles.copy(), np.empty(p.outputs)
     if p.constants[KALMAN_LAG] > 0.5:
         nonlinear_slew(p, x.reached, x.held)
@@ -158,9 +159,9 @@ def payload_predict(p: PayloadArrays, parameters: np.ndarray, x: PayloadState, a
 def payload_correct(
     p: PayloadArrays, noise: float, x: PayloadState, measured: np.ndarray, forced: bool
 ) -> tuple[float, bool]:
-    """Take the outputs in, one after the other, unless the gate refuses all; return the NIS and whether they were."""
+    """Correct with one output after the other, unless the gate rejects them; return the NIS and whether accepted."""
     m = p.outputs
-    # What is estimated: the disturbances, and how far the payload is from the one that the copies bear.
+    # The state: disturbances, and the payload less that of the copies.
     told, P = np.zeros(m + 1), x.P.copy().reshape((m + 1, m + 1))
     told[:m] = x.disturbance
     innovation, log_det = 0.0, 0.0

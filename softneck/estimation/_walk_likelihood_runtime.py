@@ -1,4 +1,4 @@
-"""Likelihood of a walk that is seen through noise: Kalman's filter of one variance in all outputs (Schweppe 1965)."""
+"""Likelihood of a random walk measured with noise: a Kalman filter with one variance (Schweppe 1965)."""
 
 import math
 
@@ -8,10 +8,9 @@ import numpy as np
 def walk_cost(
     missed: np.ndarray, came: np.ndarray, walked: np.ndarray, noise: float, variance: float, start: int
 ) -> float:
-    """Return sum of m log S + e' e / S over the rows (time, m) that came, from row `start` on.
+    """Return sum of m log S + e' e / S over the measured rows (time, m), from row `start` on.
 
-    walked: (time,) by how much the variance grows before each row; `variance` it has before the first; `noise` is the
-    measurement's.
+    `walked` (time,) is added to the variance before each row, `variance` is the initial one, `noise` the measurement's.
     """
     m = missed.shape[1]
     said = np.zeros(m)

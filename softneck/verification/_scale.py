@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import to_si
-from softneck.estimation import REACHED, Reach, motor_ends
+from softneck.estimation import NECK_REACH, REACH_OF_STATIC_GAIN, motor_ends
 from softneck.loop import shown_unit
 from softneck.robot import MOTOR_RANGE, Robot, Scaling
 
@@ -59,7 +59,7 @@ class Scale:
             most = [np.abs(source.weights) @ (0.5 * (high - low)) for source in sources]
             load = min(float(each.min()) for each in most) / (2.0 * MOTOR_RANGE)
             reached = min(
-                REACHED * abs(float(box.nominal[0])) * float(v) / Reach().start
+                REACH_OF_STATIC_GAIN * abs(float(box.nominal[0])) * float(v) / NECK_REACH
                 for source, each in zip(sources, most, strict=True) for box, v in zip(source.axes, each, strict=True)
             )  # fmt: skip
             output = reached if outputs.min is None or outputs.max is None else min(output, reached)

@@ -153,7 +153,7 @@ HIDDEN, HIDES = 0.998, 0.9979
 def test_a_small_move_is_as_quick_whatever_slow_pole_hides_behind_a_zero() -> None:
     w = np.geomspace(1.0, 100.0, 50)
     plain, with_it = (
-        axis_plant(_hiding(pole, zero), "pitch").faster(5.293).response(w)
+        axis_plant(_hiding(pole, zero), "pitch").with_faster_pole(5.293).response(w)
         for pole, zero in ((0.0, 0.0), (HIDDEN, HIDES))
     )
     # What the pair itself does at 1 rad/s: 5e-3 / (1 rad/s * 1 s).

@@ -10,7 +10,7 @@ import pytest
 
 from softneck.core import DataError
 from softneck.estimation import KalmanSettings
-from softneck.estimation._consistency import look_ahead_error
+from softneck.estimation._noise import look_ahead_error
 
 from .necks import IN_TIME, neck, recording
 

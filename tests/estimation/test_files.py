@@ -39,5 +39,5 @@ def test_what_went_says_so(tmp_path: Path, form: str, more: dict[str, np.ndarray
     header, arrays = read_archive(tmp_path / "o.npz")
     header = {key: item for key, item in header.items() if not key.startswith("format")} | {"form": form}
     write_archive(tmp_path / "old.npz", header, {**arrays, **more})
-    with pytest.raises(FileFormatError, match=rf"{gone} went after softneck 0\.2\.0, which still reads the file"):
+    with pytest.raises(FileFormatError, match=rf"{gone} was removed after softneck 0\.2\.0, which reads the file"):
         load(tmp_path / "old.npz")

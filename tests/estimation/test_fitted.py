@@ -11,7 +11,12 @@ import pytest
 
 from softneck.core import load
 from softneck.estimation import KalmanObserver, KalmanSettings
-from softneck.estimation._fitted import delayed, fitted_observer, likeliest_later, sensor_delay
+from softneck.estimation._observer import (
+    estimate_sensor_delay,
+    fit_levels_and_delays,
+    most_likely_extra_delay,
+    with_extra_delay,
+)
 
 from .necks import IN_TIME, TS, neck, recording, smooth_motion
 
@@ -22,15 +27,15 @@ def observer_of(settings: KalmanSettings = IN_TIME, *, pitch_delay: int = 4, rol
 
 def test_a_dead_time_that_the_model_lacks_is_found_by_likelihood() -> None:
     record = recording(rows=800)
-    assert likeliest_later(observer_of(), [record]) == 0
-    assert likeliest_later(observer_of(pitch_delay=2, roll_delay=0), [record]) == 2
+    assert most_likely_extra_delay(observer_of(), [record]) == 0
+    assert most_likely_extra_delay(observer_of(pitch_delay=2, roll_delay=0), [record]) == 2
 
 
 def test_what_was_fitted_is_kept_only_where_it_is_better() -> None:
     """A model that lacks two samples of dead time: noise alone mends little of it, the delay nearly all."""
     record = recording(rows=1200)
     wrong = observer_of(pitch_delay=2, roll_delay=0)
-    found = fitted_observer(wrong, [record])
+    found = fit_levels_and_delays(wrong, [record])
     assert found.checks[found.kept] == min(found.checks.values())
     assert found.kept == "noise and delay"
     assert isinstance(found.observer, KalmanObserver)
@@ -38,13 +43,13 @@ def test_what_was_fitted_is_kept_only_where_it_is_better() -> None:
     # Nothing but the sensor's noise of 0.05 deg is left, of some 140 angles known to 6 %; by default a third more.
     assert found.checks["noise and delay"] == pytest.approx(math.radians(0.05), rel=0.2)
     assert found.checks["default"] > 1.2 * found.checks["noise and delay"]
-    assert "sensor_delay" in found.untold
+    assert "sensor_delay" in found.not_identifiable
 
 
 def test_levels_that_are_right_are_not_made_worse() -> None:
     true = (math.radians(0.05), math.radians(1e-3), math.radians(1e-3))
     right = observer_of().with_noise(true)
-    found = fitted_observer(right, [recording(rows=700)])
+    found = fit_levels_and_delays(right, [recording(rows=700)])
     assert found.checks[found.kept] <= found.checks["default"]
 
 
@@ -55,10 +60,10 @@ def test_a_gyro_tells_how_late_the_angles_are() -> None:
     # A quarter of a sample is the grid; what the gyro itself is late comes on top.
     for gyro, sensor in ((0.0, 0.0), (0.0, 0.02), (0.05, 0.05)):
         settings = replace(IN_TIME, form="gyro", gyro_delay=gyro, sensor_delay=sensor)
-        told, source = sensor_delay(settings.design(neck(sample_time=0.01)), [record])
+        told, source = estimate_sensor_delay(settings.design(neck(sample_time=0.01)), [record])
         assert source == "gyro"
         assert told == pytest.approx(gyro + 0.035, abs=0.0026)
-    assert sensor_delay(IN_TIME.design(neck(sample_time=0.01)), [record]) == (None, "")
+    assert estimate_sensor_delay(IN_TIME.design(neck(sample_time=0.01)), [record]) == (None, "")
 
 
 def test_the_gyro_form_is_put_right_by_its_rates() -> None:
@@ -66,7 +71,7 @@ def test_the_gyro_form_is_put_right_by_its_rates() -> None:
     late = {axis: np.interp(record.time - 0.03, record.time, record.channels[axis]) for axis in ("pitch", "roll")}
     record = record.with_channels(**{f"{axis}_measured": angle for axis, angle in late.items()})
     observer = replace(IN_TIME, form="gyro").design(neck(sample_time=0.01))
-    found = fitted_observer(observer, [record])
+    found = fit_levels_and_delays(observer, [record])
     assert (found.kept, found.observer.delay_source) == ("noise and delay", "gyro")
     errors = [np.abs(item.estimate(record).pitch - record.channels["pitch"])[500:].max() for item in
               (observer, found.observer)]  # fmt: skip
@@ -91,11 +96,11 @@ def test_motor_positions_tell_the_most_that_it_can_be() -> None:
     for i, axis in enumerate(("pitch", "roll")):
         # An angle that stands in proportion to the motors, 3 samples ago.
         moved[f"{axis}_measured"] = 0.08 * np.concatenate([np.full(3, angles[0, i]), angles[:-3, i]])
-    told, source = sensor_delay(observer, [record.with_channels(**moved)])
+    told, source = estimate_sensor_delay(observer, [record.with_channels(**moved)])
     assert (told, source) == (pytest.approx(3 * TS), "motor positions")
     # The link lags as well: where the filter thinks of less, they tell nothing.
-    assert sensor_delay(observer_of(), [record.with_channels(**moved)]) == (None, "")
-    assert sensor_delay(observer, [record]) == (None, "")
+    assert estimate_sensor_delay(observer_of(), [record.with_channels(**moved)]) == (None, "")
+    assert estimate_sensor_delay(observer, [record]) == (None, "")
 
 
 def test_the_summary_says_where_the_delay_comes_from() -> None:
@@ -104,7 +109,7 @@ def test_the_summary_says_where_the_delay_comes_from() -> None:
 
 
 def test_only_dead_time_is_later() -> None:
-    later = delayed(observer_of(), 2)
+    later = with_extra_delay(observer_of(), 2)
     assert isinstance(later, KalmanObserver)
     assert later.delays == (6, 4)
     assert later.lead == observer_of().lead

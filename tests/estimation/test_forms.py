@@ -182,7 +182,7 @@ def test_a_plant_without_noise_may_stand_still() -> None:
 
 def test_a_model_at_20_ms_is_taken_to_10_ms() -> None:
     slow = axis_plant(LinearNeck(pitch=second_order(0.02), roll=second_order(0.02)), "pitch")
-    fast = slow.resampled(0.01)
+    fast = slow.resample(0.01)
     exact = axis_plant(LinearNeck(pitch=second_order(0.01), roll=second_order(0.01)), "pitch")
     assert (fast.delay, fast.sample_time) == (2 * slow.delay, 0.01)
     # Matrix roots of an order-2 system keep some 1e-14.

@@ -14,6 +14,7 @@ from filterpy.kalman import KalmanFilter
 from softneck.core import FileFormatError, SettingsError, load, read_archive, write_archive
 from softneck.design import PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings, NonlinearObserver, consistency
+from softneck.estimation._offline import run_filter
 from softneck.identification import GreyBox, Model, OutputError, Play, Rls
 from softneck.loop import BlockPart, Loop, StepReference, run_loop
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -137,7 +138,7 @@ def test_a_push_is_what_the_model_misses(play: Model, run: Recording) -> None:
     pushed[200:] = np.radians([3.0, -2.0])
     z = free_run(play, run) + pushed + math.radians(0.05) * rng.standard_normal(pushed.shape)
     observer = designed(replace(OURS, sensor_delay=0.0), play)
-    _, states = observer._rows(run.with_channels(pitch=z[:, 0], roll=z[:, 1]))
+    _, states = run_filter(observer, run.with_channels(pitch=z[:, 0], roll=z[:, 1]))
     found = states[:, observer._parts["disturbance"]]
     # Within a second; noise of 0.05 deg, most of which a disturbance as large as the motion lets through.
     np.testing.assert_allclose(found[250:], pushed[250:], atol=math.radians(0.25))

@@ -10,9 +10,9 @@ import pytest
 
 from softneck.core import SettingsError
 from softneck.estimation import KalmanSettings, NonlinearObserver, fit_noise
-from softneck.estimation._fitted import fitted_observer, sensor_delay
 from softneck.estimation._kalman_parts_runtime import KALMAN_FROZEN, KALMAN_GATE
 from softneck.estimation._noise import SETTLE, WalkCost
+from softneck.estimation._observer import estimate_sensor_delay, fit_levels_and_delays
 from softneck.identification import Play
 from softneck.identification.models._fitting import row_hashes
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -36,7 +36,7 @@ def observer() -> NonlinearObserver:
 def walking(observer: NonlinearObserver) -> Recording:
     """A recording of which the observer's own assumptions are true, at the levels `TRUE`."""
     run = record(signal("steps"), VirtualNeck(NeckParameters.paper()), seed=7)
-    angles, fastest = observer.free_run(run)
+    angles, fastest = observer.simulate(run)
     rng, runs = np.random.default_rng(3), []
     for _ in range(4):
         steps = np.sqrt(TRUE[1] ** 2 + (TRUE[2] * fastest) ** 2)[:, None] * rng.standard_normal(angles.shape)
@@ -72,12 +72,12 @@ def test_levels_that_are_true_are_found(observer: NonlinearObserver, walking: Re
 
 
 def test_what_was_fitted_is_kept_only_where_it_is_better(observer: NonlinearObserver, walking: Recording) -> None:
-    found = fitted_observer(observer, [walking])
+    found = fit_levels_and_delays(observer, [walking])
     assert found.checks[found.kept] == min(found.checks.values())
     assert set(found.checks) == {"default", "noise"}
-    assert "sensor_delay" in found.untold
+    assert "sensor_delay" in found.not_identifiable
     right = observer.with_noise(TRUE)
-    again = fitted_observer(right, [walking])
+    again = fit_levels_and_delays(right, [walking])
     assert again.checks[again.kept] <= again.checks["default"]
 
 
@@ -86,12 +86,12 @@ def test_rows_that_the_model_was_trained_on_tell_the_sensor_alone(
 ) -> None:
     """There it is better than anywhere else: what it misses elsewhere stays as it is."""
     seen = replace(observer, model=replace(observer.model, training_rows=row_hashes(walking)))
-    found = fitted_observer(seen, [walking])
+    found = fit_levels_and_delays(seen, [walking])
     assert found.fit.noise[1:] == observer.noise[1:]
     assert found.fit.noise[0] != observer.noise[0]
-    assert {"rest_noise_std", "motion_noise_ratio"} <= set(found.untold)
+    assert {"rest_noise_std", "motion_noise_ratio"} <= set(found.not_identifiable)
     with pytest.raises(SettingsError, match="trained on these rows"):
-        fitted_observer(seen, [walking], fixed=["measurement_noise_std"])
+        fit_levels_and_delays(seen, [walking], fixed=["measurement_noise_std"])
 
 
 def test_motor_positions_tell_the_most_that_the_sensor_can_be_late(
@@ -106,8 +106,8 @@ def test_motor_positions_tell_the_most_that_the_sensor_can_be_late(
         # An angle that stands in proportion to the motors, 3 samples ago.
         moved[axis] = 0.08 * np.concatenate([np.full(3, turned[0, i]), turned[:-3, i]])
     run = walking.with_channels(**moved)
-    assert sensor_delay(late, [run]) == (pytest.approx(3 * run.sample_time), "motor positions")
-    assert sensor_delay(observer, [run]) == (None, "")
+    assert estimate_sensor_delay(late, [run]) == (pytest.approx(3 * run.sample_time), "motor positions")
+    assert estimate_sensor_delay(observer, [run]) == (None, "")
 
 
 def test_a_level_must_be_positive(observer: NonlinearObserver) -> None:

@@ -99,7 +99,7 @@ class PiSettings(AxisSettings):
     def _small(self, plant: UncertainAxis) -> Plants:
         """Return the plant as identified, and faster where it is slow; the samples of its own come after those."""
         pole = plant.doubts.small_move_pole
-        faster = plant.nominal.faster(pole) if pole > 0.0 else plant.nominal
+        faster = plant.nominal.with_faster_pole(pole) if pole > 0.0 else plant.nominal
         return plant.samples[: 1 if faster is plant.nominal else 2]
 
 

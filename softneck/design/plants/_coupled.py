@@ -77,7 +77,7 @@ class CoupledAxis:
         gain = self.static_gain * (1.0 - pole)
         return AxisPlant(np.array([gain]), np.array([1.0, -pole]), self.delay, self.sample_time, self.second)
 
-    def faster(self, pole: float) -> CoupledAxis:  # noqa: ARG002 - what is slow in it is no pole of one axis
+    def with_faster_pole(self, pole: float) -> CoupledAxis:  # noqa: ARG002 - what is slow in it is no pole of one axis
         """Return itself."""
         return self
 

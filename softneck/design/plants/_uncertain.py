@@ -194,7 +194,7 @@ class UncertainAxis:
         """Return it with the least nominal dead time, and the form of small moves as a sample; others stay."""
         nominal = self.nominal.with_min_delay(self.doubts.least_delay)
         pole = self.doubts.small_move_pole
-        faster = nominal.faster(pole) if pole > 0.0 else nominal
+        faster = nominal.with_faster_pole(pole) if pole > 0.0 else nominal
         more = () if faster is nominal else (faster,)
         return replace(self, nominal=nominal, samples=(nominal, *more, *self.samples[1:]))
 
@@ -252,7 +252,7 @@ class UncertainPlant(ReprMixin):
             delay, pole, plant = axis.doubts.least_delay, axis.doubts.small_move_pole, axis.nominal
             if plant.with_min_delay(delay).delay > plant.delay:
                 found["least_delay"] = delay
-            if plant.faster(pole) is not plant:
+            if plant.with_faster_pole(pole) is not plant:
                 found["small_move_pole"] = pole
         return dict(sorted(found.items()))
 

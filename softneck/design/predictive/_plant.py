@@ -206,7 +206,7 @@ def taken(settings: Any, asked: Any, plant: ScaledPlant) -> dict[str, float]:
         if name == "least_delay":
             changes = any(axis.with_min_delay(value / second).delay > axis.delay for axis in plant.axes)
         else:
-            changes = any(axis.faster(value * second) is not axis for axis in plant.axes)
+            changes = any(axis.with_faster_pole(value * second) is not axis for axis in plant.axes)
         found |= {name: value} if changes else {}
     return found
 
@@ -215,7 +215,7 @@ def families(nominal: AnyAxes, small_move_pole: float) -> list[AnyAxes]:
     """Return what the robot may be: as identified, and faster."""
     if small_move_pole == 0.0:
         return [nominal]
-    fast = tuple(plant.faster(small_move_pole) for plant in nominal)
+    fast = tuple(plant.with_faster_pole(small_move_pole) for plant in nominal)
     return [nominal] if fast == nominal else [nominal, fast]
 
 
@@ -225,7 +225,7 @@ def _predicted(settings: Any, whole: ScaledPlant, axis: int) -> AnyAxis:
         return plant
     # Recordings in which tendons hang say less than a taut neck does, none says more.
     ratios = [abs(sample.static_gain / plant.static_gain) for sample in whole.samples[axis]]
-    (taut,) = times((plant.faster(settings.taut_pole),), max([1.0, *ratios]))
+    (taut,) = times((plant.with_faster_pole(settings.taut_pole),), max([1.0, *ratios]))
     return taut
 
 

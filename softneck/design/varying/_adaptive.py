@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, ReprMixin, SettingsError, Vector, require_between, to_si, write_archive
-from softneck.estimation import AxisPlant, Reach, linear_reach
+from softneck.estimation import NECK_REACH, AxisPlant, linear_reach
 from softneck.robot import Robot, Scaling, find_robot
 from softneck.runtime import Block, Port, State, sized_name
 
@@ -135,7 +135,7 @@ class AdaptiveSettings(LoopSettings):
         T, inverse = T.copy(), inverse.copy()
         T[:-1] /= units[:, None]
         inverse[:, :-1] *= units
-        size = linear_reach(nominal, uncertain.robot, np.asarray(uncertain.weights)).start / Reach().start
+        size = linear_reach(nominal, uncertain.robot, np.asarray(uncertain.weights)) / NECK_REACH
         return asked._designed(uncertain, LEARNING.scaled(size, second), (T, inverse), units)
 
     def _defaults(self, plant: UncertainPlant) -> dict[str, Any]:
@@ -178,7 +178,7 @@ class AdaptiveSettings(LoopSettings):
                 f"{plant.order}. Identify `rls` or `oe` of order 1."
             )
         late, pole = plant.with_min_delay(axis.doubts.least_delay), axis.doubts.small_move_pole
-        return late.faster(pole) if pole > 0.0 else late
+        return late.with_faster_pole(pole) if pole > 0.0 else late
 
     def _loop(self, plant: AxisPlant, delay: int) -> float:
         """Return the largest kappa up to which kappa z^-d/(z - 1) keeps both bounds."""
