@@ -31,7 +31,7 @@ from softneck.estimation import KalmanSettings
 from softneck.identification import INFINITE, GreyBox, Model, Network, OutputError, Rls, validate
 from softneck.identification.models._arrays import members
 from softneck.identification.models._model import WARM_UP
-from softneck.identification.models._validity import TRUST, grounded, tolerance_of
+from softneck.identification.models._validity import TRUST, tolerance_of, with_validity_region
 from softneck.identification.uncertainty._guarded import Base, Guarded
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
@@ -214,7 +214,7 @@ def trusted(run: Run, candidates: list[Any], kinds: tuple[str, ...]) -> Vector:
     for kind in kinds:
         model = fitted(_NN if kind == "nn" else resolve(KINDS[kind].settings)(), run, train)
         for place, trust in enumerate(candidates):
-            told = grounded(model, train, trust=trust)
+            told = with_validity_region(model, train, trust=trust)
             for test in tests:
                 free, allowed = told.simulate(test)[WARM_UP:], tolerance_of(told)
                 held = (np.abs(test.outputs[WARM_UP:] - free[:, :2]) <= allowed).all(axis=1)

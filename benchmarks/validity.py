@@ -17,7 +17,7 @@ from benchmarks.leave_one_neck_out import Run, fitted
 from softneck.core import KINDS, Matrix, resolve
 from softneck.identification import Model
 from softneck.identification.models._model import WARM_UP
-from softneck.identification.models._validity import grounded, tolerance_of
+from softneck.identification.models._validity import tolerance_of, with_validity_region
 from softneck.identification.validation._bounds import reliability
 from softneck.signals import Recording, signal
 from tests.foreign_necks.necks import CHOOSING
@@ -46,7 +46,7 @@ def main() -> None:
             run = Run(name, wanted.seed, 0)
             train = run(signal("eq22"), 1).rows(0, 7000)
             # Trained once; what it takes for granted beyond is today's.
-            model = grounded(fitted(resolve(KINDS[kind].settings)(), run, train), train)
+            model = with_validity_region(fitted(resolve(KINDS[kind].settings)(), run, train), train)
             for number, (test, duration) in enumerate(TESTS.items(), start=2):
                 everything.append(judged(model, run(signal(test, duration=duration), number)))
                 _line(kind, name, test, *everything[-1])

@@ -82,7 +82,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
-    from softneck.identification import identified
+    from softneck.identification import fit_and_validate
     from softneck.signals import open_recording, poor_excitation, why_at_rest
 
     if tolerance is not None:
@@ -110,7 +110,7 @@ def command(
     refuse_existing(path, force=replace)
     whole = open_recording(recordings, robot)
     with progress(f"identify {kind}", quiet=as_json) as report:
-        model, held_out = identified(estimator, whole, train=train, tolerance=tolerance, progress=report)
+        model, held_out = fit_and_validate(estimator, whole, train=train, tolerance=tolerance, progress=report)
     model.save(path, force=replace)
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
     poor = poor_excitation(head)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, to_si, write_archive
 from softneck.identification import KINDS as LINEAR
-from softneck.identification import Model, nested, nested_model, payloads, without_validity
+from softneck.identification import Model, embed_model, embedded_model, payloads, without_validity
 from softneck.robot import TIME_CONSTANT, Robot
 from softneck.runtime import Block, Port, State
 from softneck.signals import Recording
@@ -223,7 +223,7 @@ class NonlinearObserver(ReprMixin):
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the observer with its model to one `.npz` file."""
-        model, arrays = nested(self.model)
+        model, arrays = embed_model(self.model)
         header = {
             **file_header(self), "start": self.start, **({} if self.slew is None else {"slew": list(self.slew)}),
             "delay_source": self.delay_source, "model": model,
@@ -234,7 +234,7 @@ class NonlinearObserver(ReprMixin):
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NonlinearObserver:
         """Return the observer that `save` wrote; `softneck.core.load` calls this."""
         constants = np.ascontiguousarray(arrays["constants"], dtype=np.float64)
-        model = nested_model(header["model"], arrays)
+        model = embedded_model(header["model"], arrays)
         if constants.size != KALMAN_MORE_LAGS + max(len(model.robot.outputs.names) - 2, 0):
             raise FileFormatError("its array `constants` has another length; design the observer again.")
         # Files of earlier versions have no slew limit.

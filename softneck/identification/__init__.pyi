@@ -1,7 +1,7 @@
 from ._identify import family as family
 from ._identify import identify as identify
 from .linear._oe import OutputError as OutputError
-from .linear._online_rls import OnlineRls as OnlineRls
+from .linear._rls import OnlineRls as OnlineRls
 from .linear._rls import Recursion as Recursion
 from .linear._rls import Rls as Rls
 from .models._drive import fit_drive as fit_drive
@@ -30,8 +30,9 @@ from .validation._validation import validate as validate
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from ._identify import choose_kind as choose_kind
-from ._identify import identified as identified
+from ._identify import fit_and_validate as fit_and_validate
 from ._identify import with_fit as with_fit
+from .models._arrays import payloads as payloads
 from .models._arrays import without_validity as without_validity
 from .models._directions import bandwidth_of as bandwidth_of
 from .models._fitting import known_rows as known_rows
@@ -40,11 +41,10 @@ from .models._linear_systems import continuous_parameters as continuous_paramete
 from .models._linear_systems import redefined_input as redefined_input
 from .models._linear_systems import remove_unreachable_states as remove_unreachable_states
 from .models._linear_systems import weights_of as weights_of
-from .models._model import nested as nested
-from .models._model import nested_model as nested_model
-from .models._ports import payloads as payloads
-from .models._validity import farthest as farthest
-from .models._validity import held as held
+from .models._model import embed_model as embed_model
+from .models._model import embedded_model as embedded_model
+from .models._validity import find_farthest_motor as find_farthest_motor
+from .models._validity import low_pass_motors as low_pass_motors
 from .models._validity import with_tolerance as with_tolerance
 from .selection._auto import COLD as COLD
 from .selection._auto import HOLD_OUT as HOLD_OUT

@@ -166,10 +166,10 @@ def identify(
     estimator = make_settings(resolve(find_kind(kind, "model").settings), settings)
     whole = open_recording(recording, robot)
     with shown_progress(f"identify {kind}", progress) as tell:
-        return identified(estimator, whole, train=train, tolerance=tolerance, progress=tell)[0]
+        return fit_and_validate(estimator, whole, train=train, tolerance=tolerance, progress=tell)[0]
 
 
-def identified(
+def fit_and_validate(
     estimator: Any, whole: Recording, *, train: float, tolerance: float | None, progress: Progress
 ) -> tuple[Model, Validation | None]:
     """Return what `estimator` makes of the first part of each run, and how it does on the rest; None: nothing is."""

@@ -319,7 +319,7 @@ def measured_plant(neck: UncertainNeck, source: int) -> Plants | None:
     models = [box.measured.model for box in neck.axes if box.measured is not None]
     if len(models) < len(neck.axes):
         return None
-    parts = [model.sampled(neck.sample_time) for model in models]
+    parts = [model.discretize(neck.sample_time) for model in models]
     # As `response_of` reads them: b/(z A) behind the whole samples.
     above, below = (
         np.array([np.pad(row, (0, 5 - row.size)) for row in rows])

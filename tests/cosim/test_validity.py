@@ -11,7 +11,7 @@ import pytest
 from softneck.core import SettingsError
 from softneck.cosim.loops._simulate import validity_remarks
 from softneck.identification import Model
-from softneck.identification.models._validity import grounded
+from softneck.identification.models._validity import with_validity_region
 from softneck.loop import BlockPart, LoopResult, check_limits, metrics
 from softneck.robot import Robot
 from softneck.runtime import load_runtime
@@ -33,7 +33,7 @@ def model() -> Model:
 def trained() -> Model:
     P = np.clip(signal("eq22", duration=20.0).set_points, -1.0, 1.0)
     rows = {f"motor_setpoint_{j + 1}": P[:, j] for j in range(3)} | {"pitch": 0.05 * P[:, 0], "roll": 0.05 * P[:, 1]}
-    return grounded(model(), Recording(np.arange(len(P)) * TS, TS, rows))
+    return with_validity_region(model(), Recording(np.arange(len(P)) * TS, TS, rows))
 
 
 def run(plant: Model, height: float) -> LoopResult:

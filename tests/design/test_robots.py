@@ -19,7 +19,7 @@ from softneck.design.plants._uncertain import uncertain_plant
 from softneck.design.predictive._plant import scaled_plant
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Model
-from softneck.identification.models._state_space import lss_arrays
+from softneck.identification.models._linear_systems import lss_arrays
 from softneck.loop._faults import make_fault
 from softneck.loop._references import AheadReference, make_reference
 from softneck.plant import VirtualNeck

@@ -11,7 +11,13 @@ import pytest
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import Model, OutputError, Play, validate
 from softneck.identification.models._arrays import without_validity
-from softneck.identification.models._validity import farthest, grounded, knows_validity, tolerance_of, with_tolerance
+from softneck.identification.models._validity import (
+    find_farthest_motor,
+    has_validity,
+    tolerance_of,
+    with_tolerance,
+    with_validity_region,
+)
 from softneck.identification.models._validity_runtime import ground_outside
 from softneck.report._validation_page import validation_page
 from softneck.signals import Excitation, Recording, signal
@@ -116,7 +122,7 @@ def test_within_the_training_three_of_four_rows_are_inside(line: Model, training
 
 
 def test_a_model_that_misses_more_in_training_is_trusted_less(line: Model, training: Recording) -> None:
-    worse = grounded(replace(line, arrays={**line.arrays, "b": 2.0 * line.arrays["b"]}), training)
+    worse = with_validity_region(replace(line, arrays={**line.arrays, "b": 2.0 * line.arrays["b"]}), training)
     assert worse.simulate(training)[:, -1].mean() < line.simulate(training)[:, -1].mean()
 
 
@@ -147,7 +153,7 @@ def test_another_tolerance_scales_what_is_doubted(line: Model, training: Recordi
 def test_an_older_file_says_that_it_has_none(training: Recording) -> None:
     model, network = load(GOLDEN / "oe.npz"), load(GOLDEN / "nn.npz")
     assert network.summary().count("guarded form exists") == 1
-    assert not knows_validity(model)
+    assert not has_validity(model)
     assert (model.simulate(training)[:, -1] == 0.0).all()
     assert "no validity in this file: identify it again" in model.summary()
 
@@ -171,7 +177,7 @@ def test_a_broken_file_says_what_is_wrong(line: Model, tmp_path: Path, name: str
 def test_the_motor_to_blame_is_named(line: Model) -> None:
     motors = np.zeros((500, 3))
     motors[:, 1] = 9.0
-    place, _, value, times = farthest(line.block(), motors)
+    place, _, value, times = find_farthest_motor(line.block(), motors)
     assert (place, value) == (1, pytest.approx(9.0, rel=1e-3))
     assert times > 2.0
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from softneck.core import to_si
 from softneck.identification import Model
-from softneck.identification.models._state_space import lss_arrays
+from softneck.identification.models._linear_systems import lss_arrays
 
 from .worlds import World
 

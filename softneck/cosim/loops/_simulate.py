@@ -21,7 +21,7 @@ from softneck.core import (
     silent,
     to_si,
 )
-from softneck.identification import farthest, held
+from softneck.identification import find_farthest_motor, low_pass_motors
 from softneck.loop import BlockPart, LoopResult, Part, StepCallback, System, check_limits, metrics, run_loop
 from softneck.loop import Loop as Loop  # re-exported by the subpackage
 from softneck.robot import Robot
@@ -343,8 +343,8 @@ def _why(result: LoopResult, plant: Part, row: int) -> str:
     robot, unit = result.robot, result.robot.motors.unit
     motors = np.column_stack([result[name] for name in robot.motor_positions])
     if not isinstance(plant, BlockPart):
-        return _nearest_end(plant, held(motors[: row + 1])[-1], robot)
-    motor, stays, value, times = farthest(plant.block, motors[: row + 1])
+        return _nearest_end(plant, low_pass_motors(motors[: row + 1])[-1], robot)
+    motor, stays, value, times = find_farthest_motor(plant.block, motors[: row + 1])
     what = "has been held around" if stays else "is at"
     place = f"`{robot.motor_positions[motor]}` {what} {value / to_si(unit)[0]:.3g} {unit}"
     if times <= 1.0:

@@ -24,7 +24,7 @@ from softneck.core import (
     to_si,
     write_archive,
 )
-from softneck.identification import Model, nested, nested_model, weights_of, without_validity
+from softneck.identification import Model, embed_model, embedded_model, weights_of, without_validity
 from softneck.robot import Robot
 from softneck.runtime import Block, Port, State, sized_name
 from softneck.signals import TENDON_ANGLES
@@ -352,7 +352,7 @@ class NmpcController(ReprMixin):
 
     def save(self, path: str | Path, *, force: bool = False) -> None:
         """Write the controller with its model to one `.npz` file."""
-        model, arrays = nested(self.model)
+        model, arrays = embed_model(self.model)
         header = {
             "kind": "nmpc",
             "settings": asdict(self.settings),
@@ -366,7 +366,7 @@ class NmpcController(ReprMixin):
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NmpcController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
-        model = nested_model(header["model"], arrays)
+        model = embedded_model(header["model"], arrays)
         settings, robot = dict(header["settings"]), model.robot
         for name, usual in _GONE.items():
             if (value := settings.pop(name, usual)) != usual:

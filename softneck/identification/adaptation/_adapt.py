@@ -28,13 +28,12 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, one_blas_thread, require_positive
 from softneck.signals import Recording, concatenate, signal
 
-from ..models._arrays import check_arrays
+from ..models._arrays import check_arrays, trained_range, trained_set_points
 from ..models._directions import NECK_SECONDS, on_motors, time_constant_of
 from ..models._fitting import row_hashes
 from ..models._model import WARM_UP, Model
-from ..models._ports import trained_range, trained_set_points
 from ..models._scores import nrmse_fit
-from ..models._validity import doubted
+from ..models._validity import limit_validity
 from ..structured._greybox import NUMBERS
 
 # Kind -> the arrays that are moved; entries that are zero are structure and stay.
@@ -451,4 +450,4 @@ def _widened(model: Model, window: Recording) -> Model:
     there = scored(window)
     run = model.simulate(window)[:, : len(model.robot.outputs.names)]
     errors = np.where(there, window.outputs - run, np.nan)
-    return doubted(model, errors)
+    return limit_validity(model, errors)

@@ -29,11 +29,10 @@ from softneck.core import (
 )
 from softneck.signals import Recording
 
-from ..models._door import Door
 from ..models._drive import fit_drive
-from ..models._fitting import delay_samples, free_run_fit, training_recording
+from ..models._fitting import ScaledData, delay_samples, free_run_fit, training_recording
+from ..models._linear_systems import axes_system, lss_arrays
 from ..models._model import Model
-from ..models._state_space import axes_system, lss_arrays
 from ._regression import (
     MAX_DELAY,
     arx_rows,
@@ -301,9 +300,9 @@ class OutputError:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        door = Door.of(training_recording(recordings))
-        settings = replace(self, delay=door.seconds(self.delay), max_delay=door.seconds(self.max_delay, MAX_DELAY))
-        names, Ts, inputs = door.directions.names, door.data.sample_time, _axis_runs(door, self.source)
+        scaled = ScaledData.of(training_recording(recordings))
+        settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.seconds(self.max_delay, MAX_DELAY))
+        names, Ts, inputs = scaled.directions.names, scaled.data.sample_time, _axis_runs(scaled, self.source)
         found: list[OutputErrorFit] = []
         delays, curves, beside = [], {}, {}
         for axis, name in enumerate(names):
@@ -311,7 +310,7 @@ class OutputError:
             fit, d, curves[name], beside[name] = settings._fit_axis(Ts, inputs[axis], name)
             found.append(fit)
             delays.append(d)
-        arrays, functions = self._arrays(door, found, delays)
+        arrays, functions = self._arrays(scaled, found, delays)
         said = {}
         if self.intervals:
             each = [settings._intervals(Ts, *one) for one in zip(inputs, found, delays, strict=True)]
@@ -326,29 +325,29 @@ class OutputError:
             **said,
         }
         progress(1.0, "done")
-        return door.model("oe", self, linear_in_si, arrays=arrays, findings=_in_si(findings, door, self.nf))
+        return scaled.model("oe", self, linear_in_si, arrays=arrays, findings=_in_si(findings, scaled, self.nf))
 
     def _arrays(
-        self, door: Door, found: list[OutputErrorFit], delays: list[int]
+        self, scaled: ScaledData, found: list[OutputErrorFit], delays: list[int]
     ) -> tuple[dict[str, Matrix], dict[str, Any]]:
         """Return the arrays of the runtime, and the findings that belong to them.
 
         A model of one pole starts from its last measured output; one of more poles has a Kalman observer, as the last
         outputs determine a slow state beside a fast one only through their noise. So has one with an offset.
         """
-        drive = fit_drive(door.data)
+        drive = fit_drive(scaled.data)
         a, b = [fit.f for fit in found], [fit.b for fit in found]
         source = int(self.source == "positions")
-        if self.nf == 1 and not door.has_offset:
-            arrays = axis_arrays(door, drive, np.array(a), np.array(b), delays)
+        if self.nf == 1 and not scaled.has_offset:
+            arrays = axis_arrays(scaled, drive, np.array(a), np.array(b), delays)
             return {**arrays, "source": np.array([float(source)])}, {}
         common = min(delays)
         late = [np.concatenate([np.zeros(d - common), part]) for d, part in zip(delays, b, strict=True)]
-        system = axes_system(a, late, door.directions.weights)
+        system = axes_system(a, late, scaled.directions.weights)
         arrays = lss_arrays(system, delay=common, drive=drive.array, source=source)
-        if door.has_offset:
-            arrays = with_offset("oe", arrays, door.data)
-        return arrays, functions_found(door, a, b, delays)
+        if scaled.has_offset:
+            arrays = with_offset("oe", arrays, scaled.data)
+        return arrays, functions_found(scaled, a, b, delays)
 
     def _fit_axis(
         self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str
@@ -405,20 +404,20 @@ class OutputError:
         return found if self.delay is not None else {**found, "delay_s": [max(L - late, 0.0), L + late]}
 
 
-def _axis_runs(door: Door, source: str) -> list[list[tuple[Vector, Vector]]]:
+def _axis_runs(scaled: ScaledData, source: str) -> list[list[tuple[Vector, Vector]]]:
     """Return (input, output) of each run for each output, from set-points or logged positions.
 
     Raises:
         DataError: positions are asked for and were not logged, or only in part.
     """
-    if source == "positions" and not door.data.has_motor_positions:
+    if source == "positions" and not scaled.data.has_motor_positions:
         raise DataError("no motor positions were logged; use `source=set_points`.")
-    runs: list[list[tuple[Vector, Vector]]] = [[] for _ in door.directions.names]
-    for run in door.data.runs():
+    runs: list[list[tuple[Vector, Vector]]] = [[] for _ in scaled.directions.names]
+    for run in scaled.data.runs():
         motors = run.motor_positions if source == "positions" else run.set_points
         if not np.isfinite(motors).all():
             raise DataError("some motor positions were missed; fill them or use `source=set_points`.")
-        U = motors @ door.directions.redefinition.T
+        U = motors @ scaled.directions.redefinition.T
         for axis, pairs in enumerate(runs):
             y = run.outputs[:, axis]
             if np.isfinite(y).any():
@@ -426,12 +425,12 @@ def _axis_runs(door: Door, source: str) -> list[list[tuple[Vector, Vector]]]:
     return runs
 
 
-def _in_si(findings: dict[str, Any], door: Door, nf: int) -> dict[str, Any]:
+def _in_si(findings: dict[str, Any], scaled: ScaledData, nf: int) -> dict[str, Any]:
     """Return the findings of scaled quantities in SI."""
-    second, names = door.scaling.second, door.directions.names
+    second, names = scaled.scaling.second, scaled.directions.names
     curves = findings["delay_curve"]
     for name, unit, gain, std in zip(
-        names, door.scaling.output_unit, door.gains, findings["parameter_std"], strict=True
+        names, scaled.scaling.output_unit, scaled.gains, findings["parameter_std"], strict=True
     ):
         curves[name] = [[second * d, fit, unit * rms] for d, fit, rms in curves[name]]
         std[nf:] = [gain * value for value in std[nf:]]

@@ -12,10 +12,10 @@ from softneck.robot import Scaling
 from softneck.signals import Recording
 
 from ..models._arrays import within
-from ..models._door import Door
 from ..models._drive import DriveModel
+from ..models._fitting import ScaledData
+from ..models._linear_systems import history_array, system_of
 from ..models._model import WARM_UP, Model
-from ..models._state_space import history_array, system_of
 
 # Dead times are searched up to here, in scaled seconds: one and a half time constants.
 MAX_DELAY = 0.3
@@ -48,22 +48,26 @@ def linear_in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Ma
     return found
 
 
-def axis_arrays(door: Door, drive: DriveModel, a: Matrix, b: Matrix, delays: Sequence[int]) -> dict[str, Matrix]:
+def axis_arrays(
+    scaled: ScaledData, drive: DriveModel, a: Matrix, b: Matrix, delays: Sequence[int]
+) -> dict[str, Matrix]:
     """Return the runtime's arrays of transfer functions over redefined inputs; a (outputs, na), b (outputs, nb)."""
     history = max(a.shape[1], max(delays) + b.shape[1], drive.delay.max())
     return {
         "history": history_array(int(history), len(a)),
         "drive": drive.array,
-        "redefinition": door.directions.redefinition,
+        "redefinition": scaled.directions.redefinition,
         "a": a,
         "b": b,
         "delay": np.array(delays, dtype=np.float64),
     }
 
 
-def functions_found(door: Door, a: Sequence[Vector], b: Sequence[Vector], delays: Sequence[int]) -> dict[str, Any]:
+def functions_found(
+    scaled: ScaledData, a: Sequence[Vector], b: Sequence[Vector], delays: Sequence[int]
+) -> dict[str, Any]:
     """Return the finding with the transfer functions, in SI, of a model whose arrays hold them in one state space."""
-    rows = zip(door.directions.names, a, b, delays, door.gains, strict=True)
+    rows = zip(scaled.directions.names, a, b, delays, scaled.gains, strict=True)
     return {
         "transfer_functions": {
             name: {"a": f.tolist(), "b": (gain * g).tolist(), "delay": int(d)} for name, f, g, d, gain in rows

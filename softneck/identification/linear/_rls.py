@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,14 +23,13 @@ from softneck.core import (
     silent,
 )
 from softneck.runtime import load_functions
-from softneck.signals import Recording
+from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
-from ..models._door import Door
 from ..models._drive import fit_drive
-from ..models._fitting import delay_samples, free_run_fit, training_recording
+from ..models._fitting import ScaledData, delay_samples, free_run_fit, training_recording
+from ..models._linear_systems import lss_arrays, varx_system
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
-from ..models._state_space import lss_arrays, varx_system
 from ._regression import (
     MAX_DELAY,
     arx_rows,
@@ -259,44 +258,44 @@ class Rls:
         Raises:
             DataError: too short, constant, without two usable rows, or not enough excitation.
         """
-        door = Door.of(training_recording(recordings))
-        settings = replace(self, delay=door.seconds(self.delay), max_delay=door.seconds(self.max_delay, MAX_DELAY))
+        scaled = ScaledData.of(training_recording(recordings))
+        settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.seconds(self.max_delay, MAX_DELAY))
         fit = settings._fit_siso if self.structure == "siso" else settings._fit_motors
-        arrays, findings = fit(door, progress)
-        if door.has_offset:
-            arrays = with_offset("rls", arrays, door.data)
-        units = zip(findings["delay_curve"].items(), door.scaling.output_unit, strict=True)
+        arrays, findings = fit(scaled, progress)
+        if scaled.has_offset:
+            arrays = with_offset("rls", arrays, scaled.data)
+        units = zip(findings["delay_curve"].items(), scaled.scaling.output_unit, strict=True)
         findings["delay_curve"] = {
-            name: [[door.scaling.unscale_seconds(d), fit, unit * rms] for d, fit, rms in curve]
+            name: [[scaled.scaling.unscale_seconds(d), fit, unit * rms] for d, fit, rms in curve]
             for (name, curve), unit in units
         }
         progress(1.0, "done")
-        return door.model("rls", self, linear_in_si, arrays=arrays,
+        return scaled.model("rls", self, linear_in_si, arrays=arrays,
                           findings={"delay_criterion": "free_run", **findings})  # fmt: skip
 
-    def _fit_siso(self, door: Door, progress: Progress) -> tuple[dict[str, Matrix], dict]:
-        drive, directions, gains = fit_drive(door.data), door.directions, door.gains
-        runs = [(run.outputs, np.asarray(run.set_points @ directions.redefinition.T)) for run in door.data.runs()]
+    def _fit_siso(self, scaled: ScaledData, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+        drive, directions, gains = fit_drive(scaled.data), scaled.directions, scaled.gains
+        runs = [(run.outputs, np.asarray(run.set_points @ directions.redefinition.T)) for run in scaled.data.runs()]
         thetas, delays, stds, numbers = [], [], [], []
         curves: dict[str, Curve] = {}
         for axis, name in enumerate(directions.names):
             progress(axis / len(directions.names), name)
             one: list[tuple[Matrix, Matrix]] = [(Y[:, [axis]], U[:, [axis]]) for Y, U in runs]
-            d, theta, std, curves[name], number = self._search(door.data.sample_time, one, name)
+            d, theta, std, curves[name], number = self._search(scaled.data.sample_time, one, name)
             thetas.append(theta)
             delays.append(d)
             stds.append((std * np.repeat([1.0, gains[axis]], [self.na, self.nb])).tolist())
             numbers.append(number)
         found = {"delay_curve": curves, "condition_number": numbers, "parameter_std": stds}
         a, b = (np.array(part) for part in np.split(np.array(thetas), [self.na], axis=1))
-        if door.has_offset:
-            found |= functions_found(door, [*a], [*b], delays)
+        if scaled.has_offset:
+            found |= functions_found(scaled, [*a], [*b], delays)
             spread = [
                 np.concatenate([theta[: self.na], np.outer(weights, theta[self.na :]).ravel()])
                 for theta, weights in zip(thetas, directions.weights, strict=True)
             ]
             return motor_arrays(replace(self, structure="miso"), spread, delays, drive.array), found
-        return axis_arrays(door, drive, a, b, delays), found
+        return axis_arrays(scaled, drive, a, b, delays), found
 
     def _search(
         self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
@@ -339,9 +338,9 @@ class Rls:
             load_functions(_UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
         return state.theta, state.covariance
 
-    def _fit_motors(self, door: Door, progress: Progress) -> tuple[dict[str, Matrix], dict]:
+    def _fit_motors(self, scaled: ScaledData, progress: Progress) -> tuple[dict[str, Matrix], dict]:
         """Fit all outputs over the motors; "miso" takes a dead time each, "mimo" one for all."""
-        recording = door.data
+        recording = scaled.data
         drive = fit_drive(recording).array
         Ts = recording.sample_time
         runs = [(run.outputs, run.set_points) for run in recording.runs()]
@@ -406,3 +405,109 @@ def _fits(model: Model, recording: Recording) -> list[float]:
     simulated = model.simulate(recording)
     starts = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
     return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in axes]
+
+
+_PARTS = ("theta", "factor", "scale", "tally")
+_AXES = ("pitch", "roll")
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class OnlineState:
+    """What has been seen and learnt so far.
+
+    Attributes:
+        recursions: of pitch and roll.
+        inputs: (delay + nb, 3) set-points, the newest first; NaN before the first.
+        outputs: (na, 2) angles, the newest first; NaN where missed.
+    """
+
+    recursions: tuple[RecursionState, RecursionState]
+    inputs: Matrix
+    outputs: Matrix
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnlineRls:
+    """`Rls` sample by sample: after as many calls it has learnt what `Rls.fit` would have.
+
+    Attributes:
+        settings: with a dead time given.
+        sample_time: [s].
+    """
+
+    settings: Rls
+    sample_time: float
+
+    def __post_init__(self) -> None:
+        require_positive("sample_time", self.sample_time, "s")
+        if self.settings.delay is None:
+            raise SettingsError(
+                "a dead time cannot be searched for sample by sample; give `delay`, from a model identified before."
+            )
+
+    @property
+    def delay(self) -> int:
+        """Dead time in samples."""
+        return round((self.settings.delay or 0.0) / self.sample_time)
+
+    def initial_state(self) -> OnlineState:
+        """Return the state before anything was seen."""
+        recursion = self.settings.recursion()
+        return OnlineState(
+            recursions=(recursion.initial_state(), recursion.initial_state()),
+            inputs=np.full((self.delay + self.settings.nb, 3), np.nan),
+            outputs=np.full((self.settings.na, 2), np.nan),
+        )
+
+    def step(self, state: OnlineState, set_points: ArrayLike, measured: ArrayLike) -> OnlineState:
+        """Learn from what is known at t_k: set-points (3,) held from now on, and measured pitch and roll (2,) [rad].
+
+        A missed angle is NaN; rows that would need it are left out.
+        """
+        u = finite_vector("set_points", set_points, 3)
+        y = np.asarray(measured, dtype=np.float64).ravel()
+        if y.size != 2:
+            raise DataError(f"`measured` must have 2 entries (pitch, roll); got {y.size}.")
+        recursion = self.settings.recursion()
+        first, second = (
+            recursion.step(state.recursions[axis], self._regressor(state, axis), float(y[axis])) for axis in range(2)
+        )
+        return OnlineState(
+            recursions=(first, second),
+            inputs=np.vstack([u, state.inputs[:-1]]),
+            outputs=np.vstack([y, state.outputs[:-1]]),
+        )
+
+    def model(self, state: OnlineState) -> Model:
+        """Return what has been learnt as a model, as `Rls.fit` returns it; its drives follow their set-points."""
+        thetas = [recursion.theta for recursion in state.recursions]
+        drive = np.zeros((3, 2))
+        s = self.settings
+        if s.structure == "siso":
+            arrays = {
+                "history": np.array([float(max(s.na, self.delay + s.nb))]),
+                "drive": drive,
+                "redefinition": redefinition_matrix(TENDON_ANGLES),
+                "a": np.array([theta[: s.na] for theta in thetas]),
+                "b": np.array([theta[s.na :] for theta in thetas]),
+                "delay": np.full(2, float(self.delay)),
+            }
+        else:
+            arrays = motor_arrays(s, thetas, [self.delay, self.delay], drive)
+        stds = [recursion.parameter_std.tolist() for recursion in state.recursions]
+        return Model(
+            kind="rls",
+            sample_time=self.sample_time,
+            arrays=arrays,
+            settings=asdict(s),
+            findings={"parameter_std": stds} if np.isfinite(stds).all() else {},
+        )
+
+    def _regressor(self, state: OnlineState, axis: int) -> Vector:
+        """Return phi(t-1) of Eq. 26 for one axis."""
+        acting = state.inputs[self.delay :]
+        own, other = -state.outputs[:, axis], -state.outputs[:, 1 - axis]
+        if self.settings.structure == "siso":
+            return np.concatenate([own, acting @ redefinition_matrix(TENDON_ANGLES)[axis]])
+        pasts = [own, other] if self.settings.structure == "mimo" else [own]
+        return np.concatenate([*pasts, acting.T.ravel()])

@@ -44,7 +44,7 @@ class Continuous:
         """(n + m + 1,) a, b and the dead time."""
         return np.concatenate([self.a, self.b, [self.delay]])
 
-    def sampled(self, sample_time: float) -> tuple[Vector, Vector, int]:
+    def discretize(self, sample_time: float) -> tuple[Vector, Vector, int]:
         """Return a, b and the whole samples of delay of the same system with its input held: exact, also between."""
         A, e, C = self.canonical()
         d, old, new, Ad = _held(A, e, self.delay, sample_time)

@@ -205,7 +205,7 @@ _CROSSINGS = 0.34
 _LEAST_RATE, _MOST_RATE = 6.8e-5, 0.68
 
 
-def unrecorded(train: Recording, seconds: float, *, seed: int = 0) -> list[Recording]:
+def make_test_motions(train: Recording, seconds: float, *, seed: int = 0) -> list[Recording]:
     """Return motions along the set-points of a record, of so many seconds of a neck; outputs are NaN but for the start.
 
     Args:

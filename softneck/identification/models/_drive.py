@@ -225,12 +225,12 @@ _GAINS = (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 _PRICE = 1.4
 # Motions that are new leave larger errors than those of the training. On two necks that no test was recorded on this
 # factor cost 0.02 points of the one-step fit on the excitation trained on, and gained 0.05 to 0.2 on another one.
-BEYOND = 3.0
+NEW_MOTION_FACTOR = 3.0
 # Poles beyond this would remember a measurement for minutes.
 _RADIUS = 0.995
 
 
-def fit_echo(errors: list[Vector], order: int, *, beyond: float = 1.0) -> Vector:
+def fit_noise_model(errors: list[Vector], order: int, *, beyond: float = 1.0) -> Vector:
     """Return c (order,) of `e(k+1) = sum_i c_i e(k+1-i)` by Yule and Walker (Stoica and Moses 2005, sec. 3.4).
 
     Args:

@@ -15,10 +15,24 @@ from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot
 from softneck.signals import Recording, concatenate, independent_motions
 
+from ._arrays import MOST_PAYLOAD, trained_set_points
 from ._model import WARM_UP, Model
-from ._ports import MOST_PAYLOAD, trained_set_points
 from ._scores import nrmse_fit
-from ._validity import grounded
+from ._validity import with_validity_region
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from softneck.robot import Scaling
+from softneck.signals import scale_recording
+
+from ._directions import NECK_SECONDS, Directions, directions_of
+from ._drive import LoadedDrive, fit_loaded_drive
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -189,7 +203,7 @@ def fitted_model(
         training_rows=row_hashes(recording),
         robot=recording.robot,
     )
-    return grounded(model, recording)
+    return with_validity_region(model, recording)
 
 
 def payload_of(run: Recording) -> float:
@@ -201,3 +215,105 @@ def payload_of(run: Recording) -> float:
     if not 0.0 <= low <= MOST_PAYLOAD:
         raise DataError(f"a run's payload is {low:g} kg and must be 0 to {MOST_PAYLOAD:g}; is its column in grams?")
     return low
+
+
+Convert = Callable[[Mapping[str, Matrix], Scaling], dict[str, Matrix]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScaledData:
+    """A recording in SI, the same in scaled quantities, and the map between them.
+
+    Attributes:
+        recording: in SI.
+        data: scaled; of a robot that rests at zero, without units.
+        scaling: between them.
+        directions: of `data`.
+    """
+
+    recording: Recording
+    data: Recording
+    scaling: Scaling
+    directions: Directions
+
+    @classmethod
+    def of(cls, recording: Recording, *, amplitudes: bool = True, alike: bool = False) -> ScaledData:
+        """Scale a recording.
+
+        Args:
+            recording: to learn from.
+            amplitudes: whether set-points and outputs are scaled too; else time alone, of equations in SI.
+            alike: whether all outputs have one unit, as the motors do.
+
+        Raises:
+            DataError: an output follows no motor.
+        """
+        robot = recording.robot
+        scaling = Scaling.of(robot, set_points=recording.set_points, outputs=recording.outputs)
+        if not amplitudes:
+            zero, one = np.zeros_like(scaling.motor_rest), np.ones_like(scaling.output_unit)
+            scaling = replace(scaling, motor_unit=1.0, motor_rest=zero, output_unit=one, output_rest=0.0 * one)
+        if alike:
+            scaling = replace(scaling, output_unit=np.full_like(scaling.output_unit, scaling.output_unit.max()))
+        plain = scale_recording(recording, replace(scaling, second=1.0))
+        found = directions_of(plain, [run.set_points for run in plain.runs()], robot)
+        scaling = replace(scaling, second=found.time_constant / NECK_SECONDS)
+        return cls(recording, scale_recording(recording, scaling), scaling,
+                   replace(found, seconds=found.seconds / scaling.second))  # fmt: skip
+
+    @property
+    def has_time_constant(self) -> bool:
+        """Whether the robot gives its time constant, so that the paper's lags and training suit it."""
+        return self.recording.robot.time_constant_s is not None
+
+    @property
+    def has_offset(self) -> bool:
+        """Whether set-points or outputs at rest are not zero in SI."""
+        return bool(self.scaling.motor_rest.any() or self.scaling.output_rest.any())
+
+    @property
+    def drive(self) -> LoadedDrive:
+        """The motors' lag, and the limit that tendons share (`load` holds no rest of its own)."""
+        tendons = self.recording.robot.tendon_angles is not None and not self.scaling.motor_rest.any()
+        return fit_loaded_drive(self.data, limited=tendons)
+
+    @property
+    def gains(self) -> Vector:
+        """(outputs,) what a scaled gain of each output over a motor is in SI."""
+        return self.scaling.output_unit / self.scaling.motor_unit
+
+    def seconds(self, asked: float | None, usual: float | None = None) -> float | None:
+        """Return a setting [s] in scaled seconds, and what is usual where it is not given."""
+        return usual if asked is None else self.scaling.scale_seconds(asked)
+
+    def findings(self) -> dict[str, object]:
+        """Return directions and time constants in SI where they were learned."""
+        robot = self.recording.robot
+        if robot.weights() is not None and robot.time_constant_s is not None:
+            return {}
+        return replace(self.directions, seconds=self.scaling.second * self.directions.seconds).findings()
+
+    def in_display_unit(self, values: Matrix) -> Matrix:
+        """Return scaled differences (.., outputs) of outputs in the unit in which people see them."""
+        return in_display_unit(self.recording.robot, self.scaling.output_unit * values)
+
+    def scale(self, recording: Recording) -> Recording:
+        """Return another recording of the robot in the same quantities."""
+        return scale_recording(recording, self.scaling)
+
+    def model(
+        self, kind: str, settings: DataclassInstance, in_si: Convert, *, arrays: Mapping[str, Matrix],
+        findings: Mapping[str, Any],
+    ) -> Model:  # fmt: skip
+        """Return the model in SI of what `settings` made of `data`.
+
+        Args:
+            kind: name in the table of kinds.
+            settings: as asked for.
+            in_si: converts the arrays of the kind.
+            arrays: scaled.
+            findings: in SI.
+        """
+        findings = {**findings, **self.findings()}
+        arrays = arrays if self.scaling.is_identity else in_si(arrays, self.scaling)
+        return fitted_model(kind, settings, self.recording, arrays=arrays, findings=findings)

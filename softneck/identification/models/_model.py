@@ -33,8 +33,18 @@ from softneck.runtime import Block, State
 from softneck.signals import Labelled, Recording, RecordingLike, open_recording, require_same_robot
 
 from . import _linear_systems as _linear
-from . import _ports
-from ._arrays import check_arrays, members, memory_of, runtime_arrays, runtime_of, set_now
+from ._arrays import (
+    check_arrays,
+    input_ports,
+    members,
+    memory_of,
+    output_ports,
+    parameter_ports,
+    payloads,
+    runtime_arrays,
+    runtime_of,
+    set_now,
+)
 from ._scores import r_squared
 
 if TYPE_CHECKING:
@@ -82,9 +92,9 @@ class Model(ReprMixin):
             runtime=runtime_of(self.kind, self.arrays),
             sample_time=self.sample_time,
             arrays=tuple(runtime_arrays(self.kind, self.arrays).values()),
-            inputs=_ports.inputs(self.findings, self.robot),
-            outputs=_ports.outputs(self.kind, self.robot),
-            parameters=_ports.parameters(self.robot, self.arrays),
+            inputs=input_ports(self.findings, self.robot),
+            outputs=output_ports(self.kind, self.robot),
+            parameters=parameter_ports(self.robot, self.arrays),
         )
 
     def initial_state(self, recording: Recording | None = None, **parameters: float) -> State:
@@ -318,7 +328,7 @@ class Model(ReprMixin):
         if self.robot.in_header():
             lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs "
                          f"{', '.join(self.robot.outputs.names)}")  # fmt: skip
-        known = _ports.payloads(self.arrays)
+        known = payloads(self.arrays)
         if known is not None:
             lines.append(f"parameter `payload`: the recordings had {known[0]:g} to {known[1]:g} kg")
         if self.kind in _linear.KINDS:
@@ -408,7 +418,7 @@ def _check_header(model: Model) -> None:
     if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
         raise FileFormatError("its settings and findings must be tables.")
     try:
-        _ports.inputs(model.findings, model.robot)
+        input_ports(model.findings, model.robot)
     except (KeyError, TypeError, ValueError) as error:
         raise FileFormatError("its range of set-points must be a minimum and a maximum for each motor.") from error
     if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
@@ -453,13 +463,13 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def nested(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def embed_model(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return what the header of a controller or an observer says of its model, and its arrays by their names there."""
     arrays = {f"model_{name}": array for name, array in model.arrays.items()}
     return model._header(), {**arrays, "model_training_rows": model.training_rows}
 
 
-def nested_model(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Model:
+def embedded_model(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Model:
     """Return the model of which the file's header says `header`."""
     names = [*header["arrays"], "training_rows"]
     return Model.from_archive(dict(header), {name: arrays[f"model_{name}"] for name in names})

@@ -70,7 +70,7 @@ def tolerance(robot: Robot, recording: Recording) -> Vector:
     return _TOLERANCE_OF_RANGE * (np.nanmax(recording.outputs, axis=0) - np.nanmin(recording.outputs, axis=0))
 
 
-def grounded(model: Model, recording: Recording, *, trust: Trust | None = None) -> Model:
+def with_validity_region(model: Model, recording: Recording, *, trust: Trust | None = None) -> Model:
     """Return `model` with what its output `validity` takes.
 
     Args:
@@ -97,10 +97,10 @@ def grounded(model: Model, recording: Recording, *, trust: Trust | None = None) 
     )
 
 
-def doubted(model: Model, errors: Matrix) -> Model:
+def limit_validity(model: Model, errors: Matrix) -> Model:
     """Return `model` that trusts itself no more than `errors` (time, outputs) allow, NaN where nothing was measured."""
     allowed = tolerance_of(model)
-    if allowed is None or not knows_validity(model):
+    if allowed is None or not has_validity(model):
         return model
     doubt = model.arrays["doubt"].copy()
     missed = np.clip(np.nanmean(errors**2, axis=0) / allowed**2, 1e-6, _MOST)
@@ -134,7 +134,7 @@ def with_tolerance(model: Model, tolerance: float) -> Model:
     """
     unit, known = model.robot.outputs.display_unit, tolerance_of(model)
     require_positive("tolerance", tolerance, unit)
-    if known is None or not knows_validity(model):
+    if known is None or not has_validity(model):
         raise DataError("`tolerance` is that of `validity`, which this model does not have: identify it again.")
     allowed = np.full(known.size, tolerance * to_si(unit)[0])
     # All of `doubt` are variances over the tolerance squared.
@@ -143,12 +143,12 @@ def with_tolerance(model: Model, tolerance: float) -> Model:
     return replace(model, arrays={**model.arrays, "doubt": doubt}, findings=findings)
 
 
-def knows_validity(model: Model) -> bool:
+def has_validity(model: Model) -> bool:
     """Return whether a model says where it was trained; older files and models made by hand do not."""
     return len(model.arrays.get("ground", ())) > 0
 
 
-def farthest(block: Block, motors: Matrix) -> tuple[int, bool, float, float]:
+def find_farthest_motor(block: Block, motors: Matrix) -> tuple[int, bool, float, float]:
     """Return which motor is farthest from where it was in training: its place, whether held or as it is, where, times.
 
     Args:
@@ -157,7 +157,7 @@ def farthest(block: Block, motors: Matrix) -> tuple[int, bool, float, float]:
     """
     ground = block.arrays[layout_of(block.runtime.partition("(")[0], Arrays).place("ground")]
     n = motors.shape[1]
-    z = np.concatenate([motors[-1], held(motors)[-1]])
+    z = np.concatenate([motors[-1], low_pass_motors(motors)[-1]])
     inverse = np.linalg.inv(ground[:, 1:])
     # Of each entry alone: how far it went when all of them were within 1, one standard deviation like another.
     times = np.abs(z - inverse @ ground[:, 0]) / np.sqrt(np.sum(inverse**2, axis=1))
@@ -175,14 +175,14 @@ def _errors_and_motion(model: Model, recording: Recording) -> tuple[Matrix, Matr
         free = model.simulate(run)
         m = free[:, outputs : outputs + motors]
         # What stands at t_k follows from the motors at t_k-1.
-        z = np.hstack([m[:-1], held(m)[1:]])
+        z = np.hstack([m[:-1], low_pass_motors(m)[1:]])
         first = min(WARM_UP, len(run) - 2)
         errors.append((run.outputs - free[:, :outputs])[1 + first :])
         motion.append(z[first:])
     return np.concatenate(errors), np.concatenate(motion)
 
 
-def held(m: Matrix) -> Matrix:
+def low_pass_motors(m: Matrix) -> Matrix:
     """Return where the motors `m` (time, motors) have been held, as the runtime keeps it."""
     from scipy.signal import lfilter
 

@@ -28,13 +28,12 @@ from softneck.signals import Recording, concatenate
 
 from ..linear._oe import OutputError
 from ..models._arrays import check_table
-from ..models._directions import unrecorded
-from ..models._door import Door
+from ..models._directions import make_test_motions
 from ..models._drive import LoadedDrive, drive_start, fit_correction, load_in_si
-from ..models._fitting import SAME_EXCITATION, training_recording
+from ..models._fitting import SAME_EXCITATION, ScaledData, training_recording
+from ..models._linear_systems import history_array
 from ..models._model import Model
 from ..models._regressors import eq21_table, regression, regressor_scale, spread_table
-from ..models._state_space import history_array
 from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_layers, train_axis
 
 # Of the starts: from hardly any to one that smooths; the hold-out decides between them.
@@ -59,7 +58,7 @@ class _Problem:
         table: the regressor.
         hints: motions that nobody recorded with what the line says of them; None for none.
         prior: weight of their errors.
-        paced: whether the robot gives its time constant.
+        has_time_constant: whether the robot gives its time constant.
     """
 
     train: Recording
@@ -68,7 +67,7 @@ class _Problem:
     table: Matrix
     hints: Recording | None
     prior: float
-    paced: bool
+    has_time_constant: bool
 
     def training(self, axis: int) -> tuple[AxisData, Matrix, Matrix]:
         """Return what is learnt from, with the scales of the record alone."""
@@ -86,7 +85,7 @@ class _Problem:
         if not recording.has_motor_positions:
             logged = dict(zip(recording.robot.motor_positions, motors.T, strict=True))
             recording = recording.with_channels(**logged)
-        return axis_data(recording, motors, axis, self.table, self.paced, scale, weights)
+        return axis_data(recording, motors, axis, self.table, self.has_time_constant, scale, weights)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -150,20 +149,22 @@ class Network:
         Raises:
             DataError: too short, constant, or fewer rows than weights.
         """
-        door = Door.of(training_recording(recordings, all_motors=True))
-        recording, drive = door.data, door.drive
+        scaled = ScaledData.of(training_recording(recordings, all_motors=True))
+        recording, drive = scaled.data, scaled.drive
         # The paper's lags and training suit a robot whose pace is known beforehand; where it is learned, rows are few
         # for its time constant or many, and the simulation decides.
-        table = eq21_table(recording) if door.paced else spread_table(recording)
-        sized = self._sized(recording, table, door.paced)
+        table = eq21_table(recording) if scaled.has_time_constant else spread_table(recording)
+        sized = self._sized(recording, table, scaled.has_time_constant)
         if hold_out is None:
             train, judge = recording.split(1.0 - _HOLD_OUT)
             if all(len(run) < _LEAST for run in judge.runs()):
                 train, judge = recording, recording
         else:
-            train, judge = recording, door.scaled(hold_out)
-        hints = _hints(train, drive) if self.prior > 0.0 and door.paced else None
-        axes, interrupted = sized._train(_Problem(train, judge, drive, table, hints, self.prior, door.paced), progress)
+            train, judge = recording, scaled.scale(hold_out)
+        hints = _hints(train, drive) if self.prior > 0.0 and scaled.has_time_constant else None
+        axes, interrupted = sized._train(
+            _Problem(train, judge, drive, table, hints, self.prior, scaled.has_time_constant), progress
+        )
         names = ("W1", "b1", "W2", "b2", "w3", "b3", "input_scale", "output_scale")
         stacked = {name: np.array([axis[name] for axis in axes]) for name in names}
         arrays: dict[str, Matrix] = {
@@ -180,9 +181,9 @@ class Network:
         if interrupted:
             findings["interrupted"] = INTERRUPTED
         progress(1.0, "done")
-        return door.model("nn", sized, _in_si, arrays=arrays, findings=findings)
+        return scaled.model("nn", sized, _in_si, arrays=arrays, findings=findings)
 
-    def _sized(self, recording: Recording, table: Matrix, paced: bool) -> Network:
+    def _sized(self, recording: Recording, table: Matrix, has_time_constant: bool) -> Network:
         """Return these settings with the numbers of neurons to take.
 
         Raises:
@@ -190,7 +191,7 @@ class Network:
         """
         rows = min(regression(recording, table, axis)[1].size for axis in range(recording.outputs.shape[1]))
         hidden = self.hidden or _PAPER
-        if self.hidden is None and not paced:
+        if self.hidden is None and not has_time_constant:
             sizes = [(n, n) for n in range(_PAPER[0], _LEAST_NEURONS, -1)]
             fitting = (size for size in sizes if _ROWS_EACH * _weights(len(table), size) <= rows)
             hidden = next(fitting, (_LEAST_NEURONS, _LEAST_NEURONS))
@@ -255,7 +256,7 @@ def _hints(train: Recording, drive: LoadedDrive) -> Recording | None:
     most = round(2.0 * seconds / train.sample_time)
     motions, names = [], train.robot.outputs.names
     # Not the motions by which `identify auto` compares kinds: those have another seed.
-    for whole in unrecorded(train, seconds, seed=1):
+    for whole in make_test_motions(train, seconds, seed=1):
         motion = whole.rows(0, min(most, len(whole)))
         Y = line.simulate(motion, warm_up=1)[:, : len(names)]
         motors = drive.simulate(motion.set_points, motion.set_points[0])

@@ -170,7 +170,7 @@ class AxisData:
         lags: (f,) of the first regressors, past outputs [samples].
         shift, gain: (f,) those from the scaled output, `shift + gain y`.
         window: samples of one scaled second.
-        paced: whether the robot gives its time constant; where it is learned, the simulation alone decides.
+        has_time_constant: whether the robot gives its time constant; where it is learned, the simulation alone decides.
         weight: (time,) of an error.
     """
 
@@ -182,14 +182,14 @@ class AxisData:
     shift: Vector
     gain: Vector
     window: float
-    paced: bool
+    has_time_constant: bool
     weight: Vector
 
     @property
     def thin(self) -> int:
         """Of so many rows one is learnt from."""
         often, stay = round(_EVERY * self.window), self.target.size // _FEW
-        return max(min(often, max(stay, _THIN) if self.paced else stay), 1)
+        return max(min(often, max(stay, _THIN) if self.has_time_constant else stay), 1)
 
     def starts(self, length: int) -> Matrix:
         """(time, f) measured past outputs where they are from before a window of `length` samples; NaN elsewhere."""
@@ -235,7 +235,7 @@ def axis_data(
     motors: Matrix,
     axis: int,
     table: Matrix,
-    paced: bool,
+    has_time_constant: bool,
     scale: tuple[Matrix, Vector] | None,
     weights: Vector | None = None,
 ) -> tuple[AxisData, Matrix, Vector]:
@@ -246,7 +246,7 @@ def axis_data(
         motors: (time, motors) simulated [rad].
         axis: of the outputs.
         table: rows (source, channel, lag), past outputs first.
-        paced: whether the robot gives its time constant.
+        has_time_constant: whether the robot gives its time constant.
         scale: of other data, to be used again.
         weights: (time,) of errors; None: all alike.
     """
@@ -286,7 +286,7 @@ def axis_data(
         shift=(middle - mean[fed]) / spread[fed],
         gain=size / spread[fed],
         window=1.0 / recording.sample_time,
-        paced=paced,
+        has_time_constant=has_time_constant,
         weight=np.concatenate(weight),
     )
     return data, scale[0], scale[1]
@@ -307,7 +307,9 @@ class Best:
         """Judge a network; return whether to go on."""
         one, free = self.hold_out.weights_fit(layers)
         top = max(self.one, one)
-        if self.layers is None or (free > self.free and (one > top - _ONE_STEP_LOSS or not self.hold_out.paced)):
+        if self.layers is None or (
+            free > self.free and (one > top - _ONE_STEP_LOSS or not self.hold_out.has_time_constant)
+        ):
             self.layers, self.free = layers, free
         self.one = top
         self.tell(f"{what}, loss {cost:.4g}, hold-out {self.free:.1f} %")
@@ -394,7 +396,7 @@ def _windows(
     Z, target = data.measured[rows], data.target[rows]
     # Of free runs, then of one step.
     weight = np.concatenate([
-        data.weight[:: data.thin][there], (_ONE_STEP_WEIGHT if data.paced else 1.0) * data.weight[rows]
+        data.weight[:: data.thin][there], (_ONE_STEP_WEIGHT if data.has_time_constant else 1.0) * data.weight[rows]
     ])  # fmt: skip
 
     def errors(w: Vector, *, derivatives: bool) -> tuple[Vector, Matrix | None]:

@@ -24,7 +24,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.signals import Recording, concatenate
 
-from ..models._directions import time_constant_of, unrecorded
+from ..models._directions import make_test_motions, time_constant_of
 from ..models._fitting import MIN_ROWS
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
@@ -38,7 +38,7 @@ _LEAST_VOTES = 3
 
 def exams(train: Recording) -> list[Recording]:
     """Return the motions of the exam, whose outputs are NaN but for the start."""
-    return unrecorded(train, _SECONDS)
+    return make_test_motions(train, _SECONDS)
 
 
 def free_runs(model: Model, motions: Sequence[Recording]) -> list[Matrix]:

@@ -17,12 +17,12 @@ from softneck.runtime import have_numba, load_functions
 from softneck.signals import Recording
 
 from ..linear._regression import linear_in_si, no_base
-from ..models._door import Door
 from ..models._drive import DriveModel
+from ..models._fitting import ScaledData
+from ..models._linear_systems import history_array
 from ..models._model import WARM_UP, Model
 from ..models._regressors import history_length, motor_signals, regression, regressor_scale
 from ..models._scores import nrmse_fit
-from ..models._state_space import history_array
 from ._trees import slant_frames, slant_nodes, slant_order, tree_nodes, tree_order
 
 _TREE_SEARCH = "softneck.identification.set_membership._gamma_runtime"
@@ -69,12 +69,12 @@ def all_pairs_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Ve
 
 
 def require_feasible(
-    door: Door, table: Matrix, data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector
+    training: ScaledData, table: Matrix, data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector
 ) -> None:
     """Raise DataError, naming two samples of the recording, where equal regressors deny epsilon whatever gamma is.
 
     Args:
-        door: with what the set was made of.
+        training: with what the set was made of.
         table: the regressor, rows (source, channel, lag).
         data: scaled regressors (n, N) and targets (N,) of each axis, in the recording's order.
         gamma: (outputs,) the least; beyond 1e100 there is none.
@@ -82,13 +82,13 @@ def require_feasible(
     """
     if gamma.max() <= 1e100:
         return
-    recording, axis = door.recording, int(np.argmax(gamma))
+    recording, axis = training.recording, int(np.argmax(gamma))
     points, values = data[axis]
     j, k = sorted(least_gammas(points, values, epsilon[axis : axis + 1])[1][0].tolist())
     rows = _rows_of(recording, table, axis, values.size)
     name, unit = recording.robot.outputs.names[axis], recording.robot.outputs.display_unit
-    tried = door.shown(epsilon)
-    rise = float(door.shown(np.full_like(epsilon, np.abs(values[j] - values[k])))[axis])
+    tried = training.in_display_unit(epsilon)
+    rise = float(training.in_display_unit(np.full_like(epsilon, np.abs(values[j] - values[k])))[axis])
     where = f"samples {j} and {k} of the set"
     if rows is not None:
         where = " and ".join(
@@ -274,13 +274,15 @@ def widened(data: Data, scale: Vector, epsilon: Vector) -> tuple[Vector, Vector]
     return epsilon, gamma
 
 
-def widening(chosen: Vector, taken: Vector, door: Door) -> dict[str, str]:
+def widening(chosen: Vector, taken: Vector, training: ScaledData) -> dict[str, str]:
     """Return the finding that says where epsilon (outputs,) was widened; empty where it was not."""
     if np.array_equal(chosen, taken):
         return {}
-    wide, narrow = ("/".join(f"{value:.3g}" for value in door.shown(values)) for values in (taken, chosen))
+    wide, narrow = (
+        "/".join(f"{value:.3g}" for value in training.in_display_unit(values)) for values in (taken, chosen)
+    )
     why = "equal regressors have unequal outputs (several payloads?)"
-    unit = door.recording.robot.outputs.display_unit
+    unit = training.recording.robot.outputs.display_unit
     return {"widened": f"epsilon is {wide} {unit} instead of {narrow}: {why}"}
 
 

@@ -26,9 +26,8 @@ from softneck.core import (
 from softneck.robot import Robot, Scaling
 from softneck.signals import Recording, scale_recording
 
-from ..models._door import Door
 from ..models._drive import DriveModel, fit_drive
-from ..models._fitting import in_display_unit, training_recording
+from ..models._fitting import ScaledData, in_display_unit, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._regressors import eq21_table, lag_table
 from ._regressor import Data, Ground, gammas, require_feasible, residual_lags, scaled, set_in_si, widened, widening
@@ -72,10 +71,10 @@ class ScaleTrial:
     width: float
     slope: float
 
-    def row(self, door: Door) -> list[float | None]:
+    def row(self, training: ScaledData) -> list[float | None]:
         """Weights, first epsilon, score, coverage and width as JSON values in the unit shown; None for none."""
         widths = np.full_like(self.epsilon, self.width)
-        epsilon, width = (float(door.shown(values)[0]) for values in (self.epsilon, widths))
+        epsilon, width = (float(training.in_display_unit(values)[0]) for values in (self.epsilon, widths))
         judged = [value if np.isfinite(value) else None for value in (self.score, self.coverage, width)]
         return [self.output_weight, self.motor_weight, epsilon, *judged]
 
@@ -250,14 +249,14 @@ class SetMembership:
         Raises:
             DataError: too short, constant, or `epsilon` so small that no function fits the data.
         """
-        door = Door.of(training_recording(recordings), alike=True)
-        recording, robot = door.data, door.recording.robot
+        training = ScaledData.of(training_recording(recordings), alike=True)
+        recording, robot = training.data, training.recording.robot
         noise = noise_levels(recording)
-        ground = self._ground(recording, fit_drive(recording), door.paced)
+        ground = self._ground(recording, fit_drive(recording), training.has_time_constant)
         data = ground.data(recording)
         # One epsilon in SI, of outputs that have one unit.
-        asked = None if self.epsilon is None else self.epsilon / door.scaling.output_unit
-        chosen, tried = self._choose(ground, door, noise, asked, progress)
+        asked = None if self.epsilon is None else self.epsilon / training.scaling.output_unit
+        chosen, tried = self._choose(ground, training, noise, asked, progress)
         scale = chosen.scale
         sets = [(scaled(X, scale), y) for X, y in data]
         # An epsilon that was asked for is kept or refused.
@@ -265,19 +264,19 @@ class SetMembership:
             epsilon, gamma = widened(data, scale, chosen.epsilon)
         else:
             epsilon, gamma = chosen.epsilon, gammas(data, scale, [chosen.epsilon])[0]
-        require_feasible(door, ground.table, sets, gamma, epsilon)
+        require_feasible(training, ground.table, sets, gamma, epsilon)
         arrays = ground.arrays(data, scale, gamma, epsilon)
         progress(1.0, "done")
         unit = robot.outputs.display_unit
-        findings = {"form": self.form, f"noise_{unit}": door.shown(noise).tolist()}
-        findings |= _findings(replace(chosen, epsilon=epsilon), tried, scale, door)
+        findings = {"form": self.form, f"noise_{unit}": training.in_display_unit(noise).tolist()}
+        findings |= _findings(replace(chosen, epsilon=epsilon), tried, scale, training)
         if asked is None:
             sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
-            findings |= widening(np.minimum(sigmas[-1] * noise, epsilon), epsilon, door)
-        gamma_si = door.scaling.output_unit * gamma
+            findings |= widening(np.minimum(sigmas[-1] * noise, epsilon), epsilon, training)
+        gamma_si = training.scaling.output_unit * gamma
         findings |= {"gamma": gamma_si.tolist(), "points": int(arrays["values"].shape[1])}
-        findings[usual_finding(robot)] = door.shown(usual_widths(sets, gamma, epsilon)).tolist()
-        return door.model("nlsm", self, set_in_si, arrays=arrays, findings=findings)
+        findings[usual_finding(robot)] = training.in_display_unit(usual_widths(sets, gamma, epsilon)).tolist()
+        return training.model("nlsm", self, set_in_si, arrays=arrays, findings=findings)
 
     def _ground(self, recording: Recording, drive: DriveModel, paced: bool) -> Ground:
         """Return the set's ground; the base of form `residual` is identified on `recording`."""
@@ -295,7 +294,7 @@ class SetMembership:
         )
 
     def _choose(
-        self, ground: Ground, door: Door, noise: Vector, asked: Vector | None, progress: Progress
+        self, ground: Ground, training: ScaledData, noise: Vector, asked: Vector | None, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
         """Return the chosen scale and epsilon (`asked` where it is set), and all candidates."""
         sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
@@ -303,14 +302,14 @@ class SetMembership:
         if asked is not None and self.output_weight is not None:
             scale = grouped_scale(ground.table, self.output_weight)
             return ScaleTrial(self.output_weight, None, scale, asked, np.nan, np.nan, np.nan, np.nan), []
-        head, tail = door.data.split(1.0 - _HOLD_OUT)
+        head, tail = training.data.split(1.0 - _HOLD_OUT)
         if len(tail) <= 2 * WARM_UP:
             raise DataError(
                 "the record is too short to choose epsilon and the scale; record longer, or set epsilon and "
                 "output_weight."
             )
         # The drives are known from all rows: they are no part of what is chosen.
-        first = self._ground(head, ground.drive, door.paced)
+        first = self._ground(head, ground.drive, training.has_time_constant)
         hold_out = HoldOut(first, first.data(head), tail, epsilons, narrow=self.form == "residual")
         if self.output_weight is not None:
             outputs, motors = (self.output_weight,), ()
@@ -349,12 +348,12 @@ def noise_level(recording: Recording, axis: int) -> float:
     return max(sigma, 1e-7)
 
 
-def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector, door: Door) -> dict[str, Any]:
+def _findings(chosen: ScaleTrial, tried: list[ScaleTrial], scale: Vector, training: ScaledData) -> dict[str, Any]:
     weights = {"output_weight": chosen.output_weight, "motor_weight": chosen.motor_weight}
     return {
-        f"epsilon_{door.recording.robot.outputs.display_unit}": door.shown(chosen.epsilon).tolist(),
+        f"epsilon_{training.recording.robot.outputs.display_unit}": training.in_display_unit(chosen.epsilon).tolist(),
         **{name: weight for name, weight in weights.items() if weight is not None},
         "scale": scale.tolist(),
         # Rows: both weights, epsilon of the first output [deg], sum of all fits [%], coverage, mean width [deg].
-        "hold_out_curve": [one.row(door) for one in tried],
+        "hold_out_curve": [one.row(training) for one in tried],
     }

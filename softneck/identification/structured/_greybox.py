@@ -19,13 +19,11 @@ from softneck.robot import Robot
 from softneck.runtime import load_functions
 from softneck.signals import Recording
 
-from ..models._arrays import memory_array, within
-from ..models._door import Door
-from ..models._drive import drive_start, fit_echo
-from ..models._fitting import payload_of, training_recording
+from ..models._arrays import MOST_PAYLOAD, memory_array, within
+from ..models._drive import drive_start, fit_noise_model
+from ..models._fitting import ScaledData, payload_of, training_recording
+from ..models._linear_systems import history_array
 from ..models._model import Model
-from ..models._ports import MOST_PAYLOAD
-from ..models._state_space import history_array
 from ._loaded_greybox_runtime import loaded_neck
 
 if TYPE_CHECKING:
@@ -149,8 +147,8 @@ class GreyBox:
         """
         recording = training_recording(recordings)
         require_tendons(recording.robot, "kind `greybox`")
-        door = Door.of(recording, amplitudes=False)  # the equations are in rad
-        problem = _FitProblem.of(door)
+        scaled = ScaledData.of(recording, amplitudes=False)  # the equations are in rad
+        problem = _FitProblem.of(scaled)
         delays = problem.delays() if self.sensor_delay is None else (self.sensor_delay,)
         best: tuple[float, int, Vector] | None = None
         start = np.array([number.encode(number.guess) for number in problem.numbers])
@@ -170,7 +168,7 @@ class GreyBox:
                 start = found.x
         if best is None or not np.isfinite(best[0]):
             raise DataError("no numbers of the grey box give a finite error; look for wild values in the recording.")
-        model = _model(self, problem, door, best[1], best[2])
+        model = _model(self, problem, scaled, best[1], best[2])
         progress(1.0, "done")
         if interrupted:
             return replace(model, findings={**model.findings, "interrupted": INTERRUPTED})
@@ -200,8 +198,8 @@ class _FitProblem:
     tendons: Vector
 
     @classmethod
-    def of(cls, door: Door) -> _FitProblem:
-        recording, drive, Ts = door.data, door.drive.drive.copy(), door.data.sample_time
+    def of(cls, scaled: ScaledData) -> _FitProblem:
+        recording, drive, Ts = scaled.data, scaled.drive.drive.copy(), scaled.data.sample_time
         if not recording.has_motor_positions:
             drive[:, 1] = max(round(_TYPICAL_DRIVE_DELAY / Ts), 1)
         drive[:, 1] = np.maximum(drive[:, 1], 1.0)
@@ -311,13 +309,13 @@ class _SearchProgress:
             self.progress(min(self.calls / self.expected, 0.99), f"{self.what}, loss {self.best[0]:.4g}")
 
 
-def _model(settings: GreyBox, problem: _FitProblem, door: Door, delay: int, x: Vector) -> Model:
-    numbers, load, outputs = problem.decode(x), problem.load(x), door.data.outputs.shape[1]
+def _model(settings: GreyBox, problem: _FitProblem, scaled: ScaledData, delay: int, x: Vector) -> Model:
+    numbers, load, outputs = problem.decode(x), problem.load(x), scaled.data.outputs.shape[1]
     skip = round(_SETTLED / problem.sample_time)
     errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(x, delay), problem.runs, strict=True)]
     for error in errors:
         error[:skip] = np.nan
-    echo = np.array([fit_echo([error[:, axis] for error in errors], _ECHO) for axis in range(outputs)])
+    echo = np.array([fit_noise_model([error[:, axis] for error in errors], _ECHO) for axis in range(outputs)])
     pole = np.exp(-numbers[0] * problem.sample_time)
     drive = np.column_stack([np.full(len(problem.drive), pole), problem.drive[:, 1]])
     arrays = {
@@ -332,9 +330,9 @@ def _model(settings: GreyBox, problem: _FitProblem, door: Door, delay: int, x: V
     table = _table(problem, x, delay, errors)
     for number, row in zip(problem.numbers, table, strict=True):
         if number.is_rate:
-            row |= {key: door.scaling.second**-1 * row[key] for key in ("value", "low", "high")}
+            row |= {key: scaled.scaling.second**-1 * row[key] for key in ("value", "low", "high")}
     findings = {"sensor_delay": delay, "numbers": table}
-    return door.model("greybox", settings, lambda arrays, _: dict(arrays), arrays=arrays, findings=findings)
+    return scaled.model("greybox", settings, lambda arrays, _: dict(arrays), arrays=arrays, findings=findings)
 
 
 def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]) -> list[dict]:

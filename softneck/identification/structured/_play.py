@@ -14,12 +14,11 @@ from softneck.runtime import load_functions
 from softneck.signals import Recording
 
 from ..models._arrays import memory_array, within
-from ..models._door import Door
-from ..models._drive import BEYOND, FUNCTIONS, LoadedDrive, drive_start, fit_echo, load_in_si
-from ..models._fitting import SAME_EXCITATION, training_recording
+from ..models._drive import FUNCTIONS, NEW_MOTION_FACTOR, LoadedDrive, drive_start, fit_noise_model, load_in_si
+from ..models._fitting import SAME_EXCITATION, ScaledData, training_recording
+from ..models._linear_systems import history_array
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
-from ..models._state_space import history_array
 
 HOLD_OUT = 0.2
 # Rows held out that say something of a free run, where there are that many.
@@ -252,19 +251,19 @@ class Play:
         Raises:
             DataError: too short, constant, or fewer rows than terms.
         """
-        door = Door.of(training_recording(recordings, all_motors=True))
+        scaled = ScaledData.of(training_recording(recordings, all_motors=True))
         progress(0.0, "drives")
-        drive, T = door.drive, door.directions.all_inputs(door.data.set_points)
-        data = Data.of(door.data, drive, T)
-        extra = None if hold_out is None else Data.of(door.scaled(hold_out), drive, T)
-        settings = self._scaled(door.scaling)
-        known = door.recording.robot.time_constant_s is not None
+        drive, T = scaled.drive, scaled.directions.all_inputs(scaled.data.set_points)
+        data = Data.of(scaled.data, drive, T)
+        extra = None if hold_out is None else Data.of(scaled.scale(hold_out), drive, T)
+        settings = self._scaled(scaled.scaling)
+        known = scaled.recording.robot.time_constant_s is not None
         form, weight, fit, tried = settings._choose(data, extra, _RATES if known else _MORE_RATES, progress)
         progress(0.95, "all rows")
         arrays = _arrays(data, drive, form, weight, self.echo)
         findings = {
-            "rate": form.rate / door.scaling.second,
-            "widths": [door.scaling.motor_unit * width for width in form.widths],
+            "rate": form.rate / scaled.scaling.second,
+            "widths": [scaled.scaling.motor_unit * width for width in form.widths],
             "degree": form.degree,
             "ridge": weight,
             "terms": len(form.table),
@@ -274,7 +273,7 @@ class Play:
         if hold_out is None and tried > 1:
             findings["remark"] = SAME_EXCITATION
         progress(1.0, "done")
-        return door.model("play", self, _in_si, arrays=arrays, findings=findings)
+        return scaled.model("play", self, _in_si, arrays=arrays, findings=findings)
 
     def _scaled(self, scaling: Scaling) -> Play:
         """Return these settings in scaled quantities."""
@@ -326,7 +325,9 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
     errors[~good] = np.nan
     edges = np.cumsum([len(motors) for motors in data.motors])[:-1]
     parts: list[Matrix] = np.split(errors, edges)
-    echo = np.array([fit_echo([part[:, axis] for part in parts], order, beyond=BEYOND) for axis in range(len(W))])
+    echo = np.array(
+        [fit_noise_model([part[:, axis] for part in parts], order, beyond=NEW_MOTION_FACTOR) for axis in range(len(W))]
+    )
     history = int(max(order, drive.drive[:, 1].max(), 1))
     return {
         "history": history_array(history, len(W)),

@@ -324,7 +324,7 @@ class Family(ReprMixin):
             if pade > 0 and model.delay > 0.0:
                 G = G * control.TransferFunction(*control.pade(model.delay, pade))
             return control.TransferFunction(G.num, G.den, **names)
-        a, b, d = model.sampled(self.sample_time)
+        a, b, d = model.discretize(self.sample_time)
         b = b if b[-1] != 0.0 else b[:-1]
         below = np.concatenate([[1.0], a, np.zeros(d + b.size - a.size)])
         return control.TransferFunction(b, below, self.sample_time, **names)

@@ -28,8 +28,7 @@ from ..linear._oe import SOURCES
 from ..linear._regression import MAX_DELAY
 from ..linear._srivc_fit import Continuous, SrivcFitOptions
 from ..models._directions import Directions
-from ..models._door import Door
-from ..models._fitting import check_training
+from ..models._fitting import ScaledData, check_training
 from ._family import SCOPES, AxisFamily, Family, one_pole, relative_errors
 from ._local_models import Local, Window, axis_inputs, fit_compression, fit_local, unit_response, windows
 from ._measured import (
@@ -250,17 +249,17 @@ class FamilySettings:
         whole = concatenate(parts)
         for part in parts:
             check_training(part)
-        door = Door.of(whole)
-        scaling = door.scaling
+        data = ScaledData.of(whole)
+        scaling = data.scaling
         if self.window is not None:
             ends = scaling.unscale_seconds(_SHORTEST), scaling.unscale_seconds(_LONGEST)
             require_between("window", self.window, *ends, "s")
-        times = {"window": door.seconds(self.window, _WINDOW), "max_delay": door.seconds(self.max_delay, MAX_DELAY)}
+        times = {"window": data.seconds(self.window, _WINDOW), "max_delay": data.seconds(self.max_delay, MAX_DELAY)}
         named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
         if len(named) != len(parts):
             raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")
         scaled = replace(self, **times)
-        found = in_si(scaled._scaled_family([door.scaled(part) for part in parts], door, named, progress), scaling)
+        found = in_si(scaled._scaled_family([data.scale(part) for part in parts], data, named, progress), scaling)
         tested = {
             **found.findings["tested"],
             "sha256": [digest(part) for part in parts],
@@ -272,14 +271,14 @@ class FamilySettings:
             sample_time=whole.sample_time,
             robot=whole.robot,
             settings=asdict(self) | {key: scaling.second * (value or 0.0) for key, value in times.items()},
-            findings={**found.findings, "tested": tested, **door.findings()},
+            findings={**found.findings, "tested": tested, **data.findings()},
         )
 
-    def _scaled_family(self, parts: list[Recording], door: Door, names: list[str], progress: Progress) -> Family:
+    def _scaled_family(self, parts: list[Recording], data: ScaledData, names: list[str], progress: Progress) -> Family:
         """Return the family in scaled quantities."""
-        directions, Ts, source = door.directions, parts[0].sample_time, self.source
+        directions, Ts, source = data.directions, parts[0].sample_time, self.source
         length, lead = self.window or _WINDOW, self.max_delay or MAX_DELAY
-        upright = door.recording.robot.outputs.rest is not None and len(directions.names) <= 2
+        upright = data.recording.robot.outputs.rest is not None and len(directions.names) <= 2
         frequency = np.geomspace(_LOWEST, np.pi / Ts, _FREQUENCIES)
         search = SrivcFitOptions(sample_time=Ts, offset=True, max_delay=lead, fastest=_FASTEST)
         cut = [

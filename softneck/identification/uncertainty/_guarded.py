@@ -29,12 +29,11 @@ from softneck.core import (
 )
 from softneck.signals import Recording, concatenate
 
-from ..models._arrays import COMPOSED, memory_of, prefixed_arrays, within
+from ..models._arrays import COMPOSED, memory_of, prefixed_arrays, trained_set_points, within
 from ..models._directions import NECK_SECONDS, time_constant_of
 from ..models._fitting import row_hashes, training_recording
 from ..models._model import WARM_UP, Model
-from ..models._ports import trained_set_points
-from ..models._validity import grounded
+from ..models._validity import with_validity_region
 from ..networks._network import Network
 from ..set_membership._set_membership import SetMembership
 from ..structured._play import Play
@@ -294,7 +293,7 @@ class Guarded:
             training_rows=row_hashes(recording),
             robot=robot,
         )
-        return grounded(model, recording)
+        return with_validity_region(model, recording)
 
 
 def _member(kind: str, seed: int, rest: Recording, part: Recording) -> Model:

@@ -227,5 +227,5 @@ def unit_response(model: Continuous, u: Vector, sample_time: float) -> Vector:
     from scipy.signal import lfilter
 
     scaled = Continuous(a=model.a, b=model.a[-1:], delay=model.delay)
-    a, b, d = scaled.sampled(sample_time)
+    a, b, d = scaled.discretize(sample_time)
     return u[0] + np.asarray(lfilter(np.concatenate([np.zeros(1 + d), b]), np.concatenate([[1.0], a]), u - u[0]))

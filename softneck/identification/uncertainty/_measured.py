@@ -146,7 +146,7 @@ def nominal_output(model: Continuous, u: Vector, sample_time: float) -> Vector:
     """Return what the model answers to `u` (time,), which was held at its first value before."""
     from scipy.signal import lfilter
 
-    a, b, d = model.sampled(sample_time)
+    a, b, d = model.discretize(sample_time)
     late = np.concatenate([np.zeros(d + 1), u - u[0]])[: u.size]
     below = np.concatenate([[1.0], a])
     return np.asarray(lfilter(b, below, late)) + u[0] * model.b[-1] / model.a[-1]
@@ -221,7 +221,7 @@ class AxisMeasured:
 
 def response_of(model: Continuous, frequency: Vector, sample_time: float) -> np.ndarray:
     """Return the response of a model at `frequency` [rad/s], its input held between samples."""
-    a, b, d = model.sampled(sample_time)
+    a, b, d = model.discretize(sample_time)
     z = np.exp(1j * frequency * sample_time)
     return np.polyval(b, z) / np.polyval(np.concatenate([[1.0], a]), z) * z ** (a.size - b.size - d)
 

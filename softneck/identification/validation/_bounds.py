@@ -18,7 +18,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 
 from ..models._model import Model
-from ..models._validity import knows_validity, tolerance_of
+from ..models._validity import has_validity, tolerance_of
 from ._scored_rows import Rows
 
 LEVEL = 0.9
@@ -184,7 +184,7 @@ def judged_validity(model: Model, rows: Rows, free: Matrix) -> dict[str, Any] | 
         or nothing is judged.
     """
     allowed = tolerance_of(model)
-    if not knows_validity(model) or allowed is None or free.shape[1] <= allowed.size:
+    if not has_validity(model) or allowed is None or free.shape[1] <= allowed.size:
         return None
     there = np.isfinite(rows.measured).all(axis=1) & np.isfinite(free[:, -1])
     if not there.any():

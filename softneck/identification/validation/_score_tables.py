@@ -19,8 +19,8 @@ import numpy as np
 from softneck.core import Matrix, Vector, to_si
 from softneck.robot import Robot, Scaling
 
+from ..models._arrays import BOUNDED, trained_range
 from ..models._model import Model
-from ..models._ports import BOUNDED, trained_range
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
 from ..set_membership._set_membership import knows_what_it_saw, outside_seen
 from ._scored_rows import Rows, ScoredStretch

@@ -72,7 +72,7 @@ def _as_recording(u: Vector, y: Vector) -> Recording:
 @pytest.mark.parametrize("model", [NECK, ZERO], ids=["one pole", "two poles and a zero"])
 def test_the_sampled_form_is_exact_also_between_samples(model: Continuous) -> None:
     u = steps(600, seed=0)
-    a, b, d = model.sampled(TS)
+    a, b, d = model.discretize(TS)
     # Two computations of one response: rounding over 12,000 fine steps.
     np.testing.assert_allclose(
         lfilter(np.concatenate([np.zeros(1 + d), b]), np.concatenate([[1.0], a]), u), response(model, u), atol=1e-11
@@ -97,7 +97,7 @@ def test_it_ends_where_the_output_error_is_least() -> None:
     assert fit is not None
 
     def residual(x: Vector) -> Vector:
-        a, b, d = Continuous(a=x[:1], b=x[1:2], delay=x[2]).sampled(TS)
+        a, b, d = Continuous(a=x[:1], b=x[1:2], delay=x[2]).discretize(TS)
         free = x[3] * np.exp(-x[0] * TS * np.arange(1500))
         return y - free - lfilter(np.concatenate([np.zeros(1 + d), b]), np.concatenate([[1.0], a]), u)
 

@@ -105,7 +105,7 @@ def test_hints_are_learnt_by_their_weight() -> None:
     hints = hints.with_channels(pitch=2.0 * hints.channels["pitch"], roll=2.0 * hints.channels["roll"])
     found = []
     for prior in (0.0, 1.0):
-        problem = _Problem(recording, hints, drive, PAPER_EQ21, hints, prior, paced=True)
+        problem = _Problem(recording, hints, drive, PAPER_EQ21, hints, prior, has_time_constant=True)
         found.append([axis["fit"] for axis in settings._train(problem, silent)[0]])
     # Half of it is missed without them.
     assert max(found[0]) < 60.0
@@ -115,7 +115,7 @@ def test_hints_are_learnt_by_their_weight() -> None:
 def test_a_prior_leaves_the_scales_of_the_record_and_weighs_its_own_rows_alone() -> None:
     recording = short_neck()
     drive = fit_loaded_drive(recording)
-    plain = _Problem(recording, recording, drive, PAPER_EQ21, None, 0.1, paced=True)
+    plain = _Problem(recording, recording, drive, PAPER_EQ21, None, 0.1, has_time_constant=True)
     own, *scales = plain.training(0)
     both, *same = replace(plain, hints=_hints(recording, drive)).training(0)
     rows = own.target.size

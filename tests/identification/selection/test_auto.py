@@ -235,7 +235,7 @@ def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypa
     monkeypatch.setattr(_auto, "fitted_base", lambda *_: base)
     # Not its own: to compile each combination of kinds takes half a minute.
     monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
-    monkeypatch.setattr(_guarded, "grounded", lambda model, _: model)
+    monkeypatch.setattr(_guarded, "with_validity_region", lambda model, _: model)
     model = race.guarded(best, silent).model
     assert model is not None
     held = members(model.arrays)

@@ -7,7 +7,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.identification import INFINITE, Model, Play, validate
-from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_echo, fit_loaded_drive
+from softneck.identification.models._drive import FUNCTIONS, NO_LOAD, LoadedDrive, fit_loaded_drive, fit_noise_model
 from softneck.identification.structured._play import Data, PlayStructure, ridge, scores
 from softneck.runtime import load_functions
 from softneck.signals import Recording, redefinition_matrix
@@ -85,11 +85,11 @@ def test_the_echo_finds_an_autoregression_and_is_always_stable() -> None:
     for k in range(2, e.size):
         e[k] = 1.2 * e[k - 1] - 0.4 * e[k - 2] + rng.standard_normal()
     # Standard error of an AR coefficient at 20,000 samples: below 0.007; five of those.
-    np.testing.assert_allclose(fit_echo([e], 2), [1.2, -0.4], rtol=0, atol=0.035)
+    np.testing.assert_allclose(fit_noise_model([e], 2), [1.2, -0.4], rtol=0, atol=0.035)
     holes = np.where(rng.random(300) < 0.4, np.nan, np.linspace(0, 1, 300) ** 3)
-    c = fit_echo([holes, np.full(50, np.nan)], 6)
+    c = fit_noise_model([holes, np.full(50, np.nan)], 6)
     assert np.abs(np.roots(np.concatenate([[1.0], -c]))).max() < 1.0
-    np.testing.assert_array_equal(fit_echo([np.zeros(100)], 3), np.zeros(3))
+    np.testing.assert_array_equal(fit_noise_model([np.zeros(100)], 3), np.zeros(3))
 
 
 def test_an_echo_for_larger_errors_follows_them_more_closely_and_is_as_stable() -> None:
@@ -98,7 +98,7 @@ def test_an_echo_for_larger_errors_follows_them_more_closely_and_is_as_stable() 
     for k in range(2, smooth.size):
         smooth[k] = 1.8 * smooth[k - 1] - 0.81 * smooth[k - 2] + 0.05 * rng.standard_normal()
     noise = rng.standard_normal(smooth.size)
-    plain, bold = (fit_echo([smooth + noise], 8, beyond=factor) for factor in (1.0, 3.0))
+    plain, bold = (fit_noise_model([smooth + noise], 8, beyond=factor) for factor in (1.0, 3.0))
 
     def left(c: np.ndarray, size: float) -> float:
         e = size * smooth + noise
@@ -108,7 +108,7 @@ def test_an_echo_for_larger_errors_follows_them_more_closely_and_is_as_stable() 
     assert left(plain, 1.0) < left(bold, 1.0)
     assert left(bold, 3.0) < left(plain, 3.0)
     # It is the echo that larger errors would have given, but for the noise's estimate from three lags.
-    assert left(bold, 3.0) < 1.05 * left(fit_echo([3.0 * smooth + noise], 8), 3.0)
+    assert left(bold, 3.0) < 1.05 * left(fit_noise_model([3.0 * smooth + noise], 8), 3.0)
     assert np.abs(np.roots(np.concatenate([[1.0], -bold]))).max() < 1.0
 
 
