@@ -20,7 +20,7 @@ from softneck.core import Vector
 from softneck.identification import OutputError, Rls, validate
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
-from softneck.signals.importing._clocks import filled
+from softneck.signals.importing._clocks import fill_gaps
 from softneck.signals.recording._resampling import Samples, find_gaps, split_at_gaps
 
 HOLES = (1.02, 1.05, 1.1, 1.15, 1.2, 1.3, 1.5)
@@ -89,7 +89,7 @@ def models(seeds: int) -> None:
             there = np.ones(len(whole), dtype=bool)
             there[np.random.default_rng(seed).choice(np.arange(1, len(whole) - 1), len(whole) // rows)] = False
             logged = Samples(whole.time, whole.run, whole.channels).rows(there)
-            for found in (filled(logged, whole.robot, always=True)[0], split_at_gaps(logged)[0]):
+            for found in (fill_gaps(logged, whole.robot, always=True)[0], split_at_gaps(logged)[0]):
                 known = Recording(found.time, whole.sample_time, found.channels, found.run, whole.robot)
                 for kind in (OutputError, Rls):
                     judged = validate(kind().fit(known), other, horizons=("inf",)).fits["inf"]

@@ -38,9 +38,9 @@ def settle(guess: Guess, log: Path, proposal: Path) -> Guess:
             click.echo(str(doubt), err=True)
             kind = click.Choice([doubt.taken, *doubt.choices])
             said = click.prompt(doubt.about, default=doubt.taken, type=kind, err=True)
-            guess = guess.settled(doubt, None if said == doubt.taken else said)
+            guess = guess.settle_doubt(doubt, None if said == doubt.taken else said)
         elif click.confirm(f"{doubt}. Is that right?", default=True, err=True):
-            guess = guess.settled(doubt)
+            guess = guess.settle_doubt(doubt)
         else:
             raise DataError(
                 f"{log}: {doubt.about}: {doubt.taken} was said to be wrong. Write the right columns into a layout "

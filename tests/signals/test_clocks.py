@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError
 from softneck.signals import guess_layout, import_log
-from softneck.signals.importing._clocks import integrated, merged, turns
+from softneck.signals.importing._clocks import axis_rotations, integrate_rates, merge_clocks
 from softneck.signals.importing._guess_units import judge
 from softneck.signals.importing._layout import Source, Term
-from softneck.signals.importing.formats._dates import is_date, seconds
 from softneck.signals.importing.formats._mat import mat_arrays
+from softneck.signals.importing.formats._text import is_date, seconds
 from softneck.signals.recording._resampling import Samples, find_gaps
 
 from ..data import neck_recording
@@ -31,7 +31,7 @@ def test_messages_of_several_clocks_meet_at_the_rows_of_the_outputs() -> None:
               "motor_position_1": np.delete(0.03 * np.arange(41), slice(10, 16)) + 0.001}  # fmt: skip
     time = np.unique(np.concatenate(list(clocks.values())))
     channels = {name: np.where(np.isin(time, t), np.round(3.0 * time, 12), np.nan) for name, t in clocks.items()}
-    found, note = merged(Samples(time, np.zeros(time.size, dtype=int), channels), ("pitch", "roll"))
+    found, note = merge_clocks(Samples(time, np.zeros(time.size, dtype=int), channels), ("pitch", "roll"))
     assert "59 of" in note  # the first angle comes before the first set-point
     np.testing.assert_array_equal(found.time, clocks["pitch"][1:])
     last = np.searchsorted(clocks["motor_setpoint_1"], found.time, side="right") - 1
@@ -45,10 +45,12 @@ def test_messages_of_several_clocks_meet_at_the_rows_of_the_outputs() -> None:
 def test_a_channel_that_was_never_told_cannot_be_merged() -> None:
     time = np.arange(5.0)
     with pytest.raises(DataError, match="`motor_setpoint_1` holds no number in any row"):
-        merged(Samples(time, np.zeros(5, dtype=int), {"pitch": time, "motor_setpoint_1": time * np.nan}), ("pitch",))
+        merge_clocks(
+            Samples(time, np.zeros(5, dtype=int), {"pitch": time, "motor_setpoint_1": time * np.nan}), ("pitch",)
+        )
     late = {"pitch": np.array([1, 1, np.nan]), "motor_setpoint_1": np.array([np.nan, np.nan, 1])}
     with pytest.raises(DataError, match="no row has both an output and all set-points before it"):
-        merged(Samples(np.arange(3.0), np.zeros(3, dtype=int), late), ("pitch",))
+        merge_clocks(Samples(np.arange(3.0), np.zeros(3, dtype=int), late), ("pitch",))
 
 
 @given(rates=st.lists(st.floats(-5.0, 5.0), min_size=4, max_size=12), missed=st.integers(1, 2))
@@ -59,7 +61,7 @@ def test_rates_on_straight_lines_sum_up_exactly_and_each_run_begins_at_zero(rate
     there[missed] = np.nan  # lies on the line between its neighbours
     run = np.repeat([0, 1], len(rates))
     samples = Samples(np.tile(time, 2), run, {"motor_setpoint_1": np.tile(there, 2)})
-    found, _ = integrated(samples, {"motor_setpoint_1": Source((Term("v"),), "rad/s", integrate=True)})
+    found, _ = integrate_rates(samples, {"motor_setpoint_1": Source((Term("v"),), "rad/s", integrate=True)})
     exact = rates[0] * (time - time[0]) + rates[1] * (time**2 - time[0] ** 2) / 2.0
     # Trapezoids are exact on lines: what is left is the rounding of a dozen sums.
     np.testing.assert_allclose(found.channels["motor_setpoint_1"], np.tile(exact, 2), rtol=0, atol=1e-13)
@@ -101,10 +103,10 @@ def test_dates_in_german_with_a_comma_before_the_milliseconds(tmp_path: Path) ->
 def test_what_is_no_quaternion_is_refused_and_zeros_are_missed() -> None:
     sound = np.array([from_angles(0.1, -0.2)] * 4)
     sound[2] = 0.0
-    np.testing.assert_allclose(turns(sound)["y"], [0.1, 0.1, np.nan, 0.1], rtol=1e-14)
-    np.testing.assert_allclose(turns(sound)["x"], [-0.2, -0.2, np.nan, -0.2], rtol=1e-14)
-    with pytest.raises(DataError, match="have length 2 and not 1: they are something else"):
-        turns(np.ones((5, 4)))
+    np.testing.assert_allclose(axis_rotations(sound)["y"], [0.1, 0.1, np.nan, 0.1], rtol=1e-14)
+    np.testing.assert_allclose(axis_rotations(sound)["x"], [-0.2, -0.2, np.nan, -0.2], rtol=1e-14)
+    with pytest.raises(DataError, match="have length 2, not 1: they are no unit quaternion"):
+        axis_rotations(np.ones((5, 4)))
 
 
 def test_references_in_a_circle_end(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from softneck.core import DataError, FileFormatError, SettingsError
 from softneck.signals import Guess, guess_layout, import_log, parse_layout
-from softneck.signals.importing._doubts import percent
+from softneck.signals.importing._guess import percent
 from softneck.signals.importing._guess_units import UNITS, judge
 from softneck.signals.importing._layout import doubts_in
 
@@ -54,13 +54,13 @@ def test_what_could_be_either_is_doubted_and_can_be_settled(tmp_path: Path) -> N
     assert doubt.about == "unit of motor set-points and positions"
     assert doubt.confidence < 0.9
     assert f"NOT SURE ({100 * doubt.confidence:.0f} %)" in guess.text
-    other = guess.settled(doubt, doubt.choices[0])
+    other = guess.settle_doubt(doubt, doubt.choices[0])
     assert other.doubts == ()
     assert {other.layout.channels[name].unit for name in doubt.channels} == set(doubt.choices)
     assert parse_layout(other.text) == other.layout
     assert "NOT SURE" not in other.text
     with pytest.raises(SettingsError, match=r"unit of motor .*: `turns` is none of"):
-        guess.settled(doubt, "turns")
+        guess.settle_doubt(doubt, "turns")
 
 
 def test_the_title_of_one_settles_the_unit_of_both(tmp_path: Path) -> None:
@@ -129,8 +129,8 @@ def test_a_wrong_sign_is_turned_round_doubted_and_can_be_taken_as_logged(tmp_pat
     assert 0.5 < doubt.confidence < 0.9, "the likelier answer is taken, and asked about"
     assert guess.layout.channels["roll"].sign == -1.0
     assert guess.layout == parse_layout(guess.text)
-    assert guess.settled(doubt, "as logged").layout == right.layout
-    assert guess.settled(doubt).layout == guess.layout
+    assert guess.settle_doubt(doubt, "as logged").layout == right.layout
+    assert guess.settle_doubt(doubt).layout == guess.layout
 
 
 def test_a_log_without_a_clock_takes_the_sample_time_that_is_answered(tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_a_layout_file_tells_its_doubts_until_they_are_settled(tmp_path: Path) -
           ("setpoint", "position")),
     ]  # fmt: skip
     for doubt in guess.doubts:
-        guess = guess.settled(doubt)
+        guess = guess.settle_doubt(doubt)
     layout.write_text(guess.text)
     assert doubts_in(layout) == ()
     layout.write_bytes(b"\xff\xfe\x00")

@@ -46,7 +46,7 @@ def test_velocities_become_inputs_and_it_is_said(logs: Path) -> None:
     done = import_log(logs / "pid_200.csv", guess.layout)
     # Time in ms, 16 to 21 of them: resampled at the mean, 20.05.
     assert done.recording.sample_time == pytest.approx(0.02005, abs=5e-5)
-    assert any("summed up from rates" in note for note in done.notes)
+    assert any("integrated from rates" in note for note in done.notes)
     assert any("uneven" in note for note in done.notes)
     # Rectangles over the raw rows: half a step of the first move apart from trapezoids, 5 % of the whole.
     t, v = np.loadtxt(logs / "pid_200.csv", delimiter=",", skiprows=1, usecols=(0, 5), unpack=True)

@@ -158,7 +158,7 @@ def test_velocities_are_summed_up_where_nothing_else_moves_the_motors(tmp_path: 
     largest = np.abs(np.diff(r.motor_positions, axis=0)).max()
     expected = r.motor_positions - r.motor_positions[0]
     assert np.abs(done.recording.set_points - expected).max() < largest
-    assert any("summed up from rates" in note for note in done.notes)
+    assert any("integrated from rates" in note for note in done.notes)
 
 
 @pytest.mark.parametrize(("axis", "weights"), [("pitch", [1.0, -0.5, -0.5]), ("roll", [0.0, 0.866, -0.866])])

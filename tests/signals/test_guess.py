@@ -22,7 +22,7 @@ from softneck.signals import (
     parse_layout,
     read_layout,
 )
-from softneck.signals.importing._column_shapes import answers, lagged, rates
+from softneck.signals.importing._guess_shapes import find_outputs, find_rates, max_correlation
 from softneck.signals.importing._layout import Source, Term
 from softneck.signals.recording._channels import MOTOR_POSITIONS, known_channels, si_unit
 from softneck.signals.recording._redefinition import redefine
@@ -361,8 +361,8 @@ def test_what_leads_the_motors_is_no_angle_however_alike() -> None:
     # The angle is noisy, so that the command, 3 samples ahead, is more alike.
     noisy = np.roll(theta, 5) + theta.std() * rng.standard_normal(theta.size)
     columns: dict[str | int, np.ndarray] = {0: np.roll(theta, -3), 1: noisy, 2: np.roll(phi, 5)}
-    assert lagged(theta, columns[0], 25)[0] > lagged(theta, columns[1], 25)[0] + 0.1
-    found = answers(columns, x, list(columns))
+    assert max_correlation(theta, columns[0], 25)[0] > max_correlation(theta, columns[1], 25)[0] + 0.1
+    found = find_outputs(columns, x, list(columns))
     assert {axis: column for axis, (column, _) in found.items()} == {"pitch": 1, "roll": 2}
 
 
@@ -374,6 +374,6 @@ def test_a_motor_that_stands_still_hides_no_rates() -> None:
     v = np.gradient(x, TS, axis=0)
     v[:, 2] = 1e-3 * np.random.default_rng(1).standard_normal(len(x))
     columns: dict[str | int, np.ndarray] = dict(zip(range(6), np.column_stack([x, v]).T, strict=True))
-    found = rates(columns, np.zeros(len(x), dtype=np.int64))
+    found = find_rates(columns, np.zeros(len(x), dtype=np.int64))
     assert found is not None
     assert found[:2] == ((0, 1, 2), (3, 4, 5))

@@ -1,4 +1,4 @@
-"""Times of a log: seconds or dates, sums of columns, rows of several clocks, and rates summed up to positions."""
+"""Times of a log: seconds or dates, rows of several clocks, dropped rows, and rates integrated to positions."""
 
 from __future__ import annotations
 
@@ -15,25 +15,30 @@ from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, is_held, ma
 from ..recording._files import numbers
 from ..recording._resampling import Samples, find_gaps
 from ._layout import Layout, Source
-from .formats._dates import DATE, EPOCH, seconds
+from .formats._text import DATE, EPOCH, seconds
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from softneck.robot import Robot
 
-# Differences over this many samples, averaged over as many, drown quantisation, the drive's noise and the rule by which
-# rates were made of positions (a difference to the next row, the last, or both), and still see every move.
-_WINDOW = 20
-# Below it position and velocity do not tell of the same motion (another motor, a command, a wrong sign).
-_AGREE = 0.9
-# Estimates of one log differ by a few % between motors; a nominal time further off is wrong.
-_FITS = 0.03
+# Differences over this many samples, averaged over as many, suppress quantisation, the drive's noise and the difference
+# scheme of the rates (forward, backward or central), and keep every move.
+_WINDOW_ROWS = 20
+# Smallest correlation of a position and its rate; below it they belong to different motions or have a wrong sign.
+_MIN_CORRELATION = 0.9
+# Estimates of one log differ by a few % between motors; this is the tolerance for a nominal time.
+_TOLERANCE_RATIO = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class SampleTime:
-    """An estimate [s]: the median over motors, and the smallest and largest of them."""
+    """An estimated sample time [s]: the median over motors, and the smallest and largest.
+
+    Attributes:
+        value, lowest, highest: [s].
+        motors: number of motors that agree.
+    """
 
     value: float
     lowest: float
@@ -42,28 +47,27 @@ class SampleTime:
 
     def contradicts(self, nominal: float) -> bool:
         """Return whether `nominal` [s] lies outside the motors' values and their usual scatter."""
-        return not self.lowest * (1 - _FITS) <= nominal <= self.highest * (1 + _FITS)
+        return not self.lowest * (1 - _TOLERANCE_RATIO) <= nominal <= self.highest * (1 + _TOLERANCE_RATIO)
 
     def __str__(self) -> str:
         return f"{1e3 * self.value:.3g} ms ({1e3 * self.lowest:.3g} to {1e3 * self.highest:.3g}, {self.motors} motors)"
 
 
 def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> SampleTime:
-    """Return the period T for which `x(k+n) - x(k) = T sum v` holds best within each run, both averaged over n rows.
+    """Return the period T for which `x(k+n) - x(k) = T sum v` fits best within each run, both averaged over n rows.
 
-    Rates that are differences lack what is faster than their step, so neither side may hold it. Both sides carry
-    noise, so T is the ratio of their lengths (the geometric mean of the two regressions).
-
+    Rates that are differences lack motion faster than their step, so both sides are averaged. Both carry noise, so T is
+    the ratio of their lengths (the geometric mean of the two regressions).
     Args:
         channels: with motor_position_j [rad] and motor_velocity_j [rad/s], each (time,).
-        run: (time,) numbers of the runs.
+        run: (time,) run numbers.
     """
     periods = []
     for position, speed in zip(MOTOR_POSITIONS, MOTOR_VELOCITIES, strict=True):
         x, v = channels.get(position), channels.get(speed)
         if x is not None and v is not None:
             period, correlation = velocity_period(x, v, run)
-            if correlation > _AGREE:
+            if correlation > _MIN_CORRELATION:
                 periods.append(period)
     if not periods:
         raise DataError(
@@ -74,10 +78,10 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
 
 
 def velocity_period(x: Vector, v: Vector, run: np.ndarray) -> tuple[float, float]:
-    """Return the period [s] at which v is the rate of x, and the correlation of both motions; 0, 0 without motion."""
+    """Return the period [s] at which v is the rate of x, and their correlation; 0, 0 without motion."""
     moved, sums = [], []
     for border in np.split(np.arange(x.size), np.flatnonzero(np.diff(run)) + 1):
-        if border.size > 2 * _WINDOW:
+        if border.size > 2 * _WINDOW_ROWS:
             position, velocity = x[border], v[border]
             total = np.concatenate([[0.0], np.cumsum((velocity[1:] + velocity[:-1]) / 2)])
             moved.append(_mean_move(position))
@@ -92,18 +96,18 @@ def velocity_period(x: Vector, v: Vector, run: np.ndarray) -> tuple[float, float
 
 def _mean_move(x: Vector) -> Vector:
     """Return the differences over a window, averaged over the next one."""
-    return np.convolve(x[_WINDOW:] - x[:-_WINDOW], np.full(_WINDOW, 1.0 / _WINDOW), "valid")
+    return np.convolve(x[_WINDOW_ROWS:] - x[:-_WINDOW_ROWS], np.full(_WINDOW_ROWS, 1.0 / _WINDOW_ROWS), "valid")
 
 
-# Measured values between two messages further apart than this many usual ones are missed, not interpolated.
-_FAR = 2.5
-# Gaps of up to 3 rows (60 ms at 20 ms, less than the dead time of a neck), 10 of them at least, nearly all gaps of the
-# log, and pieces of 3 s at 20 ms or less on average: a hold-out of them is a second.
-_FEW, _OFTEN, _NEARLY_ALL, _PIECE, _WHOLE = 3, 10, 0.9, 150, 0.2
+# Values between two messages further apart than this many median steps are missed, not interpolated.
+_MAX_MESSAGE_GAP = 2.5
+# Fill gaps of up to 3 rows (60 ms at 20 ms, less than the dead time of a neck), if there are at least 10, nearly all
+# gaps of the log are as short, and pieces between them last at most 3 s at 20 ms: their hold-out would be a second.
+_MAX_GAP_ROWS, _MIN_GAPS, _MIN_GAP_SHARE, _MAX_PIECE_ROWS, _WHOLE_TOLERANCE = 3, 10, 0.9, 150, 0.2
 
 
-def time_of(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple[str, ...]]:
-    """Return (time,) [s] of a time's source, and what was done; times since 1970 count from the first."""
+def read_times(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple[str, ...]]:
+    """Return (time,) [s] of a time's source, and a note; times since 1970 count from the first row."""
     if source.unit == DATE:
         column, name = columns[0], str(source.terms[0].column)
         return seconds(column, name), (f"time counts from the first date, {column.iloc[0]}",) if len(column) else ()
@@ -113,7 +117,7 @@ def time_of(columns: Sequence[pd.Series], source: Source) -> tuple[Vector, tuple
         values = numbers(column, str(term.column), missing=False)
         scale = source.sign * factor * term.factor
         if values.size and abs(scale * values[0]) > EPOCH:
-            # Subtracted before it is scaled: whole numbers of nanoseconds lose nothing.
+            # Subtract before scaling, so that whole numbers of nanoseconds stay exact.
             start = scale * float(values[0])
             values = values - values[0]
         total = total + scale * values
@@ -127,11 +131,11 @@ def _moment(since_1970: float) -> str:
         return f"{since_1970:.10g} s"
 
 
-def merged(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
-    """Return rows where an output was measured, of rows that are messages of several clocks, and a note.
+def merge_clocks(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
+    """Return one row for each output sample of rows that are messages of several clocks, and a note.
 
-    Set-points and flags keep the last value before; other channels are interpolated linearly between their neighbours,
-    and are missed where those are far apart. Rows before the first set-point are left out.
+    Set-points and flags hold their last value; other channels are interpolated linearly, but not across long gaps. Rows
+    before the first set-point are dropped.
     """
     told = {name: np.isfinite(values) for name, values in samples.channels.items()}
     silent = [name for name, there in told.items() if not there.any()]
@@ -156,13 +160,13 @@ def merged(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str]:
 
 
 def last_values(values: Vector) -> Vector:
-    """Return each value until the next one; NaN before the first."""
+    """Hold each value until the next one; NaN before the first."""
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(values.size), -1))
     return np.where(last >= 0, values[last], np.nan)
 
 
 def _between(time: Vector, values: Vector) -> Vector:
-    """Return values at all times, on straight lines between those that are there."""
+    """Interpolate values linearly at all times, except across long gaps."""
     seen = np.isfinite(values)
     if seen.sum() < 2:
         return values
@@ -170,16 +174,16 @@ def _between(time: Vector, values: Vector) -> Vector:
     step = np.diff(t)
     usual = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     after = np.clip(np.searchsorted(t, time), 1, t.size - 1)
-    far = (t[after] - t[after - 1] > _FAR * usual) | (time < t[0]) | (time > t[-1])
+    far = (t[after] - t[after - 1] > _MAX_MESSAGE_GAP * usual) | (time < t[0]) | (time > t[-1])
     return np.where(seen, values, np.where(far, np.nan, np.interp(time, t, x)))
 
 
-def filled(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Samples, tuple[str, ...]]:
-    """Return the samples with rows that a logger dropped again and again as missed samples, and a note.
+def fill_gaps(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Samples, tuple[str, ...]]:
+    """Insert rows that a logger dropped repeatedly as missed samples, and return a note.
 
-    A gap splits a run, since nobody knows what was asked in it. Where a row or a few are lost so often that the pieces
-    would be too short to judge a model by, set-points and flags hold their last value there instead; `always`: wherever
-    they are lost (benchmarks/clock_gaps.py --models).
+    A gap splits a run, since its set-points are unknown. If short gaps are so frequent that the pieces would be too
+    short to judge a model, set-points and flags hold their last value in them instead. `always` fills all short gaps
+    (benchmarks/clock_gaps.py --models).
     """
     step, inside = np.diff(samples.time), np.diff(samples.run) == 0
     steps = step[inside & (step > 0)]
@@ -187,9 +191,10 @@ def filled(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Sam
         return samples, ()
     usual = step / float(np.median(steps))
     gap, lost = find_gaps(samples)[0], np.rint(np.clip(usual, 1.0, 1e3)).astype(np.int64) - 1
-    # A clock that jitters loses nothing: its long steps are no whole numbers of usual ones.
-    few = gap & (lost >= 1) & (lost <= _FEW) & (np.abs(usual - lost - 1) < _WHOLE)
-    seldom = few.sum() < _OFTEN or few.sum() < _NEARLY_ALL * gap.sum() or samples.time.size > _PIECE * few.sum()
+    # A clock that jitters loses no rows: its long steps are no whole multiples of the median.
+    few = gap & (lost >= 1) & (lost <= _MAX_GAP_ROWS) & (np.abs(usual - lost - 1) < _WHOLE_TOLERANCE)
+    count = few.sum()
+    seldom = count < max(_MIN_GAPS, _MIN_GAP_SHARE * gap.sum()) or samples.time.size > _MAX_PIECE_ROWS * count
     if not few.any() or (seldom and not always):
         return samples, ()
     before = np.repeat(np.flatnonzero(few), lost[few])
@@ -204,16 +209,16 @@ def filled(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Sam
         channels[name] = np.insert(values, before + 1, missed)
     time = np.insert(samples.time, before + 1, samples.time[before] + part * step[before])
     note = (
-        f"{before.size} row(s) that were not logged, in {few.sum()} gaps of {_FEW} or fewer, are missed samples, in "
-        "which set-points hold"
+        f"{before.size} row(s) that were not logged, in {few.sum()} gaps of {_MAX_GAP_ROWS} or fewer, are missed "
+        "samples, in which set-points hold"
     )
     return Samples(time, np.insert(samples.run, before + 1, samples.run[before]), channels), (note,)
 
 
-def integrated(samples: Samples, sources: Mapping[str, Source]) -> tuple[Samples, tuple[str, ...]]:
-    """Return the samples with the integrals over time of the channels whose source says so, and a note.
+def integrate_rates(samples: Samples, sources: Mapping[str, Source]) -> tuple[Samples, tuple[str, ...]]:
+    """Integrate the channels whose source is a rate, and return a note.
 
-    Rates are summed by trapezoids at the times as logged, from 0 in each run; a missed one lies between its neighbours.
+    Rates are integrated by trapezoids at the logged times, from 0 in each run; missed samples are interpolated.
     """
     names = [name for name, source in sources.items() if source.integrate and name in samples.channels]
     if not names:
@@ -226,12 +231,12 @@ def integrated(samples: Samples, sources: Mapping[str, Source]) -> tuple[Samples
             seen = np.isfinite(v)
             v = np.interp(t, t[seen], v[seen]) if seen.any() else np.zeros(v.size)
             channels[name][rows] = np.concatenate([[0.0], np.cumsum(np.diff(t) * (v[1:] + v[:-1]) / 2.0)])
-    note = f"{', '.join(names)}: summed up from rates, from 0 at the start of each run; what drifts is not seen"
+    note = f"{', '.join(names)}: integrated from rates, from 0 at the start of each run; drift remains"
     return Samples(samples.time, samples.run, channels), (note,)
 
 
-def clocked(layout: Layout, name: str) -> bool:
-    """Return whether a channel may lack numbers where rows are messages of several clocks, or rates that are summed."""
+def may_be_empty(layout: Layout, name: str) -> bool:
+    """Return whether a channel may have empty cells: rows are messages of several clocks, or it is integrated."""
     source = layout.channels.get(name)
     return layout.merge or (source is not None and source.integrate)
 
@@ -248,18 +253,18 @@ def pitch_roll(inclination: Vector, orientation: Vector) -> tuple[Vector, Vector
     return pitch, roll
 
 
-def turns(quaternion: Matrix) -> dict[str, Vector]:
-    """Return the turns [rad] about the axes `x` and `y` of a sensor, and `-x`, `-y`, of (time, 4) w, x, y, z.
+def axis_rotations(quaternion: Matrix) -> dict[str, Vector]:
+    """Return the rotations [rad] about the sensor's axes `x`, `-x`, `y`, `-y` from (time, 4) w, x, y, z.
 
-    They are the first two of yaw, pitch and roll in this order (z, y', x''), which ROS and aviation use:
-    `x = atan2(2 (w x + y z), 1 - 2 (x^2 + y^2))`, `y = asin(2 (w y - z x))` (Diebel 2006, sec. 8.11). A row without
-    numbers is a missed sample, and so is one of zeros.
+    These are roll and pitch of yaw-pitch-roll Euler angles (z, y', x''), as in ROS and aviation:
+    `x = atan2(2 (w x + y z), 1 - 2 (x^2 + y^2))`, `y = asin(2 (w y - z x))` (Diebel 2006, sec. 8.11). A row of zeros or
+    without numbers is a missed sample.
     """
     length = np.sqrt((quaternion * quaternion).sum(axis=1))
     sound = np.abs(length - 1.0) < 0.1
     if (~sound & np.isfinite(length) & (length > 0.0)).mean() > 0.5:
         middle = float(np.median(length[np.isfinite(length)]))
-        raise DataError(f"the columns of [quaternion] have length {middle:.3g} and not 1: they are something else.")
+        raise DataError(f"the columns of [quaternion] have length {middle:.3g}, not 1: they are no unit quaternion.")
     w, x, y, z = (quaternion / np.where(sound, length, np.nan)[:, None]).T
     about_x = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     about_y = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))

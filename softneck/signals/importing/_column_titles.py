@@ -1,4 +1,4 @@
-"""What a column's title says: the words loggers use, a motor's number, and a unit."""
+"""The meaning of a column's title: the words that loggers use, a motor's number, and a unit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import unicodedata
 from dataclasses import dataclass
 
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|°")
-# Without accents; what a language writes like English needs no line.
+# Words without accents; those spelled as in English are not listed.
 _GERMAN = {
     "zeit": "time", "zeitstempel": "timestamp", "uhrzeit": "time", "datum": "time", "soll": "setpoint",
     "sollwert": "setpoint", "vorgabe": "setpoint", "stellgrosse": "setpoint", "fuhrungsgrosse": "setpoint",
@@ -36,19 +36,19 @@ _PLURALS = {
     "commands": "command", "targets": "target", "motores": "motor", "posiciones": "position", "motoren": "motor",
 }  # fmt: skip
 _TRANSLATED = _GERMAN | _SPANISH | _PLURALS
-# Parts of German compounds, the longest first; `Sollposition` and `Nickwinkelgeschwindigkeit` are of such.
+# Parts of German compounds, longest first, for words such as `Sollposition` and `Nickwinkelgeschwindigkeit`.
 _PARTS = sorted((*_GERMAN, "position", "motor", "roll", "wert", "encoder"), key=len, reverse=True)
 _LINK = {"wert": "", "s": ""}
 
 
 def plain(text: str) -> str:
-    """Return a text in lower case without accents."""
+    """Return a text in lower case, without accents."""
     folded = unicodedata.normalize("NFKD", text.replace("ß", "ss"))
     return "".join(c for c in folded if not unicodedata.combining(c)).lower()
 
 
 def words_of(title: str) -> list[str]:
-    """Return the words and numbers of a title in English and in lower case."""
+    """Return the words and numbers of a title in English and lower case."""
     found: list[str] = []
     folded = unicodedata.normalize("NFKD", title.replace("ß", "ss").replace("µ", "u"))
     for word in _WORD.findall("".join(c for c in folded if not unicodedata.combining(c))):
@@ -57,7 +57,7 @@ def words_of(title: str) -> list[str]:
 
 
 def is_german(title: str) -> bool:
-    """Return whether a title holds a German word, in which `Grad` are degrees."""
+    """Return whether a title holds a German word; then `Grad` means degrees."""
     words = [part for word in _WORD.findall(plain(title)) for part in _split(word)]
     return any(word in _GERMAN for word in words)
 
@@ -69,7 +69,7 @@ def _parts(word: str) -> list[str]:
 
 
 def _split(word: str) -> list[str]:
-    """Return the parts of a compound; the word itself where it is none."""
+    """Return the parts of a compound, or the word itself."""
     rest, parts = word, []
     while rest:
         part = next((one for one in _PARTS if rest.startswith(one)), None)
@@ -92,25 +92,29 @@ _UNITS = {
     "microsegundos": "us", "nsec": "ns", "nanosec": "ns",
 }  # fmt: skip
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
-# `position[0]` of ROS and `u(:,1)` of MATLAB are numbers of a motor and not units.
+# `position[0]` of ROS and `u(:,1)` of MATLAB are motor numbers, not units.
 _INDEX = re.compile(r":?,?\s*\d+")
 
-_TIME = {"time", "t", "timestamp", "stamp", "ts", "seconds", "sec", "s", "ms", "millis", "milliseconds", "micros", "us",
-         "ns", "clock", "elapsed", "nanosec", "nsec", "segundos", "sekunden"}  # fmt: skip
-_RUN = {"run", "trial", "experiment", "segment", "repetition"}
-_COUNTER = {"index", "idx", "sample", "samples", "row", "k", "n", "count", "counter", "unnamed", "id"}
-_TARGET = ("target", "setpoint", "setpoints", "set", "sp", "reference", "ref", "command", "commanded", "cmd", "desired",
-           "des", "goal", "demand", "control", "input", "u", "cs")  # fmt: skip
-_POSITION = {"encoder", "enc", "position", "pos", "angle", "measured", "actual", "q"}
-_VELOCITY = {"velocity", "vel", "speed", "rpm", "omega", "dq", "rate"}
-_MOTOR = {"motor", "mot", "m", "winch", "tendon", "drive", "axis", "joint", "servo", "actuator", "p"}
+_TIME_WORDS = {
+    "time", "t", "timestamp", "stamp", "ts", "seconds", "sec", "s", "ms", "millis", "milliseconds", "micros", "us",
+    "ns", "clock", "elapsed", "nanosec", "nsec", "segundos", "sekunden",
+}  # fmt: skip
+_RUN_WORDS = {"run", "trial", "experiment", "segment", "repetition"}
+_COUNTER_WORDS = {"index", "idx", "sample", "samples", "row", "k", "n", "count", "counter", "unnamed", "id"}
+_TARGET_WORDS = (
+    "target", "setpoint", "setpoints", "set", "sp", "reference", "ref", "command", "commanded", "cmd", "desired", "des",
+    "goal", "demand", "control", "input", "u", "cs",
+)  # fmt: skip
+_POSITION_WORDS = {"encoder", "enc", "position", "pos", "angle", "measured", "actual", "q"}
+_VELOCITY_WORDS = {"velocity", "vel", "speed", "rpm", "omega", "dq", "rate"}
+_MOTOR_WORDS = {"motor", "mot", "m", "winch", "tendon", "drive", "axis", "joint", "servo", "actuator", "p"}
 _ANGLES = {"pitch": "pitch", "roll": "roll", "yaw": "yaw", "inclination": "inclination", "incl": "inclination",
            "tilt": "inclination", "orientation": "orientation", "orient": "orientation",
            "azimuth": "orientation"}  # fmt: skip
-#: Of a column whose title is empty, as pandas writes its index; its numbers say whether it does.
+#: Why a column with an empty title, as pandas writes its index, is ignored; its numbers confirm it.
 COUNTS_ROWS = "it counts the rows"
 _EULER = {"pitch", "roll", "yaw"}
-_SENSED = {"sensor", "measured", "imu", "actual", "meas"}
+_SENSED_WORDS = {"sensor", "measured", "imu", "actual", "meas"}
 _NOT_SENSED = (
     ({"error", "err", "ep", "ev", "deviation", "residual"}, "an error of a control loop, not a measurement"),
     ({"kinematics", "kinematic", "model", "simulated", "sim", "computed", "estimated"},
@@ -123,15 +127,15 @@ _NOT_SENSED = (
 
 @dataclass(frozen=True, slots=True)
 class Title:
-    """A title's meaning.
+    """The meaning of a title.
 
     Attributes:
         role: time, run, set-point, position, velocity, pitch, ..., ignored, or unknown.
-        family: its words without number and unit; motors' columns of one kind share it.
-        motor: the number in it, or None.
-        unit: in it, or None.
-        why: it was taken so.
-        rank: of the clue; smaller is clearer.
+        family: words without number and unit; columns of the motors share it.
+        motor: number in the title, or None.
+        unit: unit in the title, or None.
+        why: reason for the role.
+        rank: clarity of the reason; smaller is clearer.
     """
 
     role: str
@@ -143,7 +147,7 @@ class Title:
 
 
 def read_title(title: str) -> Title:
-    """Return what a column's title says."""
+    """Return the meaning of a column's title."""
     text, unit = _without_unit(title.strip())
     words = words_of(text)
     numbers = [int(word) for word in words if word.isdigit() and len(word) < 4]
@@ -172,38 +176,38 @@ def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
             return "ignored", f"'{' '.join(sorted(known & said))}' is {why}", 0
     if words[:1] == ["unnamed"]:
         return "ignored", COUNTS_ROWS, 0
-    # `tilt.pitch` of a topic is pitch.
+    # The title `tilt.pitch` of a topic means pitch.
     angle = next((word for word in (*(known & _EULER), *words) if word in _ANGLES), None)
-    target = next((word for word in _TARGET if word in known), None)
-    speed = known & _VELOCITY
+    target = next((word for word in _TARGET_WORDS if word in known), None)
+    speed = known & _VELOCITY_WORDS
     if angle is not None:
         return _angle_role(_ANGLES[angle], known, target, bool(speed))
     if motor is not None:
         if target is not None and speed:
             return "ignored", "it is a command of speed; set-points are positions", 0
         if target is not None:
-            return "set-point", f"'{target}' names what is asked of a motor", _TARGET.index(target)
+            return "set-point", f"'{target}' names a set-point of a motor", _TARGET_WORDS.index(target)
         if speed:
             return "velocity", f"'{min(speed)}' names a speed", 0
-        clues = [word for word in words if word in _POSITION] or [word for word in words if word in _MOTOR]
+        clues = [word for word in words if word in _POSITION_WORDS] or [word for word in words if word in _MOTOR_WORDS]
         if clues:
-            return "position", f"'{clues[0]}' names where a motor is", 0 if clues[0] in _POSITION else 1
-    elif known & _RUN:
+            return "position", f"'{clues[0]}' names a position of a motor", 0 if clues[0] in _POSITION_WORDS else 1
+    elif known & _RUN_WORDS:
         return "run", "it numbers the experiments", 0
-    elif known & _TIME:
-        return "time", f"'{next(word for word in words if word in _TIME)}' names time", len(words)
-    elif known & _COUNTER:
-        return "ignored", "it counts the rows by its name", 0
-    return "unknown", "softneck does not recognise its name", 0
+    elif known & _TIME_WORDS:
+        return "time", f"'{next(word for word in words if word in _TIME_WORDS)}' names time", len(words)
+    elif known & _COUNTER_WORDS:
+        return "ignored", "its name looks like a row counter", 0
+    return "unknown", "it is not recognised from its name", 0
 
 
 def _angle_role(angle: str, known: set[str], target: str | None, speed: bool) -> tuple[str, str, int]:
     if target is not None:
         if angle in ("pitch", "roll"):
-            return f"{angle}_reference", f"'{target}' names what is asked of the platform", 0
+            return f"{angle}_reference", f"'{target}' names a set-point of the platform", 0
         return "ignored", f"'{target}' is a target of the platform, not a measurement", 0
     if speed:
         if angle in ("pitch", "roll"):
             return f"{angle}_rate", f"it names the rate of {angle}", 0
         return "ignored", f"the rate of {angle} is not a channel of a recording", 0
-    return angle, f"it names the platform's {angle}", 0 if known & _SENSED else 1
+    return angle, f"it names the platform's {angle}", 0 if known & _SENSED_WORDS else 1

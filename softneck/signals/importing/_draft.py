@@ -1,8 +1,8 @@
-"""A layout in the making: which columns were taken for what, and why."""
+"""A layout under construction: the columns chosen for each channel, and why."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -11,24 +11,38 @@ from softneck.core import Matrix, Vector
 
 from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_channels
 from ._clocks import pitch_roll
-from ._column_shapes import shortened
 from ._column_titles import COUNTS_ROWS, Title, is_german, plain, read_title
 from ._layout import Column, Quaternion, Term
 from ._table_format import SniffResult
 
+# Enough rows for a decision, whatever the length of the log.
+_MAX_ROWS = 20_000
+
+
+def take_moving_rows(columns: Mapping[Column, Vector]) -> dict[Column, Vector]:
+    """Return the first rows of the columns that move; missed samples become the column's mean."""
+    found: dict[Column, Vector] = {}
+    for name, values in columns.items():
+        head = values[:_MAX_ROWS]
+        seen = np.isfinite(head)
+        # Sums of fourth powers of numbers beyond 1e60 would overflow.
+        if seen.any() and np.ptp(head[seen]) > 0 and np.abs(head[seen]).max() < 1e60:
+            found[name] = np.where(seen, head, head[seen].mean())
+    return found
+
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """Columns taken for one channel.
+    """The columns chosen for one channel.
 
     Attributes:
-        terms: whose sum it is.
-        why: it was taken.
-        unit: where the title names one.
+        terms: of a weighted sum of columns.
+        why: reason of the choice.
+        unit: named by the title, or None.
         sign: 1 or -1.
-        confidence: probability that they are it, as far as names and data tell.
-        unit_sure: whether the unit in the title has one meaning: `Grad` are degrees in German.
-        integrate: whether they are rates whose sum it is.
+        confidence: probability that the columns are right, by names and data.
+        unit_sure: whether the title's unit is unambiguous: `Grad` means degrees in German.
+        integrate: whether the columns are rates to integrate.
     """
 
     terms: tuple[Term, ...]
@@ -54,7 +68,7 @@ class Draft:
     passed_over: dict[Column, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.moving = shortened(self.sniffed.columns)
+        self.moving = take_moving_rows(self.sniffed.columns)
         units = self.sniffed.units
         self.titles = {
             name: read_title(f"{name} [{units[name]}]" if name in units else name)
@@ -62,7 +76,7 @@ class Draft:
             if isinstance(name, str)
         }
         for name, title in self.titles.items():
-            if title.why == COUNTS_ROWS and name in self.moving and not _counts(self.moving[name]):
+            if title.why == COUNTS_ROWS and name in self.moving and not (np.diff(self.moving[name]) == 1.0).all():
                 self.titles[name] = replace(title, role="unknown", why="it has no name")
 
     def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, confidence: float = 0.97) -> None:
@@ -72,63 +86,58 @@ class Draft:
         unit = title.unit if title else None
         self.picks[channel] = Pick((Term(column),), why, unit, sign, confidence, sure)
 
-    def used(self) -> set[Column]:
-        """Return all columns that were taken."""
+    def used_columns(self) -> set[Column]:
+        """Return all columns in use."""
         return {term.column for pick in self.picks.values() for term in pick.terms}
 
     def free(self) -> list[Column]:
-        """Return columns that move, were not taken, and whose names do not say that they are something else."""
-        used = self.used()
+        """Return moving columns that are not in use and may be motors or outputs by their names."""
+        used = self.used_columns()
         said = {name for name, title in self.titles.items() if title.role not in ("unknown", "position", "set-point")}
         return [name for name in self.moving if name not in used and name not in said and name not in self.passed_over]
 
     def order(self) -> None:
-        """Put the picks in the order in which a recording has its columns."""
+        """Sort the picks into the column order of a recording."""
         order = ("time", "run", *known_channels(), "inclination", "orientation")
         self.picks = {name: self.picks[name] for name in order if name in self.picks}
 
     def platform(self) -> dict[str, Vector]:
-        """Return the first rows of pitch and roll, from a tilt too, to a factor."""
+        """Return the first rows of pitch and roll, up to a factor; a tilt is converted."""
         there = [name for name in OUTPUTS if name in self.picks]
         if there:
             return {name: self.values(name) for name in there}
         if not self.has(("inclination", "orientation")):
             return {}
         turn = np.abs(self.values("orientation")).max(initial=0.0)
-        # A tilt is small or in degrees; which of both does not touch a correlation.
+        # Degrees or radians of a small tilt do not change a correlation.
         to_rad = np.pi / 180.0 if turn > 2.1 * np.pi else 1.0
         pitch, roll = pitch_roll(to_rad * self.values("inclination"), to_rad * self.values("orientation"))
         return {"pitch": pitch, "roll": roll}
 
     def has(self, channels: Sequence[str]) -> bool:
-        """Return whether all `channels` were found."""
+        """Return whether all `channels` have a pick."""
         return all(name in self.picks for name in channels)
 
     def values(self, channel: str) -> Vector:
-        """Return the first rows of a channel as logged, without its unit."""
+        """Return the first rows of a channel as logged, in the unit of the log."""
         pick = self.picks[channel]
         still = np.zeros(next(iter(self.moving.values())).size if self.moving else 0)
         return pick.sign * sum((t.factor * self.moving.get(t.column, still) for t in pick.terms), still)
 
     def motors(self) -> Matrix | None:
-        """Return the first rows of the positions, or else of the set-points, (time, 3) as logged."""
+        """Return the first rows of the positions, else of the set-points, (time, 3) as logged."""
         for names in (MOTOR_POSITIONS, SET_POINTS):
             if self.has(names):
                 return np.column_stack([self.values(name) for name in names])
         return None
 
     def runs(self) -> np.ndarray:
-        """Return the numbers of the runs of the first rows, by restarts of time."""
+        """Return run numbers of the first rows, from restarts of time."""
         rows = next(iter(self.moving.values())).size if self.moving else 0
         run = np.zeros(rows, dtype=np.int64)
         if "time" in self.picks and rows:
             run[1:] = np.cumsum(np.diff(self.values("time")) < 0)
         return run
-
-
-def _counts(values: Vector) -> bool:
-    """Return whether a column without a name is an index that a table was written with."""
-    return bool((np.diff(values) == 1.0).all())
 
 
 def say(column: Column) -> str:

@@ -1,55 +1,186 @@
-"""A layout proposed from a log: `softneck import --guess`."""
+"""A layout proposed from an unknown log: `softneck import --guess`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from softneck.core import DataError, ReprMixin
+from softneck.core import DataError, ReprMixin, SettingsError
 from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS
 from ..recording._redefinition import redefine
 from ..recording._resampling import jitter
 from ._clocks import SampleTime, estimate_sample_time
-from ._column_shapes import lagged
-from ._doubts import (
-    ONE_AXIS,
-    SURE,
-    Doubt,
-    doubts_of,
-    duplicates_doubt,
-    jitter_doubt,
-    one_axis_doubt,
-    percent,
-    settled,
-    sign_doubt,
-)
 from ._draft import Draft, say
-from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, stand_ins
-from ._guess_shapes import by_shapes
+from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, use_positions_as_inputs
+from ._guess_shapes import by_shapes, max_correlation
 from ._guess_units import Unit, nominal_step, units
-from ._layout import Column, Layout, Source, Term, layout_toml
+from ._layout import ONE_AXIS, Column, Layout, Source, Term, layout_toml
 from ._table_format import sniff
 
+#: Below this confidence a decision is asked about, or marked.
+SURE = 0.9
+_TILT = (*OUTPUTS, "inclination", "orientation", "pitch_reference", "roll_reference")
+_GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": MOTOR_VELOCITIES}
+_AS_LOGGED = "as logged"
+# However strong the correlation, a sign that contradicts the titles deserves a question.
+_MOST_SURE = 0.89
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """One uncertain decision.
+
+    Attributes:
+        about: subject, in words.
+        channels: of the recording.
+        taken: the choice made.
+        confidence: probability that it is right, 0 to 1.
+        why: its reason.
+        choices: alternatives for `settle_doubt`; without any, the columns have to be edited in the layout.
+    """
+
+    about: str
+    channels: tuple[str, ...]
+    taken: str
+    confidence: float
+    why: str
+    choices: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        """Return one line: the choice, its confidence and its reason."""
+        return f"{self.about}: {self.taken} ({percent(self.confidence)} sure): {self.why}"
+
+    def as_dict(self) -> dict[str, object]:
+        """Return the JSON values."""
+        return {**asdict(self), "confidence": round(self.confidence, 3)}
+
+
+def percent(confidence: float) -> str:
+    """Return a probability in %, without decimals."""
+    return f"{100.0 * confidence:.0f} %"
+
+
+def doubts_of(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
+    """Return the decisions on columns and units with less than 90 % confidence, the least certain first."""
+    doubts = [*_column_doubts(draft), *_unit_doubts(draft, found)]
+    if draft.quaternion is not None and draft.quaternion_sure < SURE:
+        q = draft.quaternion
+        taken = f"pitch about {q.pitch}, roll about {q.roll}"
+        doubts.append(Doubt("axes of the sensor", OUTPUTS, taken, draft.quaternion_sure, draft.quaternion_why))
+    return sorted(doubts, key=lambda doubt: doubt.confidence)
+
+
+def _column_doubts(draft: Draft) -> list[Doubt]:
+    doubts: list[Doubt] = []
+    taken: set[str] = set()
+    for about, channels in [*_GROUPS.items(), *((name, (name,)) for name in draft.picks)]:
+        names = tuple(name for name in channels if name in draft.picks and name not in taken)
+        taken |= set(names)
+        sure = min((draft.picks[name].confidence for name in names), default=1.0)
+        if sure < SURE:
+            columns = dict.fromkeys(term.column for name in names for term in draft.picks[name].terms)
+            doubts.append(Doubt(about, names, ", ".join(map(say, columns)), sure, draft.picks[names[0]].why))
+    return doubts
+
+
+def _unit_doubts(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
+    doubts: list[Doubt] = []
+    groups = {**_GROUPS, "angles of the platform": _TILT, "time": ("time",)}
+    motors = [found[name].name for name in (SET_POINTS[0], MOTOR_POSITIONS[0]) if name in draft.picks and name in found]
+    if len(motors) == 2 and motors[0] == motors[1]:
+        del groups["motor set-points"], groups["motor positions"]
+        groups = {"motor set-points and positions": (*SET_POINTS, *MOTOR_POSITIONS), **groups}
+    for about, channels in groups.items():
+        names = tuple(name for name in channels if name in draft.picks and name in found)
+        if not names or min(found[name].confidence for name in names) >= SURE:
+            continue
+        unit = min((found[name] for name in names), key=lambda one: one.confidence)
+        rate = "/s" if unit.name.endswith("/s") else ""
+        choices = ("s", "ms") if about == "time" else (f"rad{rate}", f"deg{rate}")
+        other = tuple(choice for choice in choices if choice != unit.name)
+        doubts.append(Doubt(f"unit of {about}", names, unit.name, unit.confidence, unit.why, other))
+    return doubts
+
+
+def sign_doubt(axis: str, name: str, r: float) -> Doubt:
+    """Return the doubt in the sign of an angle that was inverted because it falls while the motors' `name` rises."""
+    order = "; or motors 2 and 3 are swapped" if axis == "roll" else ""
+    why = f"as logged {axis} falls as {name} rises (correlation {r:.2f}), and recordings have both rise{order}"
+    return Doubt(f"sign of {axis}", (axis,), "turned round", min(_MOST_SURE, 0.5 - 0.5 * r), why, (_AS_LOGGED,))
+
+
+def duplicates_doubt(rows: int, first: int) -> Doubt:
+    """Return the doubt in rows with one time stamp."""
+    why = f"time stands still at {rows} row(s), first at row {first}"
+    return Doubt("rows of one time stamp", ("time",), "the first", 0.8, why, ("last",))
+
+
+def jitter_doubt(shortest: float, longest: float, usual: float) -> Doubt:
+    """Return the doubt in a clock that jitters: rows may be equidistant and their stamps [s] late."""
+    why = (
+        f"steps are {1e3 * shortest:.3g} to {1e3 * longest:.3g} ms, of all lengths between: the clock jitters and no "
+        f"gap is seen; if rows were taken evenly write `sample_time_s = {usual:.4g}` into [time]"
+    )
+    return Doubt("clock", ("time",), "rows as they are stamped, resampled", 0.8, why)
+
+
+def one_axis_doubt(axis: str) -> Doubt:
+    """Return the doubt in a log of one angle: a neck has two, so the other may be missing."""
+    other = "roll" if axis == "pitch" else "pitch"
+    why = (
+        f"no column is {other} or answers the motors like it, so the robot has one output; log {other} too if it tilts"
+    )
+    return Doubt(ONE_AXIS, (axis,), f"{axis} only", 0.8, why)
+
+
+def settle_doubt(layout: Layout, doubt: Doubt, choice: str) -> Layout:
+    """Return the layout with another choice for a doubt."""
+    if choice not in doubt.choices:
+        raise SettingsError(f"{doubt.about}: `{choice}` is none of {', '.join(doubt.choices) or 'no choices'}.")
+    if doubt.about == "rows of one time stamp":
+        return replace(layout, duplicates=choice)
+    if doubt.about.startswith("sign of"):
+        return _change_sources(layout, doubt.channels, sign=-1.0)
+    return _change_sources(layout, doubt.channels, unit=choice)
+
+
+def _change_sources(layout: Layout, channels: Sequence[str], *, unit: str | None = None, sign: float = 1.0) -> Layout:
+    """Return the layout with another unit or sign in some channels, the tilt or the time."""
+    sources = {name: source for name, source in layout.channels.items() if name in channels}
+    found = {n: replace(s, unit=unit or s.unit, sign=sign * s.sign) for n, s in sources.items()}
+    rest = {
+        name: replace(source, unit=unit, terms=source.terms if name != "time" else _without_factor(source.terms))
+        for name in ("inclination", "orientation", "time")
+        if unit is not None and name in channels and (source := getattr(layout, name)) is not None
+    }
+    return replace(layout, channels={**layout.channels, **found}, **rest)
+
+
+def _without_factor(terms: tuple) -> tuple:
+    """Return the terms of a time without the factor of another unit."""
+    return tuple(replace(term, factor=1.0) for term in terms) if len(terms) == 1 else terms
+
+
 _NO_CHANNELS = ("time", "run", "inclination", "orientation")
-# Half a second at 20 ms: the platform answers within it.
+# Longest lag of the platform behind its motors [samples]: half a second at 20 ms.
 _NECK_LAG = 25
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Guess(ReprMixin):
-    """A layout that was proposed for a log, with the reason for each line.
+    """A proposed layout, with the reason for each line.
 
     Attributes:
-        layout: as far as it goes.
-        text: the same as TOML, with a remark on each line and what is still open at its end.
-        lines: what was taken for what, and why; what was left out, and why; what is not sure.
-        missing: what a recording needs and was not found, each with its candidates and the layout's line for it.
-        doubts: what is less than 90 % sure, the least sure first.
+        layout: the layout, possibly incomplete.
+        text: the layout as TOML with a comment for each line; missing entries at the end.
+        lines: columns in use and ignored, each with its reason, and uncertain decisions.
+        missing: required entries that were not found, each with candidates and a line for the layout.
+        doubts: decisions below 90 % confidence, the least certain first.
     """
 
     layout: Layout
@@ -60,24 +191,24 @@ class Guess(ReprMixin):
     _remarks: Mapping[str, str] = field(default_factory=dict, repr=False)
     _head: str = field(default="", repr=False)
 
-    def settled(self, doubt: Doubt, choice: str | None = None) -> Guess:
-        """Return the guess where one of its doubts was settled: as it was taken, or by another of its choices.
+    def settle_doubt(self, doubt: Doubt, choice: str | None = None) -> Guess:
+        """Return the guess with one doubt settled: the choice made, or another.
 
         Raises:
-            SettingsError: not one of its choices.
+            SettingsError: `choice` is none of the doubt's choices.
         """
-        layout = self.layout if choice is None else settled(self.layout, doubt, choice)
+        layout = self.layout if choice is None else settle_doubt(self.layout, doubt, choice)
         said = f"{doubt.about}: {choice or doubt.taken}, as was answered"
         remarks = {**self._remarks, **dict.fromkeys(doubt.channels, said)}
-        return self._written(layout, remarks, self.missing, tuple(one for one in self.doubts if one is not doubt))
+        return self._rewrite(layout, remarks, self.missing, tuple(one for one in self.doubts if one is not doubt))
 
     def with_sample_time(self, sample_time: float) -> Guess:
-        """Return the guess of a log without a clock, at a sample time [s] that the user knows."""
+        """Return the guess of a log without a clock with its sample time [s]."""
         missing = tuple(line for line in self.missing if not line.startswith(_NO_CLOCK))
         remarks = {**self._remarks, "sample_time": "as was answered"}
-        return self._written(replace(self.layout, sample_time=sample_time), remarks, missing, self.doubts)
+        return self._rewrite(replace(self.layout, sample_time=sample_time), remarks, missing, self.doubts)
 
-    def _written(
+    def _rewrite(
         self, layout: Layout, remarks: Mapping[str, str], missing: tuple[str, ...], doubts: tuple[Doubt, ...]
     ) -> Guess:
         text = self._head + layout_toml(layout, remarks=remarks, open_ends=[f"MISSING {line}" for line in missing])
@@ -85,23 +216,23 @@ class Guess(ReprMixin):
 
 
 _NO_CLOCK = "the sample time"
-# Candidates that a line of what is missing names; the page and the notes have all.
-_SHOWN = 3
+# Candidates named in a line of `missing`; the page and the notes list all.
+_MAX_CANDIDATES = 3
 _NO_MOTORS = "no column is of a motor; record their set-points, positions or velocities too"
 
 
 def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
-    """Return a layout for a log of which nothing is known: a text, spreadsheet, Parquet, MAT or MCAP file.
+    """Return a layout for an unknown log: a text, spreadsheet, Parquet, MAT or MCAP file.
 
     Args:
         path: the log.
-        robot: the neck that it is of, for its motors' range.
+        robot: the neck of the log, for its motors' range.
 
     Raises:
         FileFormatError: no such file, or no table.
-        DataError: a table of fewer columns than a recording needs.
+        DataError: the table has too few columns for a recording.
     """
-    # Damaged logs hold infinities; sums of them are no news to the user.
+    # Damaged logs hold infinities; numpy's warnings about their sums would not help the user.
     with np.errstate(all="ignore"):
         return _guess(Path(path), robot)
 
@@ -110,14 +241,14 @@ def _guess(path: Path, neck: Robot) -> Guess:
     draft = Draft(sniff(path))
     by_names(draft)
     by_shapes(draft)
-    stand_ins(draft)
+    use_positions_as_inputs(draft)
     drop_or_turn_quaternion(draft)
     draft.order()
     found = units(draft)
     moved = all(name in draft.picks for name in SET_POINTS)
     robot = one_axis(draft, _other_axis(draft), neck) if moved else neck
-    check_lines, sign_doubts = _checks(draft)
-    layout, clock_lines, clock_doubts = _clocked(draft, found, _layout(draft, found, robot))
+    check_lines, sign_doubts = _check_signs(draft)
+    layout, clock_lines, clock_doubts = _choose_clock(draft, found, _layout(draft, found, robot))
     missing = _missing(draft, layout)
     other_doubts = [*sign_doubts, *([one_axis_doubt(robot.outputs.names[0])] if robot is not neck else [])]
     doubts = sorted([*doubts_of(draft, found), *clock_doubts, *other_doubts], key=lambda doubt: doubt.confidence)
@@ -125,11 +256,11 @@ def _guess(path: Path, neck: Robot) -> Guess:
     remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in other_doubts}
     remarks["file"] = "; ".join(line.removeprefix("file: ") for line in draft.sniffed.lines)
     remarks["sample_time"] = "; ".join([*clock_lines, *(f"NOT SURE: {doubt}" for doubt in clock_doubts)])
-    remarks["quaternion"] = _marked(draft.quaternion_sure) + draft.quaternion_why
+    remarks["quaternion"] = _mark(draft.quaternion_sure) + draft.quaternion_why
     lines = [*draft.sniffed.lines, *(_line(draft, found, name) for name in draft.picks), *clock_lines]
     if draft.quaternion is not None:
         lines.append(
-            _doubted(f"pitch and roll from a quaternion: because {draft.quaternion_why}", draft.quaternion_sure)
+            _mark_line(f"pitch and roll from a quaternion: because {draft.quaternion_why}", draft.quaternion_sure)
         )
     if layout.merge:
         lines.append("rows of several clocks, because set-points have empty cells: merged at the rows of the outputs")
@@ -137,7 +268,7 @@ def _guess(path: Path, neck: Robot) -> Guess:
     lines += [f"not sure: {doubt.why} ({percent(doubt.confidence)} sure of {doubt.taken})" for doubt in clock_doubts]
     lines += [*check_lines, *_left_out(draft)]
     head = f"# Proposed by `softneck import --guess` for {path.name!r}; edit it.\n\n"
-    return Guess(layout, "", tuple(lines), missing, tuple(doubts), remarks, head)._written(
+    return Guess(layout, "", tuple(lines), missing, tuple(doubts), remarks, head)._rewrite(
         layout, remarks, missing, tuple(doubts)
     )
 
@@ -154,7 +285,7 @@ def _layout(draft: Draft, found: dict[str, Unit], robot: Robot) -> Layout:
               and not name.startswith(robot.outputs.names)}  # fmt: skip
     return replace(
         draft.sniffed.form,
-        # A set-point is never missed, as a measurement may be: where it is not said it holds.
+        # A measurement may be missed, a set-point may not: an empty cell means that it holds.
         merge=draft.sniffed.form.merge and any(draft.sniffed.lacks(column) for column in asked),
         channels={name: source(name) for name in draft.picks if name not in _NO_CHANNELS and name not in absent},
         inclination=source("inclination") if tilt else None,
@@ -166,8 +297,8 @@ def _layout(draft: Draft, found: dict[str, Unit], robot: Robot) -> Layout:
     )
 
 
-def _clocked(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple[Layout, list[str], list[Doubt]]:
-    """Return the layout with its sample time, restarts and duplicates, why, and what is not sure of it."""
+def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple[Layout, list[str], list[Doubt]]:
+    """Return the layout with its sample time, restarts and duplicates, lines with reasons, and doubts."""
     lines: list[str] = []
     doubts: list[Doubt] = []
     if "time" in draft.picks:
@@ -184,7 +315,7 @@ def _clocked(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple[Layo
         if one and not layout.merge and (limits := jitter(draft.values("time"))) is not None:
             scale = nominal_step(draft, found) / limits[2]
             doubts.append(jitter_doubt(*(scale * limit for limit in limits)))
-    speed = _estimated(draft, found)
+    speed = _estimate_from_rates(draft, found)
     if speed is None:
         return layout, lines, doubts
     if layout.time is None:
@@ -200,7 +331,7 @@ def _clocked(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple[Layo
     return layout, lines, doubts
 
 
-def _estimated(draft: Draft, found: dict[str, Unit]) -> SampleTime | None:
+def _estimate_from_rates(draft: Draft, found: dict[str, Unit]) -> SampleTime | None:
     names = [name for name in (*MOTOR_POSITIONS, *MOTOR_VELOCITIES) if name in draft.picks]
     factors = {"deg": np.pi / 180, "deg/s": np.pi / 180, "rpm": np.pi / 30}
     channels = {name: factors.get(found[name].name, 1.0) * draft.values(name) for name in names}
@@ -211,20 +342,20 @@ def _estimated(draft: Draft, found: dict[str, Unit]) -> SampleTime | None:
 
 
 def _sure(draft: Draft, found: dict[str, Unit], name: str) -> float:
-    """Return how sure a channel is: of its column and of its unit, whichever is less."""
+    """Return the smaller confidence of a channel's column and unit."""
     return min(draft.picks[name].confidence, found[name].confidence if name in found else 1.0)
 
 
 def _why(draft: Draft, found: dict[str, Unit], name: str) -> str:
     unit = f"; [{found[name].name}], because {found[name].why}" if name in found else ""
-    return f"{_marked(_sure(draft, found, name))}{draft.picks[name].why}{unit}"
+    return f"{_mark(_sure(draft, found, name))}{draft.picks[name].why}{unit}"
 
 
-def _marked(sure: float) -> str:
+def _mark(sure: float) -> str:
     return "" if sure >= SURE else f"NOT SURE ({percent(sure)}): "
 
 
-def _doubted(line: str, sure: float) -> str:
+def _mark_line(line: str, sure: float) -> str:
     return line if sure >= SURE else f"not sure: {line}; {percent(sure)} sure"
 
 
@@ -233,13 +364,13 @@ def _line(draft: Draft, found: dict[str, Unit], name: str) -> str:
     columns = " and ".join(say(term.column) for term in pick.terms)
     unit = f" [{found[name].name}]" if name in found else ""
     reason = f"{pick.why}; {found[name].why}" if name in found else pick.why
-    return _doubted(f"{name} from {columns}{unit}: because {reason}", _sure(draft, found, name))
+    return _mark_line(f"{name} from {columns}{unit}: because {reason}", _sure(draft, found, name))
 
 
-def _checks(draft: Draft) -> tuple[list[str], list[Doubt]]:
-    """Say whether the platform rises with the redefined inputs, as the signs of the public face ask.
+def _check_signs(draft: Draft) -> tuple[list[str], list[Doubt]]:
+    """Check that pitch and roll rise with the redefined inputs, as the sign convention demands.
 
-    An angle that falls is turned round, which is the more likely answer, and marked as doubtful.
+    An angle that falls is inverted, which is more probably right, and marked as doubtful.
     """
     motors, platform = draft.motors(), draft.platform()
     if motors is None or not platform or len(motors) < 4 * _NECK_LAG:
@@ -248,12 +379,12 @@ def _checks(draft: Draft) -> tuple[list[str], list[Doubt]]:
     for axis, u, name in (("pitch", inputs[:, 0], "theta_i"), ("roll", inputs[:, 1], "phi_i")):
         if axis not in platform:
             continue
-        r, _ = lagged(u, platform[axis], _NECK_LAG)
+        r, _ = max_correlation(u, platform[axis], _NECK_LAG)
         if r >= -0.5:
             lines.append(f"check: {axis} and {name} of the motors have correlation {r:.2f}")
             continue
         falls = f"not sure: {axis} falls as {name} rises (correlation {r:.2f})"
-        if axis not in draft.picks:  # of a tilt, which has no sign of its own
+        if axis not in draft.picks:  # it comes from a tilt, which has no sign
             lines.append(f"{falls}; is the order of the motors right?")
             continue
         pick = draft.picks[axis]
@@ -266,7 +397,7 @@ def _checks(draft: Draft) -> tuple[list[str], list[Doubt]]:
 def _left_out(draft: Draft) -> list[str]:
     lines = [f"ignored: {say(column)}: because it holds words" for column in draft.sniffed.words]
     q = draft.quaternion
-    used = draft.used() | (set() if q is None else {q.w, q.x, q.y, q.z})
+    used = draft.used_columns() | (set() if q is None else {q.w, q.x, q.y, q.z})
     for column in draft.sniffed.columns:
         if column in used:
             continue
@@ -282,20 +413,20 @@ def _left_out(draft: Draft) -> list[str]:
         elif title is not None and title.role != "unknown":
             reason = f"{title.why}, but a set of three motors or a better name was not found with it"
         else:
-            reason = ("its name says nothing, and " if title else "") + "nothing in its data tells what it is"
+            reason = f"it is not recognised from its {'name or ' if title else ''}data"
         lines.append(f"ignored: {say(column)}: because {reason}")
     return lines
 
 
 def _other_axis(draft: Draft) -> list[Column]:
-    """Return the columns that may be an angle of the platform that was not found."""
+    """Return the columns that may be the angle that was not found."""
     roles = ("yaw", "inclination", "orientation")
-    named = [c for c, title in draft.titles.items() if title.role in roles and c not in draft.used()]
+    named = [c for c, title in draft.titles.items() if title.role in roles and c not in draft.used_columns()]
     return [*named, *(c for c in draft.free() if c not in named)]
 
 
 def _missing(draft: Draft, layout: Layout) -> tuple[str, ...]:
-    """Return what a recording needs and the layout does not give, each with the line that would do it."""
+    """Return the required entries that the layout lacks, each with the line that adds it."""
     lines = []
     absent = [name for name in SET_POINTS if name not in draft.picks]
     if absent:
@@ -311,10 +442,12 @@ def _missing(draft: Draft, layout: Layout) -> tuple[str, ...]:
 
 
 def _to_name(channel: str, candidates: list[Column], unit: str) -> str:
-    """Return the layout's line that names a channel, and the first columns that it may be."""
+    """Return the layout's line for a channel, and the first columns that it may be."""
     if not candidates:
         return "no column is left that moves; record it too"
-    shown = ", ".join(repr(column) for column in candidates[:_SHOWN]) + (", ..." if candidates[_SHOWN:] else "")
+    shown = ", ".join(repr(column) for column in candidates[:_MAX_CANDIDATES]) + (
+        ", ..." if candidates[_MAX_CANDIDATES:] else ""
+    )
     return f"is it {shown}? Write `{channel} = {{ column = {_toml(candidates[0])}, unit = '{unit}' }}`"
 
 

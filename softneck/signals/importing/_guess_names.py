@@ -1,4 +1,4 @@
-"""The part of a guess that goes by the titles of the columns, checked against the data where there is a choice."""
+"""The part of a guess that uses column titles, checked against the data if several fit."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from softneck.robot import Robot
 
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column
 from ..recording._redefinition import redefine
-from ._clocks import turns, velocity_period
-from ._column_shapes import lagged
+from ._clocks import axis_rotations, velocity_period
 from ._column_titles import plain
 from ._draft import Draft, Pick, say
+from ._guess_shapes import max_correlation
 from ._layout import Column, Quaternion, Term
 
-# `imu.orientation.x`, `quat_w`, `qx`, `rotation[2]`: what it is of, and which part.
+# `imu.orientation.x`, `quat_w`, `qx`, `rotation[2]`: prefix and component.
 _PART = re.compile(r"(?P<of>.*?(?:quat\w*|orientation|attitude|rotation|\bq|_q))[._ \[]?(?P<part>[wxyz])\]?")
 _NECK_LAG = 25
-# Names and the motors' answer agree, or names alone.
-_SURE, _BY_CONVENTION = 0.95, 0.6
-# What was logged takes the place of what was asked for: true, but another input than a controller will have.
+# Confidence by names and correlation, and by names alone.
+_BY_CORRELATION, _BY_CONVENTION = 0.95, 0.6
+# Confidence in measured positions as inputs: correct, but a controller will have set-points.
 _STAND_IN = 0.85
 
 
 def quaternions(draft: Draft) -> None:
-    """Take four columns that are a quaternion, and pass them over as anything else."""
+    """Take four columns that form a quaternion; they are no other channel."""
     groups: dict[str, dict[str, Column]] = defaultdict(dict)
     for column in draft.titles:
         match = _PART.fullmatch(plain(str(column)).strip())
@@ -46,14 +46,14 @@ def quaternions(draft: Draft) -> None:
 
 
 def drop_or_turn_quaternion(draft: Draft) -> None:
-    """Leave a quaternion out where angles were found; else find which of its turns answer the motors."""
+    """Discard the quaternion if angles were found; else choose the rotations that follow the motors."""
     q = draft.quaternion
     if q is None or draft.has(OUTPUTS) or draft.has(("inclination", "orientation")):
         draft.quaternion = None
         return
     columns = [draft.sniffed.columns[name] for name in (q.w, q.x, q.y, q.z)]
     values = np.column_stack(columns)[:20_000]
-    motors, turned = draft.motors(), turns(values)
+    motors, turned = draft.motors(), axis_rotations(values)
     draft.quaternion_why = (
         "turns about the sensor's y and x axes, as in ROS; which is pitch depends on how it is mounted"
     )
@@ -62,7 +62,7 @@ def drop_or_turn_quaternion(draft: Draft) -> None:
         return
     found: dict[str, tuple[float, str]] = {}
     for axis, u in zip(OUTPUTS, redefine(motors[: len(values)]).T, strict=False):
-        answers = {name: lagged(u, np.nan_to_num(turned[name]), _NECK_LAG)[0] for name in turned}
+        answers = {name: max_correlation(u, np.nan_to_num(turned[name]), _NECK_LAG)[0] for name in turned}
         name = max(answers, key=lambda one: answers[one])
         found[axis] = (answers[name], name)
     (r, pitch), (s, roll) = found["pitch"], found["roll"]
@@ -72,11 +72,11 @@ def drop_or_turn_quaternion(draft: Draft) -> None:
             f"turns about {pitch} and {roll} of the sensor rise with theta_i and phi_i of the motors (correlation "
             f"{r:.2f}, {s:.2f})"
         )
-        draft.quaternion_sure = min(_SURE, 0.2 + min(r, s))
+        draft.quaternion_sure = min(_BY_CORRELATION, 0.2 + min(r, s))
 
 
-def stand_ins(draft: Draft) -> None:
-    """Take positions, or sums of velocities, as inputs where no set-points were logged, and say so."""
+def use_positions_as_inputs(draft: Draft) -> None:
+    """Use positions, or integrated velocities, as inputs if no set-points were logged."""
     if any(name in draft.picks for name in SET_POINTS):
         return
     if draft.has(MOTOR_POSITIONS):
@@ -84,7 +84,7 @@ def stand_ins(draft: Draft) -> None:
             pick = draft.picks[there]
             why = f"no set-points were logged, so the positions are the inputs ({pick.why}), without the drives' lag"
             draft.picks[asked] = replace(pick, why=why, confidence=min(_STAND_IN, pick.confidence))
-            # Positions and velocities tell the sample time where nothing else does.
+            # Without a time column the positions and velocities determine the sample time.
             if "time" in draft.picks:
                 del draft.picks[there]
     elif draft.has(MOTOR_VELOCITIES):
@@ -96,10 +96,7 @@ def stand_ins(draft: Draft) -> None:
 
 
 def one_axis(draft: Draft, candidates: list[Column], neck: Robot) -> Robot:
-    """Return the neck, or the part of it that bends in the one plane that was logged.
-
-    It is a part only where no column could be the other angle; its channels are those of a neck but for that.
-    """
+    """Return the neck, or its part in one plane if only one angle was logged and no column may be the other."""
     there = [name for name in OUTPUTS if name in draft.picks]
     if len(there) != 1 or candidates or draft.quaternion is not None or "inclination" in draft.picks:
         return neck
@@ -114,14 +111,14 @@ def one_axis(draft: Draft, candidates: list[Column], neck: Robot) -> Robot:
     return Robot.from_dict(table)
 
 
-# Rates agree with differences of positions; below it they are another motion.
-_RATE = 0.9
+# Smallest correlation of a rate with differences of its position.
+_MIN_RATE_CORRELATION = 0.9
 
 Family = tuple[Column, Column, Column]
 
 
 def by_names(draft: Draft) -> None:
-    """Take what titles name."""
+    """Take the columns that titles name."""
     own = _own_titles(draft)
     quaternions(draft)
     by_role: dict[str, list[tuple[int, Column]]] = defaultdict(list)
@@ -142,7 +139,7 @@ def by_names(draft: Draft) -> None:
 
 
 def _own_titles(draft: Draft) -> set[Column]:
-    """Take columns that are titled as in a recording of ours."""
+    """Take columns with the titles of a recording."""
     own: set[Column] = set()
     for column in draft.titles:
         try:
@@ -164,7 +161,7 @@ def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) ->
         rising = float((step > 0).mean()) if step.size else 0.0
         if draft.sniffed.form.merge and step.size and (step >= 0).all():
             rising = 1.0  # messages of several clocks have one time
-        if column in draft.used():
+        if column in draft.used_columns():
             continue
         if "time" in draft.picks:
             draft.passed_over[column] = f"{say(draft.picks['time'].terms[0].column)} names time more clearly"
@@ -180,7 +177,7 @@ def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) ->
 
 
 def _seconds_and_nanoseconds(draft: Draft) -> None:
-    """Take two columns of a stamp of ROS 2, which are a time only together."""
+    """Take both columns of a ROS 2 stamp, which are a time only together."""
     for column, title in draft.titles.items():
         if title.role == "time" and title.unit == "ns":
             whole = [c for c, t in draft.titles.items() if (t.role, t.family, t.unit) == ("time", title.family, "s")]
@@ -190,16 +187,16 @@ def _seconds_and_nanoseconds(draft: Draft) -> None:
 
 
 def _families(draft: Draft, role: str, own: set[Column]) -> list[Family]:
-    """Return three columns of one kind, numbered 1 to 3 or 0 to 2, the clearest names first."""
+    """Return triples of columns numbered 1 to 3 or 0 to 2 that share a name, the clearest names first."""
     groups: dict[tuple[int, str], dict[int, Column]] = defaultdict(dict)
     for column, title in draft.titles.items():
         if title.role == role and title.motor is not None and column not in own:
             groups[title.rank, title.family].setdefault(title.motor, column)
     found = [(rank, group) for (rank, _), group in groups.items() if sorted(group) in ([1, 2, 3], [0, 1, 2])]
-    return [_sorted(group) for _, group in sorted(found, key=lambda entry: entry[0])]
+    return [_by_number(group) for _, group in sorted(found, key=lambda entry: entry[0])]
 
 
-def _sorted(group: dict[int, Column]) -> Family:
+def _by_number(group: dict[int, Column]) -> Family:
     first, second, third = (group[number] for number in sorted(group))
     return first, second, third
 
@@ -210,7 +207,7 @@ def _take(draft: Draft, channels: tuple[str, ...], family: Family, more: str = "
 
 
 def _set_points(draft: Draft, own: set[Column]) -> None:
-    """Take the set-points; of several kinds, those that the positions follow most closely."""
+    """Take the set-points; of several families, the one that the positions follow most closely."""
     families = _families(draft, "set-point", own)
     if not families or draft.has(SET_POINTS):
         return
@@ -230,16 +227,16 @@ def _set_points(draft: Draft, own: set[Column]) -> None:
 
 
 def _follow(draft: Draft, family: Family) -> float:
-    """Return how well the positions follow a family at least; 0 for what stands still."""
+    """Return the smallest correlation of the positions with a family; 0 for a constant."""
     pairs = [
-        lagged(draft.moving[column], draft.values(position), 10)[0] if column in draft.moving else 0.0
+        max_correlation(draft.moving[column], draft.values(position), 10)[0] if column in draft.moving else 0.0
         for column, position in zip(family, MOTOR_POSITIONS, strict=True)
     ]
     return min(pairs)
 
 
 def _velocities(draft: Draft, own: set[Column]) -> None:
-    """Take named velocities, or a command of speed less its error where that is the rate of the positions."""
+    """Take named velocities, or a speed command minus its error if that is the rate of the positions."""
     if draft.has(MOTOR_VELOCITIES):
         return
     named = _families(draft, "velocity", own)
@@ -248,7 +245,7 @@ def _velocities(draft: Draft, own: set[Column]) -> None:
         return
     if not draft.has(MOTOR_POSITIONS):
         return
-    commands = [family for family in _families(draft, "set-point", own) if family[0] not in draft.used()]
+    commands = [family for family in _families(draft, "set-point", own) if family[0] not in draft.used_columns()]
     for command in commands:
         for error in _families(draft, "ignored", own):
             if not all(column in draft.moving for column in (*command, *error)):
@@ -258,7 +255,7 @@ def _velocities(draft: Draft, own: set[Column]) -> None:
                 velocity_period(draft.values(position), speed, draft.runs())[1]
                 for position, speed in zip(MOTOR_POSITIONS, speeds, strict=True)
             )
-            if agree > _RATE:
+            if agree > _MIN_RATE_CORRELATION:
                 why = f"their difference is the rate of the position (correlation {agree:.2f} or more)"
                 for channel, c, e in zip(MOTOR_VELOCITIES, command, error, strict=True):
                     draft.picks[channel] = Pick((Term(c), Term(e, -1.0)), why)
@@ -283,7 +280,7 @@ def _platform(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) -> Non
             draft.pick(role, column, draft.titles[column].why)
     for role in ("pitch", "roll", "yaw", "inclination", "orientation"):
         for _, column in by_role[role]:
-            if column not in draft.used():
+            if column not in draft.used_columns():
                 draft.passed_over.setdefault(column, _not_taken(draft, role))
 
 

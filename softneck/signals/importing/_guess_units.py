@@ -1,4 +1,4 @@
-"""Units of a guess: from titles, or else from what the numbers can be."""
+"""Units of a guess: from titles, else from the range of the numbers."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ import numpy as np
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, file_unit
 from ._clocks import velocity_period
 from ._draft import Draft
-from .formats._dates import DATE
+from .formats._text import DATE
 
 _DEGREE = pi / 180.0
 UNITS = {"rad": 1.0, "deg": _DEGREE}
-# ln of what is usual, and its spread: half of all logs lie within a factor of exp(0.67 spread).
-# [rad] The paper's motors move by 1 to 6 rad, and by less in logs near rest.
+# Logarithms of usual sizes and their spreads: half of all logs lie within a factor of exp(0.67 spread).
+# [rad] The paper's motors move by 1 to 6 rad, and less in logs near rest.
 _MOTOR_REACH, _MOTOR_SPREAD = log(2.0), 0.8
 # [rad] The platform tilts by 5 to 45 deg.
 _TILT_REACH, _TILT_SPREAD = log(0.3), 0.8
-# [rad/rad] 5 deg a rad at winches of 7.5 mm; of stiff necks and thin winches less, of long arms more.
+# [rad/rad] 5 deg per rad for winches of 7.5 mm; less for stiff necks and thin winches, more for long arms.
 _GAIN, _GAIN_SPREAD = log(0.1), 0.9
-# [rad] Beyond the paper's range, and where the platform has turned by more than a right angle.
+# [rad] Largest motor angle of the paper, and a tilt of about 45 deg.
 MOTOR_RANGE, _TILT_RANGE = 6.0, 0.8
 _BEYOND_RANGE = log(0.03)
 _TILT_LIMIT = pi / 2.0
-# One logger writes set-points and positions in one unit, nearly always.
-_SEPARATE = log(0.02)
-# Positions reach what is asked for, or, of drives that were off or late, anything.
+# Probability that a logger writes set-points and positions in two units.
+_TWO_UNITS_LOG_ODDS = log(0.02)
+# Positions reach their set-points, or any value if a drive is off or late.
 _FOLLOW_SPREAD, _LATE, _LATE_SPREAD = 0.2, 0.05, 2.0
 
 
@@ -40,8 +40,8 @@ class Verdict:
 
     Attributes:
         unit: "rad" or "deg".
-        probability: that it is, all other groups being what they may.
-        alone: whether set-points and positions were judged to differ.
+        probability: over all units of the other groups.
+        alone: whether set-points and positions have different units.
     """
 
     unit: str
@@ -50,11 +50,11 @@ class Verdict:
 
 
 def judge(reaches: Mapping[str, float], titled: Mapping[str, str]) -> dict[str, Verdict]:
-    """Return the units of the groups `set-points`, `positions` and `tilt`, as far as they are logged.
+    """Return the units of the logged groups among `set-points`, `positions` and `tilt`.
 
     Args:
-        reaches: group -> largest size as logged, of a channel of it.
-        titled: group -> unit that titles name, which stands.
+        reaches: group -> largest magnitude as logged.
+        titled: group -> unit in its titles, which is kept.
     """
     groups = [name for name in ("set-points", "positions", "tilt") if name in reaches]
     odds: dict[tuple[str, ...], float] = {}
@@ -76,11 +76,11 @@ def judge(reaches: Mapping[str, float], titled: Mapping[str, str]) -> dict[str, 
 
 
 def _log_odds(reach: Mapping[str, float], units: Mapping[str, str]) -> float:
-    """Return ln of the odds of reaches [rad] in units, to a constant."""
+    """Return the log-odds of magnitudes [rad], up to a constant."""
     total = 0.0
     motors = [reach[name] for name in ("set-points", "positions") if reach.get(name, 0.0) > 0.0]
     if len({units[name] for name in ("set-points", "positions") if name in units}) > 1:
-        total += _SEPARATE
+        total += _TWO_UNITS_LOG_ODDS
     if len(motors) == 2:
         apart = log(motors[0] / motors[1])
         follow = _normal(apart, _FOLLOW_SPREAD) + log1p(-_LATE)
@@ -102,25 +102,25 @@ def _normal(distance: float, spread: float) -> float:
     return -0.5 * (distance / spread) ** 2 - log(spread)
 
 
-_REFERENCES = ("pitch_reference", "roll_reference")
-_TILTED = ("pitch", "roll", "inclination", *_REFERENCES)
-# The paper's sample time [s], which decides where the data leave it open; sample times of loggers lie around it by a
-# factor of exp(1.2), two thirds of them.
-_USUAL, _STEP_SPREAD = 0.02, 1.2
-# Units of a time column: name, in `s` or `ms`, and factor to it.
+_REFERENCE_CHANNELS = ("pitch_reference", "roll_reference")
+_TILT_CHANNELS = ("pitch", "roll", "inclination", *_REFERENCE_CHANNELS)
+# [s] The paper's sample time, the prior where data leave it open; two thirds of all loggers lie within a factor of
+# exp(1.2).
+_USUAL_STEP_S, _STEP_SPREAD = 0.02, 1.2
+# Unit in the title of a time column -> unit `s` or `ms` of the layout, and factor.
 _CLOCKS = {"s": ("s", 1.0), "ms": ("ms", 1.0), "us": ("ms", 1e-3), "ns": ("ms", 1e-6)}
-# No guess is surer: robots differ more than the odds know. What set-points and positions in two units are at most.
-_SUREST, _ALONE = 0.99, 0.85
-# Pitch and roll further apart than this are doubted.
-_FAR_APART, _ALIKE = 20.0, 0.6
-# What is asked of an angle and what it does are in two units where they are further apart than half way (in logarithms)
-# from 1 to 57. Positions that follow set-points this well and are so many times as large, or as small, are counts,
-# turns or those before a gear, unless the number is nearly the 57 of degrees.
-_TWO_UNITS, _FOLLOW, _COUNTS, _DEGREES = 7.6, 0.9, 3.0, (45.0, 72.0)
+# Largest confidence, since robots differ more than the prior; the same if set-points and positions have two units.
+_MAX_CONFIDENCE, _SEPARATE_CONFIDENCE = 0.99, 0.85
+# Ratio of pitch to roll that makes their unit doubtful, and its confidence.
+_DOUBTFUL_RATIO, _DOUBTFUL_CONFIDENCE = 20.0, 0.6
+# References and angles have two units if they differ by more than half of the factor 57, in logarithms. Positions that
+# follow set-points this well and are so many times larger or smaller are counts, turns, or before a gear, unless the
+# ratio is near 57.
+_TWO_UNITS_RATIO, _MIN_FOLLOW_CORRELATION, _MIN_COUNT_RATIO, _DEGREE_RATIOS = 7.6, 0.9, 3.0, (45.0, 72.0)
 
 
 class Unit(NamedTuple):
-    """A channel's unit, a factor to it, why, and how likely it is."""
+    """A channel's unit, a factor to it, the reason, and the confidence."""
 
     name: str
     factor: float
@@ -129,7 +129,7 @@ class Unit(NamedTuple):
 
 
 def units(draft: Draft) -> dict[str, Unit]:
-    """Return for each pick its unit."""
+    """Return the unit of each pick."""
     found: dict[str, Unit] = {}
     for channel, pick in draft.picks.items():
         if pick.unit is not None and channel not in ("time", "run"):
@@ -149,7 +149,7 @@ def units(draft: Draft) -> dict[str, Unit]:
 
 
 def largest(draft: Draft, channel: str, step: float = 1.0) -> float:
-    """Return the largest size of a channel as logged, also if it stands still; of a rate, of its sum at `step` [s]."""
+    """Return the largest magnitude of a channel as logged; of a rate, of its integral with `step` [s]."""
     columns = draft.sniffed.columns
     values = np.asarray(sum(term.factor * columns[term.column] for term in draft.picks[channel].terms))
     if draft.picks[channel].integrate:
@@ -173,23 +173,24 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     odds = {
         name: exp(
-            -0.5 * (log(max(typical, 1e-300) * factor * (1e-3 if unit == "ms" else 1.0) / _USUAL) / _STEP_SPREAD) ** 2
+            -0.5
+            * (log(max(typical, 1e-300) * factor * (1e-3 if unit == "ms" else 1.0) / _USUAL_STEP_S) / _STEP_SPREAD) ** 2
         )
         for name, (unit, factor) in _CLOCKS.items()
     }
     name = max(odds, key=lambda key: odds[key])
-    sure = min(odds[name] / sum(odds.values()), _SUREST) if sum(odds.values()) > 0.0 else 0.5
+    sure = min(odds[name] / sum(odds.values()), _MAX_CONFIDENCE) if sum(odds.values()) > 0.0 else 0.5
     why = f"its steps of {typical:.4g} are a sample time only in {name}"
     found["time"] = Unit(*_CLOCKS[name], why, sure)
 
 
 def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
-    """Judge the units of set-points, positions and platform together; a title tells the unit of its whole group."""
+    """Judge the units of set-points, positions and platform together; a title's unit holds for its whole group."""
     apart = _asked_in_another_unit(draft, found)
     groups = {
         "set-points": [name for name in SET_POINTS if name in draft.picks],
         "positions": [name for name in MOTOR_POSITIONS if name in draft.picks and not counted],
-        "tilt": [name for name in _TILTED if name in draft.picks and name not in apart],
+        "tilt": [name for name in _TILT_CHANNELS if name in draft.picks and name not in apart],
     }
     groups = {group: names for group, names in groups.items() if names}
     step = nominal_step(draft, found)
@@ -204,12 +205,15 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
     verdicts = judge(reaches, {**titled, "tilt": "deg"} if turned else titled)
     for group, verdict in verdicts.items():
         why = _why(reaches, titled, group, verdict)
-        sure = 1.0 if group in titled or reaches[group] == 0.0 else min(verdict.probability, _SUREST)
-        sure = min(sure, _ALONE) if verdict.alone else sure
+        sure = 1.0 if group in titled or reaches[group] == 0.0 else min(verdict.probability, _MAX_CONFIDENCE)
+        sure = min(sure, _SEPARATE_CONFIDENCE) if verdict.alone else sure
         if group == "tilt" and turned:
-            why, sure = "the orientation reaches more than a turn in rad", _SUREST
-        elif group == "tilt" and group not in titled and _apart(draft):
-            why, sure = f"{why}; but one of pitch and roll goes {_FAR_APART:g} times as far as the other", _ALIKE
+            why, sure = "the orientation reaches more than a turn in rad", _MAX_CONFIDENCE
+        elif group == "tilt" and group not in titled and _may_differ_in_unit(draft):
+            why, sure = (
+                f"{why}; but one of pitch and roll goes {_DOUBTFUL_RATIO:g} times as far as the other",
+                _DOUBTFUL_CONFIDENCE,
+            )
         for name in (*groups[group], *(["orientation"] if group == "tilt" and "orientation" in draft.picks else [])):
             found.setdefault(name, Unit(verdict.unit + ("/s" if group in summed else ""), 1.0, why, sure))
     if "tilt" in verdicts:
@@ -219,32 +223,33 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
 
 
 def _asked_in_another_unit(draft: Draft, found: dict[str, Unit]) -> tuple[str, ...]:
-    """Return the references where no title names a unit and they reach so far beside the angles that theirs differs."""
-    asked = [name for name in _REFERENCES if name in draft.picks]
+    """Return the references whose magnitude differs so much from the angles that their unit must differ too."""
+    asked = [name for name in _REFERENCE_CHANNELS if name in draft.picks]
     angles = [name for name in (*OUTPUTS, "inclination") if name in draft.picks]
     if any(name in found for name in (*asked, *angles)):
         return ()
     reaches = [max((largest(draft, name) for name in names), default=0.0) for names in (asked, angles)]
-    return tuple(asked) if max(reaches) > _TWO_UNITS * min(reaches) > 0.0 else ()
+    return tuple(asked) if max(reaches) > _TWO_UNITS_RATIO * min(reaches) > 0.0 else ()
 
 
 def _references(draft: Draft, found: dict[str, Unit]) -> None:
-    """Take references that are not in the unit of the angles in the other one, which is doubted, and so is theirs."""
-    for name in (one for one in _REFERENCES if one in draft.picks and one not in found):
+    """Give references in another unit than the angles the other unit; both are doubtful."""
+    for name in (one for one in _REFERENCE_CHANNELS if one in draft.picks and one not in found):
         beside = next((one for one in (*OUTPUTS, "inclination") if one in found), None)
         if beside is None:
             continue
         other = "deg" if found[beside].name == "rad" else "rad"
         why = f"reach {largest(draft, name):.4g}, the angles {largest(draft, beside):.4g}: they are in two units"
-        found[name] = Unit(other, 1.0, f"what is asked of the angles {why}", _ALONE)
+        found[name] = Unit(other, 1.0, f"references of the angles {why}", _SEPARATE_CONFIDENCE)
         for angle in (*OUTPUTS, "inclination", "orientation"):
-            if angle in found and found[angle].confidence > _ALONE:
-                found[angle] = found[angle]._replace(confidence=_ALONE, why=f"{found[angle].why}; references {why}")
+            if angle in found and found[angle].confidence > _SEPARATE_CONFIDENCE:
+                found[angle] = found[angle]._replace(
+                    confidence=_SEPARATE_CONFIDENCE, why=f"{found[angle].why}; references {why}"
+                )
 
 
 def _counts(draft: Draft, found: dict[str, Unit]) -> float | None:
-    """Return how many times as large as the set-points positions of no named unit are that follow them, where that is
-    no question of rad and deg."""
+    """Return the ratio of positions to the set-points that they follow; None if it may be that of rad and deg."""
     if not draft.has(MOTOR_POSITIONS) or not draft.has(SET_POINTS) or MOTOR_POSITIONS[0] in found:
         return None
     x, u = (np.column_stack([draft.values(name) for name in names]) for names in (MOTOR_POSITIONS, SET_POINTS))
@@ -253,31 +258,31 @@ def _counts(draft: Draft, found: dict[str, Unit]) -> float | None:
         return None
     x, u = x[seen] - x[seen].mean(axis=0), u[seen] - u[seen].mean(axis=0)
     size = np.sqrt((x**2).sum() * (u**2).sum())
-    if size <= 0.0 or (x * u).sum() < _FOLLOW * size:
+    if size <= 0.0 or (x * u).sum() < _MIN_FOLLOW_CORRELATION * size:
         return None
-    # Drives lag behind what is asked: the static gain of one pole, and not the ratio of sizes, is a count's.
+    # Drives lag behind their set-points, so the ratio is the static gain of a first-order fit, not that of the sizes.
     before_and_now = np.column_stack([x[:-1].ravel(), u[:-1].ravel(), u[1:].ravel()])
     a, *b = np.linalg.lstsq(before_and_now, x[1:].ravel(), rcond=None)[0]
     counts = float(sum(b) / (1.0 - a)) if abs(a) < 1.0 else 0.0
     apart = max(counts, 1.0 / counts) if counts > 0.0 else 0.0
-    return counts if apart > _COUNTS and not _DEGREES[0] < apart < _DEGREES[1] else None
+    return counts if apart > _MIN_COUNT_RATIO and not _DEGREE_RATIOS[0] < apart < _DEGREE_RATIOS[1] else None
 
 
 def _of_counts(counts: float, unit: str) -> Unit:
-    """Return the unit of positions by that of their set-points, to be multiplied by a factor that was fitted."""
+    """Return the unit of positions: that of their set-points, with a fitted factor."""
     factor = float(f"{1.0 / counts:.4g}")
     why = f"they follow the set-points {counts:.4g} times as large (counts, turns, a gear?); the factor was fitted"
-    return Unit(unit, factor, why, _ALIKE)
+    return Unit(unit, factor, why, _DOUBTFUL_CONFIDENCE)
 
 
-def _apart(draft: Draft) -> bool:
-    """Return whether pitch and roll of a log may be in two units, or one of them is something else."""
+def _may_differ_in_unit(draft: Draft) -> bool:
+    """Return whether pitch and roll may be in two units, or one of them is another quantity."""
     sizes = [largest(draft, name) for name in OUTPUTS if name in draft.picks]
-    return len(sizes) == 2 and max(sizes) > _FAR_APART * min(sizes) > 0.0
+    return len(sizes) == 2 and max(sizes) > _DOUBTFUL_RATIO * min(sizes) > 0.0
 
 
 def _why(reaches: dict[str, float], titled: dict[str, str], group: str, verdict: Verdict) -> str:
-    """Return why a group is in its unit."""
+    """Return the reason for a group's unit."""
     reach = reaches[group]
     if group == "tilt":
         if titled.get(group):
@@ -307,7 +312,7 @@ def _why(reaches: dict[str, float], titled: dict[str, str], group: str, verdict:
 
 
 def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
-    """Take the unit in which rates and positions agree at a period next to the time column's, or to 20 ms."""
+    """Choose the unit in which rates and positions agree at a period close to the time column's, or to 20 ms."""
     if not draft.has(MOTOR_VELOCITIES) or MOTOR_VELOCITIES[0] in found:
         return
     if not draft.has(MOTOR_POSITIONS):
@@ -332,9 +337,9 @@ def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
 
 
 def nominal_step(draft: Draft, found: dict[str, Unit]) -> float:
-    """Return the time column's usual step [s], or the paper's sample time where there is none."""
+    """Return the time column's median step [s], or the paper's sample time without one."""
     if "time" not in draft.picks:
-        return _USUAL
+        return _USUAL_STEP_S
     unit, factor, *_ = found["time"]
     if unit == DATE:
         unit = "s"

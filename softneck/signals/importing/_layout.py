@@ -1,4 +1,4 @@
-"""The layout of a foreign log: a TOML file that says which column is what."""
+"""The layout of an unknown log: a TOML file that maps columns to channels."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from softneck.robot import Robot
 
 from ..recording._channels import NECK, known_channels, si_unit
 from ..recording._files import WHITESPACE, TextForm
-from .formats._dates import DATE
-from .formats._encodings import ENCODINGS
+from .formats._text import DATE, ENCODINGS
 
 Column = str | int
 DUPLICATES = ("first", "last")
-#: Keys of [file], attributes of a layout by the same names, in the order in which they are written.
+#: Keys of [file] and attributes of `Layout`, in the order of the file.
 FILE_KEYS = ("variable", "sheet", "encoding", "skip", "unit_row", "header", "delimiter", "decimal", "rows")
 _TIME_KEYS = {"column", "terms", "unit", "factor", "sample_time_s", "new_run_at_restart", "duplicates", "run_column",
               "merge"}  # fmt: skip
@@ -37,9 +36,9 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Where a channel comes from: the sum of terms, in `unit`, times `sign`; where `integrate`, its integral over time.
+    """Source of a channel: a sum of terms in `unit`, times `sign`; `integrate` takes its integral over time.
 
-    The unit of what is integrated is that of the rate, and each run begins at 0.
+    The unit of an integrated source is that of the rate; each run starts at 0.
     """
 
     terms: tuple[Term, ...]
@@ -48,13 +47,13 @@ class Source:
     integrate: bool = False
 
 
-#: Turns about an axis of the sensor that pitch and roll may be.
+#: Sensor axes about which pitch and roll may rotate.
 AXES = ("x", "-x", "y", "-y")
 
 
 @dataclass(frozen=True, slots=True)
 class Quaternion:
-    """Columns of a sensor's orientation, and the turns about its axes that are pitch and roll."""
+    """Columns of a sensor's orientation, and the axes of pitch and roll."""
 
     w: Column
     x: Column
@@ -66,19 +65,19 @@ class Quaternion:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class Layout(ReprMixin):
-    """How a foreign log is read: which column is which channel, in which unit.
+    """How to read a log: its format, and the source and unit of each channel.
 
     Attributes:
         channels: channel name -> source.
-        inclination, orientation: sources of the tilt vector, instead of pitch and roll.
+        inclination, orientation: sources of a tilt vector, instead of pitch and roll.
         quaternion: of the sensor, instead of pitch and roll.
         time: the time column's source, or None; its unit may be `date`.
-        merge: the rows are messages of several clocks: rows are those of the outputs, set-points hold their last value.
+        merge: rows are messages of several clocks: keep those of the outputs, set-points hold their last value.
         sample_time: true sample time [s]; None takes it from the time column.
-        estimate: take the sample time at which logged positions and velocities agree.
+        estimate: estimate the sample time from positions and velocities.
         new_run_at_restart: a time that goes back starts a new run.
-        duplicates: which row to keep of those with one time stamp, `first` or `last`; None refuses them.
-        run: the column that numbers the runs, or None.
+        duplicates: row to keep of one time stamp, `first` or `last`; None refuses duplicates.
+        run: the column of run numbers, or None.
         variable: the matrix of a MAT file; None takes its vectors by name.
         sheet: of a spreadsheet; None takes the largest.
         encoding: of a text.
@@ -86,9 +85,9 @@ class Layout(ReprMixin):
         delimiter: between cells, one character or `whitespace`.
         decimal: the decimal mark, `.` or `,`.
         skip: lines before the table.
-        unit_row: whether the line below the names holds units; it is left out.
-        rows: first and last row (not included) to take.
-        robot: whose channels these are.
+        unit_row: whether a line of units follows the names; it is skipped.
+        rows: first and last row (not included).
+        robot: the robot of the channels.
     """
 
     channels: Mapping[str, Source]
@@ -115,16 +114,16 @@ class Layout(ReprMixin):
 
     @property
     def form(self) -> TextForm:
-        """How a text is a table."""
+        """Return the format of a text table."""
         return TextForm(self.header, self.delimiter, self.decimal, self.skip, self.unit_row, self.encoding)
 
 
 def read_layout(path: str | Path, *, robot: Robot = NECK) -> Layout:
-    """Read a layout file (docs, "Layouts") of a log of `robot`.
+    """Read the layout file (docs, "Layouts") of a log of `robot`.
 
     Raises:
         FileFormatError: no such file or no TOML.
-        SettingsError: a key, channel or unit that a layout does not have.
+        SettingsError: an unknown key, channel or unit.
     """
     source = Path(path)
     require_file(source)
@@ -141,11 +140,11 @@ def read_layout(path: str | Path, *, robot: Robot = NECK) -> Layout:
 
 
 def parse_layout(text: str, *, robot: Robot = NECK) -> Layout:
-    """Return the layout of a log of `robot` that a TOML text holds; the inverse of `layout_toml`.
+    """Parse the TOML text of a layout for `robot`; the inverse of `layout_toml`.
 
     Raises:
         FileFormatError: no TOML.
-        SettingsError: a key, channel or unit that a layout does not have.
+        SettingsError: an unknown key, channel or unit.
     """
     try:
         table = tomllib.loads(text)
@@ -250,7 +249,7 @@ def _source(entry: Any, quantity: str, where: str) -> Source:
         raise SettingsError(f"{where} names no unit.")
     integrate = _flag(entry, "integrate", default=False)
     if to_si(entry["unit"])[1] != (f"{quantity}/s" if integrate else quantity):
-        what = f"; what is integrated to {quantity} is in {quantity}/s" if integrate else f"; its SI unit is {quantity}"
+        what = f"; a rate in {quantity}/s is integrated to {quantity}" if integrate else f"; its SI unit is {quantity}"
         raise SettingsError(f"{where} cannot be in `{entry['unit']}`{what}.")
     parsed = tuple(Term(term["column"], _factor(term.get("factor", 1.0), where)) for term in terms)
     if entry.get("sign", 1) not in (1, -1) or isinstance(entry.get("sign"), bool):
@@ -306,27 +305,27 @@ def _skip(value: Any) -> int:
 
 
 def _delimiter(value: Any) -> str:
-    # More than one character would be a regular expression to the reader of tables, and some of those never end.
+    # pandas would take more characters for a regular expression, and some of those never end.
     if value != WHITESPACE and not (isinstance(value, str) and len(value) == 1):
         raise SettingsError(f"[file] delimiter must be one character or `{WHITESPACE}`; got {value!r}.")
     return value
 
 
 def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, open_ends: Sequence[str] = ()) -> str:
-    """Return the TOML text of which `parse_layout` makes `layout` again.
+    """Return a layout as TOML text; the inverse of `parse_layout`.
 
     Args:
         layout: to write.
-        remarks: channel (or `time`, `file`, `inclination`, `orientation`) -> why; becomes a comment.
-        open_ends: lines that become comments at the end: what is still to be filled in.
+        remarks: channel (or `time`, `file`, `inclination`, `orientation`) -> comment.
+        open_ends: comments for the end: entries to fill in.
 
     Raises:
-        SettingsError: the time column is a sum of columns or has a sign, which a file cannot say.
+        SettingsError: the time is a sum of columns or has a sign, which a file cannot express.
     """
     why = remarks or {}
     blocks = [_file(layout, why), _time(layout, why)]
     simple = {name: source for name, source in layout.channels.items() if len(source.terms) == 1}
-    # An empty table is written too: it tells a layout from other TOML files.
+    # An empty [channels] is written too: it distinguishes a layout from other TOML files.
     lines = ["[channels]"]
     for name, source in simple.items():
         lines += [*_comment(why.get(name)), f"{name} = {_inline(source)}"]
@@ -397,29 +396,29 @@ def _sum(source: Source) -> list[str]:
 
 
 def _text(value: str | int | tuple[int, int]) -> str:
-    """Return a string as TOML writes it, whole numbers, or true and false."""
-    # JSON leaves DEL as it is, TOML does not.
+    """Return a string, whole numbers or a boolean as TOML."""
+    # Unlike JSON, TOML escapes DEL.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _comment(text: str | None) -> list[str]:
-    """Return comment lines; control characters, which a comment may not hold, become blanks."""
+    """Return comment lines; control characters, which TOML forbids there, become blanks."""
     if not text:
         return []
     return ["# " + "".join(c if c.isprintable() else " " for c in line) for line in text.splitlines()]
 
 
-#: What a doubt in which outputs a robot has is about.
+#: Subject of a doubt about the robot's outputs.
 ONE_AXIS = "outputs"
-# As a guess writes them: `NOT SURE (70 %): why` of a channel's column and unit, `NOT SURE: what (80 % sure): why` else.
+# Format of a guess: `NOT SURE (70 %): why` for a channel's column and unit, else `NOT SURE: subject (80 % sure): why`.
 _NOT_SURE = re.compile(r"NOT SURE(?: \((\d+ %)\))?: (.*?)(?=; NOT SURE|$)")
 _KEY = re.compile(r"\[?(?:channels\.)?(\w+)")
 
 
 def doubts_in(path: str | Path) -> tuple[str, ...]:
-    """Return what a layout file marks as not sure, as `what (80 % sure): why`, which outputs there are first.
+    """Return the doubts marked in a layout file, as `subject (80 % sure): why`; that about the outputs comes first.
 
-    Who looked and found a guess right removes its remark.
+    A user who confirms a guess deletes its remark.
     """
     try:
         text = settings_text(path)

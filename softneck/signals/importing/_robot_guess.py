@@ -1,4 +1,4 @@
-"""A robot and a layout proposed from a log of another robot than the neck, by the titles of its columns."""
+"""A robot and a layout proposed from the column titles of a log of another robot than the neck."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from softneck.robot import Robot
 from ._column_titles import read_title
 from ._layout import Column, Layout, Source, Term
 from ._table_format import SniffResult, sniff
-from .formats._dates import DATE
+from .formats._text import DATE
 
-# Words for what a robot is moved by; what else moves is an output.
-_MOVERS = {
+# Words for motors; other columns that move are outputs.
+_MOTOR_WORDS = {
     "motor", "motors", "setpoint", "set", "target", "command", "cmd", "input", "u", "pressure", "pump", "valve",
     "voltage", "volt", "chamber", "tendon", "cable", "servo", "actuator", "winch", "pwm", "duty", "control", "force",
     "torque", "heater",
 }  # fmt: skip
-# Of these none turns a winch: where titles speak of one, and of nothing that a neck has, it is another robot's log.
+# These move no winch: a log with one of them and without any channel of a neck is another robot's.
 _NO_WINCH = {"pressure", "pump", "valve", "voltage", "volt", "chamber", "pwm", "duty", "heater"}
 _OF_A_NECK = ("pitch", "roll", "inclination", "orientation", "pitch_reference", "roll_reference", "position",
               "set-point", "velocity")  # fmt: skip
@@ -33,7 +33,7 @@ _WORD = re.compile(r"[a-z]+|\d+")
 
 @dataclass(frozen=True, slots=True)
 class NamedColumns:
-    """Columns that a user named, each by its title or, where there are none, its index."""
+    """Columns named by a user, by title or index."""
 
     motors: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -42,12 +42,12 @@ class NamedColumns:
 
 @dataclass(frozen=True, slots=True)
 class RobotGuess:
-    """What a log seems to be of.
+    """A proposed robot and layout.
 
     Attributes:
         robot: its directions are to be identified.
-        layout: how the log becomes a recording of it.
-        lines: what each column was taken for.
+        layout: maps the log to its channels.
+        lines: reasons for each column.
     """
 
     robot: Robot
@@ -56,13 +56,13 @@ class RobotGuess:
 
     @property
     def remark(self) -> str:
-        """What the layout says of it."""
+        """Return the remark for the layout file."""
         moved, outputs = (", ".join(part.names) for part in (self.robot.motors, self.robot.outputs))
         return f"NOT SURE: robot: {moved} move, {outputs} are outputs (80 % sure): by words in the titles"
 
 
 def is_of_another_robot(path: str | Path) -> bool:
-    """Return whether a log's titles speak of pressures, pumps or voltages, and of no motor or angle of a neck."""
+    """Return whether titles name pressures, pumps or voltages, and no motor or angle of a neck."""
     try:
         titles = [title for title in sniff(path, fewest=2).columns if isinstance(title, str)]
         spoken = any(_words(title) & _NO_WINCH for title in titles)
@@ -72,10 +72,10 @@ def is_of_another_robot(path: str | Path) -> bool:
 
 
 def guess_robot(path: str | Path) -> RobotGuess:
-    """Return the robot that a log's titles speak of: motors by their words, and all else that moves as outputs."""
+    """Propose a robot by a log's titles: words for motors, and all other moving columns as outputs."""
     table = sniff(path, fewest=2)
     time, run, rest = _clock(table)
-    motors = [title for title in rest if _words(title) & _MOVERS]
+    motors = [title for title in rest if _words(title) & _MOTOR_WORDS]
     outputs = [title for title in rest if title not in motors]
     if not motors:
         raise DataError(
@@ -84,14 +84,14 @@ def guess_robot(path: str | Path) -> RobotGuess:
         )
     if not outputs:
         raise DataError(f"{path}: beside {', '.join(motors)} no column moves that could be an output.")
-    robot, units = _proposed(path, table, motors, outputs)
+    robot, units = _propose_robot(path, table, motors, outputs)
     layout = _layout(table, robot, motors, outputs, (time, run))
     unknown = [f"{title}: its unit is unknown here and taken as 1" for title in rest if _unknown_unit(title)]
     lines = (
         *table.lines,
         *unknown,
         f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
-        f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and are nothing else",
+        f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and have no other role",
         "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
     )
     return RobotGuess(robot, layout, lines)
@@ -100,12 +100,12 @@ def guess_robot(path: str | Path) -> RobotGuess:
 def robot_of_columns(
     path: str | Path, named: NamedColumns, *, robot: Robot | None = None, sample_time: float | None = None
 ) -> RobotGuess:
-    """Return robot and layout of a log whose columns are named.
+    """Return robot and layout of a log whose columns the user named.
 
     Args:
         path: of the log.
         named: its columns, in the order of the robot's channels.
-        robot: whose they are; None: the neck where they are its own, else one is proposed.
+        robot: None takes the neck if the columns fit it, else proposes a robot.
         sample_time: [s] of a log without a clock.
     """
     table = sniff(path, fewest=2)
@@ -127,7 +127,7 @@ def robot_of_columns(
             f"{path}: has a clock, `{time}`; leave out --sample-time, or say --resample {sample_time:g}."
         )
     if robot is None:
-        robot = Robot.preset() if _of_neck(table, motors, outputs) else _proposed(path, table, motors, outputs)[0]
+        robot = Robot.preset() if _of_neck(table, motors, outputs) else _propose_robot(path, table, motors, outputs)[0]
     for count, needed, what in (
         (len(motors), len(robot.motors.names), "motor"), (len(outputs), len(robot.outputs.names), "output"),
         (len(positions), len(robot.motors.names) if positions else 0, "position"),
@@ -154,16 +154,16 @@ def _column(path: str | Path, table: SniffResult, asked: str) -> Column:
 
 
 def _of_neck(table: SniffResult, motors: Sequence[Column], outputs: Sequence[Column]) -> bool:
-    """Return whether columns are of three winches in angles, of pitch and of roll."""
+    """Return whether columns are three winches in angles, pitch and roll."""
     units = [_unit_of(table, column) or "rad" for column in motors]
     named = [read_title(str(column)).role for column in outputs]
     return len(motors) == 3 and named == ["pitch", "roll"] and all(to_si(unit)[1] == "rad" for unit in units)
 
 
-def _proposed(
+def _propose_robot(
     path: str | Path, table: SniffResult, motors: Sequence[Column], outputs: Sequence[Column]
 ) -> tuple[Robot, list[str]]:
-    """Return a robot that such columns are of, with the units of its motors and outputs."""
+    """Propose a robot for such columns; return it with the units of its motors and outputs."""
     units = [_common_unit(path, table, titles) for titles in (motors, outputs)]
     content = {
         "name": re.sub(r"[^A-Za-z0-9_ ]+", "_", Path(path).stem),
@@ -181,7 +181,7 @@ def _proposed(
 
 
 def layout_for(path: str | Path, robot: Robot) -> Layout:
-    """Return the layout of a log whose titles are the robot's channels, or the names of its motors and outputs."""
+    """Return the layout of a log titled by the robot's channels, or by the names of its motors and outputs."""
     table = sniff(path, fewest=2)
     time, run, rest = _clock(table)
     found = {" ".join(_WORD.findall(_UNIT.sub("", title).lower())): title for title in rest}
@@ -236,12 +236,12 @@ def _layout(
 
 
 def _clock_unit(table: SniffResult, column: Column) -> str:
-    """Return the unit of a column of time: `date` where it holds such."""
+    """Return the unit of a time column; `date` for dates."""
     return DATE if column in table.dates else read_title(str(column)).unit or "s"
 
 
 def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column]) -> str:
-    """Return the unit that titles name; 1 where none does."""
+    """Return the common unit in the titles; 1 without any."""
     named = [_unit_of(table, title) or "1" for title in titles]
     if len({to_si(unit)[1] for unit in named}) > 1:
         raise DataError(
@@ -273,7 +273,7 @@ def _words(title: str) -> set[str]:
 
 
 def _names(titles: Sequence[Column]) -> list[str]:
-    """Return titles as names: letters, digits and _, a letter first, none twice."""
+    """Return titles as unique names of letters, digits and _ that start with a letter."""
     names: list[str] = []
     for number, title in enumerate(titles):
         name = re.sub(r"\W+", "_", _UNIT.sub("", str(title)).strip(), flags=re.ASCII).strip("_") or f"c{number + 1}"

@@ -1,4 +1,4 @@
-"""What kind of table a log is: encoding, delimiter, decimal mark, header, sheet, and which matrix of a MAT file."""
+"""Format of a log's table: encoding, delimiter, decimal mark, header, sheet, and matrix of a MAT file."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from softneck.core import DataError, FileFormatError, Vector
 from ..recording._files import WHITESPACE, read_table
 from ._clocks import last_values
 from ._layout import Column, Layout
-from .formats._dates import is_date, seconds
-from .formats._encodings import encoding_of, format_of
 from .formats._mat import mat_arrays, table_of
 from .formats._mcap import mcap_table
 from .formats._sheets import sheet_cells, sheet_table
+from .formats._text import encoding_of, format_of, is_date, seconds
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-# Enough lines to tell a format, whatever the size of the log.
+# Enough lines to detect a format.
 _HEAD_BYTES = 2**16
 _HEAD_ROWS = 500
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 # Three motors and an angle; a recording of a neck has five channels and a time.
-_FEWEST = 4
+_MIN_COLUMNS = 4
 _NAMES = {"\t": "a tab", ";": "`;`", ",": "`,`", WHITESPACE: "blanks"}
-# Rows of several clocks: so few have all their cells.
+# Share of complete rows below which rows are messages of several clocks.
 _WHOLE_ROWS = 0.5
 
 Form = tuple["pd.DataFrame", Layout, tuple[str, ...], list[str]]
@@ -42,17 +41,17 @@ Form = tuple["pd.DataFrame", Layout, tuple[str, ...], list[str]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SniffResult:
-    """A log's columns and how they were read.
+    """A log's columns and the detected format.
 
     Attributes:
-        columns: name, or index where there is no header -> (time,) numbers; NaN where a cell is empty. Dates are
-            seconds; of rows of several clocks each column holds its last value.
-        words: columns that hold no numbers.
-        form: a layout without channels that says how to read the file; `merge` where rows may be of several clocks.
-        lines: why.
-        units: what the line of units says of each column, where there is such a line.
-        dates: columns that hold dates or times of day.
-        frame: the table itself.
+        columns: name, or index without a header -> (time,) numbers; NaN for empty cells. Dates are seconds; with
+            several clocks each column holds its last value.
+        words: columns without numbers.
+        form: a layout without channels: the format of the file; `merge` if rows may be of several clocks.
+        lines: reasons.
+        units: column -> unit in a line of units, if there is one.
+        dates: columns of dates or times of day.
+        frame: the table.
     """
 
     columns: dict[Column, Vector]
@@ -69,15 +68,15 @@ class SniffResult:
         return bool(cells.isna().any())
 
 
-def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
-    """Read a log of unknown form, of at least `fewest` columns: those that a recording of its robot needs."""
+def sniff(path: str | Path, *, fewest: int = _MIN_COLUMNS) -> SniffResult:
+    """Detect the format of a log and read it; a recording of its robot needs at least `fewest` columns."""
     source = Path(path)
     frame, form, lines, units = _form(source, fewest)
     columns: dict[Column, Vector] = {}
     words: list[Column] = []
     dates: set[Column] = set()
     for place, name in enumerate(frame.columns):
-        # Where a name stands twice, only its index tells which.
+        # A repeated name needs the index.
         key = name if isinstance(name, str) and list(frame.columns).count(name) == 1 else place
         values = _numbers(frame.iloc[:, place])
         if values is None and (values := _seconds(frame.iloc[:, place])) is not None:
@@ -87,7 +86,7 @@ def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
         else:
             columns[key] = values
     if len(columns) < fewest:
-        needed = "three set-points, pitch and roll" if fewest == _FEWEST else "a set-point and an output at least"
+        needed = "three set-points, pitch and roll" if fewest == _MIN_COLUMNS else "a set-point and an output at least"
         raise DataError(
             f"{source}: has {len(columns)} column(s) of numbers; a recording needs {needed}. "
             "Is this a log? If so, write its delimiter into a layout and use --layout."
@@ -100,7 +99,7 @@ def sniff(path: str | Path, *, fewest: int = _FEWEST) -> SniffResult:
 
 
 def _form(source: Path, fewest: int) -> Form:
-    """Return a log's table, how it is read, why, and the cells of its line of units."""
+    """Return a log's table, its format, reasons, and the cells of its line of units."""
     kind = format_of(source)
     if kind == "mat":
         return (*_arrays(source, fewest), [])
@@ -123,7 +122,7 @@ def _form(source: Path, fewest: int) -> Form:
 
 
 def without_remarks(frame: pd.DataFrame) -> pd.DataFrame:
-    """Return a table without the lines that a logger or its operator put between its rows: `# paused`, `% mark 2`."""
+    """Drop comment lines between the rows, such as `# paused` or `% mark 2`."""
     if not frame.shape[1] or frame.iloc[:, 0].dtype.kind != "O":
         return frame
     remark = frame.iloc[:, 0].astype(str).str.lstrip().str.startswith(("#", "%"))
@@ -131,14 +130,14 @@ def without_remarks(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _is_sparse(columns: dict[Column, Vector]) -> bool:
-    """Return whether rows are messages of several clocks: few are whole, and columns lack cells in different rows."""
+    """Return whether rows are messages of several clocks: few are complete, and different cells are empty."""
     absent = [np.isnan(values) for values in columns.values()]
     patterns = {gaps.tobytes() for gaps in absent if gaps.mean() > 0.2}
     return len(patterns) > 1 and float(np.any(absent, axis=0).mean()) > 1.0 - _WHOLE_ROWS
 
 
 def _seconds(column: pd.Series) -> Vector | None:
-    """Return a column of dates as seconds, or None where it holds none."""
+    """Return a column of dates as seconds, or None for another column."""
     cells = column.head(_HEAD_ROWS)
     if column.dtype.kind != "M" and not (cells.size and all(map(is_date, cells))):
         return None
@@ -149,7 +148,7 @@ def _seconds(column: pd.Series) -> Vector | None:
 
 
 def _numbers(column: pd.Series) -> Vector | None:
-    """Return a column's numbers, or None where it holds words, dates or lists."""
+    """Return a column's numbers, or None for words, dates or lists."""
     import pandas as pd
 
     if column.dtype.kind in "biuf":
@@ -161,9 +160,9 @@ def _numbers(column: pd.Series) -> Vector | None:
     except (TypeError, ValueError, OverflowError):
         return None
     absent = column.isna() | column.astype(str).str.strip().str.lower().eq("nan")
-    filled = ~np.isnan(values) | absent.to_numpy()
-    # A few words in a column of numbers are for the importer to name, row by row.
-    return values if values.size and filled.mean() > 0.5 and np.isfinite(values).any() else None
+    fill_gaps = ~np.isnan(values) | absent.to_numpy()
+    # The importer reports single words in a column of numbers, with their row.
+    return values if values.size and fill_gaps.mean() > 0.5 and np.isfinite(values).any() else None
 
 
 def _arrays(source: Path, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str, ...]]:
@@ -186,11 +185,11 @@ def _arrays(source: Path, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str,
 def _sheet(source: Path) -> Form:
     sheet, cells = sheet_cells(source, None)
     rows = [[str(cell).strip() for cell in row] for row in cells[:_HEAD_ROWS]]
-    filled = [sum(bool(cell) for cell in row) for row in rows]
-    usual = Counter(count for count in filled if count > 1).most_common(1)
+    fill_gaps = [sum(bool(cell) for cell in row) for row in rows]
+    usual = Counter(count for count in fill_gaps if count > 1).most_common(1)
     if not usual:
         raise FileFormatError(f"{source}: cannot be read as a table (no row of sheet `{sheet}` has two cells).")
-    skip = next(place for place, count in enumerate(filled) if count >= usual[0][0])
+    skip = next(place for place, count in enumerate(fill_gaps) if count >= usual[0][0])
     header = any(cell and not _NUMBER.fullmatch(cell) and not is_date(cell) for cell in rows[skip])
     units = _unit_row(rows[skip + 1 : skip + 3]) if header else []
     form = Layout(channels={}, sheet=sheet, header=header, skip=skip, unit_row=bool(units))
@@ -200,7 +199,7 @@ def _sheet(source: Path) -> Form:
 
 
 def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list[str]]:
-    """Return how a text is a table, why, and the cells of its line of units."""
+    """Return the format of a text table, reasons, and the cells of its line of units."""
     encoding, said = encoding_of(source)
     with source.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -211,7 +210,7 @@ def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list
     if not lines:
         raise FileFormatError(f"{source}: cannot be read as a table (it is empty).")
     delimiter, cells = _delimiter(lines, fewest)
-    # A logger's remarks before the table are cut into another number of cells.
+    # Comments before the table have another number of cells.
     skip = next((place for place, line in enumerate(raw) if len(_cells(line, delimiter)) == cells), 0)
     lines = [line for line in raw[skip:] if line.strip()]
     body = [cell.strip() for line in lines[1:] for cell in _cells(line, delimiter)]
@@ -248,7 +247,7 @@ def _remarks(form: Layout) -> list[str]:
 
 
 def _unit_row(lines: Sequence[Sequence[str]]) -> list[str]:
-    """Return the cells of the row below the names, without brackets, if it holds no number and the next row does."""
+    """Return the cells of the row below the names, without brackets, if it holds units and the next row numbers."""
     if len(lines) < 2:
         return []
     cells = [cell.strip("[]()").strip() for cell in lines[0]]
@@ -264,7 +263,10 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _delimiter(lines: list[str], fewest: int) -> tuple[str, int]:
-    """Return what cuts nearly all lines into equally many cells, and how many; a comma may be a decimal mark: late."""
+    """Return the delimiter that splits nearly all lines into equally many cells, and their number.
+
+    The comma comes late, since it may be a decimal mark.
+    """
     for delimiter in ("\t", ";", ",", WHITESPACE):
         counts = Counter(len(_cells(line, delimiter)) for line in lines)
         cells, often = counts.most_common(1)[0]

@@ -1,6 +1,6 @@
-"""MATLAB files as arrays: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no other files.
+"""MATLAB files as arrays: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no links to other files.
 
-`scipy.io.loadmat` follows cells within cells without a bound: 10 MB of them end the process (segmentation fault).
+`scipy.io.loadmat` follows nested cells without a limit: 10 MB of them crash the process (segmentation fault).
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"
 _MATRIX, _COMPRESSED = 14, 15
 # Table 1-3: classes of arrays.
 _CELL, _STRUCT, _NUMBERS = 1, 2, range(6, 16)
-_COMPLEX = 0x0800
-_HEADER = 128
-# HDF5 file format, II.A: where MATLAB (512) and others put the superblock.
+_COMPLEX_FLAG = 0x0800
+_HEADER_BYTES = 128
+# HDF5 file format, II.A: offsets of the superblock; MATLAB uses 512.
 _SIGNATURE, _SUPERBLOCKS = b"\x89HDF\r\n\x1a\n", (0, 512, 1024, 2048)
-# Structures of logs are one or two deep; deeper ones are loops or hostile.
+# Structures of logs have one or two levels; deeper ones are loops or hostile.
 _MAX_DEPTH = 4
 
 
 @dataclass(slots=True)
 class _Elements:
-    """Elements one behind the other in `data`, numbers in byte `order`."""
+    """A sequence of elements in `data`, numbers in byte `order`."""
 
     data: memoryview
     order: str
@@ -47,14 +47,14 @@ class _Elements:
         """Return the type and the content of the next element."""
         word, size = struct.unpack_from(self.order + "II", self.data, self.place)
         start = self.place + 8
-        # A small element has its size in the upper half of its type and up to 4 bytes in place of the size.
+        # A small element has its size in the upper half of its type, and up to 4 bytes instead of the size.
         if word >> 16:
             kind, size, start, self.place = word & 0xFFFF, word >> 16, self.place + 4, start
             if size > 4:
                 raise ValueError("a small element holds more than 4 bytes")
         else:
             kind = word
-            # All but compressed elements fill up to 8 bytes.
+            # Elements are padded to 8 bytes, except compressed ones.
             self.place = start + size + (0 if kind == _COMPRESSED else -size % 8)
         if start + size > len(self.data):
             raise ValueError("it ends in the middle of a variable")
@@ -73,33 +73,33 @@ class _Elements:
 
 
 def is_mat5(data: bytes) -> bool:
-    """Return whether a file begins as one of version 5."""
-    return len(data) >= _HEADER and data[124:128] in (b"\x00\x01IM", b"\x01\x00MI")
+    """Return whether a file has the header of version 5."""
+    return len(data) >= _HEADER_BYTES and data[124:128] in (b"\x00\x01IM", b"\x01\x00MI")
 
 
 def read_mat5(data: bytes) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the real numeric arrays of a file by their names; structures and cells are opened.
+    """Yield name -> real numeric array of a file; structures and cells are opened.
 
-    A field is `structure.field`; an element of a cell, or of an array of structures, `name{1}`.
+    A field is `structure.field`; an element of a cell or of an array of structures is `name{1}`.
     """
     if not is_mat5(data):
         raise ValueError("neither version 5 nor 7.3; save it with -v7")
     left = largest_unpacked(len(data))
-    file = _Elements(memoryview(data), "<" if data[126:128] == b"IM" else ">", _HEADER)
+    file = _Elements(memoryview(data), "<" if data[126:128] == b"IM" else ">", _HEADER_BYTES)
     while file.place + 8 <= len(data):
         kind, content = file.next()
         if kind == _COMPRESSED:
-            unpacked = _unpacked(content, file.order, left)
+            unpacked = _unpack(content, file.order, left)
             left -= len(unpacked)
             kind, content = _Elements(unpacked, file.order).next()
         if kind == _MATRIX:
             yield from _array(_Elements(content, file.order), None, 0)
 
 
-def _unpacked(content: memoryview, order: str, most: int) -> memoryview:
+def _unpack(content: memoryview, order: str, most: int) -> memoryview:
     stream = zlib.decompressobj()
     head = stream.decompress(content, 8)
-    # What it says it unpacks to; a stream that holds more is not at its end behind that.
+    # The declared size; a stream that holds more has not ended after it.
     size = struct.unpack(order + "II", head)[1]
     unpacked = head + stream.decompress(stream.unconsumed_tail, size + 1) if size < most else b""
     if not stream.eof or len(unpacked) > 8 + size:
@@ -108,7 +108,7 @@ def _unpacked(content: memoryview, order: str, most: int) -> memoryview:
 
 
 def _array(parts: _Elements, name: str | None, depth: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield what an array holds; `name` replaces its own, which is empty within structures."""
+    """Yield the arrays in an element; `name` replaces its own, which is empty within structures."""
     if not len(parts.data):
         return
     flags = int(parts.numbers()[0])
@@ -129,7 +129,7 @@ def _array(parts: _Elements, name: str | None, depth: int) -> Iterator[tuple[str
             for start in range(0, len(names) - width + 1, width):
                 field = names[start : start + width].split(b"\0")[0].decode("utf-8", errors="replace")
                 yield from _array(_Elements(_matrix(parts), parts.order), f"{element}.{field}", depth + 1)
-    elif kind in _NUMBERS and not flags & _COMPLEX:
+    elif kind in _NUMBERS and not flags & _COMPLEX_FLAG:
         # Stored by columns, in the smallest type that holds the numbers.
         yield name, parts.numbers().astype(np.float64).reshape(shape, order="F")
 
@@ -142,12 +142,12 @@ def _matrix(parts: _Elements) -> memoryview:
     return content
 
 
-# More are no experiments.
+# Larger cells are no experiments.
 _MAX_ELEMENTS = 10_000
 
 
 def mat_arrays(source: Path) -> dict[str, np.ndarray]:
-    """Return all arrays (rows, columns) of numbers in a MAT file by their names."""
+    """Return name -> array (rows, columns) of all numbers in a MAT file."""
     try:
         hdf5 = _is_hdf5(source)
         if hdf5:
@@ -191,21 +191,21 @@ def _members(group: Any, prefix: str, depth: int, seen: set[int]) -> Iterator[tu
     import h5py
 
     for name in group:
-        # Soft and external links lead elsewhere, external ones to other files; MATLAB writes neither.
+        # Soft and external links lead elsewhere, the latter to other files; MATLAB writes neither.
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
         yield from _item(group[name], f"{prefix}{name}", depth, seen)
 
 
 def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield what a group or a dataset holds; of `seen` addresses nothing more: references may lead in circles."""
+    """Yield the arrays in a group or dataset; skip `seen` addresses, since references may form cycles."""
     import h5py
 
     if isinstance(item, h5py.Group):
         if depth < _MAX_DEPTH:
             yield from _members(item, f"{name}.", depth + 1, seen)
     elif isinstance(item, h5py.Dataset) and item.dtype.kind == "O" and item.size is not None and depth < _MAX_DEPTH:
-        # Elements of cells, and fields of arrays of structures, lie elsewhere in the file.
+        # Elements of cells and fields of arrays of structures are references.
         references = np.asarray(item[()]) if item.size <= _MAX_ELEMENTS else np.array([])
         for place, reference in enumerate(references.ravel(order="C")):
             if isinstance(reference, h5py.Reference) and reference:
@@ -219,7 +219,7 @@ def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[st
             raise DataError(f"variable `{name}` lies in another file; softneck reads what is in this one.")
         if item.size is not None and 8 * item.size > largest_unpacked(8 * item.file.id.get_filesize()):
             raise DataError(f"variable `{name}` declares {item.size} numbers; that is not a log.")
-        # MATLAB stores columns first: the file's shape is the transpose.
+        # MATLAB stores columns first: the file holds the transpose.
         yield name, np.asarray(item[()], dtype=np.float64).T
 
 
@@ -229,29 +229,31 @@ def _is_numbers(item: Any) -> bool:
 
 
 Arrays = dict[str, np.ndarray]
-#: The column that numbers the elements of a cell, or of an array of structures, from which a table was made.
+#: The column that numbers the elements of a cell or of an array of structures.
 RUN = "run"
 _ELEMENT = re.compile(r"\{(\d+)\}")
-# More columns beside a vector are a picture or a map, not signals.
-_WIDEST = 16
+# Wider matrices are pictures or maps, not signals.
+_MAX_SIGNAL_COLUMNS = 16
 
 
 def table_of(source: Path, arrays: Arrays, variable: str | None, wanted: tuple[str, ...] = ()) -> pd.DataFrame:
     """Return the table of a file's arrays.
 
     Args:
-        source: the file, for errors.
+        source: the file, for messages.
         arrays: name -> (rows, columns).
-        variable: a matrix (time, columns), whose columns get the numbers 0, 1, ...; None takes all vectors by their
-            names, and matrices beside them (time, n) as `name(:,1)` to `name(:,n)`. What cells of structures hold,
-            one experiment in each, is joined below each other with the column `run`.
-        wanted: the columns that are needed; vectors of another length are left out.
+        variable: a matrix (time, columns), whose columns get the numbers 0, 1, ...; None takes all vectors by name, and
+            matrices (time, n) as `name(:,1)` to `name(:,n)`. Experiments in elements of a cell are concatenated, with
+            the column `run`.
+        wanted: the required columns; vectors of another length are dropped.
     """
     import pandas as pd
 
     if variable is not None:
         if variable not in arrays:
-            raise DataError(f"{source}: there is no variable `{variable}` with numbers; the file has {listed(arrays)}.")
+            raise DataError(
+                f"{source}: there is no variable `{variable}` with numbers; the file has {list_arrays(arrays)}."
+            )
         array = arrays[variable]
         return pd.DataFrame(array.T if array.shape[0] == 1 else array)
     runs = _experiments(arrays)
@@ -266,7 +268,7 @@ def table_of(source: Path, arrays: Arrays, variable: str | None, wanted: tuple[s
 
 
 def _experiments(arrays: Arrays) -> dict[int, Arrays]:
-    """Return what each element of a cell or of an array of structures holds, if there are several that hold vectors."""
+    """Return number -> arrays of each element of a cell or array of structures, if several hold vectors."""
     runs: dict[int, Arrays] = {}
     for name, array in arrays.items():
         match = _ELEMENT.search(name)
@@ -279,7 +281,7 @@ def _columns(source: Path, arrays: Arrays, wanted: tuple[str, ...]) -> dict[str,
     vectors = {_ELEMENT.sub("", name): a.ravel() for name, a in arrays.items() if 1 in a.shape and a.size > 1}
     if not vectors:
         raise DataError(
-            f"{source}: has no vectors of numbers; name the matrix by `[file] variable`; it has {listed(arrays)}."
+            f"{source}: has no vectors of numbers; name the matrix by `[file] variable`; it has {list_arrays(arrays)}."
         )
     lengths = {name: vectors[name].size for name in wanted if name in vectors}
     if len(set(lengths.values())) > 1:
@@ -288,22 +290,22 @@ def _columns(source: Path, arrays: Arrays, wanted: tuple[str, ...]) -> dict[str,
     rows = next(iter(lengths.values()), usual_length(arrays))
     found = {name: vector for name, vector in vectors.items() if vector.size == rows}
     for name, array in arrays.items():
-        if 1 not in array.shape and rows in array.shape and min(array.shape) <= _WIDEST:
+        if 1 not in array.shape and rows in array.shape and min(array.shape) <= _MAX_SIGNAL_COLUMNS:
             by_time = array if array.shape[0] == rows else array.T
             found |= {f"{_ELEMENT.sub('', name)}(:,{j + 1})": by_time[:, j] for j in range(by_time.shape[1])}
     return found
 
 
 def usual_length(arrays: Arrays) -> int:
-    """Return the length that most columns have, of vectors and of matrices beside them; 0 without vectors."""
+    """Return the length of most columns, of vectors and matrices; 0 without vectors."""
     sizes = Counter(array.size for array in arrays.values() if 1 in array.shape and array.size > 1)
     for array in arrays.values():
-        for size in set(array.shape) if 1 not in array.shape and min(array.shape) <= _WIDEST else ():
+        for size in set(array.shape) if 1 not in array.shape and min(array.shape) <= _MAX_SIGNAL_COLUMNS else ():
             if size in sizes:
                 sizes[size] += array.size // size
     return sizes.most_common(1)[0][0] if sizes else 0
 
 
-def listed(arrays: Arrays) -> str:
+def list_arrays(arrays: Arrays) -> str:
     """Return all arrays with their sizes, for a message."""
     return ", ".join(f"{name} ({a.shape[0]} x {a.shape[1]})" for name, a in arrays.items()) or "none"

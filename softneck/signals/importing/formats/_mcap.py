@@ -1,6 +1,6 @@
-"""ROS 2 bags of the MCAP kind as one sparse table: a row for each message, columns `topic.field[0]`.
+"""ROS 2 bags in MCAP format as a sparse table: a row for each message, columns `topic.field[0]`.
 
-Messages are decoded by `mcap-ros2-support` (MIT, pure Python), and JSON ones as they are.
+`mcap-ros2-support` (MIT, pure Python) decodes messages; JSON ones are read directly.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     import pandas as pd
     from mcap.records import Chunk
 
-# What `softneck drives run --log` calls itself in the header of its logs.
+# Name of `softneck drives run --log` in the header of its logs.
 OURS = b"softneck"
-#: The column of time of such a table [s].
+#: The time column of such a table [s].
 TIME = "time"
 _MAX_DEPTH, _MOST_NUMBERS = 6, 64
-# [ns] A clock of messages that is further from the logger's is a simulation's, or was never set.
+# [ns] A message clock that differs more from the logger's is simulated or was never set.
 _SAME_CLOCK = 10**9
 _MOST_CELLS = 50_000_000
-# [bytes] No message that is not a picture comes near; a damaged length must not reserve the memory of the machine.
+# [bytes] Only pictures are larger; a damaged length must not allocate the machine's memory.
 LARGEST_RECORD = 1 << 26
 
 
 def is_run_log(source: Path) -> bool:
-    """Return whether an MCAP file was written by softneck's drives: then its first record says so."""
+    """Return whether softneck's drives wrote an MCAP file, by its first record."""
     try:
         with source.open("rb") as file:
             return OURS in file.read(256)
@@ -40,9 +40,9 @@ def is_run_log(source: Path) -> bool:
 
 
 def require_chunks(source: Path) -> None:
-    """Raise FileFormatError where a file's compressed pieces unpack to more than they say or than a log may hold.
+    """Raise FileFormatError if compressed chunks unpack to more than declared or than a log may hold.
 
-    Where it is damaged otherwise the reader says so.
+    The reader reports other damage.
     """
     from mcap.records import Chunk
     from mcap.stream_reader import StreamReader
@@ -60,13 +60,13 @@ def require_chunks(source: Path) -> None:
                 return
             if isinstance(piece, Chunk):
                 total += piece.uncompressed_size
-                # What it says first: to look whether that is true takes as much memory.
+                # Check the declared size first: verifying it takes that much memory.
                 require_unpacked(source, total, size)
                 require_unpacked(source, total if _is_true(piece) else MOST_UNPACKED + 1, size)
 
 
 def _is_true(piece: Chunk) -> bool:
-    """Return whether a compressed piece does not hold more than it says, as far as it can be read."""
+    """Return whether a compressed chunk holds no more than declared, as far as it can be read."""
     from lz4.frame import LZ4FrameDecompressor
     from zstandard import CONTENTSIZE_UNKNOWN, get_frame_parameters
 
@@ -74,17 +74,17 @@ def _is_true(piece: Chunk) -> bool:
     try:
         if piece.compression == "lz4":
             return len(LZ4FrameDecompressor().decompress(piece.data, max_length=says + 1)) <= says
-        # Where the frame does not say, zstd stops at what the piece says.
+        # Without a size in the frame, zstd stops at the chunk's declared size.
         holds = get_frame_parameters(piece.data).content_size if piece.compression == "zstd" else says
         return holds in (says, CONTENTSIZE_UNKNOWN)
-    except Exception:  # damaged: its reader says so
+    except Exception:  # the reader reports the damage
         return True
 
 
 def mcap_table(source: Path) -> pd.DataFrame:
-    """Return a row for each message in the order of time, NaN where a topic said nothing.
+    """Return one row for each message in order of time; NaN in columns of other topics.
 
-    Time is that of the messages' headers where they have one that follows the logger's, else the logger's.
+    Time is that of the messages' headers if they follow the logger's clock, else the logger's.
     """
     for package in ("mcap", "mcap_ros2"):
         require_package(package)
@@ -106,7 +106,7 @@ def mcap_table(source: Path) -> pd.DataFrame:
             clocks.append((logged, _stamp(content, logged)))
     except (DataError, FileFormatError):
         raise
-    except Exception as error:  # its readers and decoders raise whatever damaged bytes lead to
+    except Exception as error:  # readers and decoders raise anything for damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise FileFormatError(f"{source}: cannot be read as MCAP ({reason}).") from error
     frame = pd.DataFrame(rows)
@@ -115,7 +115,7 @@ def mcap_table(source: Path) -> pd.DataFrame:
         raise DataError(
             f"{source}: no message of ROS 2 or JSON holds numbers{also}; record topics of set-points and angles."
         )
-    # Whole nanoseconds: a double of seconds since 1970 is off by 1e-7 s, and messages of one instant would swap.
+    # Whole nanoseconds: a double of seconds since 1970 is off by 1e-7 s, which would reorder simultaneous messages.
     logged, stamped = np.array(clocks, dtype=np.int64).T
     time = np.where(np.abs(stamped - logged) < _SAME_CLOCK, stamped, logged)
     frame.insert(0, TIME, (time - time.min()) / 1e9)
@@ -123,7 +123,7 @@ def mcap_table(source: Path) -> pd.DataFrame:
 
 
 def _stamp(content: Any, logged: int) -> int:
-    """Return the time in a message's header [ns], or the logger's where it has none."""
+    """Return the time in a message's header [ns], else the logger's."""
     stamp = getattr(getattr(content, "header", None), "stamp", None)
     if stamp is None or not hasattr(stamp, "sec") or not hasattr(stamp, "nanosec"):
         return logged
@@ -152,7 +152,7 @@ def _messages(source: Path, skipped: set[str]) -> Iterator[tuple[str, int, Any]]
 
 
 def _numbers(content: Any, name: str, depth: int) -> Iterator[tuple[str, float]]:
-    """Yield all numbers of a message with their names; a header becomes its stamp [s]."""
+    """Yield (name, number) of all numbers in a message; a header becomes its stamp [s]."""
     if isinstance(content, bool | int | float):
         yield name, float(content)
     elif depth > _MAX_DEPTH or isinstance(content, str | bytes) or content is None:
@@ -168,7 +168,7 @@ def _numbers(content: Any, name: str, depth: int) -> Iterator[tuple[str, float]]
             items = list(content)
         except TypeError:
             return
-        if len(items) <= _MOST_NUMBERS:  # more are pictures, clouds and maps
+        if len(items) <= _MOST_NUMBERS:  # longer lists are pictures, clouds and maps
             for place, item in enumerate(items):
                 yield from _numbers(item, f"{name}[{place}]", depth + 1)
 

@@ -1,6 +1,6 @@
 """Spreadsheets (.xlsx, .xls, .xlsb, .ods) as rows of cells, by python-calamine.
 
-It reads all four in one wheel without dependencies; openpyxl reads the first.
+It reads all four formats in one wheel without dependencies; openpyxl reads only .xlsx.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 # A sheet of Excel has 1,048,576 rows.
 _MOST_CELLS = 50_000_000
-# Two cells in opposite corners make the reader take a place for each cell between; where memory ends it ends the
-# process, so that another one tries first: with 128 MB, and more for more bytes of the file.
-_TRY = """
+# Two cells in opposite corners make the reader allocate all cells between, and the process dies without memory. So a
+# child process reads the file first, with 128 MB and more for larger files.
+_TRIAL_SCRIPT = """
 import resource, sys
 import python_calamine
 resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[2]),) * 2)
@@ -34,7 +34,7 @@ Cells = Sequence[Sequence[object]]
 
 
 def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
-    """Return a sheet's name and its rows of cells; without a name the sheet with most cells."""
+    """Return a sheet's name and its rows of cells; the largest sheet without a name."""
     require_package("python_calamine")
     import python_calamine as calamine
 
@@ -53,20 +53,20 @@ def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
         return found.name, found.to_python(skip_empty_area=False)
     except DataError:
         raise
-    except Exception as error:  # its readers raise whatever damaged bytes lead to
+    except Exception as error:  # readers raise anything for damaged bytes
         reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise FileFormatError(f"{source}: cannot be read as a spreadsheet ({reason}).") from error
 
 
 def _try(source: Path) -> None:
-    """Raise FileFormatError where reading a spreadsheet ends the process that does so."""
+    """Raise FileFormatError if reading a spreadsheet kills the process."""
     most = min(_MOST_ROOM, _LEAST_ROOM + _ROOM_PER_BYTE * source.stat().st_size)
-    arguments = [sys.executable, "-c", _TRY, str(source.resolve()), str(most)]
+    arguments = [sys.executable, "-c", _TRIAL_SCRIPT, str(source.resolve()), str(most)]
     try:
         done = subprocess.run(arguments, capture_output=True, timeout=_PATIENCE_S, check=False)
     except subprocess.TimeoutExpired:
         raise FileFormatError(f"{source}: takes longer than {_PATIENCE_S:g} s to read; export it as CSV.") from None
-    # An exception of the reader is exit code 1: what is wrong it says when it is asked here.
+    # The reader's own exceptions give exit code 1; they are reported by the real reading.
     if done.returncode < 0 or b"MemoryError" in done.stderr:
         raise FileFormatError(
             f"{source}: its sheets would fill {most / 1e6:.0f} MB of memory, which no log of its size does; "
@@ -75,7 +75,7 @@ def _try(source: Path) -> None:
 
 
 def sheet_table(cells: Cells, *, header: bool, skip: int, unit_row: bool) -> pd.DataFrame:
-    """Return the table below `skip` rows: names in its first row, or columns 0, 1, ..."""
+    """Return the table after `skip` rows, with names in its first row or columns 0, 1, ..."""
     import pandas as pd
 
     rows = cells[skip:]
@@ -83,7 +83,7 @@ def sheet_table(cells: Cells, *, header: bool, skip: int, unit_row: bool) -> pd.
     if header and rows:
         names = [str(cell).strip() or f"Unnamed: {place}" for place, cell in enumerate(rows[0])]
         rows = rows[1 + unit_row :]
-    # An empty cell comes as an empty text; all rows of a sheet are of one width.
+    # An empty cell is an empty text; all rows have the same width.
     frame = pd.DataFrame([[None if cell == "" else cell for cell in row] for row in rows], dtype=object)
     frame = frame.dropna(how="all").reset_index(drop=True)
     found = pd.DataFrame({place: _column(pd.Series(frame[place])) for place in frame.columns})
@@ -92,7 +92,7 @@ def sheet_table(cells: Cells, *, header: bool, skip: int, unit_row: bool) -> pd.
 
 
 def _column(cells: pd.Series) -> pd.Series:
-    """Return numbers, dates or words; spreadsheets say of each cell which it is."""
+    """Return a column as numbers, dates or words, by the types of its cells."""
     import pandas as pd
 
     kinds = {type(cell) for cell in cells.dropna()}
