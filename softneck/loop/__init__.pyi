@@ -34,10 +34,10 @@ from ._references import reference_key as reference_key
 from ._references import reference_keys as reference_keys
 from ._references import same_quantity as same_quantity
 from ._result import SETTLING_BAND as SETTLING_BAND
+from ._result import error_unit as error_unit
 from ._result import metric_names as metric_names
-from ._result import shown_unit as shown_unit
-from ._run import Rows as Rows
+from ._run import LoopRows as LoopRows
 from ._run import StepCallback as StepCallback
-from ._run import cycle as cycle
+from ._run import row_actions as row_actions
 from ._wiring import Wiring as Wiring
 from ._wiring import wire as wire

@@ -1,4 +1,4 @@
-"""Faults at work: detours of signals on the bus, and what happens on them."""
+"""Faults on the bus of a loop: copies of the signals that faults change, and their readers sent to the copies."""
 
 from __future__ import annotations
 
@@ -13,53 +13,47 @@ from softneck.core import DataError, SettingsError, Vector, require_one_of, to_s
 from softneck.robot import Robot
 from softneck.runtime import Port
 
-from ._faults import Fault, MotorFault, NeckFault, SensorFault, with_kind
+from ._faults import Fault, MotorFault, NeckFault, SensorFault, fault_label
 from ._faults_runtime import FAULT_ADD, FAULT_DELAY, FAULT_DROPOUT, FAULT_FREEZE, FAULT_SLOW
 from ._loop import Part
 from ._wiring import BusSignal, Tap, Wiring, measured_names
 
 _NECK = Robot.preset("neck")
-# What each kind does but those that add something.
-_WHAT = {
+# Kind of fault -> its action in the runtime; all other kinds add a value.
+_ACTIONS = {
     "dropout": FAULT_DROPOUT, "freeze": FAULT_FREEZE, "stuck": FAULT_FREEZE, "delay": FAULT_DELAY, "slow": FAULT_SLOW,
 }  # fmt: skip
-# Share of a step by which a delay or the edge of a window may miss a sample: rounding of k * step.
+# Tolerance, as a share of a step, for a delay or an edge of a window that should be on a sample: rounding of k * step.
 _SAME_TIME = 1e-6
 
 
 class ActiveFault:
-    """One fault on its places of the bus.
+    """One fault with its positions on the bus.
 
     Attributes:
-        what: it does, see `_faults_runtime`.
-        slots, flags: positions of its signals, and of those of validity.
+        what: its action, see `_faults_runtime`.
+        slots, flags: positions of its signals, and of their validity flags.
         first, last: rows of its window.
-        lag: rows that it remembers.
+        lag: number of rows in its memory.
     """
 
     def __init__(self, fault: Fault, slots: list[int], flags: list[int], scale: Vector, step: float) -> None:
-        """Prepare `fault` on the bus positions `slots`, with `flags` those of validity.
-
-        Args:
-            fault: what to do.
-            slots: (n,) positions of its signals.
-            flags: positions that a dropout sets to zero.
-            scale: (n,) SI to the unit of each signal.
-            step: of the loop [s].
-        """
+        """Prepare `fault` for a loop with this `step` [s]; `scale` (n,) converts SI to the unit of each signal."""
         self.fault, self.slots, self.flags = fault, slots, flags
         self.first = math.ceil(fault.start / step - _SAME_TIME)
         end = fault.start + fault.duration
         self.last = math.ceil(end / step - _SAME_TIME) if math.isfinite(end) else 2**62
         self._scale, self._step = scale, step
         kind = "add" if isinstance(fault, NeckFault) else fault.kind
-        self.what, self.drawn = _WHAT.get(kind, FAULT_ADD), kind in ("noise", "outlier")
+        self.what, self.drawn = _ACTIONS.get(kind, FAULT_ADD), kind in ("noise", "outlier")
         self.lag = _lag(fault, step) or 1
-        # The two tails of a normal variable: a share of the samples, of either sign.
-        self._far = NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if kind == "outlier" else 0.0
+        # A normal variable beyond this, of either sign, is an outlier: the given share of the samples.
+        self._outlier_quantile = (
+            NormalDist().inv_cdf(1.0 - 0.5 * getattr(fault, "share", 0.0)) if kind == "outlier" else 0.0
+        )
 
     def amount(self, k: int) -> Vector:
-        """Return what is added at row `k` (n,): bias, offset and disturbance, noise, outliers."""
+        """Return the values (n,) that the fault adds at row `k`."""
         fault = self.fault
         if isinstance(fault, NeckFault):
             return self._scale * np.array(list(fault.values.values()))
@@ -67,36 +61,36 @@ class ActiveFault:
             return self._scale * fault.std * self._draws(k)
         if fault.kind == "outlier":
             draw = self._draws(k)
-            return np.where(np.abs(draw) > self._far, self._scale * fault.size * np.sign(draw), 0.0)
+            return np.where(np.abs(draw) > self._outlier_quantile, self._scale * fault.size * np.sign(draw), 0.0)
         return self._scale * fault.size
 
     @property
     def most(self) -> Vector:
-        """How far a slow motor gets in one step (n,)."""
+        """The largest move of a slow motor in one step (n,)."""
         return self._scale * getattr(self.fault, "rate", 0.0) * self._step
 
     def _draws(self, k: int) -> Vector:
-        """Return the normal draws (n,) of row `k`: a function of seed and row, so that nothing must be remembered."""
+        """Return the normal draws (n,) of row `k`; they depend on seed and row alone, so that there is no state."""
         return np.random.default_rng([getattr(self.fault, "seed"), k]).standard_normal(len(self.slots))  # noqa: B009
 
 
 class FaultStages:
-    """All faults of a loop, as `_faults_runtime` reads them.
+    """All faults of a loop in the form that `_faults_runtime` reads.
 
     Attributes:
-        lists, arrays: the same, for interpreted and for compiled rows.
+        lists, arrays: the same content, for interpreted and for compiled rows.
     """
 
     def __init__(
         self, detours: Sequence[list[int]], sensors: Sequence[ActiveFault], plant: Sequence[ActiveFault], rows: int
     ) -> None:
-        """Lay out faults of a run of `rows` rows.
+        """Lay out the faults of a run of `rows` rows.
 
         Args:
-            detours: positions of the plant's outputs, of their faulty copies, and both of what the plant reads.
-            sensors: the faults there, in the file's order.
-            plant: those of what the plant reads.
-            rows: of the run.
+            detours: positions of the plant's outputs and of their copies, then of the plant's inputs and their copies.
+            sensors: the faults of outputs, in the file's order.
+            plant: the faults of inputs.
+            rows: number of rows.
         """
         self._acting = (*sensors, *plant)
         codes, slots, spans, held = [], [], [], 0
@@ -123,7 +117,7 @@ class FaultStages:
         self.arrays = (whole[:4], table, whole[4], *numbers)
 
     def draw(self, first: int, stop: int) -> None:
-        """Draw what is random in rows `first` to `stop`."""
+        """Draw the random values of rows `first` to `stop`."""
         for acting, span in self._drawn:
             for k in range(max(first, acting.first), min(stop, acting.last)):
                 self._added[k, span] = acting.amount(k)
@@ -132,7 +126,7 @@ class FaultStages:
 def place_faults(
     faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], *, step: float, rows: int, robot: Robot = _NECK
 ) -> tuple[Wiring, FaultStages]:
-    """Put `faults` between the parts for `rows` rows of `step` [s] and return the wiring with their detours.
+    """Return the wiring with the copies that `faults` change, and the faults laid out for `rows` rows of `step` [s].
 
     Raises:
         SettingsError: the plant lacks what a fault acts on, or a delay is not a multiple of the step.
@@ -143,7 +137,8 @@ def place_faults(
         if isinstance(fault, SensorFault):
             names = sensor_outputs(fault, parts["plant"], robot)
             slots = [detours.of_output(name) for name in names]
-            flags = [detours.of_output("measurement_valid")] if _drops(fault, parts["plant"]) else []
+            has_flag = any(port.name == "measurement_valid" for port in parts["plant"].outputs)
+            flags = [detours.of_output("measurement_valid")] if fault.kind == "dropout" and has_flag else []
             sensors.append(ActiveFault(fault, slots, flags, _scales(parts["plant"].outputs, names, fault), step))
         else:
             names = _plant_inputs(fault, parts["plant"], robot)
@@ -160,39 +155,33 @@ def sensor_outputs(fault: SensorFault, plant: Part, robot: Robot = _NECK) -> tup
     names = fault.signals or tuple(f"{axis}_measured" if f"{axis}_measured" in known else axis for axis in axes)
     for name in names:
         if name not in known:
-            raise SettingsError(f"the {with_kind(fault)} acts on `{name}`, which is not an output of the plant.")
+            raise SettingsError(f"the {fault_label(fault)} acts on `{name}`, which is not an output of the plant.")
     return names
-
-
-def _drops(fault: SensorFault, plant: Part) -> bool:
-    return fault.kind == "dropout" and any(port.name == "measurement_valid" for port in plant.outputs)
 
 
 def _plant_inputs(fault: MotorFault | NeckFault, plant: Part, robot: Robot) -> tuple[str, ...]:
     if isinstance(fault, MotorFault):
         if fault.motor > len(robot.set_points):
-            raise SettingsError(
-                f"the {with_kind(fault)} is of motor {fault.motor}; {robot.label()} has {len(robot.set_points)}."
-            )
+            count = len(robot.set_points)
+            raise SettingsError(f"the {fault_label(fault)} is of motor {fault.motor}; {robot.label()} has {count}.")
         return (robot.set_points[fault.motor - 1],) if fault.motor else robot.set_points
     known = [port.name for port in plant.inputs]
     for name in fault.values:
         if name not in known:
-            raise SettingsError(
-                f"the {with_kind(fault)} needs the plant's input `{name}`; this plant's inputs are {', '.join(known)}."
-            )
+            listed = ", ".join(known)
+            raise SettingsError(f"the {fault_label(fault)} needs the plant's input `{name}`; the plant has {listed}.")
     return tuple(fault.values)
 
 
 def _scales(ports: Sequence[Port], names: Sequence[str], fault: Fault) -> Vector:
-    """Return (n,) the factors from SI to the unit of each signal; a foreign plant may measure in degrees."""
+    """Return the factors (n,) from SI to the unit of each signal; a plant from another tool may measure in degrees."""
     units = {port.name: port.unit for port in ports}
     factors = []
     for name in names:
         try:
             factors.append(1.0 / to_si(units[name] or "1")[0])
         except DataError as error:
-            raise SettingsError(f"the {with_kind(fault)} acts on `{name}`: {error}") from error
+            raise SettingsError(f"the {fault_label(fault)} acts on `{name}`: {error}") from error
     return np.array(factors)
 
 
@@ -206,7 +195,7 @@ def _lag(fault: Fault, step: float) -> int:
 
 
 class _FaultRouting:
-    """New places on the bus for signals that faults change, and readers sent there."""
+    """Adds positions on the bus for signals that faults change, and lets the other parts read them."""
 
     def __init__(self, wiring: Wiring, measured: tuple[str, ...]) -> None:
         self._wiring, self._measured = wiring, measured
@@ -217,18 +206,18 @@ class _FaultRouting:
         self._inputs: dict[str, tuple[int, int]] = {}
 
     def of_output(self, name: str) -> int:
-        """Return the place where all readers but the plant itself now find the plant's output `name`."""
+        """Return the position where all parts but the plant itself read the plant's output `name`."""
         if name not in self._outputs:
             old, port = next((n.slot, n.port) for n in self._named if n.part == "plant" and n.port.name == name)
             new = self._add(old, "sensor", replace(port, name=f"{name}_measured" if name in self._measured else name))
             for part, tap in self._taps.items():
                 if part != "plant":
-                    self._taps[part] = _redirected(tap, old, new, fragile=not port.boolean)
+                    self._taps[part] = _redirect(tap, old, new, fragile=not port.boolean)
             self._outputs[name] = (old, new)
         return self._outputs[name][1]
 
     def of_input(self, name: str) -> int:
-        """Return the place that the plant's input `name` now reads."""
+        """Return the position that the plant's input `name` now reads."""
         if name not in self._inputs:
             tap = self._taps["plant"]
             i = tap.names.index(name)
@@ -251,11 +240,11 @@ class _FaultRouting:
         return replace(self._wiring, start=np.array(self._start), named=tuple(self._named), taps=self._taps)
 
     def places(self) -> list[list[int]]:
-        """Return from where to where the plant's outputs are copied, and what it reads."""
+        """Return the positions of outputs and of their copies, then of inputs and their copies."""
         return [[pair[i] for pair in table.values()] for table in (self._outputs, self._inputs) for i in (0, 1)]
 
 
-def _redirected(tap: Tap, old: int, new: int, *, fragile: bool) -> Tap:
+def _redirect(tap: Tap, old: int, new: int, *, fragile: bool) -> Tap:
     hit = np.flatnonzero(tap.slots == old)
     if not hit.size:
         return tap

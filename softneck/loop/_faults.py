@@ -1,6 +1,6 @@
-"""Faults as parts of a loop: what goes wrong, from when on and for how long.
+"""Faults of a loop: their kinds, start and duration, and the keys of a loop file that describe them.
 
-They act on signals between the parts, so that they work on any plant; those inside the neck use its inputs.
+They act on signals between the parts and so work on any plant; disturbances inside the neck use its inputs.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _NECK = Robot.preset("neck")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorFault:
-    """Fault of the measured outputs between plant and observer or controller; the true ones are unchanged.
+    """A fault of the measured outputs between plant and observer or controller; the true outputs do not change.
 
     Attributes:
         kind: "dropout" (no value, `measurement_valid` false), "freeze" (the last value before it), "bias"
             (plus `size`), "outlier" (plus or minus `size` in a `share` of the samples), "delay" (older by
             `delay`), "noise" (plus white noise of standard deviation `std`).
         start: [s]; duration: [s], infinity for the rest of the run.
-        axis: one of the robot's outputs, such as "pitch"; "both" for all of them.
+        axis: one of the robot's outputs, such as "pitch"; "both" means all of them.
         signals: other outputs of the plant instead, such as ("pitch_rate_measured",).
         size, std: in SI.
         share: of the samples, 0 to 1.
@@ -62,7 +62,7 @@ class SensorFault:
             raise SettingsError(f"`share` must be above 0 and at most 1; got {self.share:g}.")
         require_whole("seed", self.seed, 0, 2**31 - 1)
         if self.kind in ("bias", "outlier") and self.size == 0.0:
-            raise SettingsError(f"`size` of a sensor {self.kind} must not be zero; say how large it is.")
+            raise SettingsError(f"`size` of a sensor {self.kind} must not be zero.")
         if self.kind == "noise":
             require_positive("std", self.std, "rad")
         if self.kind == "delay":
@@ -71,15 +71,15 @@ class SensorFault:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotorFault:
-    """What a motor does with its set-point.
+    """A fault of a motor that changes how it follows its set-point.
 
     Attributes:
-        kind: "stuck" (stays where it was sent last), "slow" (moves at `rate` at most), "offset" (plus `size`).
+        kind: "stuck" (stays at its last set-point), "slow" (moves at `rate` at most), "offset" (plus `size`).
         start: [s]; duration: [s], infinity for the rest of the run.
-        motor: 1, 2 or 3; 0 for all.
+        motor: from 1 on; 0 means all.
         rate: [rad/s].
         size: [rad].
-        robot: whose motor it is; of another than the neck rate and size are in the SI unit of its motors.
+        robot: of the motor; rate and size of other robots than the neck are in the SI unit of their motors.
     """
 
     kind: str
@@ -102,7 +102,7 @@ class MotorFault:
         if self.kind == "slow":
             require_positive("rate", self.rate, "rad/s")
         if self.kind == "offset" and self.size == 0.0:
-            raise SettingsError("`size` of a motor offset must not be zero; say how large it is.")
+            raise SettingsError("`size` of a motor offset must not be zero.")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,8 +110,7 @@ class NeckFault:
     """A disturbance inside the neck: `values` are added to the plant's inputs of those names.
 
     Attributes:
-        values: input -> what is added, such as {"payload": 0.5} [kg], {"push_x": 5.0} [N],
-            {"base_tilt_pitch": 0.1} [rad].
+        values: input -> added value: {"payload": 0.5} [kg], {"push_x": 5.0} [N], {"base_tilt_pitch": 0.1} [rad].
         start: [s]; duration: [s], infinity for the rest of the run.
     """
 
@@ -127,12 +126,12 @@ class NeckFault:
             require_finite(name, value, "SI")
 
 
-#: Any fault that a loop can act out.
+#: Any fault of a loop.
 Fault = SensorFault | MotorFault | NeckFault
 
 # kind in a loop file -> (class, its `kind`, the keys that it takes without their unit).
 _SENSOR_KEYS = ("axis", "signals")
-_FILE: dict[str, tuple[type, str, tuple[str, ...]]] = {
+_FILE_KINDS: dict[str, tuple[type, str, tuple[str, ...]]] = {
     "sensor_dropout": (SensorFault, "dropout", _SENSOR_KEYS),
     "sensor_freeze": (SensorFault, "freeze", _SENSOR_KEYS),
     "sensor_bias": (SensorFault, "bias", (*_SENSOR_KEYS, "size")),
@@ -146,7 +145,7 @@ _FILE: dict[str, tuple[type, str, tuple[str, ...]]] = {
     "push": (NeckFault, "push_", ("x", "y")),
     "base_tilt": (NeckFault, "base_tilt_", ("pitch", "roll")),
 }
-FAULT_KINDS = tuple(_FILE)
+FAULT_KINDS = tuple(_FILE_KINDS)
 
 
 def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> Fault:
@@ -155,9 +154,9 @@ def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) ->
     Raises:
         SettingsError: unknown kind or key, or a value out of range.
     """
-    if kind not in _FILE:
+    if kind not in _FILE_KINDS:
         raise SettingsError(f"unknown kind of fault `{kind}`; use one of {', '.join(FAULT_KINDS)}.")
-    made, what, known = _FILE[kind]
+    made, what, known = _FILE_KINDS[kind]
     chosen: dict[str, object] = {}
     for key, value in values.items():
         name, factor = _split(key)
@@ -177,23 +176,25 @@ def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) ->
 
 
 def fault_field(kind: str, key: str) -> str | None:
-    """Return what a key of a loop file such as `size_deg` sets in a fault of `kind`, None if it sets nothing."""
+    """Return the attribute that a key such as `size_deg` sets in a fault of `kind`; None for an unknown key."""
     name = _split(key)[0]
-    return name if kind in _FILE and name in (*_FILE[kind][2], "start", "duration") else None
+    return name if kind in _FILE_KINDS and name in (*_FILE_KINDS[kind][2], "start", "duration") else None
 
 
 def fault_keys(fault: Fault) -> dict[str, object]:
     """Return the keys of a loop file that describe `fault`, all in SI."""
     prefix = ""
     if isinstance(fault, NeckFault):
-        kind = next((k for k, (made, p, known) in _FILE.items() if made is NeckFault and _covers(p, known, fault)), "")
-        prefix = _FILE[kind][1] if kind else ""
+        kind = next(
+            (k for k, (made, p, known) in _FILE_KINDS.items() if made is NeckFault and _covers(p, known, fault)), ""
+        )
+        prefix = _FILE_KINDS[kind][1] if kind else ""
         values: dict[str, object] = {name.removeprefix(prefix): value for name, value in fault.values.items()}
     else:
-        kind = next(k for k, (made, what, _) in _FILE.items() if isinstance(fault, made) and what == fault.kind)
-        values = {name: getattr(fault, name) for name in _FILE[kind][2]}
+        kind = next(k for k, (made, what, _) in _FILE_KINDS.items() if isinstance(fault, made) and what == fault.kind)
+        values = {name: getattr(fault, name) for name in _FILE_KINDS[kind][2]}
     if not kind:
-        raise SettingsError(f"the {with_kind(fault)} is of a kind that a loop file cannot hold; make it of several.")
+        raise SettingsError(f"a loop file cannot hold the {fault_label(fault)}; split it into several faults.")
     values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items() if value != ()}
     times = {"start": fault.start, "duration": fault.duration}
     return {"kind": kind, **values, **{name: time for name, time in times.items() if math.isfinite(time)}}
@@ -203,8 +204,8 @@ def _covers(prefix: str, known: tuple[str, ...], fault: NeckFault) -> bool:
     return all(name.startswith(prefix) and name.removeprefix(prefix) in known for name in fault.values)
 
 
-def with_kind(fault: Fault) -> str:
-    """Return what a message calls a fault."""
+def fault_label(fault: Fault) -> str:
+    """Return the name of a fault for messages."""
     if isinstance(fault, NeckFault):
         return f"disturbance of {', '.join(fault.values)}"
     return f"{'sensor' if isinstance(fault, SensorFault) else 'motor'} {fault.kind}"

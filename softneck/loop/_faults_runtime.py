@@ -1,8 +1,8 @@
-"""What faults do to signals on the bus of a loop, row by row.
+"""Change signals on the bus of a loop by its faults, row by row.
 
-A fault is a row of `codes`: place (0 where sensors are read, 1 where the plant reads), what it does, its first and
-last row, begin and end of its signals among `slots`, end of its validity flags there, begin of its memory, and the
-rows that it remembers.
+A fault is a row of `codes`: place (0 where sensors are read, 1 where the plant reads), action, first and last row,
+begin and end of its signals among `slots`, end of its validity flags there, begin of its memory, and number of rows in
+the memory.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ FAULT_SLOW = 4
 
 
 def faults_act(k: int, place: int, faults: tuple, bus: np.ndarray) -> None:
-    """Copy signals past the faults of one place, and let these act at row `k`.
+    """Copy the signals that the faults of one place change, and apply these faults at row `k`.
 
     faults: detours (from and to of both places), codes, slots, greatest steps, (rows, slots) what to add, memory.
     """
     detours, codes = faults[0], faults[1]
     origins, targets = detours[2 * place], detours[2 * place + 1]
-    # What a fault may change has a place of its own; the signal itself stays true for whoever reads it elsewhere.
+    # Faults change a copy; the signal itself stays true for other readers.
     for i in range(len(origins)):
         bus[targets[i]] = bus[origins[i]]
     for i in range(len(codes)):
@@ -34,14 +34,14 @@ def faults_act(k: int, place: int, faults: tuple, bus: np.ndarray) -> None:
 
 
 def fault_act(k: int, code: np.ndarray, faults: tuple, bus: np.ndarray) -> None:
-    """Let one fault act at row `k`, and remember what it needs."""
+    """Apply one fault at row `k` and update its memory."""
     slots, most, added, memory = faults[2], faults[3], faults[4], faults[5]
     kind, begin, end = code[1], code[4], code[5]
     on = code[2] <= k < code[3]
     for i in range(begin, end):
         slot, at = slots[i], code[7] + i - begin
         now = bus[slot]
-        # Bias, outliers, noise, offsets and what acts on the neck: all drawn before the run, a row each.
+        # Bias, outliers, noise, offsets and disturbances of the neck: all rows were computed before.
         if kind == FAULT_ADD:
             if on:
                 bus[slot] = now + added[k, i]
@@ -49,21 +49,20 @@ def fault_act(k: int, code: np.ndarray, faults: tuple, bus: np.ndarray) -> None:
             if on:
                 bus[slot] = math.nan
         elif kind == FAULT_FREEZE:
-            # The memory follows while nothing is wrong.
-            # At the very first row there is nothing before: that row's own value stays.
+            # The memory follows the signal until the fault starts. At row 0 there is no earlier value: its own stays.
             if on and k > 0:
                 bus[slot] = memory[at]
             else:
                 memory[at] = now
         elif kind == FAULT_SLOW:
-            # From what was shown on the last row, in the window or before it: a slow motor begins without a jump.
+            # From the value of the last row, in the window or before it: a slow motor starts without a jump.
             if on and k > 0:
                 bus[slot] = memory[at] + min(max(now - memory[at], -most[i]), most[i])
             memory[at] = bus[slot]
         else:
             fault_delay(k, i, code, memory, bus, slot, on)
     if kind == FAULT_DROPOUT and on:
-        # The flags of validity stand behind the signals in `slots`.
+        # The validity flags come after the signals in `slots`.
         for i in range(end, code[6]):
             bus[slots[i]] = 0.0
 
@@ -71,13 +70,13 @@ def fault_act(k: int, code: np.ndarray, faults: tuple, bus: np.ndarray) -> None:
 def fault_delay(
     k: int, i: int, code: np.ndarray, memory: np.ndarray, bus: np.ndarray, slot: int, on: bool
 ) -> None:  # fmt: skip
-    """Show the value of some rows ago; before the first row a signal was what it is there."""
+    """Return the signal of `lag` rows ago to the bus; before row 0 it had the value of row 0."""
     width, lag, now = code[5] - code[4], code[8], bus[slot]
     first = code[7] + i - code[4]
     if k == 0:
         for row in range(lag):
             memory[first + row * width] = now
-    # What is read here was written `lag` rows ago, in the place that now is written anew.
+    # A ring buffer: this cell was written `lag` rows ago and is overwritten now.
     at = first + (k % lag) * width
     if on:
         bus[slot] = memory[at]

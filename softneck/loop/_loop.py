@@ -1,4 +1,4 @@
-"""The parts of a loop and the closed loop of them."""
+"""The closed loop: its parts, reference, faults and order; and systems of parts that are no closed loop."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Part(Protocol):
     def role(self) -> str: ...
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
-        """Begin a run at `time` [s] and return the outputs (n_out,) there; may be called again after `close`."""
+        """Start a run at `time` [s] and return the outputs (n_out,) there; may be called again after `close`."""
         ...
 
     def advance(self, time: float, inputs: Vector) -> Vector:
@@ -46,15 +46,15 @@ class Part(Protocol):
         ...
 
     def close(self) -> None:
-        """Release what `start` took."""
+        """Release the resources of `start`."""
         ...
 
 
 class BlockPart:
-    """A `Block` as a part: its runtime stepped in place, without a copy of the state for each sample."""
+    """A `Block` as a part; its state is stepped in place, without a copy for each sample."""
 
     def __init__(self, block: Block) -> None:
-        """Adapt `block`; the state comes with `start`."""
+        """Adapt `block`; `start` makes the state."""
         self.block = block
         self.inputs = block.inputs
         self.outputs = block.outputs
@@ -64,7 +64,7 @@ class BlockPart:
         self._parameters = self._state = self._outputs = np.zeros(0)
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:  # noqa: ARG002 - blocks know no absolute time
-        """Return the outputs at the start; unknown parameters raise SettingsError."""
+        """Return the outputs at the start; raise SettingsError for unknown parameters."""
         state = self.block.initial_state(**parameters)
         self._parameters, self._state = state.parameters, state.values.copy()
         self._outputs = state.outputs.copy()
@@ -75,26 +75,26 @@ class BlockPart:
         return self.step(time, inputs).copy()
 
     def step(self, time: float, inputs: Vector) -> Vector:  # noqa: ARG002
-        """Step once and return the outputs where the next step changes them."""
+        """Step once and return the outputs without a copy: the next step changes them."""
         self._step(self.block.arrays, self._parameters, self._state, inputs, self._outputs)
         return self._outputs
 
     def close(self) -> None:
-        """Do nothing: a block holds nothing but memory."""
+        """Do nothing: a block holds only memory."""
 
     @property
     def memory(self) -> tuple[Vector, Vector, Vector]:
-        """Parameters, state and outputs, as the runtime changes them in place."""
+        """Parameters, state and outputs, which the runtime changes in place."""
         return self._parameters, self._state, self._outputs
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A connection that says itself what becomes of the value, whatever the units: factor * value + offset.
+    """A connection factor * value + offset, in place of any conversion of units.
 
     Attributes:
         origin: "part.output".
-        factor, offset: of the value.
+        factor, offset: applied to the output's value.
     """
 
     origin: str
@@ -103,8 +103,8 @@ class Link:
 
 
 ORDERS = ("sequential", "jacobi")
-_NAMES = ("plant", "observer", "controller", "reference")
-# Parameter of a controller's FMU: take motor positions as they come, instead of a model of the drives inside it.
+PART_NAMES = ("plant", "observer", "controller", "reference")
+# Parameter of a controller's FMU: use measured motor positions instead of a model of the drives inside it.
 USE_MOTOR_POSITIONS = "use_motor_positions"
 
 
@@ -113,19 +113,19 @@ class Loop(ReprMixin):
     """A closed loop.
 
     Attributes:
-        plant, controller, observer: the parts; without an observer the controller sees the measured outputs.
-        reference: called with the time [s], returns all outputs and co-contraction, in SI; or a part of role
-            "reference", whose outputs are those.
+        plant, controller, observer: the parts; without an observer the controller reads the measured outputs.
+        reference: a function of time [s] that returns all outputs and co-contraction in SI; or a part of role
+            "reference" with these outputs.
         duration: [s].
         order: "sequential" (as on the hardware: plant outputs at t_k, observer, controller, plant) or "jacobi"
-            (all inputs first, then all steps: one sample more in the observer and one in the controller).
-        plant_parameters, observer_parameters, controller_parameters: other values by name.
+            (all inputs first, then all steps: one more sample of delay in observer and controller each).
+        plant_parameters, observer_parameters, controller_parameters: values that differ from the defaults, by name.
         plant_inputs: constants for plant inputs such as `payload`.
-        faults: what goes wrong, acting in this order.
-        others: further parts by name, such as a filter; and `other_parameters` their parameters.
+        faults: applied in this order.
+        others: further parts by name, such as a filter; `other_parameters` are their parameters.
         other_inputs: part -> constants for inputs of the observer, the controller or one of the others.
-        connections: "part.input" -> "part.output", or a `Link` with factor and offset, where names alone do not say it.
-        robot: whose loop it is.
+        connections: "part.input" -> "part.output", or a `Link` with factor and offset, for ports with different names.
+        robot: that is controlled.
     """
 
     plant: Part
@@ -149,7 +149,7 @@ class Loop(ReprMixin):
         require_positive("duration", self.duration, "s")
         require_one_of("order", self.order, ORDERS)
         for name in self.others:
-            if name in _NAMES or not name.isidentifier():
+            if name in PART_NAMES or not name.isidentifier():
                 raise SettingsError(f"`{name}` cannot be the name of a further part; use letters, digits and _.")
 
     @property
@@ -163,7 +163,7 @@ class Loop(ReprMixin):
 
     @property
     def parameters(self) -> dict[str, Mapping[str, float]]:
-        """Return part -> its parameters; an FMU's `use_motor_positions` is true where nobody says otherwise."""
+        """Return part -> its parameters; an FMU's `use_motor_positions` is true by default."""
         named = {
             "plant": self.plant_parameters,
             "observer": self.observer_parameters,
@@ -171,7 +171,7 @@ class Loop(ReprMixin):
         }
         named |= dict(self.other_parameters)
         for name, part in self.parts.items():
-            # A loop connects the positions; blocks take them always, FMUs when told to.
+            # A loop connects the positions; blocks always use them, FMUs only with this parameter.
             if USE_MOTOR_POSITIONS in {port.name for port in getattr(part, "parameters", ())}:
                 named[name] = {USE_MOTOR_POSITIONS: 1.0, **named.get(name, {})}
         return named
@@ -182,20 +182,20 @@ class Loop(ReprMixin):
         return {**self.other_inputs, "plant": self.plant_inputs}
 
     def close(self) -> None:
-        """Release what the parts hold, such as loaded FMUs."""
+        """Release the resources of the parts, such as loaded FMUs."""
         for part in self.parts.values():
             part.close()
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class System(ReprMixin):
-    """Parts and their connections; nothing is connected by name, and no part must be a plant or a controller.
+    """Parts with explicit connections; none of them needs to be a plant or a controller.
 
     Attributes:
         parts: by name.
         connections: "part.input" -> "part.output", or a `Link` with factor and offset.
-        constants: part -> values of inputs that nobody writes.
-        parameters: part -> other values of its parameters.
+        constants: part -> values of inputs that are not connected.
+        parameters: part -> values that differ from the defaults.
         duration: [s].
         order: "jacobi" or "sequential", as of a `Loop`.
     """
@@ -214,10 +214,10 @@ class System(ReprMixin):
 
     @property
     def faults(self) -> tuple[Fault, ...]:
-        """Return nothing: faults act on the sensor and the motors of a plant."""
+        """Return no faults: they act on sensor and motors of a plant."""
         return ()
 
     def close(self) -> None:
-        """Release what the parts hold, such as loaded FMUs."""
+        """Release the resources of the parts, such as loaded FMUs."""
         for part in self.parts.values():
             part.close()

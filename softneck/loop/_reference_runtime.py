@@ -1,6 +1,6 @@
-"""References: what outputs and co-contraction are to be, for loops (`_references.py`) and the reference FMU.
+"""References of outputs and co-contraction, for loops (`_references.py`) and the reference FMU.
 
-`step` from sample k returns the reference at sample k + 1, which is where a master reads it.
+`step` from sample k returns the reference at sample k + 1, where a master reads it.
 """
 
 import math
@@ -11,14 +11,14 @@ from softneck.runtime._layout import Arrays, StateVector, array, cells
 
 
 class ReferenceArrays(Arrays):
-    """Which reference, and the rows of a recorded one."""
+    """The kind of reference, and the table of a recorded one."""
 
     setup = array("2", "kind: 0 step, 1 ramp, 2 sine, 3 rotation, 4 recording; sample time [s]")
     table = array("rows, columns", "time [s], outputs and co-contraction of a recording")
 
 
 class ReferenceState(StateVector):
-    """Where in time it is."""
+    """The position in time."""
 
     sample = cells("", "number of the sample")
     row = cells("", "row of the table")
@@ -34,7 +34,7 @@ def initialise(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, ou
 def step(
     p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, inputs: np.ndarray, outputs: np.ndarray
 ) -> None:
-    """Go on by one sample."""
+    """Advance by one sample."""
     x.sample += 1.0
     reference_at(p, parameters, x, outputs)
 
@@ -48,7 +48,7 @@ def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, 
     time = x.sample * p.setup[1]  # from a count: sums of sample times would drift
     frequency, at, rise = float(parameters[m + 2]), float(parameters[m + 3]), float(parameters[m + 4])
     if kind == 4:
-        # Time only goes forward: the search goes on where it was.
+        # Time only increases: the search continues at the last row.
         k = reference_row(time, p.table, int(x.row))
         x.row = float(k)
         for j in range(m + 1):
@@ -65,7 +65,7 @@ def reference_at(p: ReferenceArrays, parameters: np.ndarray, x: ReferenceState, 
 
 
 def reference_value(kind: int, time: float, value: float, frequency: float, at: float, rise: float) -> float:
-    """Jump from zero at `at` (0), rise linearly over `rise` (1), or swing from `at` on (2)."""
+    """Return a step at `at` (0), a linear rise over `rise` (1), or a sine from `at` on (2)."""
     if kind == 0:
         # Times are multiples of a sample time; half a nanosecond covers their rounding.
         if time >= at - 5e-10:
@@ -79,16 +79,16 @@ def reference_value(kind: int, time: float, value: float, frequency: float, at: 
 def reference_rotation(
     time: float, inclination: float, frequency: float, at: float, rise: float
 ) -> tuple[float, float]:  # fmt: skip
-    """Go around: A cos(w t) and A sin(w t), A rising from zero over `rise`."""
+    """Return A cos(w t) and A sin(w t), where A rises from zero over `rise`."""
     elapsed = max(0.0, time - at)
-    # Out of the upright on a spiral: a circle begun at once would be a step.
+    # A spiral out of the upright: a circle at once would be a step.
     a = inclination * min(1.0, elapsed / rise)
     angle = 2.0 * math.pi * frequency * elapsed
     return a * math.cos(angle), a * math.sin(angle)
 
 
 def reference_row(time: float, table: np.ndarray, k: int) -> int:
-    """Return the row of a recording that holds at `time`, from row `k` on."""
+    """Return the row of a recording at `time`; the search starts at row `k`."""
     while k + 1 < table.shape[0] and table[k + 1, 0] <= time + 5e-10:  # rounding of the times, as in `reference_value`
         k += 1
     return k

@@ -28,7 +28,7 @@ from softneck.runtime import Block, Port
 from ._reference_runtime import reference_rotation, reference_row, reference_value
 
 _NECK = Robot.preset("neck")
-#: Kind, in the order of the runtime -> what else than values it takes, with where it begins without being told.
+#: Kind, in the order of the runtime -> its parameters besides values, with their defaults.
 SHAPES: dict[str, dict[str, float]] = {
     "step": {"at": 0.0},
     "ramp": {"at": 0.0, "rise": 1.0},
@@ -37,12 +37,12 @@ SHAPES: dict[str, dict[str, float]] = {
 }
 _ENDINGS = {"at": "s", "rise": "s", "frequency": "hz"}
 _TIMES = {"": 1.0, "s": 1.0, "ms": 1e-3, "hz": 1.0}
-# No output turns further [rad]; more is a value in degrees.
-_HALF_TURN = np.pi
+# Largest angle of an output [rad]; a larger value is probably in degrees.
+_MAX_ANGLE_RAD = np.pi
 
 
 class Reference(Protocol):
-    """Anything that returns all outputs and co-contraction at `time` [s], in SI: of a neck pitch, roll and delta_i."""
+    """A function of `time` [s] that returns all outputs and co-contraction in SI: pitch, roll and delta_i of a neck."""
 
     def __call__(self, time: float, /) -> tuple[float, ...]:
         """Return the reference at `time`."""
@@ -51,14 +51,14 @@ class Reference(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RobotReference:
-    """A step (a jump from zero at `at`), ramp (over `rise`), sine (in phase from `at` on) or rotation of two angles.
+    """A step (from zero at `at`), ramp (over `rise`), sine (with phase zero at `at`) or rotation of two angles.
 
-    In a rotation the tilt goes around: A cos(w t) and A sin(w t), A rising from zero over `rise`.
+    A rotation is A cos(w t) and A sin(w t), where A rises from zero over `rise`.
 
     Attributes:
         kind: "step", "ramp", "sine" or "rotation".
-        values: (outputs,) end values or amplitudes [SI]; of a rotation its inclination A, for both outputs.
-        cocontraction: wanted mean of the motors, delta_i of a neck [SI]; that of sine and rotation is constant.
+        values: (outputs,) end values or amplitudes [SI]; for a rotation the inclination A.
+        cocontraction: mean of the motors, delta_i of a neck [SI]; constant for sine and rotation.
         at, rise: [s].
         frequency: [Hz].
     """
@@ -88,10 +88,10 @@ class RobotReference:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RecordingReference(ReprMixin):
-    """Recorded outputs of any robot, each row held until the next; the last one is held to the end.
+    """Recorded outputs of any robot; each row holds until the next one, and the last one to the end.
 
     Attributes:
-        table: (rows, outputs + 2) time [s], rising; outputs, of a neck pitch and roll [rad]; co-contraction.
+        table: (rows, outputs + 2) increasing time [s], outputs (of a neck pitch and roll [rad]), co-contraction.
     """
 
     table: Matrix
@@ -105,27 +105,27 @@ class RecordingReference(ReprMixin):
 
     @classmethod
     def of(cls, time: Vector, channels: Mapping[str, Vector], names: Sequence[str]) -> RecordingReference:
-        """Return the reference that a recording holds: the references of the outputs `names`, or else they."""
+        """Return the recorded references of the outputs `names`, or the outputs themselves if there are none."""
         columns = [channels.get(f"{name}_reference", channels[name]) for name in names]
         common = channels.get("cocontraction_reference", np.zeros(time.size))
         return cls(np.column_stack([time, *columns, common]))
 
     def __call__(self, time: float, /) -> tuple[float, ...]:
         """Return the reference at `time` [s]: all outputs, then co-contraction."""
-        # The search only comes near, in few steps; the row itself is the runtime's to say.
+        # The search finds the neighbourhood fast; the runtime then determines the row.
         near = max(0, int(np.searchsorted(self.table[:, 0], time, side="right")) - 1)
         return tuple(self.table[reference_row(time, self.table, near), 1:].tolist())
 
 
 def reference(kind: str, values: Mapping[str, float], robot: Robot = _NECK) -> RobotReference:
-    """Return a reference of outputs, `inclination`, `cocontraction`, `at`, `rise` and `frequency`, all in SI.
+    """Return a reference from outputs, `inclination`, `cocontraction`, `at`, `rise` and `frequency`, all in SI.
 
     Raises:
-        SettingsError: unknown kind or name, a value beyond what the output may be, or a rotation of no two angles.
+        SettingsError: unknown kind or name, a value outside the range of the output, or a rotation without two angles.
     """
     if kind == "rotation" and (len(robot.outputs.names) != 2 or to_si(robot.outputs.unit)[1] != "rad"):
         names = ", ".join(robot.outputs.names)
-        raise SettingsError(f'kind = "rotation" is for two angles; {robot.label()} has {names}.')
+        raise SettingsError(f'kind = "rotation" needs two angles; {robot.label()} has {names}.')
     wanted = {**dict.fromkeys(_units(kind, robot), 0.0), **SHAPES[kind]}
     for name, value in values.items():
         if name not in wanted:
@@ -163,10 +163,10 @@ def RotationReference(**values: float) -> RobotReference:
 def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
     """Return a reference from the keys of a loop file: `x_mm = 10`, or `x = 10` in its display unit; `at_s`.
 
-    The kinds are step, ramp, sine and rotation; a recorded one is made of its arrays by `RecordingReference`.
+    The kinds are step, ramp, sine and rotation; `RecordingReference` makes a recorded one.
 
     Raises:
-        SettingsError: as of `reference`.
+        SettingsError: as for `reference`.
     """
     require_one_of("kind", kind, tuple(SHAPES))
     chosen = {}
@@ -179,10 +179,10 @@ def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK
 
 
 def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
-    """Return what a key such as `x_mm` or `at_s` sets in a reference of `kind`, and its factor to SI.
+    """Return the value that a key such as `x_mm` or `at_s` sets in a reference of `kind`, and its factor to SI.
 
     Raises:
-        SettingsError: nothing, or an angle without unit where the robot's file is in another than people see.
+        SettingsError: an unknown key, or an angle without unit where unit and display unit of the outputs differ.
     """
     units, times = _units(kind, robot), SHAPES.get(kind, {})
     name, _, unit = (key, "", "") if key in units or key in times else key.rpartition("_")
@@ -218,11 +218,11 @@ def reference_keys(made: object, robot: Robot = _NECK) -> dict[str, float | str]
 
 
 def same_quantity(one: str, other: str) -> bool:
-    """Return whether two keys set the same quantity, perhaps in two units, such as `x_mm` and `x`."""
-    return _stem(one) == _stem(other)
+    """Return whether two keys set the same quantity, also in different units, such as `x_mm` and `x`."""
+    return _without_unit(one) == _without_unit(other)
 
 
-def _stem(key: str) -> str:
+def _without_unit(key: str) -> str:
     name, _, unit = key.rpartition("_")
     try:
         return name if unit in _TIMES or to_si(unit) else key
@@ -236,11 +236,11 @@ def _units(kind: str, robot: Robot) -> dict[str, str]:
 
 
 def reference_range(name: str, robot: Robot) -> tuple[float, float, str]:
-    """Return lowest and highest value of an output, the inclination or co-contraction, and the unit they are in."""
+    """Return lowest and highest value of an output, the inclination or co-contraction, and their unit."""
     outputs, motors = robot.outputs, robot.motors
     if name == "cocontraction":
         return min(motors.setpoint_min or (-np.inf,)), max(motors.setpoint_max or (np.inf,)), motors.unit
-    half = _HALF_TURN / to_si(outputs.unit)[0] if to_si(outputs.unit)[1] == "rad" else np.inf
+    half = _MAX_ANGLE_RAD / to_si(outputs.unit)[0] if to_si(outputs.unit)[1] == "rad" else np.inf
     if name == "inclination":
         most = min(outputs.max or (half,))
         return -most, most, outputs.unit
@@ -257,13 +257,13 @@ def _check_range(name: str, value: float, robot: Robot) -> None:
     if not low * factor <= value <= high * factor:
         hint = ": degrees?" if si == "rad" and name != "cocontraction" else "."
         raise SettingsError(
-            f"`{name}` must be within {low:g} to {high:g} {unit}, as robot {robot.label()} may be; "
+            f"`{name}` must be within {low:g} to {high:g} {unit}, the range of robot {robot.label()}; "
             f"got {value / factor:g}{hint}"
         )
 
 
 def reference_ports(robot: Robot = _NECK) -> tuple[Port, ...]:
-    """Return the outputs of a reference of `robot`."""
+    """Return the output ports of a reference of `robot`."""
     outputs, motors = robot.outputs, robot.motors
     unit, motor = to_si(outputs.unit)[1], to_si(motors.unit)[1]
     common = f"co-contraction {robot.cocontraction_name} (Eq. 11)" if robot.directions.names else "mean of the motors"
@@ -276,14 +276,14 @@ def reference_ports(robot: Robot = _NECK) -> tuple[Port, ...]:
 
 
 class AheadReference:
-    """A reference as a part that also tells what it will be `ahead` later; a `softneck.loop.Part`."""
+    """A reference as a part with outputs for now and for `ahead` later; a `softneck.loop.Part`."""
 
     role = "reference"
 
     def __init__(
         self, reference: Reference, ahead: float, *, sample_time: float = 0.02, robot: Robot | None = None
     ) -> None:
-        """Adapt `reference`, a function of time; `ahead` [s] is the controller's `preview`, `robot` None a neck."""
+        """Adapt `reference`, a function of time; `ahead` [s] is the controller's `preview`, `robot` None the neck."""
         require_positive("ahead", ahead, "s")
         require_positive("sample_time", sample_time, "s")
         self.reference, self.ahead, self.sample_time = reference, ahead, sample_time
@@ -297,27 +297,28 @@ class AheadReference:
         )  # fmt: skip
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
-        """Return what holds at `time` [s]; it has no parameters."""
+        """Return the reference at `time` [s]; it has no parameters."""
         if parameters:
             raise SettingsError(f"`{next(iter(parameters))}` is not a parameter of a reference ahead; it has none.")
         return self._at(time)
 
     def advance(self, time: float, inputs: Vector) -> Vector:  # noqa: ARG002 - it has none
-        """Return what holds one sample after `time` [s]."""
+        """Return the reference one sample after `time` [s]."""
         return self._at(time + self.sample_time)
 
     def close(self) -> None:
-        """Do nothing: it holds nothing."""
+        """Do nothing: there is nothing to release."""
 
     def _at(self, time: float) -> Vector:
         return np.array([*self.reference(time), 1.0, *self.reference(time + self.ahead)[: self._count]])
 
 
-_RECORDED = 4
+# Kind of a recorded reference in the runtime.
+_RECORDING_KIND = 4
 
 
 def _parameters(robot: Robot) -> tuple[Port, ...]:
-    """Return the parameters, in the runtime's order; the starts of those that a kind does not have are never read."""
+    """Return the parameters in the order of the runtime; each kind reads only its own."""
     outputs = to_si(robot.outputs.unit)[1]
 
     def port(name: str, unit: str, description: str, shown: str) -> Port:
@@ -339,7 +340,7 @@ def _parameters(robot: Robot) -> tuple[Port, ...]:
 
 
 class ReferenceBlock:
-    """A reference that an FMU can be built of (`softneck.fmu.describe._describe.Buildable`)."""
+    """A reference from which an FMU can be built (a `softneck.fmu.Buildable`)."""
 
     def __init__(
         self,
@@ -352,22 +353,22 @@ class ReferenceBlock:
         """Describe `reference` as a block.
 
         Args:
-            reference: one of softneck's own, or any function of time if `duration` is given.
+            reference: one of softneck's, or any function of time if `duration` is given.
             sample_time: [s].
-            duration: for how long a function of your own is written down, sample by sample [s].
-            robot: whose; None: the neck's.
+            duration: for which a function of the user is tabulated, sample by sample [s].
+            robot: None for the neck.
         """
         require_positive("sample_time", sample_time, "s")
         self.reference, self.sample_time = reference, sample_time
         self._duration, self._robot = duration, Robot.preset() if robot is None else robot
 
     def block(self) -> Block:
-        """Return the block; its outputs are those of the reference, one sample after each step.
+        """Return the block; its outputs are the reference one sample after each step.
 
         Raises:
-            SettingsError: a function of the user's own without a duration.
+            SettingsError: a function of the user without a duration.
         """
-        kind, starts, table = self._described()
+        kind, starts, table = self._describe()
         parameters = tuple(replace(port, start=starts.get(port.name, port.start)) for port in _parameters(self._robot))
         return Block(
             kind="reference", role="reference", runtime="softneck.loop._reference_runtime",
@@ -376,24 +377,24 @@ class ReferenceBlock:
         )  # fmt: skip
 
     def summary(self) -> str:
-        """Return a line for people."""
+        """Return one line on the reference."""
         name = type(self.reference).__name__
-        values = ", ".join(f"{key} = {value:g}" for key, value in self._described()[1].items())
+        values = ", ".join(f"{key} = {value:g}" for key, value in self._describe()[1].items())
         return f"{name}{f' ({values}; SI)' if values else ''} at {1e3 * self.sample_time:g} ms"
 
-    def _described(self) -> tuple[int, dict[str, float], np.ndarray]:
+    def _describe(self) -> tuple[int, dict[str, float], np.ndarray]:
         made, columns = self.reference, len(self._robot.outputs.names) + 2
         if isinstance(made, RobotReference):
             names = ("inclination",) if made.kind == "rotation" else self._robot.outputs.names
             starts = dict(zip(names, made.values, strict=True)) | {"cocontraction": made.cocontraction}
             starts |= {name: getattr(made, name) for name in SHAPES[made.kind]}
             return list(SHAPES).index(made.kind), starts, np.zeros((1, columns))
-        return _RECORDED, {}, made.table if isinstance(made, RecordingReference) else self._table()
+        return _RECORDING_KIND, {}, made.table if isinstance(made, RecordingReference) else self._table()
 
     def _table(self) -> np.ndarray:
-        """Return (rows, 1 + values): the reference's values, sample by sample."""
+        """Return the reference as a table (rows, 1 + values), sample by sample."""
         if self._duration is None:
-            raise SettingsError("a reference of your own needs the duration over which it is written down.")
+            raise SettingsError("a reference that is a function needs `duration`, over which it is tabulated.")
         require_steps("duration_s", self._duration, self.sample_time, 4)
         times = np.arange(math.ceil(self._duration / self.sample_time) + 1) * self.sample_time
         return np.array([[time, *self.reference(time)] for time in times.tolist()])

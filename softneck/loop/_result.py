@@ -1,4 +1,4 @@
-"""What a run of a loop leaves: one table of signals with their units, and how well the loop did, in numbers."""
+"""The result of a loop: its signals with their units, its metrics, and limits on these."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from softneck.robot import Robot
 class LoopResult(ReprMixin):
     """All signals of one run, named as in a recording.
 
-    At row k stand the outputs of the plant at t_k and what observer and controller held from t_k on.
+    Row k has the outputs of the plant at t_k, and the outputs of observer and controller from t_k on.
 
     Attributes:
         time: (N,) [s].
-        signals: name -> (N,), in SI; `pitch` and `roll` are the plant's own, `pitch_estimate` and
-            `roll_estimate` the observer's.
+        signals: name -> (N,), in SI; `pitch` is of the plant, `pitch_estimate` of the observer.
         units: name -> unit.
         sample_time: [s].
-        robot: whose loop it was.
+        robot: that was controlled.
     """
 
     time: Vector
@@ -35,7 +34,7 @@ class LoopResult(ReprMixin):
     robot: Robot = field(default_factory=Robot.preset)
 
     def summary(self) -> str:
-        """Return a line on what ran."""
+        """Return one line on duration, step and signals."""
         length, step = len(self.time) * self.sample_time, 1e3 * self.sample_time
         return f"{length:g} s in steps of {step:g} ms, {len(self.signals)} signals of {self.robot.name}"
 
@@ -47,7 +46,7 @@ class LoopResult(ReprMixin):
             raise DataError(f"the result has no signal `{name}`; it has {', '.join(self.signals)}.") from None
 
     def angle(self, axis: str, which: str = "true") -> Vector:
-        """Return an output (N,), of a neck "pitch" or "roll"; the other one where the plant does not offer `which`.
+        """Return an output (N,), of a neck "pitch" or "roll"; if the plant has no such signal, the other `which`.
 
         Args:
             axis: name of the output.
@@ -57,18 +56,19 @@ class LoopResult(ReprMixin):
         return self.signals[names[0]] if names[0] in self.signals else self[names[1]]
 
 
-# Settling is to 5 % of the step, as in the lab's reports and the bake-off of `softneck.design`.
+# Settling is to 5 % of the step, as in the lab's reports.
 SETTLING_BAND = 0.05
-# A tendon that pulls less than this hangs [N]: 0.1 g, far below any pretension.
-_SLACK = 1e-3
-_RISE = (0.1, 0.9)
-# The steady state is judged on the last quarter of what follows the step.
-_STEADY_PART = 0.25
+# A tendon with less tension than this is slack [N]: 0.1 g, far below any pretension.
+_SLACK_TENSION_N = 1e-3
+# Rise time is from 10 to 90 % of the step.
+_RISE_LEVELS = (0.1, 0.9)
+# The steady state is the last quarter of the time after the step.
+_STEADY_SHARE = 0.25
 
 # Metrics whose limit is a lower one.
-_AT_LEAST = ("validity.min",)
-_AXIS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
-_MOTORS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
+_LOWER_LIMITS = ("validity.min",)
+_AXIS_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
+_MOTOR_METRICS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
 Metrics = dict[str, dict[str, float | None]]
 
 
@@ -77,9 +77,9 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
 
     For an axis:
 
-    - `rise_s`: from 10 to 90 % of the step [s], first samples at or beyond; `settling_s`: from the step to the
+    - `rise_s`: from 10 to 90 % of the step [s], first samples at or above; `settling_s`: from the step to the
       first sample from which the error stays below 5 % of it [s]; `overshoot_pct`: of the step, zero if none.
-      All three are None where the reference makes no single step, and where the level is never reached.
+      All three are None unless the reference is one step, and where the level is never reached.
     - `rms_error_deg`, `iae` [rad s], `ise` [rad^2 s]: of reference minus output, over the whole run.
     - `itae` [rad s^2]: the error's size times the time since the step (since the start without one).
     - `steady_rms_deg`: rms error over the last quarter of the time after the step (of the run without one).
@@ -88,14 +88,14 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
     P1^2 + P2^2 + P3^2 [rad^2 s], `total_variation_rad` = sum of all moves, `limit_violation_s` = time with a
     set-point beyond 6 rad [s]; `slack_s` = time with a tendon without tension [s], None where no tension is known.
 
-    `validity.min` is the least that the plant's output `validity` was; there is none where the plant has none.
+    `validity.min` is the minimum of the plant's output `validity`, if it has one.
 
-    Another robot has a table for each of its outputs. What is in deg and rad above is in the display unit of its
-    outputs and the unit of its motors, which end the names (`rms_error_mm`, `max_bar`); angles stay in deg.
+    Another robot has a table for each of its outputs. Metrics in deg and rad above have the display unit of its outputs
+    and the unit of its motors, also in their names (`rms_error_mm`, `max_bar`); angles stay in deg.
 
     Args:
         result: of a run.
-        angle: "true" (where the plant offers it, else measured) or "measured"; missing samples are left out.
+        angle: "true" (measured if the plant has no true one) or "measured"; missing samples are left out.
 
     Raises:
         SettingsError: another `angle`.
@@ -106,13 +106,13 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
     P = np.column_stack([result[name] for name in robot.set_points]) / to_si(unit)[0]
     moves = np.abs(np.diff(P, axis=0))
     return {
-        **{name: _axis(result, name, angle) for name in robot.outputs.names},
+        **{name: _axis_metrics(result, name, angle) for name in robot.outputs.names},
         "motors": {
             f"max_{_word(unit)}": float(np.abs(P).max()),
             f"max_rate_{_word(unit)}_s": float(moves.max(initial=0.0)) / result.sample_time,
             "effort": float(np.sum(P**2) * result.sample_time),
             f"total_variation_{_word(unit)}": float(moves.sum()),
-            "limit_violation_s": float(_beyond(P, robot).sum() * result.sample_time),
+            "limit_violation_s": float(_outside_range(P, robot).sum() * result.sample_time),
             "slack_s": _slack(result),
         },
         # Only an identified plant has it.
@@ -122,14 +122,14 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
 
 def metric_names(robot: Robot) -> tuple[str, ...]:
     """Return the names of all metrics of a robot's loops, as in [limits]."""
-    unit, motor = shown_unit(robot)[0], _word(robot.motors.unit)
-    ends = [name.removesuffix("_deg") + f"_{unit}" if name.endswith("_deg") else name for name in _AXIS]
-    moved = [name.replace("_rad", f"_{motor}") for name in _MOTORS]
+    unit, motor = error_unit(robot)[0], _word(robot.motors.unit)
+    ends = [name.removesuffix("_deg") + f"_{unit}" if name.endswith("_deg") else name for name in _AXIS_METRICS]
+    moved = [name.replace("_rad", f"_{motor}") for name in _MOTOR_METRICS]
     return (*(f"{axis}.{end}" for axis in robot.outputs.names for end in ends), *(f"motors.{name}" for name in moved))
 
 
-def _beyond(P: np.ndarray, robot: Robot) -> np.ndarray:
-    """Return (time,) where a set-point (time, motors) is beyond what its motor may do."""
+def _outside_range(P: np.ndarray, robot: Robot) -> np.ndarray:
+    """Return (time,) whether a set-point (time, motors) is outside the range of its motor."""
     low, high = robot.motors.setpoint_min, robot.motors.setpoint_max
     beyond = np.zeros(P.shape, dtype=bool)
     if low is not None and high is not None:
@@ -146,7 +146,7 @@ def _word(unit: str) -> str:
 def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list[dict[str, Any]]:
     """Compare metrics with limits named as in a loop file, such as "pitch.overshoot_pct" or "validity.min".
 
-    A validity of at least its limit holds; of everything else at most.
+    The limit of a validity is a lower one; all others are upper ones.
 
     Returns:
         For each limit {"metric", "limit", "value", "holds"}; a metric that is None does not hold.
@@ -158,36 +158,36 @@ def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list
     rows = []
     for name, limit in limits.items():
         if name == "validity.min" and name not in known:
-            raise SettingsError("limit on `validity.min`, and this plant has no output `validity`: identify a model.")
+            raise SettingsError("limit on `validity.min`, but the plant has no output `validity`: identify a model.")
         if name not in known:
             raise SettingsError(f"limit on unknown metric `{name}`; use one of {', '.join(known)}.")
         if isinstance(limit, bool) or not isinstance(limit, int | float) or math.isnan(limit):
             raise SettingsError(f"the limit of `{name}` must be a number; got {limit!r}.")
         value = known[name]
-        holds = value is not None and (value >= limit if name in _AT_LEAST else value <= limit)
+        holds = value is not None and (value >= limit if name in _LOWER_LIMITS else value <= limit)
         rows.append({"metric": name, "limit": float(limit), "value": value, "holds": bool(holds)})
     return rows
 
 
-def _axis(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
+def _axis_metrics(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
     r, y = result[f"{axis}_reference"], result.angle(axis, angle)
     step = _find_step(r)
     if step is not None and step[0] == 0:
         outputs = result.robot.outputs
         at = outputs.names.index(axis)
-        stood = float(_held(y)[0]) if outputs.rest is None else to_si(outputs.unit)[0] * outputs.rest[at]
-        step = (0, stood, step[2])
+        rest = float(_fill_missing(y)[0]) if outputs.rest is None else to_si(outputs.unit)[0] * outputs.rest[at]
+        step = (0, rest, step[2])
     first = 0 if step is None else step[0]
     error = r - y
     known = np.isfinite(error)
-    tail = error[first + math.floor((1.0 - _STEADY_PART) * (r.size - first)) :]
+    tail = error[first + math.floor((1.0 - _STEADY_SHARE) * (r.size - first)) :]
     shape: dict[str, float | None] = {"rise_s": None, "settling_s": None, "overshoot_pct": None}
     if step is not None and known[step[0] :].any() and step[2] != step[1]:
         k, low, high = step
         response = (y[k:] - low) / (high - low)
-        shape = _step_shape(_held(response), result.sample_time)
+        shape = _step_shape(_fill_missing(response), result.sample_time)
     size, since = np.abs(error[known]), result.time[known] - result.time[first]
-    unit, factor = shown_unit(result.robot)
+    unit, factor = error_unit(result.robot)
     return {
         **shape,
         f"rms_error_{unit}": _rms(error, factor),
@@ -198,8 +198,8 @@ def _axis(result: LoopResult, axis: str, angle: str) -> dict[str, float | None]:
     }
 
 
-def _held(y: Vector) -> Vector:
-    """Return `y` (n,) with each missing sample as the one before it; the first ones as the first that is known."""
+def _fill_missing(y: Vector) -> Vector:
+    """Return `y` (n,) with missing samples filled by the last known one, at the start by the first known one."""
     known = np.flatnonzero(np.isfinite(y))
     return y[known[np.maximum(np.searchsorted(known, np.arange(y.size), side="right") - 1, 0)]]
 
@@ -209,7 +209,7 @@ def _slack(result: LoopResult) -> float | None:
     names = [f"tension_{j}" for j in motors if f"tension_{j}" in result.signals]
     if not names:
         return None
-    slack = np.any([result[name] <= _SLACK for name in names], axis=0)
+    slack = np.any([result[name] <= _SLACK_TENSION_N for name in names], axis=0)
     return float(slack.sum() * result.sample_time)
 
 
@@ -228,8 +228,8 @@ def _find_step(r: Vector) -> tuple[int, float, float] | None:
 
 
 def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
-    """Return rise, settling and overshoot of a response `y` (n,) that should go from 0 to 1."""
-    low, high = (np.flatnonzero(y >= level) for level in _RISE)
+    """Return rise, settling and overshoot of a response `y` (n,) to a step from 0 to 1."""
+    low, high = (np.flatnonzero(y >= level) for level in _RISE_LEVELS)
     outside = np.flatnonzero(np.abs(y - 1.0) >= SETTLING_BAND)
     settled = 0 if outside.size == 0 else int(outside[-1]) + 1
     return {
@@ -239,8 +239,8 @@ def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
     }
 
 
-def shown_unit(robot: Robot) -> tuple[str, float | None]:
-    """Return the unit of errors as the end of a name, and its factor to SI; of angles deg, and None."""
+def error_unit(robot: Robot) -> tuple[str, float | None]:
+    """Return the unit of errors as the end of a name, and its factor to SI; "deg" and None for angles."""
     factor, si = to_si(robot.outputs.display_unit)
     return ("deg", None) if si == "rad" else (_word(robot.outputs.display_unit), factor)
 

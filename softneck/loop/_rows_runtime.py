@@ -1,7 +1,6 @@
-"""The rows of a loop: one cycle, interpreted or compiled, that simulations, studies, verification and drives share.
+"""The rows of a loop, interpreted or compiled, for simulations, studies, verification and drives.
 
-What happens in a row is a list of actions (see `_rows.py`). All that changes is changed in place: the bus, what each
-part holds, the memory of faults.
+A row is a list of actions (see `_run.py`). The bus, the outputs of each part and the memory of faults change in place.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ ROWS_DONE = 0
 ROWS_MISSING_INPUT = 1
 ROWS_BAD_OUTPUT = 2
 
-# The actions of a cycle: what, which part or place of faults, every how many rows.
+# Actions of a row; each comes with its part or place of faults, and its period in rows.
 ROWS_STEP = 0
 ROWS_SHOW = 1
 ROWS_REFER = 2
@@ -25,25 +24,22 @@ ROWS_RECORD = 4
 
 
 def part_step(part: int, time: float, parts: tuple, inputs: np.ndarray, outputs: np.ndarray) -> bool:
-    """Step one part and return whether all its outputs are known to be finite.
-
-    For parts that are compiled `load_linked` writes this function anew.
-    """
+    """Step one part and return whether all its outputs are finite; `load_linked` replaces it for compiled parts."""
     values = parts[part](time, inputs)
     # A part may have written into `outputs` itself.
     if values is not outputs:
         outputs[:] = values
-    # One sum tells whether a closer look is needed; in Python, which warns of no inf - inf.
+    # The sum is finite unless an output is not; Python's `sum` does not warn of inf - inf.
     return math.isfinite(sum(values.tolist()))
 
 
 def run_rows(
     first: int, stop: int, plan: tuple, signals: tuple, faults: tuple, parts: tuple, table: np.ndarray
 ) -> tuple:
-    """Run rows `first` to `stop`; return (what stopped them, part).
+    """Run rows `first` to `stop`; return (code of the problem, part).
 
-    plan: (actions, step [s], taps, reference (rows, 4)). signals: (bus, what each part holds, the places on the bus
-    where it is shown, the next row), the reference behind the parts. parts: for `part_step`.
+    plan: (actions, step [s], taps, reference (rows, 4)). signals: (bus, last outputs of each part, their views of the
+    bus, the next row), with the reference after the parts. parts: for `part_step`.
     """
     cycle, step, taps, reference = plan
     bus, held, shown, following = signals
@@ -63,25 +59,25 @@ def run_rows(
                 faults_act(k, part, faults, bus)
             else:
                 table[k] = bus
-        # A run that stops or is saved goes on from here.
+        # A stopped or saved run continues here.
         following[0] = k + 1
     return ROWS_DONE, 0
 
 
 def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.ndarray, parts: tuple) -> int:
-    """Gather the inputs of a part, step it, look at its outputs.
+    """Gather the inputs of a part, step it, and check its outputs.
 
-    taps: of each part, the inputs' places on the bus, their factors and offsets (none if nothing is converted), which
-    of them must not be missing, and which of its outputs may be (none if nobody looks).
+    taps: of each part, the positions of its inputs on the bus, their factors and offsets (none without conversion),
+    the inputs that must not be missing, and the outputs that may be (none without a check).
     """
     slots, scales, fragile, missing = taps
-    # A copy: no part can change the bus by its inputs.
+    # A copy, so that no part can change the bus through its inputs.
     inputs = bus[slots[part]]
     if scales[part].size:
         inputs *= scales[part][0]
         inputs += scales[part][1]
     if fragile[part].size:
-        # Parts that cannot use a missing value say so; all others get the NaN.
+        # Parts that cannot use a missing value stop the run; all others get the NaN.
         for i in fragile[part]:
             if not math.isfinite(inputs[i]):
                 return ROWS_MISSING_INPUT
@@ -89,7 +85,7 @@ def rows_step(part: int, time: float, taps: tuple, bus: np.ndarray, outputs: np.
         return ROWS_DONE
     may_miss = missing[part]
     for i in range(may_miss.size):
-        # NaN says "missing" where that may be; infinity is never an answer.
+        # NaN means "missing" where that is allowed; infinity is always an error.
         if not math.isfinite(outputs[i]) and not (may_miss[i] and math.isnan(outputs[i])):
             return ROWS_BAD_OUTPUT
     return ROWS_DONE

@@ -1,4 +1,7 @@
-"""One run of a loop: the actions of a row, their order, and the rows on one bus."""
+"""Run a loop: the actions of a row in their order, and all rows on one bus of signals.
+
+Parts, wiring, order and faults become the arrays that `_rows_runtime` reads.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +26,16 @@ from ._result import LoopResult
 from ._rows_runtime import ROWS_DISTURB, ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP, run_rows
 from ._wiring import BusSignal, Tap, Wiring, wire
 
-# What to do, the part or place that it is about, every how many rows.
+# (action, part or place of faults, period in rows)
 Action = tuple[int, int, int]
 
-# Their outputs are valid one sample after the step: they break every loop of dependencies.
-LATE_ROLES = ("plant", "reference")
+
+def has_delayed_outputs(part: Part) -> bool:
+    """Return whether the outputs of a step of `part` are valid one sample later, which breaks algebraic loops."""
+    return part.role in ("plant", "reference")
 
 
-def late(part: Part) -> bool:
-    """Return whether what a step of `part` returns is valid one sample later."""
-    return part.role in LATE_ROLES
-
-
-def cycle(
+def row_actions(
     parts: Mapping[str, Part],
     taps: Mapping[str, Tap],
     ratios: Mapping[str, int],
@@ -44,17 +44,17 @@ def cycle(
     disturbed: bool,
     closed: bool = True,
 ) -> list[Action]:
-    """Return the actions of a row: what is valid at t_k comes to the bus, the parts step, the row is recorded.
+    """Return the actions of a row: the values at t_k are put on the bus, the parts step, the row is recorded.
 
-    Sequential, as on the hardware: the plant is read, then observer and controller step, each seeing what those
-    before it say, then the plant. Jacobi: all step with what is on the bus at t_k; the outputs are seen at t_k+1.
+    Sequential, as on the hardware: the plant is read, then observer and controller step, each with the outputs of the
+    earlier ones, then the plant. Jacobi: all parts step with the bus at t_k, and their outputs are read at t_k+1.
 
     Args:
         parts: name -> part.
         taps: part -> its inputs.
         ratios: part -> its sample time in rows.
         order: "sequential" or "jacobi".
-        disturbed: whether faults act.
+        disturbed: whether there are faults.
         closed: whether there is a reference.
 
     Raises:
@@ -62,53 +62,53 @@ def cycle(
     """
     numbers = {name: i for i, name in enumerate(parts)}
 
-    def each(what: int, names: Iterable[str]) -> list[Action]:
-        return [(what, numbers[name], ratios[name]) for name in names]
+    def each(action: int, names: Iterable[str]) -> list[Action]:
+        return [(action, numbers[name], ratios[name]) for name in names]
 
-    waiting = [name for name, part in parts.items() if late(part)]
+    waiting = [name for name, part in parts.items() if has_delayed_outputs(part)]
     refer = [] if "reference" in parts or not closed else [(ROWS_REFER, len(parts), 1)]
-    # Sensors' faults act on what arrives, the others on what the plant is about to read.
+    # Faults of sensors act on the outputs that arrive, the others on the inputs that the plant is about to read.
     at_sensors, at_plant = ([(ROWS_DISTURB, place, 1)] if disturbed else [] for place in (0, 1))
     arrive = [*each(ROWS_SHOW, waiting), *refer, *at_sensors]
     leave = [*at_plant, (ROWS_RECORD, 0, 1)]
     if order == "jacobi":
         return [*arrive, *leave, *each(ROWS_STEP, parts), *each(ROWS_SHOW, [n for n in parts if n not in waiting])]
     ordered = [
-        (what, numbers[name], ratios[name]) for name in step_order(parts, taps) for what in (ROWS_STEP, ROWS_SHOW)
+        action for name in step_order(parts, taps) for what in (ROWS_STEP, ROWS_SHOW) for action in each(what, [name])
     ]
     return [*arrive, *ordered, *leave, *each(ROWS_STEP, waiting)]
 
 
 def step_order(parts: Mapping[str, Part], taps: Mapping[str, Tap]) -> tuple[str, ...]:
-    """Return the names of the parts whose outputs hold at once, each after those that feed it.
+    """Return the names of the parts without delayed outputs, each after those that feed it.
 
-    An observer's set-points are those held until now (docs, "Timing"): they wait for no controller.
+    An observer reads the set-points of the last row (docs, "Timing"), so it waits for no controller.
 
     Raises:
-        SettingsError: an algebraic loop; the line names its parts and variables.
+        SettingsError: an algebraic loop; the message names its parts and variables.
     """
-    waits = {name: _feeders(name, parts, taps[name]) for name, part in parts.items() if not late(part)}
+    waits = {name: _feeders(name, parts, taps[name]) for name, part in parts.items() if not has_delayed_outputs(part)}
     done: list[str] = []
     while len(done) < len(waits):
         ready = [name for name in waits if name not in done and all(feeder in done for feeder in waits[name])]
         if not ready:
-            raise SettingsError(_circle({name: waits[name] for name in waits if name not in done}))
-        # An observer before whoever moves the motors, wherever it stands: else it would know set-points of its future.
+            raise SettingsError(_algebraic_loop({name: waits[name] for name in waits if name not in done}))
+        # An observer steps before the part that moves the motors, or it would read set-points of its future.
         done.append(min(ready, key=lambda name: parts[name].role != "observer"))
     return tuple(done)
 
 
 def _feeders(name: str, parts: Mapping[str, Part], tap: Tap) -> dict[str, str]:
-    """Return the part -> variable that must be known before `name` steps."""
+    """Return part -> variable of the outputs that are needed before `name` steps."""
     feeders = {}
     for owner, port in zip(tap.owners, tap.ports, strict=True):
         held = parts[name].role == "observer" and is_set_point(port.name)
-        if owner in parts and not late(parts[owner]) and not held:
+        if owner in parts and not has_delayed_outputs(parts[owner]) and not held:
             feeders.setdefault(owner, port.name)
     return feeders
 
 
-def _circle(waits: Mapping[str, Mapping[str, str]]) -> str:
+def _algebraic_loop(waits: Mapping[str, Mapping[str, str]]) -> str:
     path = [next(iter(waits))]
     while path.count(path[-1]) < 2:
         path.append(next(feeder for feeder in waits[path[-1]] if feeder in waits))
@@ -120,23 +120,23 @@ def _circle(waits: Mapping[str, Mapping[str, str]]) -> str:
     )
 
 
-_MODULE = "softneck.loop._rows_runtime"
+_ROWS_RUNTIME = "softneck.loop._rows_runtime"
 
 
-class Rows:
+class LoopRows:
     """The rows of one run; its parts have started.
 
     Attributes:
         names: of the parts, by the number that `run` returns.
-        bus: all signals as they are now.
-        held: what each part returned last, shown on the bus when the cycle says so; behind them the reference.
+        bus: the current values of all signals.
+        held: the last outputs of each part, put on the bus by an action, and the reference at the end.
     """
 
     def __init__(
         self,
         parts: Mapping[str, Part],
         wiring: Wiring,
-        cycle: list[Action],
+        actions: list[Action],
         *,
         step: float,
         starts: Mapping[str, Vector],
@@ -148,21 +148,21 @@ class Rows:
 
         Args:
             parts: name -> part.
-            wiring: who feeds whom.
-            cycle: the actions of a row, see `_order.cycle`.
+            wiring: connections of the parts.
+            actions: of a row, from `row_actions`.
             step: time of a row [s].
             starts: name -> outputs at the start, of those that have started.
-            faults: what goes wrong.
+            faults: laid out by `place_faults`.
             reference: (rows, 4) of a reference that is no part.
             checked: stop where an output becomes NaN or infinite.
         """
         self.names, self._parts = tuple(parts), tuple(parts.values())
-        self._cycle, self._faults = tuple(zip(*cycle, strict=True)), faults or FaultStages([[]] * 4, [], [], 0)
+        self._actions, self._faults = tuple(zip(*actions, strict=True)), faults or FaultStages([[]] * 4, [], [], 0)
         self.bus = wiring.start.copy()
         for name, outputs in starts.items():
             self.bus[wiring.spans[name]] = outputs
         shown = [self.bus[wiring.spans[name]] for name in (*self.names, "reference")]
-        # A block's outputs are a part of its memory, where compiled rows find and leave them.
+        # Outputs of blocks are a part of their memory, which compiled rows read and write.
         self.held = tuple(
             part.memory[2] if isinstance(part, BlockPart) and name in starts else places.copy()
             for name, part, places in zip((*self.names, "reference"), (*self._parts, None), shown, strict=True)
@@ -173,7 +173,7 @@ class Rows:
         missing = [[port.missing for port in part.outputs] if checked else [] for part in self._parts]
         table = np.zeros((0, shown[-1].size)) if reference is None else reference
         self._plan = (
-            self._cycle,
+            self._actions,
             step,
             (
                 tuple(tap.slots for tap in taps),
@@ -183,11 +183,11 @@ class Rows:
             ),
             table,
         )
-        # A block is stepped in place; whoever else calls it gets a copy of its outputs.
+        # Blocks are stepped in place, without copies of their outputs.
         self._steps = tuple(part.step if _is_its_block(part) else part.advance for part in self._parts)
 
     def run(self, first: int, stop: int, table: Matrix, *, compiled: bool = False) -> tuple[int, int]:
-        """Run rows `first` to `stop`, noted in `table`; return 0 or what went wrong, and the part."""
+        """Run rows `first` to `stop` into `table`; return 0 or the code of the problem, and the part."""
         faults = self._faults
         self._following[0] = first
         faults.draw(first, stop)
@@ -198,21 +198,21 @@ class Rows:
 
     @property
     def row(self) -> int:
-        """The next row, also where a part broke off with an error."""
+        """The next row, also after an error of a part."""
         return int(self._following[0])
 
     @cached_property
     def _linked(self) -> tuple[Callable[..., tuple[int, int]], tuple, tuple]:
         """The compiled rows, and their plan and parts."""
         parts = [part for part in self._parts if _is_its_block(part)]
-        function = load_linked(_MODULE, [part.block.runtime for part in parts]).run_rows
+        function = load_linked(_ROWS_RUNTIME, [part.block.runtime for part in parts]).run_rows
         memories = tuple(zip(*(part.memory[:2] for part in parts), strict=True))
-        actions = tuple(np.array(column, dtype=np.int64) for column in self._cycle)
+        actions = tuple(np.array(column, dtype=np.int64) for column in self._actions)
         return function, (actions, *self._plan[1:]), (tuple(part.block.arrays for part in parts), *memories)
 
 
 def _is_its_block(part: Part) -> TypeGuard[BlockPart]:
-    """Return whether a part does what its block does; not where it has an `advance` of its own."""
+    """Return whether a part only steps its block; a subclass may override `advance`."""
     return isinstance(part, BlockPart) and type(part).advance is BlockPart.advance
 
 
@@ -227,7 +227,7 @@ _RATIO_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopStep:
-    """What a step callback sees: the signals of one row."""
+    """The signals of one row, for a step callback."""
 
     index: int
     time: float
@@ -258,13 +258,13 @@ def run_loop(
     """Run `loop` from t = 0 and return its signals, one row for each sample of the fastest part.
 
     Args:
-        loop: what to run.
-        report: called now and then with the done fraction, 0 to 1.
+        loop: to run.
+        report: called regularly with the done fraction, 0 to 1.
         on_step: called after each row; it stops the run by returning True.
         pace: run at this multiple of real time; as fast as possible if not given.
         keep: leave the parts loaded for the next run; `loop.close()` releases them.
-        compiled: run all rows as one compiled function where all parts are blocks and nobody watches the steps: the
-            same bits, much sooner once it is compiled; other loops run as always.
+        compiled: run all rows as one compiled function if all parts are blocks and there is neither `on_step` nor
+            `pace`; the results are the same to the bit.
 
     Raises:
         SettingsError: sample times that do not divide, inputs without a source, algebraic loops.
@@ -285,21 +285,18 @@ class LoopRun:
     """A loop that is running; use it in a `with` statement, which releases the parts at the end.
 
     Attributes:
-        loop: what runs.
-        row, rows: the next row and their number in all.
+        loop: that runs.
+        row, rows: the next row and the number of rows.
         step: base step [s], the shortest sample time.
     """
 
     def __init__(self, loop: Loop | System, *, compiled: bool = False) -> None:
-        """Wire `loop`; the parts start with the first `advance`.
-
-        `compiled` takes compiled rows where all parts are blocks.
-        """
+        """Connect the parts of `loop`, which start with the first `advance`; `compiled` as in `run_loop`."""
         self.loop, self._parts = loop, dict(loop.parts)
         closed = isinstance(loop, Loop)
         self.step, ratios = _schedule(self._parts)
         wiring = wire(self._parts, loop.constants, loop.connections, loop.robot, closed=closed)
-        self._cycle = cycle(
+        self._actions = row_actions(
             self._parts, wiring.taps, ratios, order=loop.order, disturbed=bool(loop.faults), closed=closed
         )  # fmt: skip
         self.row = 0
@@ -311,10 +308,10 @@ class LoopRun:
         self._table = np.empty((self.rows, self._wiring.start.size))
         self._reference = _reference_table(loop, self.step, self.rows) if isinstance(loop, Loop) else None
         self._compile = compiled and can_compile(self._parts)
-        self._begun: Rows | None = None
+        self._running: LoopRows | None = None
 
     def __enter__(self) -> LoopRun:
-        """Return the run itself."""
+        """Return the run."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -323,7 +320,7 @@ class LoopRun:
 
     def close(self) -> None:
         """Release the parts."""
-        self._begun = None
+        self._running = None
         self.loop.close()
 
     def advance(
@@ -334,7 +331,7 @@ class LoopRun:
         on_step: StepCallback | None = None,
         pace: float | None = None,
     ) -> bool:
-        """Run `rows` more rows, all that are left if not given; return whether the end is reached.
+        """Run `rows` more rows, or all that are left; return whether the end is reached.
 
         Raises:
             DataError: a part returned NaN or infinity; the message names part, variable and time.
@@ -347,7 +344,7 @@ class LoopRun:
         watched = on_step is not None or pace is not None
         begin, first = clock.perf_counter(), self.row
         while self.row < stop:
-            # Rows run until somebody wants to know of them.
+            # LoopRows run in one call until the next callback.
             end = self.row + 1 if watched else stop if report is None else (self.row // stride + 1) * stride
             try:
                 problem, part = running.run(
@@ -360,7 +357,9 @@ class LoopRun:
             if report is not None and self.row % stride == 0:
                 report(self.row / self.rows)
             if pace is not None:
-                _wait_until(begin + (self.row - first) * self.step / pace)
+                rest = begin + (self.row - first) * self.step / pace - clock.perf_counter()
+                if rest > 0.0:
+                    clock.sleep(rest)
             k = self.row - 1
             if on_step is not None and on_step(LoopStep(k, k * self.step, self._table[k], self._columns)):
                 self._table = self._table[: self.row]
@@ -368,8 +367,8 @@ class LoopRun:
                 break
         return self.row == self.rows
 
-    def _explain(self, running: Rows, part: int) -> None:
-        """Raise what is wrong with the inputs or outputs of a part that stopped the rows."""
+    def _explain(self, running: LoopRows, part: int) -> None:
+        """Raise the DataError of the part that stopped the rows, for its inputs or outputs."""
         name, time = running.names[part], self.row * self.step
         self._wiring.taps[name].read(running.bus, time)
         self._require_finite(name, running.held[part], time)
@@ -382,17 +381,17 @@ class LoopRun:
             signals[name], units[name] = _in_si(self._table[: self.row, slot], by_slot[slot].port)
         return LoopResult(np.arange(self.row) * self.step, signals, units, self.step, self.loop.robot)
 
-    def _start(self) -> Rows:
-        if self._begun is None:
+    def _start(self) -> LoopRows:
+        if self._running is None:
             outputs = {}
             for name, part in self._parts.items():
                 outputs[name] = part.start(0.0, self.loop.parameters.get(name, {}))
                 self._require_finite(name, outputs[name], 0.0)
-            self._begun = Rows(
-                self._parts, self._wiring, self._cycle, step=self.step, starts=outputs, reference=self._reference,
+            self._running = LoopRows(
+                self._parts, self._wiring, self._actions, step=self.step, starts=outputs, reference=self._reference,
                 faults=self._faults,
             )  # fmt: skip
-        return self._begun
+        return self._running
 
     def _require_finite(self, name: str, outputs: Vector, time: float) -> None:
         for port, value in zip(self._parts[name].outputs, outputs, strict=True):
@@ -429,22 +428,21 @@ def _reference_table(loop: Loop, step: float, rows: int) -> Matrix | None:
 
 
 def _columns(wiring: Wiring) -> dict[str, int]:
-    """Return name in the result -> place on the bus; what a sensor says goes before what the plant meant."""
+    """Return name in the result -> position on the bus; a sensor's signal takes the name of the plant's."""
     faulty = {item.port.name for item in wiring.named if item.part == "sensor"}
     columns: dict[str, int] = {}
     for item in wiring.named:
-        name = _signal_name(item, columns, faulty)
-        columns[name] = item.slot
+        columns[_signal_name(item, columns, faulty)] = item.slot
     return columns
 
 
 def _plain_columns(wiring: Wiring) -> dict[str, int]:
-    """Return "part.output" -> place on the bus."""
+    """Return "part.output" -> position on the bus."""
     return {f"{item.part}.{item.port.name}": item.slot for item in wiring.named}
 
 
 def _in_si(values: Vector, port: Port) -> tuple[Vector, str]:
-    """Return a signal (N,) in SI with its unit; one of a unit that nobody knows stays as it is."""
+    """Return a signal (N,) in SI with its unit; a signal with an unknown unit stays unchanged."""
     try:
         factor, unit = to_si(port.unit or "1")
     except DataError:
@@ -459,9 +457,3 @@ def _signal_name(item: BusSignal, taken: Mapping[str, int], faulty: set[str]) ->
     if item.part == "plant" and name in faulty:
         return f"plant_{name}"
     return name if name not in taken else f"{item.part}_{name}"
-
-
-def _wait_until(moment: float) -> None:
-    rest = moment - clock.perf_counter()
-    if rest > 0.0:
-        clock.sleep(rest)

@@ -1,7 +1,6 @@
-"""Who feeds whom: inputs connected to outputs by name, with units converted, on one vector of signals.
+"""Connect inputs to outputs by name, with conversion of units, on one vector of signals.
 
-All outputs, references and constants of a loop lie side by side in the "bus"; the inputs of a part are a
-selection of it, so that a step costs one gather.
+The "bus" holds all outputs, references and constants of a loop; the inputs of a part are a selection of it.
 """
 
 from __future__ import annotations
@@ -16,36 +15,35 @@ from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
 from softneck.runtime import Port
 
-from ._loop import Link, Part
+from ._loop import PART_NAMES, Link, Part
 from ._references import reference_ports
 
-_HEALTHY = (("observer", "healthy"), ("plant", "measurement_valid"))
+_HEALTHY_SOURCES = (("observer", "healthy"), ("plant", "measurement_valid"))
 _NECK = Robot.preset("neck")
-_USUAL = ("plant", "observer", "controller", "reference")
-# What holds where nobody says otherwise: measurements are valid, controllers enabled.
+# Inputs without a source: measurements are valid, controllers enabled.
 _DEFAULTS = {"healthy": 1.0, "measurement_valid": 1.0, "enabled": 1.0}
 
 
 def measured_names(robot: Robot) -> tuple[str, ...]:
-    """Return the names of outputs and their rates, which a sensor may tell."""
+    """Return the names of outputs and their rates, which a sensor may measure."""
     return (*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names))
 
 
 def _sources(wanted: str, robot: Robot) -> tuple[tuple[str, str], ...]:
-    """Return where an input comes from, best source first; nothing for a name that connects to an equal name."""
+    """Return the sources of an input, best first; empty for an input that connects to an output of the same name."""
     if wanted == "healthy":
-        return _HEALTHY
+        return _HEALTHY_SOURCES
     bare = wanted.removesuffix("_measured")
     return (("plant", wanted), ("plant", bare)) if wanted != bare and bare in measured_names(robot) else ()
 
 
 @dataclass(frozen=True, slots=True)
 class BusSignal:
-    """A place on the bus that a result shows.
+    """A position on the bus that a result has as a signal.
 
     Attributes:
         slot: position in the bus.
-        part: whose it is; "sensor" and "fault" for copies that faults change.
+        part: of the signal; "sensor" and "fault" for copies that faults change.
         port: name and unit.
     """
 
@@ -62,10 +60,10 @@ class Tap:
         part: its name in the loop.
         ports: of the inputs.
         owners: part that feeds each input, "" for a constant.
-        sources: text "plant `pitch`" of each source, for messages.
+        sources: name of each source, such as "plant `pitch`", for messages.
         slots: (n_in,) positions in the bus.
         scales: (2, n_in) factor and offset from the source to the input; None where nothing is converted.
-        fragile: positions among the inputs where a missing value may come but must not.
+        fragile: inputs whose source may be missing, but that must not be missing themselves.
     """
 
     part: str
@@ -88,7 +86,7 @@ class Tap:
             i = self.fragile[~np.isfinite(u[self.fragile])][0]
             raise DataError(
                 f"input `{self.names[i]}` of the {self.part} is {u[i]} at t = {time:g} s (from {self.sources[i]}); "
-                "put an observer between that bridges missing measurements."
+                "put an observer between, which bridges missing measurements."
             )
         return u
 
@@ -99,7 +97,7 @@ class Wiring:
 
     Attributes:
         start: (n_bus,) the bus with its start values and constants.
-        named: what of it a result shows.
+        named: its signals in a result.
         spans: part -> its outputs in the bus.
         taps: part -> its inputs.
     """
@@ -122,10 +120,10 @@ def wire(
 
     Args:
         parts: name in the loop -> part.
-        constants: part -> values of inputs that nobody else writes, such as `payload` of the plant.
-        connections: "part.input" -> "part.output", or a `Link`, for what names alone do not say.
-        robot: whose loop it is.
-        closed: it is a loop, with a plant and a reference; False for parts that need be neither.
+        constants: part -> values of inputs that are not connected, such as `payload` of the plant.
+        connections: "part.input" -> "part.output", or a `Link`, for ports with different names.
+        robot: that is controlled.
+        closed: whether it is a loop with a plant and a reference.
 
     Raises:
         SettingsError: an input without a source, two writers, units that do not fit, an unknown name.
@@ -142,7 +140,7 @@ def wire(
     taps = {}
     for name, part in parts.items():
         _check_constants(name, part, constants.get(name, {}))
-        finder = _Finder(name, parts, slots, constants.get(name, {}), links, robot)
+        finder = _SourceFinder(name, parts, slots, constants.get(name, {}), links, robot)
         places = []
         for value in map(finder.source, part.inputs):
             if isinstance(value, tuple):
@@ -162,7 +160,7 @@ def _links(
     slots: Mapping[tuple[str, str], int],
     constants: Mapping[str, Mapping[str, float]],
 ) -> dict[tuple[str, str], tuple[str, str]]:
-    """Return (part, input) -> (part, output) of the connections that the user wrote."""
+    """Return (part, input) -> (part, output) of explicit connections."""
     links = {}
     for target, origin in connections.items():
         origin = origin.origin if isinstance(origin, Link) else origin
@@ -170,9 +168,8 @@ def _links(
         if part not in parts or name not in {port.name for port in parts[part].inputs}:
             raise SettingsError(f"connection to `{target}`: there is no such input; {_offers(part, parts, 'inputs')}")
         if (owner, output) not in slots:
-            raise SettingsError(
-                f"connection from `{origin}`: there is no such output; {_offers(owner, parts, 'outputs')}"
-            )
+            offers = _offers(owner, parts, "outputs")
+            raise SettingsError(f"connection from `{origin}`: there is no such output; {offers}")
         if name in constants.get(part, {}):
             raise SettingsError(f"input `{name}` of the {part} has two writers: `{origin}` and a constant.")
         links[part, name] = (owner, output)
@@ -210,8 +207,8 @@ def _check_constants(name: str, part: Part, constants: Mapping[str, float]) -> N
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Finder:
-    """Finds what feeds the inputs of part `name`."""
+class _SourceFinder:
+    """Finds the sources of the inputs of part `name`."""
 
     name: str
     parts: Mapping[str, Part]
@@ -221,7 +218,7 @@ class _Finder:
     robot: Robot
 
     def source(self, port: Port) -> tuple[str, str] | float:
-        """Return (part, output) that feeds `port`, or the constant that it gets."""
+        """Return the (part, output) that feeds `port`, or its constant."""
         if (self.name, port.name) in self.links:
             return self.links[self.name, port.name]
         if port.name in self.constants:
@@ -231,11 +228,13 @@ class _Finder:
         for candidate in _candidates(self.name, port.name, self.parts, self.robot):
             if candidate in self.slots:
                 return candidate
-        others = [part for part in self._further() if (part, port.name) in self.slots]
+        # Any output of the same name may feed a further part; the four usual parts are never connected by chance.
+        usual = PART_NAMES if self.name in PART_NAMES else ()
+        others = [part for part in self.parts if part not in (self.name, *usual) and (part, port.name) in self.slots]
         if len(others) > 1:
             raise SettingsError(
                 f"input `{port.name}` of the {self.name} has {len(others)} writers: {', '.join(others)}; "
-                "say which in [connections]."
+                "choose one in [connections]."
             )
         if others:
             return others[0], port.name
@@ -243,13 +242,7 @@ class _Finder:
             return _DEFAULTS[port.name]
         candidates = _candidates(self.name, port.name, self.parts, self.robot)
         tried = " or ".join(f"`{out}` of the {part}" for part, out in candidates)
-        raise SettingsError(f"nothing feeds input `{port.name}` of the {self.name}; it would take {tried}.")
-
-    def _further(self) -> list[str]:
-        """Return the parts beyond the usual candidates that may feed part `name`."""
-        # A further part may read any other; the usual ones never fall back silently on each other.
-        usual = _USUAL if self.name in _USUAL else ()
-        return [part for part in self.parts if part != self.name and part not in usual]
+        raise SettingsError(f"nothing feeds input `{port.name}` of the {self.name}; it needs {tried}.")
 
 
 def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot) -> Iterator[tuple[str, str]]:
@@ -258,7 +251,7 @@ def _candidates(name: str, wanted: str, parts: Mapping[str, Part], robot: Robot)
     elif wanted in robot.set_points:
         yield ("controller", wanted)
     elif name == "controller" and wanted in measured_names(robot):
-        # With an observer its estimate or nothing: a silent fall-back would hide a wrong observer.
+        # With an observer only its estimate: a silent fall-back would hide a wrong observer.
         yield from [("observer", wanted)] if "observer" in parts else _sources(f"{wanted}_measured", robot)
     else:
         yield from ((part, wanted) for part in ("reference", "plant", "observer") if part != name)
@@ -294,7 +287,7 @@ def _tap(
 def _factor(origin: str, source: Port, target: str, port: Port) -> float:
     """Return the factor from the unit of `source` to that of `port`."""
     if source.unit == port.unit or source.boolean or port.boolean or {"", "1"} & {source.unit, port.unit}:
-        return 1.0  # foreign FMUs often state no unit: then there is nothing to convert
+        return 1.0  # many FMUs of other tools state no unit
     try:
         (a, si_a), (b, si_b) = to_si(source.unit), to_si(port.unit)
     except DataError as error:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import tomli_w
 
 from softneck.core import atomic_write, file_hash, write_certificate
-from softneck.loop import shown_unit
+from softneck.loop import error_unit
 from softneck.plots import write_page
 from softneck.verification import nominal_plants, sources_of, write_linear
 
@@ -110,7 +110,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     taut = task.cocontraction is not None
     at = _LOOP_TAUT if taut else _LOOP_AT
     neck = task.asked.certificate.sim
-    first, unit = robot.outputs.names[0], shown_unit(robot)[0]
+    first, unit = robot.outputs.names[0], error_unit(robot)[0]
     table: dict[str, Any] = {
         "duration_s": at + float(neck["duration_s"]),
         "plant": {_plant_key(path): _relative(path, folder)},

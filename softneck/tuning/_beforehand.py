@@ -10,7 +10,7 @@ import numpy as np
 from softneck.core import SettingsError
 from softneck.design import ControllerLimits, LoopSettings, UncertainPlant, axis_test, least_rise, uncertain_plant
 from softneck.estimation import AxisPlant
-from softneck.loop.default_limits import usual_rise
+from softneck.loop.default_limits import required_rise
 from softneck.robot import TIME_CONSTANT
 from softneck.verification import digits
 
@@ -65,7 +65,7 @@ def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
         test = axis_test(axis.nominal, limits, uncertain.redefinition[1])
         latest = max((plant.delay + 1) * plant.sample_time for plant in (axis.nominal, *axis.samples))
         least = least_rise(axis.nominal, test, size)
-        found.append(usual_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
+        found.append(required_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
     # Who asks for an earlier settling asks for a rise before it.
     most = digits(time * max(*found, USUAL_RISE * TIME_CONSTANT))
     return min(most, asked.wanted("sim.settling_s") or math.inf) if most < math.inf else None

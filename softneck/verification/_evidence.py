@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, ReprMixin, Vector
-from softneck.loop import shown_unit
+from softneck.loop import error_unit
 from softneck.runtime import Block
 
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
@@ -326,7 +326,7 @@ def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: 
         return {
             "kind": "own" if run.parameters is None else "neck", "name": run.name, "parameters": parameters,
             "payload_kg": run.payload,
-            **{f"{name}_{shown_unit(controller.robot)[0]}": size * share for name, share in
+            **{f"{name}_{error_unit(controller.robot)[0]}": size * share for name, share in
                zip(controller.robot.outputs.names, direction(run.orientation, controller.robot), strict=True)},
             "seed": run.seed, "at_s": at, "duration_s": at + float(asked.sim["duration_s"]),
             "sample_time_s": controller.block.sample_time, "order": controller.order,

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import DataError, Progress, Vector, silent
-from softneck.loop import BlockPart, Loop, LoopResult, Part, run_loop, shown_unit
+from softneck.loop import BlockPart, Loop, LoopResult, Part, error_unit, run_loop
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 
@@ -386,7 +386,7 @@ def louder(
 
 def crossing_facts(item: Crossing) -> dict[str, Any]:
     """Return a crossing as JSON values."""
-    unit, factor = shown_unit(item.robot)
+    unit, factor = error_unit(item.robot)
     per = math.radians(1.0) if factor is None else factor
     return {
         "kind": "experiment", "name": item.plant, "axis": item.axes, "raised": item.what,

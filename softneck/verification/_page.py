@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Vector, to_si
-from softneck.loop import shown_unit
+from softneck.loop import error_unit
 from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel, Section, Table, page
 
 from ._evidence import Evidence, LinearEvidence
@@ -132,7 +132,7 @@ def step_chart(steps: Steps, plants: Plants, scale: Scale) -> Chart:
     finite: np.ndarray = np.asarray(np.isfinite(steps.angles).all(axis=2))
     worst = int(np.argmax(steps.metrics["overshoot_pct"]))
     axis_of = int(steps.worse["overshoot_pct"][worst])
-    robot, shown, unit = scale.robot, scale.shown, shown_unit(scale.robot)[0]
+    robot, shown, unit = scale.robot, scale.shown, error_unit(scale.robot)[0]
     for i, axis in enumerate(plants.axes):
         y = shown(steps.angles[i][finite[i]]) if finite[i].any() else np.zeros((1, t.size))
         row = worst if i == axis_of else int(np.argmax(np.where(finite[i], np.max(steps.angles[i], axis=1), -np.inf)))
@@ -174,7 +174,7 @@ def neck_chart(evidence: Evidence, scale: Scale) -> Chart:
         Curve(t, along[id(worst)], f"largest overshoot: {worst.name}", RED, width=1.2),
         Curve(t, table[0], runs[0].name, "black", width=1.2),
     ]
-    title, unit = f"Steps of the virtual {scale.robot.name}", shown_unit(scale.robot)[0]
+    title, unit = f"Steps of the virtual {scale.robot.name}", error_unit(scale.robot)[0]
     return Chart(title, [Panel(curves, f"true output along the step [{unit}]")], row_height=3.4)
 
 
@@ -356,7 +356,7 @@ def _plants(found: Verification) -> Section:
         "source",
         "axis",
         "",
-        f"static gain [{shown_unit(robot)[0]}/{robot.motors.unit}]",
+        f"static gain [{error_unit(robot)[0]}/{robot.motors.unit}]",
         "pole [1/s]",
         "dead time [ms]",
     ]

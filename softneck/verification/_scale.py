@@ -12,7 +12,7 @@ import numpy as np
 
 from softneck.core import to_si
 from softneck.estimation import NECK_REACH, REACH_OF_STATIC_GAIN, motor_ends
-from softneck.loop import shown_unit
+from softneck.loop import error_unit
 from softneck.robot import MOTOR_RANGE, Robot, Scaling
 
 from ._plants import UncertainNeck
@@ -96,7 +96,7 @@ class Scale:
         if name.rpartition(".")[2] in _ANGLES:
             return name
         motor = self.robot.motors.unit.replace("/", "_")
-        own = re.sub(r"_deg$", f"_{shown_unit(self.robot)[0]}", name)
+        own = re.sub(r"_deg$", f"_{error_unit(self.robot)[0]}", name)
         return re.sub(r"_rad$", f"_{motor}", own.replace("variation_rad_s", f"variation_{motor}_s"))
 
     def table(self, defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -107,17 +107,17 @@ class Scale:
 
     def si(self, value: float) -> float:
         """Return an output as people see it, such as in deg, in SI."""
-        factor = shown_unit(self.robot)[1]
+        factor = error_unit(self.robot)[1]
         return math.radians(value) if factor is None else factor * value
 
     def shown(self, values: Any) -> Any:
         """Return outputs in SI as people see them."""
-        factor = shown_unit(self.robot)[1]
+        factor = error_unit(self.robot)[1]
         return np.degrees(values) if factor is None else values / factor
 
 
 def _shown(robot: Robot) -> float:
-    factor = shown_unit(robot)[1]
+    factor = error_unit(robot)[1]
     return math.radians(1.0) if factor is None else factor
 
 

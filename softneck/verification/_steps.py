@@ -13,7 +13,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
 from softneck.design import motor_ranges
-from softneck.loop import SETTLING_BAND, shown_unit
+from softneck.loop import SETTLING_BAND, error_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, load_functions
 
@@ -122,7 +122,7 @@ def run_steps(
         angles.append(y[:, :, axis])
         other.append(np.delete(y[:, :half], axis, axis=2))
         motors.append(P)
-    parts = [_metrics(angles[i], other[i], test, half, Ts, shown_unit(whose)[1]) for i in range(m)]
+    parts = [_metrics(angles[i], other[i], test, half, Ts, error_unit(whose)[1]) for i in range(m)]
     table = {name: np.stack([part[name] for part in parts]) for name in METRICS}
     return Steps(
         np.arange(rows) * Ts,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softneck.core import Matrix, SettingsError, Vector, atomic_write, to_si
-from softneck.loop import shown_unit
+from softneck.loop import error_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, Port
 from softneck.signals import Recording, write_recording
@@ -187,7 +187,7 @@ def write_neck(
 ) -> Path:  # fmt: skip
     """Write `name.toml`, a loop over the virtual neck; `worst` is what the certificate says of that run."""
     whose = Robot.preset() if robot is None else robot
-    unit = shown_unit(whose)[0]
+    unit = error_unit(whose)[0]
     ends = [worst[f"{axis}_{unit}"] for axis in whose.outputs.names]
     values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
     text = _loop(
@@ -202,7 +202,7 @@ def write_neck(
 
 def _step(robot: Robot, levels: Iterable[float], at: float) -> str:
     """Return the keys of a step from zero to levels in the unit that people see."""
-    unit = shown_unit(robot)[0]
+    unit = error_unit(robot)[0]
     wanted = [f"{axis}_{unit} = {float(level)!r}" for axis, level in zip(robot.outputs.names, levels, strict=True)]
     return "\n".join(['kind = "step"', *wanted, f"at_s = {at:g}"])
 

@@ -48,7 +48,9 @@ def test_a_rise_follows_from_the_motors_and_the_dead_time() -> None:
         y[k + 1] = y[k] + dt * pole * (gain * u[k] - y[k])
     least = dt * (int(np.argmax(y >= 0.9 * 15.0)) - int(np.argmax(y >= 0.1 * 15.0)))
     # Euler's steps here, samples of 20 ms there: a hundredth besides.
-    assert pytest.approx(default_limits.usual_rise(least, 0.1), abs=0.0101) == default_limits.NECK_RISE_S
-    assert default_limits.usual_rise(0.3, 0.0) == 0.3  # no dead time: the motors alone
+    assert pytest.approx(default_limits.required_rise(least, 0.1), abs=0.0101) == default_limits.NECK_RISE_S
+    assert default_limits.required_rise(0.3, 0.0) == 0.3  # no dead time: the motors alone
     # Twice as slow in everything is twice the rise, but for rounding to hundredths.
-    assert default_limits.usual_rise(0.4, 0.3) == pytest.approx(2 * default_limits.usual_rise(0.2, 0.15), abs=0.011)
+    assert default_limits.required_rise(0.4, 0.3) == pytest.approx(
+        2 * default_limits.required_rise(0.2, 0.15), abs=0.011
+    )

@@ -227,7 +227,7 @@ def uneven_delay() -> Fault:
     [
         (
             no_such_input,
-            "disturbance of push_y needs the plant's input `push_y`; this plant's inputs are motor_setpoint_1",
+            "disturbance of push_y needs the plant's input `push_y`; the plant has motor_setpoint_1",
         ),
         (no_such_output, "sensor freeze acts on `yaw`, which is not an output of the plant"),
         (uneven_delay, r"sensor delay of 0\.03 s is not a multiple of the loop's step 0\.02 s"),

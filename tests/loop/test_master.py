@@ -76,7 +76,7 @@ def test_an_algebraic_loop_is_refused_by_name_and_runs_as_jacobi() -> None:
 def test_two_parts_that_offer_the_same_output_are_two_writers() -> None:
     reader = FunctionPart("controller", ports("half"), ports("seen"), lambda _, u: [float(u[0])])
     others = {"one": halving_filter(), "two": halving_filter("roll_reference"), "reader": reader}
-    with pytest.raises(SettingsError, match=r"input `half` of the reader has 2 writers: one, two; say which"):
+    with pytest.raises(SettingsError, match=r"input `half` of the reader has 2 writers: one, two; choose one in"):
         run_loop(loop_with(others=others))
     result = run_loop(loop_with(others=others, connections={"reader.half": "two.half"}))
     assert result["seen"][10] == -0.05

@@ -46,7 +46,7 @@ def test_a_function_of_ones_own_is_written_down_sample_by_sample() -> None:
     block = ReferenceBlock(own, duration=1.0).block()
     _, Y = block.run(block.initial_state(), np.zeros((49, 0)))
     np.testing.assert_array_equal(Y[:, 0], [0.1 * (k * 0.02) for k in range(1, 50)])
-    with pytest.raises(SettingsError, match="needs the duration"):
+    with pytest.raises(SettingsError, match="needs `duration`"):
         ReferenceBlock(own).block()
 
 

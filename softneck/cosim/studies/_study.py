@@ -17,7 +17,7 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, SettingsError, SoftneckError, file_hash
 from softneck.design import own_attributes, own_controller
-from softneck.loop import Loop, LoopRun, metric_names, reference_key, shown_unit
+from softneck.loop import Loop, LoopRun, error_unit, metric_names, reference_key
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 
@@ -464,7 +464,7 @@ def _objectives(table: Mapping[str, Any], robot: Robot) -> tuple[str, ...]:
     names = robot.outputs.names
     axis = next((name for asked in (stated, limited) for name in names if name in asked), names[0])
     moved = next(name for name in metric_names(robot) if name.startswith("motors.total_variation_"))
-    return (f"{axis}.rms_error_{shown_unit(robot)[0]}", moved)
+    return (f"{axis}.rms_error_{error_unit(robot)[0]}", moved)
 
 
 def _asked(reference: Mapping[str, Any], key: str, robot: Robot) -> str:

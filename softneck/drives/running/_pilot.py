@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
-from softneck.loop import Loop, LoopResult, Rows, cycle, wire
+from softneck.loop import Loop, LoopResult, LoopRows, row_actions, wire
 from softneck.loop._rows_runtime import ROWS_RECORD, ROWS_REFER, ROWS_SHOW, ROWS_STEP
 from softneck.robot import Robot
 from softneck.signals import NECK, require_same_robot
@@ -54,8 +54,10 @@ class LoopPilot:
         require_same_robot(robot, loop.robot, "loop and drives")
         wiring = wire(self._parts, loop.constants, loop.connections, loop.robot)
         self._wiring = wiring
-        # As in a simulation, but that the plant is hardware, and nobody knows the reference's rows ahead.
-        actions = cycle(self._parts, wiring.taps, dict.fromkeys(self._parts, 1), order=loop.order, disturbed=False)
+        # As in a simulation, but that the plant is hardware, and the reference is not known ahead.
+        actions = row_actions(
+            self._parts, wiring.taps, dict.fromkeys(self._parts, 1), order=loop.order, disturbed=False
+        )
         self._plant = tuple(self._parts).index("plant")
         self._cycle = [
             (ROWS_SHOW if what == ROWS_REFER else what, part, every)
@@ -84,9 +86,9 @@ class LoopPilot:
         others = {name: part for name, part in self._parts.items() if name != "plant"}
         self._running = self._begun({n: part.start(0.0, parameters.get(n, {})) for n, part in others.items()})
 
-    def _begun(self, starts: Mapping[str, Vector]) -> Rows:
+    def _begun(self, starts: Mapping[str, Vector]) -> LoopRows:
         # What is no number is the master's to judge: it stops the drives where set-points become so.
-        return Rows(self._parts, self._wiring, self._cycle, step=self.sample_time, starts=starts, checked=False)
+        return LoopRows(self._parts, self._wiring, self._cycle, step=self.sample_time, starts=starts, checked=False)
 
     def warm(self) -> None:
         """Step all parts once with the neck at rest: what compiles or loads at its first call does so before a run."""
