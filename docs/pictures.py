@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.plots import chart_figure
-from softneck.plots._quality_page import faults_chart
+from softneck.plots._recording_pages import faults_chart
 from softneck.signals import Excitation, Recording, SetPointLimits, assess_quality, prepare, signal
 
 STATIC = Path(__file__).parent / "_static"

@@ -64,7 +64,7 @@ def command(
         return
     from softneck.cosim import load_loop, load_ssp, require_trusted, run_setup
     from softneck.loop import System
-    from softneck.plots import neck_view, not_drawn, write_page
+    from softneck.plots import neck_view, why_not_drawn, write_page
     from softneck.signals import recording_suffix, write_recording
 
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
@@ -82,7 +82,7 @@ def command(
         if loop_file.suffix != ".ssp":
             require_trusted(loop_file, trust=trust)
         setup = load_loop(loop_file, robot=robot)
-    view = html.with_name(f"{html.stem}_3d.html") if html is not None and not not_drawn(setup.loop.robot) else None
+    view = html.with_name(f"{html.stem}_3d.html") if html is not None and not why_not_drawn(setup.loop.robot) else None
     if view is not None:
         refuse_existing(view, force=force)
     if certificate is not None and not setup.limits:
@@ -156,7 +156,7 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
 
 def _page(name: str, result: Result, view: Path | None) -> str:
     from softneck.core import to_si
-    from softneck.plots import Section, Table, loop_chart, not_drawn, page
+    from softneck.plots import Section, Table, loop_chart, page, why_not_drawn
 
     tables = [Table("Metrics", *_metrics(result))]
     if result.limits:
@@ -173,7 +173,7 @@ def _page(name: str, result: Result, view: Path | None) -> str:
     if view is not None:
         method.append(Markup('<a href="{}">The robot in 3-D</a>').format(view.name))
     else:
-        method.append(not_drawn(result.robot))
+        method.append(why_not_drawn(result.robot))
     return page(
         "Closed loop" if name == "loop" else f"Closed loop: {name.replace('_', ' ')}",
         [Section("Response", charts=[chart], tables=tables, method=method)],

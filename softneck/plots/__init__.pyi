@@ -10,10 +10,15 @@ from ._page import Section as Section
 from ._page import Table as Table
 from ._page import page as page
 from ._page import write_page as write_page
-from ._quality_page import quality_page as quality_page
+from ._recording_pages import quality_page as quality_page
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._chart import BLUE as BLUE
+from ._chart import GREEN as GREEN
+from ._chart import GREY as GREY
+from ._chart import ORANGE as ORANGE
+from ._chart import curve_styles as curve_styles
 from ._charts import cover_chart as cover_chart
 from ._charts import distribution_chart as distribution_chart
 from ._charts import frequency_response_chart as frequency_response_chart
@@ -23,10 +28,6 @@ from ._charts import pareto_chart as pareto_chart
 from ._charts import recording_chart as recording_chart
 from ._charts import residual_chart as residual_chart
 from ._charts import validation_chart as validation_chart
-from ._import_page import import_page as import_page
-from ._neck3d import not_drawn as not_drawn
-from ._style import BLUE as BLUE
-from ._style import GREEN as GREEN
-from ._style import GREY as GREY
-from ._style import ORANGE as ORANGE
-from ._style import looks as looks
+from ._neck3d import why_not_drawn as why_not_drawn
+from ._page import cell as cell
+from ._recording_pages import import_page as import_page

@@ -1,38 +1,57 @@
-"""A plot as plain data: curves in panels in a chart, which a matplotlib figure or an interactive page then draws."""
+"""Charts as plain data: curves in panels, drawn by a matplotlib figure or an interactive page."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softneck.core import DataError, ReprMixin, Vector, require_one_of, to_si
-
-from ._style import BLUE, GREY, looks
+from softneck.robot import Robot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# How a curve is drawn. `step` holds each value until the next sample, as a motor holds its set-point; `marked` is a
-# line with its samples as points; `stems` are thin bars from zero.
+# Palette of Okabe and Ito.
+BLUE, ORANGE, GREEN, RED, PURPLE, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#666666"
+SKY = "#56B4E9"
+COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY)
+MOTOR_COLOURS = (BLUE, ORANGE, GREEN)
+# Of eight motors; the first three also stand for other things.
+ALL_MOTOR_COLOURS = (*MOTOR_COLOURS, RED, PURPLE, SKY, GREY, "black")
+
+
+def in_display_unit(values: np.ndarray, robot: Robot) -> np.ndarray:
+    """Convert outputs from SI to the robot's display unit."""
+    return values * (1.0 / to_si(robot.outputs.display_unit)[0])
+
+
+def curve_styles() -> Iterator[tuple[str, str]]:
+    """Yield (colour, style) of one curve after the other: all colours as lines, then dashed, then dotted."""
+    return itertools.cycle([(colour, style) for style in ("line", "dashed", "dotted") for colour in COLOURS])
+
+
+# Styles of curves. `step` holds each value until the next sample, as a motor holds its set-point; `marked` is a line
+# with its samples as points; `stems` are thin bars from zero.
 STYLES = ("line", "dashed", "dotted", "points", "marked", "step", "bars", "stems", "band")
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Curve(ReprMixin):
-    """One set of points, drawn in one style; a NaN breaks lines and bands, nothing is drawn across it.
+    """A set of points in one style; a NaN breaks lines and bands.
 
     Attributes:
-        x: (n,), in the unit that the panel's label says.
-        y: (n,); of a `band` its lower edge, of `bars` and `stems` their heights.
-        label: in the legend; empty: not in it. Curves of one chart with one label are shown and hidden together.
+        x: (n,), in the unit of the panel's label.
+        y: (n,); of a `band` the lower edge, of `bars` and `stems` the heights.
+        label: in the legend, if not empty. Curves of one label are shown and hidden together in a chart.
         colour: as #rrggbb, or "black".
         style: one of `STYLES`.
         width: of lines, or of the points' diameter / 3 [points].
-        upper: (n,) upper edge of a `band`; None for all other styles.
+        upper: (n,) upper edge of a `band`; None for other styles.
     """
 
     x: Vector
@@ -59,20 +78,20 @@ class Curve(ReprMixin):
 
     @property
     def upper_edge(self) -> Vector:
-        """Upper edge of a band; of another style its y."""
+        """Upper edge of a band; of other styles y."""
         return self.y if self.upper is None else self.upper
 
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """A straight line through a whole panel: a bound, a limit, or where one part of the data ends.
+    """A straight line through a whole panel: a bound, a limit, or a border.
 
     Attributes:
         value: y of a horizontal line, x of a `vertical` one.
-        label: in the legend; empty: not in it.
+        label: in the legend, if not empty.
         colour: as #rrggbb.
-        dashed: or drawn through.
-        vertical: whether it stands.
+        dashed: whether the line is dashed.
+        vertical: whether the line is vertical.
     """
 
     value: float
@@ -84,19 +103,19 @@ class Level:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Panel(ReprMixin):
-    """One pair of axes.
+    """A pair of axes.
 
     Attributes:
-        curves: drawn in this order, the last on top.
+        curves: in drawing order, the last on top.
         y_label: with its unit, such as "pitch [deg]".
-        x_label: with its unit; empty: the chart's, under its lowest panels.
+        x_label: with its unit; if empty, that of the chart under its lowest panels.
         levels: straight lines.
-        title: above the panel; often empty.
-        legend: whether the curves' labels are shown in this panel.
-        y_range: lowest and highest y to start with; None: what the curves need.
+        title: above the panel; may be empty.
+        legend: whether the panel has a legend.
+        y_range: initial limits of y; None fits the curves.
         log_x, log_y: logarithmic axes.
-        equal: one unit is as long on both axes, as a path over pitch and roll needs.
-        ticks: names that stand at x = 0, 1, ... instead of numbers.
+        equal: one unit has the same length on both axes, as for a path over pitch and roll.
+        ticks: names at x = 0, 1, ... instead of numbers.
     """
 
     curves: Sequence[Curve]
@@ -114,15 +133,15 @@ class Panel(ReprMixin):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Chart(ReprMixin):
-    """Panels under each other (or in several columns) that belong together.
+    """Panels that belong together, in one or more columns.
 
     Attributes:
-        title: above them.
+        title: above the panels.
         panels: row by row.
-        x_label: of the lowest panels, unless they have their own.
-        columns: panels beside each other.
-        linked: whether all panels share their x axis; zooming one zooms all.
-        caption: a sentence or two for under the chart in a page.
+        x_label: of the lowest panels without their own.
+        columns: number of panels in a row.
+        linked: whether all panels share and zoom one x axis.
+        caption: text under the chart in a page.
         row_height: of one panel [inch].
     """
 
@@ -142,17 +161,17 @@ class Chart(ReprMixin):
 
     @property
     def rows(self) -> int:
-        """How many rows of panels there are."""
+        """Number of rows of panels."""
         return -(-len(self.panels) // self.columns)
 
     def x_label_of(self, number: int) -> str:
-        """Return the x label of a panel: its own, or the chart's where nothing is below it."""
+        """Return the x label of a panel: its own, or the chart's in the lowest row."""
         own = self.panels[number].x_label
         return own or (self.x_label if number + self.columns >= len(self.panels) else "")
 
 
 def bar_width(x: Vector) -> float:
-    """Return the width of bars at `x` that touch."""
+    """Return the width of adjacent bars at `x`."""
     return float(np.min(np.diff(np.sort(x)))) if x.size > 1 else 1.0
 
 
@@ -160,12 +179,7 @@ _DASHES = {"dashed": "--", "dotted": ":"}
 
 
 def chart_figure(chart: Chart, *, width: float = 10.0) -> Figure:
-    """Draw a chart.
-
-    Args:
-        chart: what to draw.
-        width: of the figure [inch].
-    """
+    """Draw a chart as a figure of `width` [inch]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -202,7 +216,7 @@ def _draw(ax: Axes, panel: Panel) -> None:
     ax.set_ylabel(panel.y_label)
     ax.set_title(panel.title, fontsize="medium", loc="left")
     if panel.legend and any(item.label for item in (*panel.curves, *panel.levels)):
-        # Above the axes, so that no curve hides under it.
+        # Above the axes, so that it hides no curve.
         ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), fontsize="small", ncols=4, frameon=False)
 
 
@@ -210,7 +224,7 @@ def _draw_curve(ax: Axes, curve: Curve) -> None:
     x, y, colour, name = curve.x, curve.y, curve.colour, curve.label or "_"  # no legend
     match curve.style:
         case "band":
-            # A band is light, for the curves on it to be seen.
+            # A light band leaves the curves on it visible.
             ax.fill_between(x, y, curve.upper_edge, color=colour, alpha=0.25, lw=0, label=name)
         case "bars":
             ax.bar(x, y, width=bar_width(x), color=colour, alpha=0.6, label=name)
@@ -227,18 +241,18 @@ def _draw_curve(ax: Axes, curve: Curve) -> None:
 
 
 def signals_figure(time: Vector, columns: Mapping[str, Vector], units: Mapping[str, str], title: str) -> Figure:
-    """Draw channels, those of one unit in one panel; angles, by whatever time, in degrees."""
+    """Draw channels over time, one panel for each unit; angles in degrees."""
     groups: dict[str, list[str]] = {}
     for name in columns:
         groups.setdefault(units[name], []).append(name)
     panels = []
     for unit, names in groups.items():
-        seen = unit.replace("rad", "deg") if unit.startswith("rad") else unit
-        scale = to_si("deg")[0] if seen != unit else 1.0
+        drawn = unit.replace("rad", "deg") if unit.startswith("rad") else unit
+        scale = to_si("deg")[0] if drawn != unit else 1.0
         curves = [
             Curve(time, columns[name] / scale, name, colour, style)
-            for name, (colour, style) in zip(names, looks(), strict=False)
+            for name, (colour, style) in zip(names, curve_styles(), strict=False)
         ]
-        what = names[0].rpartition("_")[0] or "value" if len(names) > 1 else names[0]
-        panels.append(Panel(curves, f"{what} [{seen or '-'}]"))
+        label = names[0].rpartition("_")[0] or "value" if len(names) > 1 else names[0]
+        panels.append(Panel(curves, f"{label} [{drawn or '-'}]"))
     return chart_figure(Chart(title, panels))

@@ -1,4 +1,4 @@
-"""The charts of recordings, validations and loops, and the same as matplotlib figures."""
+"""Charts of recordings, validations and loops, and some of them as matplotlib figures."""
 
 from __future__ import annotations
 
@@ -13,25 +13,39 @@ from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot, Scaling
 from softneck.signals import NECK, Recording
 
-from ._chart import Chart, Curve, Level, Panel, chart_figure
-from ._style import ALL_MOTOR_COLOURS, BLUE, GREEN, GREY, ORANGE, RED, SKY, looks, shown
+from ._chart import (
+    ALL_MOTOR_COLOURS,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    SKY,
+    Chart,
+    Curve,
+    Level,
+    Panel,
+    chart_figure,
+    curve_styles,
+    in_display_unit,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Of the whole time: the space between two runs that both start at zero.
-_SPACE = 0.03
+# Space between two runs that both start at zero, as a share of the whole time.
+_RUN_SPACING = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timeline:
-    """Where rows lie on the time axis.
+    """Positions of rows on the time axis.
 
     Attributes:
-        x: (rows + breaks,) [s]; one more point after each stretch, one sample behind its last row.
-        breaks: rows before which a stretch ends.
-        starts: x of the first row of each stretch but the first.
-        moved: whether stretches were moved, since their times would lie on each other.
+        x: (rows + breaks,) [s]; each segment has one more point, a sample after its last row.
+        breaks: first rows of all segments but the first.
+        starts: x of these rows.
+        moved: whether segments were moved because their times overlap.
     """
 
     x: Vector
@@ -41,21 +55,20 @@ class Timeline:
 
     @property
     def x_label(self) -> str:
-        """The title of the axis."""
-        return "time [s], runs one behind the other" if self.moved else "time [s]"
+        """Title of the axis."""
+        return "time [s], runs in sequence" if self.moved else "time [s]"
 
     def spread(self, values: Vector) -> Vector:
-        """Return `values` (rows,) with a NaN after each stretch: (rows + breaks,)."""
+        """Return `values` (rows,) with a NaN after each segment: (rows + breaks,)."""
         return np.insert(np.asarray(values, dtype=np.float64), self.breaks, np.nan)
 
 
 def timeline(time: Vector, run: np.ndarray | None = None) -> Timeline:
-    """Lay rows out on a time axis that never runs back.
+    """Place rows on a time axis that never runs back.
 
     Args:
-        time: (rows,) [s]; may start anew where a run does.
-        run: (rows,) number of the run or stretch of each row; a row after a step that is not a sample time starts a
-            stretch as well.
+        time: (rows,) [s]; may restart with a run.
+        run: (rows,) run or segment numbers; a step that is no sample time starts a segment too.
     """
     time = np.asarray(time, dtype=np.float64)
     shape = time.shape if run is None else run.shape
@@ -68,14 +81,14 @@ def timeline(time: Vector, run: np.ndarray | None = None) -> Timeline:
     if run is not None:
         broken |= np.diff(run) != 0
     breaks = np.flatnonzero(broken) + 1
-    x, moved = _moved(time, breaks, usual)
+    x, moved = _separate_segments(time, breaks, usual)
     return Timeline(np.insert(x, breaks, x[breaks - 1] + usual), breaks, x[breaks], moved)
 
 
-def _moved(time: Vector, breaks: np.ndarray, usual: float) -> tuple[Vector, bool]:
-    """Push each stretch that would not start behind the one before it."""
+def _separate_segments(time: Vector, breaks: np.ndarray, usual: float) -> tuple[Vector, bool]:
+    """Move each segment that would overlap the one before it."""
     edges = [0, *breaks.tolist(), time.size]
-    space = max(_SPACE * sum(time[b - 1] - time[a] for a, b in itertools.pairwise(edges)), 2 * usual)
+    space = max(_RUN_SPACING * sum(time[b - 1] - time[a] for a, b in itertools.pairwise(edges)), 2 * usual)
     x, moved = time.copy(), False
     for start, stop in itertools.pairwise(edges[1:]):
         if x[start] <= x[start - 1]:
@@ -84,15 +97,15 @@ def _moved(time: Vector, breaks: np.ndarray, usual: float) -> tuple[Vector, bool
     return x, moved
 
 
-BLACK, _BOUND = "black", "99 % bounds"
+BLACK, _BOUND_LABEL = "black", "99 % bounds"
 _ZERO = Level(0.0, dashed=False)
-# Of scaled outputs, 1 deg of the neck: noise of one that rests does not fill its panel.
+# Smallest range of a panel in scaled outputs, 1 deg of the neck, so that noise at rest does not fill it.
 _LEAST_RANGE = np.radians(1.0)
 _OUTPUT_COLOURS = (BLUE, ORANGE, GREEN, SKY)
 
 
 def recording_chart(recording: Recording, title: str) -> Chart:
-    """Describe an experiment: set-points, held between samples, and outputs, in the units in which people see them."""
+    """Describe an experiment: set-points, held between samples, and outputs, both in display units."""
     robot, outputs = recording.robot, recording.outputs
     line = timeline(recording.time, recording.run)
     unit, drawn = robot.motors.unit, robot.outputs.display_unit
@@ -102,7 +115,7 @@ def recording_chart(recording: Recording, title: str) -> Chart:
         for j, name in enumerate(robot.motors.names)
     ]
     angles = [
-        Curve(line.x, line.spread(shown(outputs[:, i], robot)), name, colour, width=0.9)
+        Curve(line.x, line.spread(in_display_unit(outputs[:, i], robot)), name, colour, width=0.9)
         for i, (name, colour) in enumerate(zip(robot.outputs.names, _OUTPUT_COLOURS, strict=False))
     ]
     borders, what = _borders(line), "angle" if drawn == "deg" else "output"
@@ -125,26 +138,26 @@ def validation_chart(
 
     Args:
         time: (time,) [s].
-        measured: (time, outputs) in SI, of a neck pitch and roll [rad]; NaN where a row is not scored.
-        predictions: name -> (time, outputs); NaN where there is none.
+        measured: (time, outputs) in SI; NaN for rows that are not scored.
+        predictions: name -> (time, outputs); NaN for missing ones.
         title: of the chart.
-        bounds: lower and upper (time, outputs) that a model promises, drawn as a band.
-        run: (time,) numbers of the stretches, which no line joins; None: wherever the time jumps.
-        caption: for under the chart.
-        robot: whose outputs these are; they are drawn in its display unit.
+        bounds: lower and upper (time, outputs) of a model, drawn as a band.
+        run: (time,) segment numbers, which no line connects; None breaks lines where the time jumps.
+        caption: text under the chart.
+        robot: of the outputs; gives their display unit.
     """
     line = timeline(time, run)
     panels, unit, there = [], robot.outputs.display_unit, np.where(np.isfinite(measured).any(axis=0), measured, 0.0)
-    least = shown(_LEAST_RANGE * Scaling.of(robot, outputs=there).output_unit, robot)
+    least = in_display_unit(_LEAST_RANGE * Scaling.of(robot, outputs=there).output_unit, robot)
     for i, axis in enumerate(robot.outputs.names):
-        y = line.spread(shown(measured[:, i], robot))
+        y = line.spread(in_display_unit(measured[:, i], robot))
         curves, errors = [], []
         if bounds is not None:
-            lower, upper = (line.spread(shown(edge[:, i], robot)) for edge in bounds)
+            lower, upper = (line.spread(in_display_unit(edge[:, i], robot)) for edge in bounds)
             curves.append(Curve(line.x, lower, "bounds", SKY, "band", upper=upper))
         curves.append(Curve(line.x, y, "measured", BLACK, width=1.2))
-        for (name, values), (colour, style) in zip(predictions.items(), looks(), strict=False):
-            yhat = line.spread(shown(values[:, i], robot))
+        for (name, values), (colour, style) in zip(predictions.items(), curve_styles(), strict=False):
+            yhat = line.spread(in_display_unit(values[:, i], robot))
             curves.append(Curve(line.x, yhat, name, colour, style, 0.9))
             errors.append(Curve(line.x, y - yhat, name, colour, style, 0.8))
         panels.append(Panel(curves, f"{axis} [{unit}]", y_range=_range_for(y, curves, float(least[i]))))
@@ -153,7 +166,7 @@ def validation_chart(
 
 
 def _range_for(measured: Vector, curves: list[Curve], least: float) -> tuple[float, float] | None:
-    """Keep what was measured, or as much as `least`, readable beside a prediction that runs off; None: none does."""
+    """Return y limits for the measured values, at least `least` wide, if a curve leaves them by far; else None."""
     seen = measured[np.isfinite(measured)]
     if seen.size == 0:
         return None
@@ -172,16 +185,16 @@ def loop_chart(
     caption: str = "",
     robot: Robot = NECK,
 ) -> Chart:
-    """Describe a closed loop: reference, true, measured and estimated outputs, motors, tensions where there are any.
+    """Describe a closed loop: reference, true, measured and estimated outputs, motors, and tensions.
 
     Args:
         time: (time,) [s].
-        signals: name -> (time,) in SI: the outputs, of a neck pitch and roll (with _reference, _measured, _estimate),
-            motor_setpoint_1..n, motor_position_1..n, tension_1..n [N].
+        signals: name -> (time,) in SI: outputs (and their _reference, _measured, _estimate), motor_setpoint_1..n,
+            motor_position_1..n, tension_1..n [N].
         title: of the chart.
-        limits: metric -> limit; those of a step's overshoot and settling time are drawn.
-        caption: for under the chart.
-        robot: whose loop it is; outputs are drawn in its display unit, motors in their unit.
+        limits: metric -> limit; those of overshoot and settling time are drawn for a step.
+        caption: text under the chart.
+        robot: of the loop; gives the display units.
     """
     panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
@@ -202,7 +215,7 @@ def loop_chart(
 
 
 def _motor(robot: Robot, number: int) -> str:
-    """Return by what a legend tells a motor apart: its number where it is named by it, else its name."""
+    """Return the short name of a motor for a legend."""
     return robot.motors.names[number].removeprefix("motor_").replace("_", " ")
 
 
@@ -214,7 +227,7 @@ def _output_panel(
         ("_estimate", ORANGE, 0.9), ("_reference", BLACK, 1.0),
     )  # fmt: skip
     curves = [
-        Curve(time, shown(signals[f"{name}{end}"], robot), end.strip("_") or "true", colour, width=width)
+        Curve(time, in_display_unit(signals[f"{name}{end}"], robot), end.strip("_") or "true", colour, width=width)
         for end, colour, width in looks_of
         if f"{name}{end}" in signals
     ]
@@ -224,7 +237,7 @@ def _output_panel(
 
 
 def _around(curves: list[Curve], values: list[float]) -> tuple[float, float] | None:
-    """Return a range that shows curves and `values`, which lines across a panel do not ask for; None: without any."""
+    """Return y limits that include the curves and `values`; None without values."""
     if not values:
         return None
     seen = np.concatenate([*(curve.y[np.isfinite(curve.y)] for curve in curves), values])
@@ -235,7 +248,7 @@ def _around(curves: list[Curve], values: list[float]) -> tuple[float, float] | N
 def _step_limits(
     time: Vector, reference: Vector | None, name: str, limits: Mapping[str, float], robot: Robot
 ) -> list[Level]:
-    """Return how far a step may overshoot and when it has to be settled; nothing where the reference is no step."""
+    """Return lines for the limits on overshoot and settling time; none unless the reference is one step."""
     jumps = () if reference is None else np.flatnonzero(np.diff(reference))
     if reference is None or len(jumps) != 1:
         return []
@@ -243,7 +256,7 @@ def _step_limits(
     levels = []
     if (most := limits.get(f"{name}.overshoot_pct")) is not None:
         top = reference[at] + most / 100.0 * (reference[at] - reference[at - 1])
-        levels.append(Level(float(shown(top, robot)), f"overshoot at most {most:g} %", RED))
+        levels.append(Level(float(in_display_unit(top, robot)), f"overshoot at most {most:g} %", RED))
     if (latest := limits.get(f"{name}.settling_s")) is not None:
         levels.append(Level(float(time[at]) + latest, f"settled after {latest:.3g} s", RED, vertical=True))
     return levels
@@ -261,16 +274,16 @@ def residual_chart(
     caption: str = "",
     robot: Robot = NECK,
 ) -> Chart:
-    """Describe residual tests as MATLAB's `resid`: one column for each output, of a neck pitch and roll.
+    """Describe residual tests as MATLAB's `resid` does, one column for each output.
 
     Args:
-        autocorrelation: of the one-step errors: lags (n,) [samples], values (outputs, n) and their bounds (outputs,);
-            lag 0, which is 1, is not drawn.
+        autocorrelation: of the one-step errors: lags (n,) [samples], values (outputs, n), bounds (outputs,); lag 0,
+            which is 1, is not drawn.
         cross_correlation: with the motors' set-points: lags (m,) [samples], values (outputs, motors, m), bounds
             (outputs, motors).
         title: of the chart.
-        caption: for under the chart.
-        robot: whose outputs and motors these are.
+        caption: text under the chart.
+        robot: of the outputs and motors.
     """
     lags, values, bounds = autocorrelation
     cross_lags, cross, cross_bounds = cross_correlation
@@ -302,14 +315,14 @@ def _stems(lags: np.ndarray, values: Vector, bound: float, title: str) -> Panel:
         Curve(x, np.where(out, values, np.nan), "outside", RED, "stems"),
     ]
     levels = [Level(0.0, dashed=False)]
-    if np.isfinite(bound):  # too few rows have none
-        levels += [Level(bound, _BOUND), Level(-bound)]
+    if np.isfinite(bound):  # too few rows give no bound
+        levels += [Level(bound, _BOUND_LABEL), Level(-bound)]
     edge = 1.15 * max(float(np.nan_to_num(bound)), float(np.nan_to_num(np.abs(values)).max(initial=0.0)), 1e-3)
     return Panel(curves, "correlation", levels=levels, title=title, legend=False, y_range=(-edge, edge))
 
 
 def cover_chart(frequency: Vector, errors: Matrix, weight: Vector, title: str) -> Chart:
-    """Describe relative errors of all samples (n, m) under the weight (m,) over `frequency` (m,) [rad/s]."""
+    """Describe relative errors of samples (n, m) under the weight (m,) over `frequency` (m,) [rad/s]."""
     curves = [
         Curve(frequency, np.maximum(row, 1e-4), "" if number else "samples", GREY, width=0.6)
         for number, row in enumerate(errors)
@@ -323,19 +336,19 @@ def frequency_response_chart(
     frequency: Vector, response: np.ndarray, radius: Vector, coherence: Vector, title: str, *, unit: str,
     models: Mapping[str, np.ndarray],
 ) -> Chart:  # fmt: skip
-    """Describe gain, phase and coherence of one entry of a frequency response, models beside it.
+    """Describe gain, phase and coherence of one entry of a frequency response, beside models.
 
     Args:
         frequency: (n,) [rad/s].
-        response: (n,) complex, NaN where it is not known.
-        radius: (n,) of the circles in which it lies with 95 %.
+        response: (n,) complex, NaN if unknown.
+        radius: (n,) radius of the 95 % confidence circles.
         coherence: (n,) 0 to 1.
         title: of the chart.
         unit: of `response`.
         models: name -> (n,) complex.
     """
     size = np.abs(response)
-    # What reaches zero has no end on a logarithmic axis, and the phase of a circle that holds zero is anything.
+    # A logarithmic axis has no zero, and the phase of a circle around zero is undefined.
     low, known = np.maximum(size - radius, 1e-3 * size), radius < size
     phase = np.full(response.shape, np.nan)
     phase[known] = np.degrees(np.unwrap(np.angle(response[known])))
@@ -351,7 +364,7 @@ def frequency_response_chart(
     for (name, values), colour in zip(models.items(), (ORANGE, GREEN, RED, GREY), strict=False):
         gains.append(Curve(frequency, np.abs(values), name, colour))
         phases.append(Curve(frequency, np.degrees(np.unwrap(np.angle(values))), name, colour))
-    # Frequencies at which nothing is known would flatten what is.
+    # Unknown frequencies would dominate the range.
     y_range = (0.3 * float(size[known].min()), 3.0 * float(size[known].max())) if known.any() else None
     panels = [
         Panel(gains, f"gain [{unit}]", log_x=True, log_y=True, y_range=y_range),
@@ -371,12 +384,12 @@ def validation_figure(
     run: np.ndarray | None = None,
     robot: Robot = NECK,
 ) -> Figure:
-    """Draw `validation_chart`: measured and predicted outputs, of a neck (time, 2) [rad], each with its error below."""
+    """Draw `validation_chart`: measured and predicted outputs (time, outputs) in SI, each with its error below."""
     return chart_figure(validation_chart(time, measured, predictions, title, bounds=bounds, run=run, robot=robot))
 
 
-_POINT = 1.6
-_BINS = 40
+_POINT_WIDTH = 1.6
+_MAX_BINS = 40
 
 
 def pareto_chart(
@@ -387,20 +400,20 @@ def pareto_chart(
     *,
     caption: str = "",
 ) -> Chart:
-    """Describe runs by two metrics, and the front that no run beats in both.
+    """Describe runs by two metrics, and their Pareto front.
 
     Args:
-        groups: name -> (x, y) of its runs; runs that are not finite are left out.
+        groups: name -> (x, y) of its runs; only finite ones are drawn.
         front: (x, y) of the front, by rising x.
         labels: of the axes.
         title: of the chart.
-        caption: for under the chart.
+        caption: text under the chart.
     """
     curves = []
-    for (name, (x, y)), (colour, _) in zip(groups.items(), looks(), strict=False):
+    for (name, (x, y)), (colour, _) in zip(groups.items(), curve_styles(), strict=False):
         known = np.isfinite(x) & np.isfinite(y)
         if known.any():
-            curves.append(Curve(np.asarray(x)[known], np.asarray(y)[known], name, colour, "points", _POINT))
+            curves.append(Curve(np.asarray(x)[known], np.asarray(y)[known], name, colour, "points", _POINT_WIDTH))
     if not curves:
         raise DataError(f"no run has both {labels[0]} and {labels[1]}.")
     curves.append(Curve(front[0], front[1], "Pareto front", RED, "marked", 1.4))
@@ -408,12 +421,12 @@ def pareto_chart(
 
 
 def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *, caption: str = "") -> Chart:
-    """Describe how metrics are spread over the runs: a panel for each metric, a line for each group.
+    """Describe the distribution of metrics over runs: a panel for each metric, a curve for each group.
 
     Args:
-        values: metric -> name of a group -> (n,); values that are not finite are left out.
+        values: metric -> group -> (n,); only finite values count.
         title: of the chart.
-        caption: for under the chart.
+        caption: text under the chart.
     """
     panels = []
     for metric, groups in values.items():
@@ -429,14 +442,14 @@ def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *
 def influence_chart(
     inputs: Mapping[str, Vector], metric: tuple[str, Vector], failed: np.ndarray, title: str, *, caption: str = ""
 ) -> Chart:
-    """Describe what a metric depends on: a panel for each number that varied, a point for each run.
+    """Describe the influence of numeric settings on a metric: a panel for each setting, a point for each run.
 
     Args:
-        inputs: key -> (n,) what was put in.
-        metric: its label and (n,) values.
-        failed: (n,) whether a run broke a limit; such are drawn in another colour.
+        inputs: key -> (n,) values.
+        metric: label and (n,) values.
+        failed: (n,) whether a run breaks a limit, which has another colour.
         title: of the chart.
-        caption: for under the chart.
+        caption: text under the chart.
     """
     label, y = metric
     bad = np.asarray(failed, dtype=bool)
@@ -446,7 +459,7 @@ def influence_chart(
         for mask, name, colour in ((~bad, "holds", BLUE), (bad, "breaks a limit", RED)):
             known = mask & np.isfinite(y) & np.isfinite(x)
             if known.any():
-                curves.append(Curve(np.asarray(x, float)[known], y[known], name, colour, "points", _POINT))
+                curves.append(Curve(np.asarray(x, float)[known], y[known], name, colour, "points", _POINT_WIDTH))
         curves = curves or [Curve(np.zeros(0), np.zeros(0), "", GREY, "points")]
         panels.append(Panel(curves, label, x_label=key, legend=not panels))
     return Chart(title, panels, linked=False, caption=caption, row_height=2.0)
@@ -460,15 +473,15 @@ def pareto_figure(
 
 
 def _shares(metric: str, groups: Mapping[str, Vector], *, legend: bool) -> Panel:
-    """Return the share of each group's runs in each of the bins that all groups have in common."""
+    """Return a panel with the share of each group's runs in common bins."""
     every = np.concatenate(list(groups.values()))
     low, high = float(every.min()), float(every.max())
     if high - low <= 1e-12 * max(1.0, abs(high)):
         low, high = low - 0.5, high + 0.5
-    edges = np.linspace(low, high, int(np.clip(np.sqrt(every.size), 8, _BINS)) + 1)
+    edges = np.linspace(low, high, int(np.clip(np.sqrt(every.size), 8, _MAX_BINS)) + 1)
     middles = 0.5 * (edges[:-1] + edges[1:])
     curves = []
-    for (name, values), (colour, _) in zip(groups.items(), looks(), strict=False):
+    for (name, values), (colour, _) in zip(groups.items(), curve_styles(), strict=False):
         share = 100.0 * np.histogram(values, edges)[0] / values.size
         single = len(groups) == 1
         curves.append(Curve(middles, share, name, colour, "bars" if single else "marked"))

@@ -1,7 +1,7 @@
-"""Charts drawn in the browser: zoomed, hovered over, curves hidden by a click on the legend; with Bokeh, offline.
+"""Interactive charts in the browser with zoom, values under the mouse and hidden curves; by Bokeh, offline.
 
-Bokeh's JavaScript ships inside its Python package, so that a page can carry its one copy along. It is imported when
-the first page with a chart is made, for the command line to start fast.
+A page carries its one copy of Bokeh's JavaScript, which ships inside the Python package. Bokeh is imported with the
+first chart, since that takes a while.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ if TYPE_CHECKING:
     from bokeh.plotting import figure as Plot
 
 _PIXELS_PER_INCH = 96
-# Left of the frame, for the panels of a column to stand under each other whatever their numbers need.
-_MARGIN = 72
-# Longer curves are one pixel wide: browsers draw such lines 5 to 10 times as fast as the next wider ones.
-_FINE = 2_000
+# Left margin, which aligns the panels of a column whatever the width of their numbers.
+_LEFT_MARGIN_PX = 72
+# Longer curves are one pixel wide: browsers draw those 5 to 10 times faster.
+_MAX_WIDE_SAMPLES = 2_000
 _FONT = "system-ui, sans-serif"
-# Names under an axis are slanted [rad] and need so much room more [pixels].
-_SLANT, _NAMED = 0.5, 60
+# Names under an axis: slant [rad] and additional height [pixels].
+_TICK_SLANT, _TICK_NAMES_PX = 0.5, 60
 _DASHES = {"dashed": [6, 4], "dotted": [2, 3]}
-#: Bokeh's licence (BSD-3) asks for its notice; packed as the library is, nobody would find it there.
+#: Notice required by Bokeh's licence (BSD-3); the text in the packed library is not readable.
 LICENCE = "Plots: Bokeh, Copyright (c) Anaconda, Inc., and Bokeh Contributors; BSD-3-Clause, text in the library."
-_TOOLS = "box_zoom,pan,reset,save"
+_TOOL_NAMES = "box_zoom,pan,reset,save"
 
 
-def compressed(data: bytes) -> str:
-    """Return bytes as base64 text of their gzip; the same for the same bytes."""
+def gzip_base64(data: bytes) -> str:
+    """Return bytes as base64 text of their gzip; the result is reproducible."""
     return base64.b64encode(gzip.compress(data, 9, mtime=0)).decode()
 
 
 @lru_cache(maxsize=1)
 def library() -> str:
-    """Return the JavaScript that draws charts, packed: Bokeh's core, one copy for a page, without widgets or tables."""
+    """Return Bokeh's core JavaScript, packed, without widgets or tables."""
     from bokeh.resources import Resources
 
-    return compressed("\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw).encode())
+    return gzip_base64("\n".join(Resources(mode="inline", components=["bokeh"], log_level="error").js_raw).encode())
 
 
 def draw(chart: Chart) -> tuple[Any, int]:
-    """Return a chart as Bokeh's JSON, and the height that it takes [pixels]."""
+    """Return a chart as Bokeh's JSON, and its height [pixels]."""
     from bokeh.embed import json_item
     from bokeh.layouts import gridplot
     from bokeh.models import BoxZoomTool, ToolProxy
@@ -75,13 +75,13 @@ def draw(chart: Chart) -> tuple[Any, int]:
 
 
 class _Sources:
-    """Curves with one x share a source, so that the page holds the x once."""
+    """Data sources, one for all curves with the same x, so that a page holds x once."""
 
     def __init__(self) -> None:
         self._known: list[tuple[Vector, ColumnDataSource]] = []
 
     def add(self, x: Vector, y: Vector) -> tuple[ColumnDataSource, str]:
-        """Return the source that now holds `y` and the name of its column."""
+        """Return the source that holds `y` and the name of its column."""
         from bokeh.models import ColumnDataSource
 
         source = next((s for known, s in self._known if known is x or np.array_equal(known, x)), None)
@@ -89,7 +89,7 @@ class _Sources:
             source = ColumnDataSource({"x": x})
             self._known.append((x, source))
         column = f"y{len(source.column_names)}"
-        values: Any = y.astype(np.float32)  # Bokeh's own type hint forgets arrays
+        values: Any = y.astype(np.float32)  # Bokeh's type hint lacks arrays
         source.add(values, column)
         return source, column
 
@@ -103,23 +103,23 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
     plot = figure(
         height=height + (30 if x_label else 0) + (20 if panel.title else 0),
         sizing_mode="stretch_width",
-        tools=_TOOLS,
+        tools=_TOOL_NAMES,
         x_axis_type="log" if panel.log_x else "linear",
         y_axis_type="log" if panel.log_y else "linear",
         x_axis_label=x_label or None,
         y_axis_label=panel.y_label,
         match_aspect=panel.equal,
-        min_border_left=_MARGIN,
+        min_border_left=_LEFT_MARGIN_PX,
         min_border_right=12,
         min_border_top=4,
         min_border_bottom=4,
         outline_line_color=None,
     )
     plot.toolbar.active_drag = next(tool for tool in plot.tools if isinstance(tool, BoxZoomTool))
-    # A bare wheel scrolls the page; with Ctrl (a pinch on a touchpad) it zooms along x.
+    # The wheel scrolls the page; with Ctrl (a pinch on a touchpad) it zooms along x.
     plot.add_tools(WheelZoomTool(dimensions="both" if panel.equal else "width", modifiers={"ctrl": True}))
     if panel.y_range is None:
-        plot.y_range.update(only_visible=True)  # a hidden curve leaves its room to the others
+        plot.y_range.update(only_visible=True)  # the range follows the visible curves
     else:
         plot.y_range = Range1d(start=panel.y_range[0], end=panel.y_range[1])
     plot.x_range.update(range_padding=0.01)
@@ -128,14 +128,14 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         axis.update(axis_label_text_font=_FONT, axis_label_text_font_style="normal", axis_label_text_font_size="12px")
         axis.update(major_label_text_font=_FONT, major_label_text_font_size="11px", minor_tick_line_color=None)
     if chart.linked and not x_label:
-        # The panel below has the same axis. Powers of ten cannot be drawn at no size (Bokeh stops with a NaN box).
+        # The panel below has the same axis. On a logarithmic axis Bokeh fails at size 0 (NaN box).
         plot.xaxis.major_label_text_font_size = "1px" if panel.log_x else "0px"
         plot.xaxis.major_label_text_alpha = 0.0
     if panel.ticks:
         plot.xaxis.ticker = list(range(len(panel.ticks)))
         plot.xaxis.major_label_overrides = dict(enumerate(panel.ticks))
-        plot.xaxis.major_label_orientation = _SLANT
-        plot.height = (plot.height or 0) + _NAMED
+        plot.xaxis.major_label_orientation = _TICK_SLANT
+        plot.height = (plot.height or 0) + _TICK_NAMES_PX
     if panel.title:
         plot.title = Title(text=panel.title, text_font=_FONT, text_font_size="12px")
     return plot
@@ -145,14 +145,14 @@ def _fill(plot: Plot, panel: Panel, sources: _Sources, x_name: str) -> None:
     from bokeh.models import Legend, LegendItem, Span
 
     items: dict[str, list[Any]] = {}
-    told: dict[ColumnDataSource, list[tuple[str, str]]] = {}
+    columns: dict[ColumnDataSource, list[tuple[str, str]]] = {}
     for curve in panel.curves:
         drawn, column = _draw_curve(plot, curve, sources)
         if curve.label:
             items.setdefault(curve.label, []).extend(drawn)
         if column:
             source: Any = drawn[0].data_source
-            told.setdefault(source, []).append((curve.label or panel.y_label, f"@{column}{{%.4g}}"))
+            columns.setdefault(source, []).append((curve.label or panel.y_label, f"@{column}{{%.4g}}"))
     for level in panel.levels:
         dash = [6, 4] if level.dashed else []
         dimension = "height" if level.vertical else "width"
@@ -160,38 +160,38 @@ def _fill(plot: Plot, panel: Panel, sources: _Sources, x_name: str) -> None:
             Span(location=level.value, dimension=dimension, line_color=level.colour, line_width=1, line_dash=dash)
         )
         if level.label:
-            # A Span has no entry in a legend; an empty line with its look has.
+            # A Span has no legend entry, an empty line with its look has one.
             sample = plot.line([np.nan], [np.nan], color=level.colour, line_dash=dash)
             items.setdefault(level.label, []).append(sample)
-    _tell(plot, told, x_name)
+    _add_hover(plot, columns, x_name)
     if panel.legend and items:
         legend = Legend(items=[LegendItem(label=name, renderers=drawn) for name, drawn in items.items()])
-        plot.add_layout(_dressed(legend), "above")
+        plot.add_layout(_style_legend(legend), "above")
 
 
-def _tell(plot: Plot, told: Mapping[ColumnDataSource, Sequence[tuple[str, str]]], x_name: str) -> None:
-    """Show the values of all curves at the last sample left of the mouse in one box.
+def _add_hover(plot: Plot, columns: Mapping[ColumnDataSource, Sequence[tuple[str, str]]], x_name: str) -> None:
+    """Show the values of all curves at the sample left of the mouse in one box.
 
-    Bokeh's own hover makes a box for each curve, and they hide each other. What answers here is a line that is not
-    seen: it has every sample, is never hidden and does not count for the axis.
+    Bokeh's own hover makes a box for each curve, and they overlap. Here an invisible line with every sample responds;
+    it is never hidden and does not count for the axis.
     """
     from bokeh.models import DataRange1d, HoverTool
 
-    seen: Any = list(plot.renderers)
+    visible: Any = list(plot.renderers)
     if isinstance(plot.y_range, DataRange1d):
-        plot.y_range.renderers = seen
+        plot.y_range.renderers = visible
     sides = itertools.cycle(("right", "left", "below", "above"))
-    for (source, rows), side in zip(told.items(), sides, strict=False):
-        silent = plot.line("x", "x", source=source, line_color=None)
+    for (source, rows), side in zip(columns.items(), sides, strict=False):
+        line = plot.line("x", "x", source=source, line_color=None)
         hover = HoverTool(tooltips=[(x_name, "@x{%.6g}"), *rows], mode="vline")
         hover.update(
-            renderers=[silent], formatters={"@x": "printf"} | {name[: name.index("{")]: "printf" for _, name in rows}
+            renderers=[line], formatters={"@x": "printf"} | {name[: name.index("{")]: "printf" for _, name in rows}
         )
         hover.update(line_policy="none", point_policy="follow_mouse", attachment=side, description="values")
         plot.add_tools(hover)
 
 
-def _dressed(legend: Legend) -> Legend:
+def _style_legend(legend: Legend) -> Legend:
     legend.update(
         orientation="horizontal", click_policy="hide", border_line_color=None, padding=2, margin=2, spacing=14
     )
@@ -200,11 +200,11 @@ def _dressed(legend: Legend) -> Legend:
 
 
 def _draw_curve(plot: Plot, curve: Curve, sources: _Sources) -> tuple[list[GlyphRenderer[Any]], str]:
-    """Return what is drawn, and the column of its values in its source (empty: none to tell)."""
+    """Return the glyphs of a curve, and the column of its values in its source; empty for a band."""
     from bokeh.models import ColumnDataSource
 
     colour, name = curve.colour, curve.label or None
-    width = 1.3 * curve.width if curve.x.size <= _FINE else 1.0
+    width = 1.3 * curve.width if curve.x.size <= _MAX_WIDE_SAMPLES else 1.0
     if curve.style == "band":
         outlines: Any = _outlines(curve)
         source = ColumnDataSource(outlines)
@@ -228,7 +228,7 @@ def _draw_curve(plot: Plot, curve: Curve, sources: _Sources) -> tuple[list[Glyph
 
 
 def _outlines(curve: Curve) -> dict[str, list[Vector]]:
-    """Return the outline of each piece of a band without a NaN (Bokeh's own bands are drawn across one)."""
+    """Return the outline of each piece of a band without a NaN; Bokeh's own bands cross NaNs."""
     lower, upper = curve.y, curve.upper_edge
     good = np.isfinite(curve.x + lower + upper)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]]))).reshape(-1, 2).tolist()

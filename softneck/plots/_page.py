@@ -1,9 +1,9 @@
-"""Self-contained HTML pages: text, tables and figures in one file that opens offline."""
+"""Self-contained HTML pages: text, tables and charts in one file that opens offline."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from softneck.core import ReprMixin, atomic_write
+from softneck.core import ReprMixin, atomic_write, percent
 
 from ._chart import Chart, Curve
-from ._interactive import LICENCE, compressed, draw, library
+from ._interactive import LICENCE, draw, gzip_base64, library
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Table(ReprMixin):
-    """A table of text; a cell "holds" or "fails" is coloured.
+    """A table of text; cells "holds" and "fails" are coloured.
 
     Attributes:
         caption: above it.
         head: titles of the columns.
-        rows: of cells.
-        text: so many columns, from the first, hold words and not numbers.
+        rows: rows of cells.
+        text: number of left columns with words instead of numbers.
     """
 
     caption: str
@@ -35,17 +35,33 @@ class Table(ReprMixin):
     text: int = 1
 
 
+def cell(value: Any, spec: str = ".4g") -> str:
+    """Return a value as a table cell: a float by `spec` (`%`: a fit), `-` for None and NaN.
+
+    Values of a mapping are separated by `/`, the ends of an interval by `..`.
+    """
+    if isinstance(value, Mapping):
+        return "/".join(cell(item, spec) for item in value.values())
+    if isinstance(value, list | tuple):
+        return "..".join(cell(end, spec) for end in value)
+    if value is None or value != value:
+        return "-"
+    if not isinstance(value, float):
+        return str(value)
+    return percent(value) if spec == "%" else f"{value:{spec}}"
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class Section(ReprMixin):
-    """One part of a page; what is shown stands before its numbers, and these before how they came about.
+    """A part of a page: charts first, then numbers, then methods.
 
     Attributes:
         title: of the part.
         text: paragraphs.
-        tables: under the pictures.
+        tables: under the charts.
         charts: interactive ones.
-        findings: severity (ok, note, warning) and a sentence of each; a numbered list.
-        method: paragraphs at the end: how the numbers are defined and made.
+        findings: (severity, sentence) pairs, a numbered list; severity is ok, note or warning.
+        method: paragraphs at the end: definitions and methods of the numbers.
     """
 
     title: str
@@ -59,23 +75,23 @@ class Section(ReprMixin):
 def page(
     title: str, sections: Sequence[Section], *, verdict: str = "", holds: bool | None = None, footer: str = ""
 ) -> str:
-    """Return the HTML text of a page; all text is escaped, charts and what draws them are inside.
+    """Return the HTML text of a page; all text is escaped, charts and their library are included.
 
-    The page forbids itself every request, by its content security policy.
+    Its content security policy forbids every request.
 
     Args:
-        title: says the thing.
-        sections: the first of them shows what proves the verdict.
-        verdict: one sentence, before all else.
-        holds: whether that is good or bad news; None: neither.
-        footer: who wrote the page.
+        title: subject of the page.
+        sections: the first one shows the evidence for the verdict.
+        verdict: one sentence, at the top.
+        holds: whether the verdict is good or bad; None: neither.
+        footer: program that wrote the page.
     """
     import jinja2
 
-    charts = iter(thinned([chart for section in sections for chart in section.charts]))
+    charts = iter(thin_charts([chart for section in sections for chart in section.charts]))
     drawn: dict[str, Any] = {}
     parts = [_part(number, section, charts, drawn) for number, section in enumerate(sections, start=1)]
-    packed = Markup(compressed(json.dumps(drawn, separators=(",", ":")).encode()))
+    packed = Markup(gzip_base64(json.dumps(drawn, separators=(",", ":")).encode()))
     script = Markup(library()) if any(section.charts for section in sections) else ""
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(_file("_page.html"))
     return template.render(
@@ -85,14 +101,14 @@ def page(
 
 
 def _part(number: int, section: Section, charts: Iterator[Chart], drawn: dict[str, Any]) -> dict[str, Any]:
-    """Return what the template shows of a section; its charts go to `drawn`."""
-    shown = []
+    """Return the template's values for a section; its charts are added to `drawn`."""
+    parts = []
     for k, _ in enumerate(section.charts, start=1):
         chart, name = next(charts), f"c{number}-{k}"
         drawn[name], height = draw(chart)
-        shown.append({"id": name, "title": chart.title, "caption": chart.caption, "height": height})
+        parts.append({"id": name, "title": chart.title, "caption": chart.caption, "height": height})
     taken = {name: getattr(section, name) for name in ("title", "text", "tables", "findings", "method")}
-    return {**taken, "charts": shown}
+    return {**taken, "charts": parts}
 
 
 def _file(name: str) -> str:
@@ -100,37 +116,37 @@ def _file(name: str) -> str:
 
 
 def write_page(path: str | Path, html: str, *, force: bool = False) -> None:
-    """Write a page in one piece; raises OutputFileError if it exists (and not `force`) or cannot be written."""
+    """Write a page atomically; raise OutputFileError if it exists (and not `force`) or cannot be written."""
     with atomic_write(path, force=force) as temporary:
         temporary.write_text(html, encoding="utf-8")
 
 
-# Samples of a page: compressed, about three bytes each, and a third more as text.
-_MOST_SAMPLES = 300_000
-_CONTINUOUS = ("line", "dashed", "dotted", "step", "band", "points")
+# Samples of a page: about three bytes each when compressed, four as text.
+_MAX_SAMPLES = 300_000
+_CONTINUOUS_STYLES = ("line", "dashed", "dotted", "step", "band", "points")
 
 
-def thinned(charts: Sequence[Chart], most: int = _MOST_SAMPLES) -> list[Chart]:
-    """Return charts of at most `most` samples: as they are, or their longest curves in pieces; captions say so."""
+def thin_charts(charts: Sequence[Chart], most: int = _MAX_SAMPLES) -> list[Chart]:
+    """Return charts with at most `most` samples; longer curves are reduced to extremes, which captions mention."""
     sizes = [curve.y.size for chart in charts for panel in chart.panels for curve in panel.curves]
     limit = max(sizes, default=0)
     while sum(min(size, limit) for size in sizes) > most:
         limit = int(0.9 * limit)
-    return [_thinned(chart, limit) for chart in charts]
+    return [_thin_chart(chart, limit) for chart in charts]
 
 
-def _thinned(chart: Chart, limit: int) -> Chart:
+def _thin_chart(chart: Chart, limit: int) -> Chart:
     longest = max(curve.y.size for panel in chart.panels for curve in panel.curves)
     if longest <= limit:
         return chart
-    panels = [replace(panel, curves=[_piecewise(curve, limit) for curve in panel.curves]) for panel in chart.panels]
-    said = f"Of {longest} samples the least and the most of each {2 * longest / limit:.0f} are drawn."
-    return replace(chart, panels=panels, caption=f"{chart.caption} {said}".strip())
+    panels = [replace(panel, curves=[_thin_curve(curve, limit) for curve in panel.curves]) for panel in chart.panels]
+    note = f"Of {longest} samples the minimum and the maximum of each {2 * longest / limit:.0f} are drawn."
+    return replace(chart, panels=panels, caption=f"{chart.caption} {note}".strip())
 
 
-def _piecewise(curve: Curve, limit: int) -> Curve:
-    """Return the least and the most of each piece, in the order in which they came, at its first and middle x."""
-    if curve.y.size <= limit or curve.style not in _CONTINUOUS:
+def _thin_curve(curve: Curve, limit: int) -> Curve:
+    """Return the minimum and the maximum of each piece, in their order, at its first and middle x."""
+    if curve.y.size <= limit or curve.style not in _CONTINUOUS_STYLES:
         return curve
     edges = np.unique(np.linspace(0, curve.y.size, limit // 2 + 1).astype(int))
     start, stop = edges[:-1], edges[1:]

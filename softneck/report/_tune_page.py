@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from softneck.design import assumed_lines
-from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, looks, page
+from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, curve_styles, page
 from softneck.tuning import step_response
 from softneck.verification import metric_title
 
@@ -109,7 +109,7 @@ def _asked(found: Tuned) -> Section:
 
 def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
     curves: list[Curve] = []
-    for item, (colour, style) in zip(items[:_STEPS], looks(), strict=False):
+    for item, (colour, style) in zip(items[:_STEPS], curve_styles(), strict=False):
         time, y, reference = step_response(found.task, item)
         if not curves:
             curves.append(Curve(time, reference, "reference", GREY, "step"))

@@ -136,7 +136,7 @@ def test_the_page_of_a_loop_has_a_panel_for_each_output_in_its_unit(call: Call, 
         assert label in page + charts_of(page), label
     # What tendons bend is what the 3-D view draws.
     assert not (tmp_path / "loop_3d.html").exists()
-    assert "has no view in 3-D: it is drawn of robots that tendons at known angles bend." in page
+    assert "has no view in 3-D: only robots bent by tendons at known angles have one." in page
 
 
 @pytest.mark.slow

@@ -75,9 +75,7 @@ def test_a_robot_that_no_tendons_bend_is_not_drawn() -> None:
         "directions": {"kind": "identified"},
     })  # fmt: skip
     recording = Recording(0.02 * np.arange(5), 0.02, {"motor_setpoint_1": np.ones(5), "level": np.ones(5)}, robot=robot)
-    with pytest.raises(
-        DataError, match=r"robot `tank` \(\w{8}\) has no view in 3-D: it is drawn of robots that tendons"
-    ):
+    with pytest.raises(DataError, match=r"robot `tank` \(\w{8}\) has no view in 3-D: only robots bent by tendons"):
         neck_view(recording)
 
 

@@ -15,8 +15,8 @@ import pytest
 from PIL import Image
 
 from softneck.plots import Chart, Curve, Level, Panel, Section, page
-from softneck.plots._page import thinned
-from softneck.plots._style import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from softneck.plots._chart import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from softneck.plots._page import thin_charts
 
 from ..browser import Shown, own_text, shown
 
@@ -121,7 +121,7 @@ def test_a_page_of_too_many_samples_keeps_the_least_and_the_most_of_each_piece_a
     y[rng.integers(0, t.size, 5)] = 9.0  # a spike of one sample must not vanish
     y[40_000:60_000] = np.nan
     charts = [Chart("long", [Panel([Curve(t, y), Curve(t, 2 * y)], "y")]), Chart("short", [Panel([Curve(X, X)], "y")])]
-    long, short = thinned(charts, most=10_000)
+    long, short = thin_charts(charts, most=10_000)
     assert short is charts[1]
     assert sum(curve.y.size for panel in long.panels for curve in panel.curves) <= 10_000
     assert "Of 100000 samples" in long.caption
@@ -131,7 +131,7 @@ def test_a_page_of_too_many_samples_keeps_the_least_and_the_most_of_each_piece_a
     inside = (curve.x > t[40_100]) & (curve.x < t[59_900])  # but for the pieces at its ends
     assert np.isnan(curve.y[inside]).all()
     assert (np.diff(curve.x) > 0).all()
-    assert thinned(charts)[0] is charts[0]
+    assert thin_charts(charts)[0] is charts[0]
 
 
 def test_the_command_line_starts_without_the_drawing_library() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from softneck.plots import chart_figure, quality_page
-from softneck.plots._quality_page import faults_chart
+from softneck.plots._recording_pages import faults_chart
 from softneck.signals import Quality, Recording, assess_quality, concatenate
 
 from ..data import neck_recording

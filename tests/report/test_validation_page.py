@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from softneck.identification import INFINITE, Model, Validation, validate
-from softneck.plots._style import BLUE, COLOURS, ORANGE
+from softneck.plots._chart import BLUE, COLOURS, ORANGE
 from softneck.report import validation_page
 from softneck.signals import Recording, concatenate
 

@@ -1,0 +1,277 @@
+"""Pages of a log and a recording: its import, and its quality."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softneck.core import Vector, to_si
+from softneck.signals import Doubt, Layout, Quality, Recording, Source, file_unit, is_held
+
+from ._chart import ALL_MOTOR_COLOURS, GREEN, GREY, ORANGE, PURPLE, RED, Chart, Curve, Panel
+from ._page import Section, Table, cell, page
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+# More points would hide each other and fill the page.
+_MAX_POINTS = 3_000
+
+
+def import_page(
+    log: Path,
+    frame: pd.DataFrame,
+    layout: Layout,
+    *,
+    recording: Recording | None,
+    doubts: Sequence[Doubt] = (),
+    lines: Sequence[str] = (),
+    problems: Sequence[str] = (),
+) -> str:
+    """Return the HTML page of an import.
+
+    Args:
+        log: file of the log.
+        frame: its table.
+        layout: its layout.
+        recording: the result; None if something is missing.
+        doubts: of the guess, the least certain first.
+        lines: of the guess, and notes of the import.
+        problems: missing entries, or the reason for no recording.
+    """
+    first, *charts = [*_charts(frame, layout, recording), None]
+    sections = [_doubts_section(doubts, problems, lines, first), _mapping(frame, layout, recording)]
+    if charts[:-1]:
+        sections.append(Section("Raw and made", charts=[chart for chart in charts if chart is not None]))
+    if left_out := [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]:
+        sections.append(Section("Left out", text=left_out))
+    return page(
+        f"Import of {log.name}", sections, verdict=_import_verdict(doubts, problems, recording),
+        holds=False if problems else None if doubts else True,
+        footer="Written by softneck import.",
+    )  # fmt: skip
+
+
+def _import_verdict(doubts: Sequence[Doubt], problems: Sequence[str], recording: Recording | None) -> str:
+    if problems or recording is None:
+        return f"No recording: {problems[0] if problems else 'something is missing'}"
+    made = f"A recording of {len(recording)} rows was made"
+    return f"{made}; {len(doubts)} guesses are for you to confirm." if doubts else f"{made}; no guess is in doubt."
+
+
+def _doubts_section(
+    doubts: Sequence[Doubt], problems: Sequence[str], lines: Sequence[str], chart: Chart | None
+) -> Section:
+    """Return the doubts and problems for the reader to decide, with the first chart."""
+    findings = [("warning", f"missing: {problem}") for problem in problems]
+    findings += [("warning", line.removeprefix("warning: ")) for line in lines if line.startswith("warning: ")]
+    # A list, since a phone shows two columns of a table of five.
+    findings += [
+        ("note", f"{one} ({'or: ' + ', '.join(one.choices) if one.choices else 'if not, edit the layout'})")
+        for one in doubts
+    ]
+    if not doubts:
+        findings.append(("ok", "nothing that was guessed is less than 90 % sure."))
+    method = (
+        "Left: the columns as logged, over their rows. Right: the recording's channels over time, in the same colours."
+    )
+    charts = [] if chart is None else [chart]
+    return Section("Doubts", findings=findings, charts=charts, method=[method] if charts else [])
+
+
+def _mapping(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> Section:
+    text = [f"{len(frame)} rows and {frame.shape[1]} columns in the log."]
+    if recording is not None:
+        text.append(
+            f"The recording has {len(recording)} rows in {len(recording.runs())} run(s) at "
+            f"{1e3 * recording.sample_time:.6g} ms."
+        )
+    rows = []
+    for name, source in _sources(layout).items():
+        there = recording is not None and name in recording.channels
+        unit = file_unit(name, layout.robot) if name not in ("inclination", "orientation", "time") else ""
+        made = _span(recording.channels[name] / to_si(unit)[0], unit) if there and recording is not None else ""
+        how = ("inverted" if source.sign < 0 else "") + (" integrated" if source.integrate else "")
+        rows.append([name, _source_text(source), made, how.strip()])
+    head = ["channel", "from", "in the recording", ""]
+    return Section("Mapping", text=text, tables=[Table("Channels", head, rows, text=2)])
+
+
+def _sources(layout: Layout) -> dict[str, Source]:
+    tilt = {"inclination": layout.inclination, "orientation": layout.orientation, "time": layout.time}
+    return {**layout.channels, **{name: source for name, source in tilt.items() if source is not None}}
+
+
+def _source_text(source: Source) -> str:
+    terms = [f"{t.column}" if t.factor == 1.0 else f"{t.factor:.4g} x {t.column}" for t in source.terms]
+    return f"{' + '.join(terms)} [{source.unit}]"
+
+
+def _column(frame: pd.DataFrame, name: str | int) -> Vector:
+    import pandas as pd
+
+    cells = frame[name] if name in frame.columns else frame.iloc[:, int(name)]
+    return np.asarray(pd.to_numeric(cells, errors="coerce"), dtype=np.float64)
+
+
+def _span(values: Vector, unit: str) -> str:
+    seen = values[np.isfinite(values)]
+    return f"{seen.min():.4g} to {seen.max():.4g} {unit}" if seen.size else "no number"
+
+
+def _charts(frame: pd.DataFrame, layout: Layout, recording: Recording | None) -> list[Chart]:
+    """Return a chart for each group of channels, with the raw columns beside them."""
+    sources = _sources(layout)
+    robot = layout.robot
+    channels = {
+        "set-points": robot.set_points, "positions": robot.motor_positions, "velocities": robot.motor_velocities,
+    }  # fmt: skip
+    groups = {title: [name for name in layout.channels if name in names] for title, names in channels.items()}
+    taken = {name for names in groups.values() for name in names}
+    for output in robot.outputs.names:
+        groups[output] = [name for name in layout.channels if name.startswith(output) and name not in taken]
+    charts = []
+    for title, names in groups.items():
+        raw = names or (["inclination", "orientation"] if title in ("pitch", "roll") else [])
+        raw = [name for name in raw if name in sources]
+        made = [name for name in (names or [title]) if recording is not None and name in recording.channels]
+        if raw or made:
+            panels = [_raw_panel(frame, {name: sources[name] for name in raw})]
+            if recording is not None and made:
+                panels.append(_made_panel(recording, made))
+            charts.append(Chart(title.capitalize(), panels, x_label="", columns=2, linked=False, row_height=2.6))
+    return [chart for chart in charts if any(panel.curves for panel in chart.panels)]
+
+
+def _raw_panel(frame: pd.DataFrame, sources: dict[str, Source]) -> Panel:
+    columns = dict.fromkeys(term.column for source in sources.values() for term in source.terms)
+    every = max(1, len(frame) // _MAX_POINTS)
+    rows = np.arange(0, len(frame), every, dtype=np.float64)
+    curves = [
+        Curve(rows, _column(frame, name)[::every], str(name), ALL_MOTOR_COLOURS[k % len(ALL_MOTOR_COLOURS)], "line")
+        for k, name in enumerate(columns)
+    ]
+    units = {source.unit for source in sources.values()}
+    return Panel(curves, f"as logged [{'/'.join(sorted(units)) or '?'}]", x_label="row", title="raw")
+
+
+def _made_panel(recording: Recording, names: Sequence[str]) -> Panel:
+    every = max(1, len(recording) // _MAX_POINTS)
+    unit = file_unit(names[0], recording.robot)
+    time = recording.time[::every]
+    curves = [
+        Curve(
+            time, recording.channels[name][::every] / to_si(file_unit(name, recording.robot))[0], name,
+            ALL_MOTOR_COLOURS[k % len(ALL_MOTOR_COLOURS)], "step" if is_held(name) else "line",
+        )
+        for k, name in enumerate(names)
+    ]  # fmt: skip
+    # Colours and order are those of the columns beside it; a phone has no room for a second legend.
+    return Panel(curves, f"recording [{unit}]", x_label="time [s]", title="made", legend=False)
+
+
+_FAULTS = (("missed", RED), ("frozen", PURPLE), ("clipped", ORANGE), ("outliers", GREEN))
+_FAULT_NAMES = {"outliers": "spikes"}
+# Marks of one fault in one channel.
+_MAX_MARKS = 200
+
+
+def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
+    """Describe the measured channels over time: a band over the rows of each fault, a point on each spike."""
+    # Times restart with each run; row numbers do not.
+    t = np.arange(len(recording)) * recording.sample_time
+    border = np.flatnonzero(np.diff(recording.run)) + 1
+    panels = []
+    for name in [name for name in _drawn_channels(recording) if name not in recording.robot.set_points]:
+        y = _values(recording, name)
+        y[border] = np.nan
+        curves = [Curve(t, y, colour=GREY, width=0.7)]
+        for sort, colour in _FAULTS:
+            if segments := getattr(quality.channels[name], sort)[:_MAX_MARKS]:
+                rows = [np.arange(one.start, one.stop) for one in segments]
+                curves.append(_fault_curve(t, _values(recording, name), rows, sort, colour))
+        panels.append(Panel(curves, f"{name.replace('_', ' ')} [{quality.channels[name].unit}]"))
+    return Chart(title, panels, "time from the first row [s]", row_height=2.0)
+
+
+def _fault_curve(t: Vector, y: Vector, rows: Sequence[np.ndarray], sort: str, colour: str) -> Curve:
+    """Return the marks of a fault: points for spikes, else bands over its rows."""
+    if sort == "outliers":
+        at = np.concatenate(rows)
+        return Curve(t[at], y[at], _FAULT_NAMES[sort], colour, "points", 1.3)
+    low, high = (float(np.nan_to_num(edge)) for edge in (np.nanmin(y, initial=0.0), np.nanmax(y, initial=0.0)))
+    step = t[1] - t[0] if t.size > 1 else 1.0
+    x = np.concatenate([[t[one[0]], t[one[-1]] + step, t[one[-1]] + step] for one in rows])
+    gaps = np.tile([0.0, 0.0, np.nan], len(rows))
+    return Curve(x, low + gaps, sort, colour, "band", upper=high + gaps)
+
+
+def _drawn_channels(recording: Recording) -> list[str]:
+    robot = recording.robot
+    names = (*robot.set_points, *robot.motor_positions, *robot.outputs.names)
+    return [name for name in names if name in recording.channels]
+
+
+def _values(recording: Recording, name: str) -> Vector:
+    """Return a copy of a channel in its file unit."""
+    return recording.channels[name] / to_si(file_unit(name, recording.robot))[0]
+
+
+def quality_page(recording: Recording, quality: Quality, title: str) -> str:
+    """Return the HTML page of a recording's quality: findings, channels and excitation."""
+    bandwidth = quality.spectrum.bandwidth
+    spectrum = f"Power of {', '.join(quality.spectrum.inputs)} (Welch, never across runs)."
+    if not np.isnan(bandwidth):
+        spectrum += f" Inputs without power up to the bandwidth of {bandwidth:.3g} rad/s identify no model."
+    faults = faults_chart(recording, quality, "Measured channels, with the rows of each fault marked")
+    sections = [
+        Section("Findings", charts=[faults], findings=_findings(quality)),
+        Section("Channels", tables=[_channel_table(quality)]),
+        Section("Excitation", text=[spectrum, *quality.numbers()]),
+    ]
+    return page(
+        title, sections, verdict=_quality_verdict(recording, quality), holds=quality.severity != "warning",
+        footer="Written by softneck info.",
+    )  # fmt: skip
+
+
+def _quality_verdict(recording: Recording, quality: Quality) -> str:
+    """Return a sentence on the quality and length of the recording."""
+    count = {severity: sum(one.severity == severity for one in quality.findings) for severity in ("warning", "note")}
+    runs = len(recording.runs())
+    words = {
+        "warning": f"Fix this before you identify a model from it ({count['warning']} warnings below)",
+        "note": f"Fit to identify a model, with {count['note']} thing(s) to know",
+        "ok": "Fit to identify a model; nothing is wrong with it",
+    }
+    return (
+        f"{words[quality.severity]}. It has {quality.rows} rows in {runs} run{'s' if runs > 1 else ''} at "
+        f"{1e3 * quality.sample_time:g} ms, {quality.rows * quality.sample_time:.1f} s."
+    )
+
+
+def _findings(quality: Quality) -> list[tuple[str, str]]:
+    """Return each finding with the time of its first place."""
+    return [
+        (
+            one.severity,
+            str(one).removeprefix(f"{one.severity}: ")
+            + (f" First at {one.time:.2f} s of its run." if one.time is not None and "at " not in one.message else ""),
+        )
+        for one in quality.findings
+    ]
+
+
+def _channel_table(quality: Quality) -> Table:
+    head = ["channel", "lowest", "highest", "unit", "step", "noise", "missed", "frozen", "clipped", "spikes"]
+    rows = []
+    for name, channel in quality.channels.items():
+        values = channel.as_dict()
+        counts = [str(values[f"{sort}_rows"]) for sort, _ in _FAULTS]
+        low, high, step = (cell(values[key], ".3g") for key in ("lowest", "highest", "quantum"))
+        noise = "-" if channel.is_command else cell(values["noise_std"], ".3g")
+        rows.append([name, low, high, channel.unit, step, noise, *counts])
+    return Table("Channels: steps and noise in the channel's unit, faults in rows", head, rows)
