@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from softneck.robot import Robot
 
 
-_HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
-_TITLE = "Free-run fit [%] over what was left out, mean of {names}; +- one standard error"
+_TABLE_HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
+_TABLE_TITLE = "Free-run fit [%] over what was left out, mean of {names}; +- one standard error"
 
 _OTHER = {
     "linear": "`design` of most kinds takes linear models: the best of them, {kind}, is in {path}",
@@ -77,7 +77,7 @@ def identify_auto(
         print_json({**facts, **kept})
         _refuse_useless(path, why, judged)
         return
-    print_table(_title(parts[0].robot), _HEAD, _rows(choice))
+    print_table(_title(parts[0].robot), _TABLE_HEAD, _rows(choice))
     click.echo(f"{choice.why}\n{path}\n{models[0].summary()}")
     for remark in [*said, *choice.remarks]:
         note(remark)
@@ -106,7 +106,7 @@ def _others(choice: Choice) -> dict[str, Choice]:
 
 
 def _title(robot: Robot) -> str:
-    return _TITLE.format(names=" and ".join(robot.outputs.names))
+    return _TABLE_TITLE.format(names=" and ".join(robot.outputs.names))
 
 
 def _rows(choice: Choice) -> list[list[str]]:
@@ -160,7 +160,7 @@ def _page(choice: Choice) -> str:
     from softneck.plots import Section, Table, page
     from softneck.report import curves
 
-    table = Table(_title(_model(choice).robot), _HEAD, _rows(choice))
+    table = Table(_title(_model(choice).robot), _TABLE_HEAD, _rows(choice))
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
     each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
     all_scores = Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)

@@ -117,7 +117,7 @@ def observer_command(
     lines: list[str] = []
     if data:
         named = {setting.partition("=")[0].strip() for setting in settings}
-        found, lines = _fitted(observer, data, robot, named)
+        found, lines = _fit(observer, data, robot, named)
         observer, fit = found.observer, found.fit
         told = {
             "fit": {
@@ -140,9 +140,7 @@ def observer_command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
-def _fitted(
-    observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
-) -> tuple[FittedObserver, list[str]]:
+def _fit(observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]) -> tuple[FittedObserver, list[str]]:
     """Fit the observer to the recordings; return it and the lines to print."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
     from softneck.estimation import consistency, fit_observer

@@ -23,7 +23,7 @@ _EXTRAS = {"dask": ("distributed", "studies on a cluster")}
 @click.command("doctor", epilog="Example: softneck doctor --json")
 @common_options()
 def command(as_json: bool) -> None:
-    """Say which parts of this machine work: packages, compilers, FMU platforms, CAN, extras."""
+    """Check this machine: packages, compilers, FMU platforms, CAN, extras."""
     checks = [_python(), *_packages(), _compiler(), _fmu_platform(), _compiled_fmus(), _can(), *_extras()]
     bad = [check for check in checks if check["state"] == "missing"]
     if as_json:
@@ -42,15 +42,15 @@ def _python() -> dict[str, str]:
     return _check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
 
 
-def _needed() -> list[str]:
-    """Return the names of all packages that the installed softneck asks for."""
+def _requirements() -> list[str]:
+    """Return the names of all packages that the installed softneck requires."""
     asked = [line for line in metadata.requires("softneck") or [] if "extra ==" not in line]
     return [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in asked]
 
 
 def _packages() -> list[dict[str, str]]:
     found = []
-    for name in _needed():
+    for name in _requirements():
         try:
             found.append(_check(name, "ok", metadata.version(name)))
         except metadata.PackageNotFoundError:

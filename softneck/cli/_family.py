@@ -81,8 +81,8 @@ def command(
 def _facts(path: Path, family: Family) -> dict[str, Any]:
     axes = {
         name: {
-            "nominal": _named(axis.nominal),
-            "box": {"low": _named(axis.box[0]), "high": _named(axis.box[1])},
+            "nominal": _parameters(axis.nominal),
+            "box": {"low": _parameters(axis.box[0]), "high": _parameters(axis.box[1])},
             "samples": int(axis.used.sum()),
             "largest_relative_error": float(axis.envelope.max()),
             "covered": family.covered(name),
@@ -98,16 +98,16 @@ def _facts(path: Path, family: Family) -> dict[str, Any]:
             "from": [*family.robot.input_names, family.robot.cocontraction_name][: len(next(iter(family.cross)))],
             **dict(zip(family.axes, family.cross, strict=True)),
         },
-        "compression": _named(family.compression),
+        "compression": _parameters(family.compression),
         "settings": family.settings,
         "findings": family.findings,
         "band_rad_s": {name: family.band(name) for name in family.axes},
-        "measured": {name: _measured(found) for name, found in family.measured.items()},
+        "measured": {name: _response_facts(found) for name, found in family.measured.items()},
         "summary": family.summary(),
     }
 
 
-def _measured(found: Any) -> dict[str, Any]:
+def _response_facts(found: Any) -> dict[str, Any]:
     return {
         "poles": found.model.a.size, "dead_time_s": found.model.delay, "held_out_rms": found.held_out,
         "frequency_rad_s": found.frequency, "weight": found.weight, "bands_rad_s": found.borders,
@@ -115,7 +115,7 @@ def _measured(found: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _named(numbers: np.ndarray) -> dict[str, float]:
+def _parameters(numbers: np.ndarray) -> dict[str, float]:
     return dict(zip(("static_gain", "pole", "delay_s"), numbers.tolist(), strict=True))
 
 
@@ -137,7 +137,7 @@ def _page(family: Family) -> str:
 
 
 def _verdict(family: Family, name: str, gain: float, unit: str) -> str:
-    """Return where the weight covers what an axis was measured to do, and how wide its plant is."""
+    """Return the band in which the weight covers the measured responses, and the range of the plant."""
     low, high = (_numbers(row, gain) for row in family.axes[name].box)
     span = f"its static gain is {low[0]} to {high[0]} {unit} and its dead time {low[2]} to {high[2]} ms"
     band = family.band(name)

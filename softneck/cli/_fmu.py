@@ -131,7 +131,7 @@ def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bo
 
 
 def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
-    """Return what `source` names: a softneck file of the robot, a neck or a robot by its file or preset."""
+    """Return the softneck file, neck or robot that `source` names, by its file or preset."""
     from softneck.cosim import is_loop_file, reference_of
     from softneck.fmu import buildable
 
@@ -143,7 +143,7 @@ def _can_be_fmu(source: str | Path) -> bool:
 
 
 def _has_sensitivities(block: Block) -> bool:
-    """Return whether an FMU of `block` can have them; of a folder the others are built without, which is said."""
+    """Return whether an FMU of `block` can have sensitivities; print a warning if not."""
     from softneck.fmu import next_outputs
 
     try:
@@ -154,7 +154,7 @@ def _has_sensitivities(block: Block) -> bool:
 
 
 def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:
-    """Return the scores of a model on recordings as one, each run of its own; None for what is not a model."""
+    """Validate a model on all recordings together; return None if `thing` is no model."""
     from softneck.identification import Model, validate
     from softneck.signals import open_recording
 
@@ -185,7 +185,7 @@ def _what(files: tuple[str, ...], output: Path | None, *, force: bool) -> tuple[
 
 
 def _inside(folder: Path) -> list[Path]:
-    """Return the files of a folder that are, or may be, ours."""
+    """Return the files of a folder that are, or may be, files of softneck."""
     sources = sorted(path for path in folder.iterdir() if path.suffix == ".npz" or _is_neck(path))
     if not sources:
         raise FileFormatError(f"{folder}: holds no model, observer, controller or neck file.")
@@ -193,7 +193,7 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _is_neck(path: Path) -> bool:
-    """Return whether a file means to be a neck's; what is wrong in it is said when it is read."""
+    """Return whether a file has the keys of a neck file; reading it checks the rest."""
     from softneck.fmu import has_keys
     from softneck.plant import NeckParameters
 

@@ -37,7 +37,7 @@ from .shared._options import (
 if TYPE_CHECKING:
     from softneck.identification import Model, Validation
 
-_ANOTHER = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
+_ADVICE = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
 _KINDS += "\n  auto     tries them all and takes the best in free run"
 
@@ -125,7 +125,7 @@ def command(
     if why is not None:
         still = tail and why_at_rest(tail, whole)
         why, advice = still or why, "" if still or held_out is None else left_out(held_out)
-        advice = advice or (poor[0] if poor else _ANOTHER)
+        advice = advice or (poor[0] if poor else _ADVICE)
         raise CheckFailedError(f"{path}: no model of the rows held out: {why}. {advice}")
 
 
@@ -144,7 +144,7 @@ def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:
 
 @dataclass(frozen=True, slots=True)
 class _Adaptation:
-    """What `--set` takes beside `--from`; `window`: the latest seconds to look at."""
+    """The settings of `--from`; `window` is the length of the latest data to use [s]."""
 
     window: float = 30.0
 
@@ -153,14 +153,14 @@ def adapt(
     kind: str, model: Path, recordings: tuple[Path, ...], output: Path | None, *, settings: Sequence[str],
     robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Refit MODEL to the latest data, starting from what it is; write the model, and say what became of it."""
+    """Refit MODEL to the latest data, starting from its present parameters; write the result and print the fits."""
     from softneck.signals import open_recording
 
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     old = load_for_robot(model, "model", robot)
     if kind not in (old.kind, "auto"):
-        raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; what is refitted stays what it is.")
+        raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; a refitted model keeps its kind.")
     window = float(apply_settings(_Adaptation, settings).window)
     require_positive("window", window, "s")
     new = old.adapted(open_recording(recordings, robot), window=window)

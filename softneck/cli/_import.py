@@ -28,10 +28,10 @@ def is_terminal() -> bool:
 
 
 def settle(guess: Guess, log: Path, proposal: Path) -> Guess:
-    """Return the guess with all doubts answered, the least sure first, and the sample time of a log without a clock.
+    """Ask the user about all doubts and the sample time of a log without a clock; return the settled guess.
 
     Raises:
-        DataError: columns were said to be wrong; the line says where to fix them.
+        DataError: the user rejects columns; the message names the layout to fix.
     """
     for doubt in guess.doubts:
         if doubt.choices:
@@ -54,18 +54,18 @@ def settle(guess: Guess, log: Path, proposal: Path) -> Guess:
 
 @dataclass(slots=True)
 class _Job:
-    """An import on its way: what is read and where it goes.
+    """One import: its log, options and output files.
 
     Attributes:
         log: to read.
         path: of the recording.
-        replace: whether what stands at `path` and beside it may be replaced.
-        force: whether the user said so, as for files that were named one by one.
+        replace: whether files at `path` and beside it may be replaced.
+        force: whether `--force` is given.
         html: of the preview.
         yes: take all guesses without asking.
         as_json: print JSON.
         sample_time: to resample at: a number [s], "robot", or None.
-        clock: the sample time [s] of a log without a clock, as the user knows it.
+        clock: the sample time [s] of a log without a clock, given by the user.
         named: the columns that the user named.
         texts: file -> text to write beside the recording, and whether it may be replaced.
     """
@@ -83,7 +83,7 @@ class _Job:
     texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
 
     def beside(self, ending: str) -> Path:
-        """Return the path of a file beside the recording; raise OutputFileError where one stands there."""
+        """Return the path of a file beside the recording; raise OutputFileError if it exists and must be kept."""
         path = self.path.with_suffix(ending)
         refuse_existing(path, force=self.replace)
         return path
@@ -188,7 +188,7 @@ def command(
     if html is not None:
         refuse_existing(html, force=force)
     if alone:
-        _finish(job, *(_run_log(log) if ours else _recorded(log, robot)))
+        _finish(job, *(_run_log(log) if ours else _read_recorded(log, robot)))
         return
     facts: dict[str, Any] = {}
     whose = find_robot(robot, beside=log)
@@ -207,14 +207,14 @@ def command(
 
 
 def _can_guess(robot: Robot) -> bool:
-    """Return whether a robot's channels are those that are looked for in a log without titles."""
+    """Return whether a log without titles can be guessed for this robot: it has the neck's channels."""
     from softneck.signals import OUTPUTS, SET_POINTS
 
     return (robot.set_points, robot.outputs.names) == (SET_POINTS, OUTPUTS)
 
 
-def _recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any]]:
-    """Return a recording that is to be brought to another sample time."""
+def _read_recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any]]:
+    """Return a recording to be resampled."""
     from softneck.signals import ImportResult, read_recording
 
     before = read_recording(log, robot=robot)
@@ -235,7 +235,7 @@ def _finish(
     job: _Job, imported: ImportResult, facts: dict[str, Any], layout: Layout | None = None,
     proposed: Guess | None = None,
 ) -> None:  # fmt: skip
-    """Resample where asked, write all files, and say what was done."""
+    """Resample if required, write all files, and print a summary."""
     from softneck.signals import write_recording
 
     imported = _at_sample_time(job, imported)
@@ -247,7 +247,7 @@ def _finish(
 
 
 def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
-    """Return the import at the sample time that was asked for."""
+    """Return the import at the required sample time."""
     from softneck.signals import ImportResult, resampled
 
     if job.sample_time is None:
@@ -262,7 +262,7 @@ def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
 
 
 def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: ImportResult | None) -> str:
-    """Return the page that shows the log's columns and what was made of them."""
+    """Return the page that shows the log's columns and their channels."""
     from softneck.plots import import_page  # the charts take a while to import
     from softneck.signals import read_log
 
@@ -278,7 +278,7 @@ def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: Import
 
 
 def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, Any]]:
-    """Guess a layout, ask about what is not sure, and import by it."""
+    """Guess a layout, ask about its doubts, and import by it."""
     import tomli_w
 
     from softneck.signals import guess_layout, import_log
@@ -383,7 +383,7 @@ def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: boo
 
 
 def _one_output(more: dict[str, Any]) -> str:
-    """Return what the last line says of a log that was taken for that of a robot with one output."""
+    """Return the end of the last line for a log taken as that of a robot with one output."""
     from softneck.signals import ONE_AXIS
 
     taken = [doubt["taken"] for doubt in more.get("doubts", ()) if doubt["about"] == ONE_AXIS]

@@ -1,4 +1,4 @@
-"""softneck info: what a file is."""
+"""softneck info: type and content of a file."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 def describe_log(file: Path) -> dict[str, Any]:
-    """Return what a log of drives holds: cycles, frames, duration, nodes, first error, and where it is cut."""
+    """Return the content of a drives log: cycles, frames, duration, nodes, first error, and its cut."""
     from softneck.drives import read_run_log
 
     log = read_run_log(file)
@@ -79,9 +79,9 @@ def _first_error(frames: Sequence[tuple[float, bool, Frame]]) -> str:
     return ""
 
 
-_RECORDINGS = (".csv", ".parquet")
+_RECORDING_SUFFIXES = (".csv", ".parquet")
 # Reading and checking a smaller file takes well under 2 s.
-_LARGE = 20_000_000
+_LARGE_FILE_BYTES = 20_000_000
 
 
 @click.command("info", epilog="Example: softneck info eq22.csv --html quality.html")
@@ -89,15 +89,15 @@ _LARGE = 20_000_000
 @click.option("--html", type=click.Path(path_type=Path), metavar="FILE", help="Page on a recording's quality.")
 @common_options("force")
 def command(file: Path, html: Path | None, force: bool, as_json: bool) -> None:
-    """Say what FILE is: a recording, model, observer, controller, FMU, SSP, loop, layout, robot, neck, study,
-    certificate or log (tables, and those of `softneck drives run --log`).
+    """Show the type and content of FILE: a recording, model, observer, controller, FMU, SSP, loop, layout, robot, neck,
+    study, certificate or log (tables, and those of `softneck drives run --log`).
 
-    For a recording it also reports the quality: faults of its channels, and what its inputs can teach a model. For a
-    log it reports what `softneck import --guess` would take each column for.
+    For a recording it also reports the quality: faults of its channels, and whether its inputs excite the robot
+    enough. For a log it reports the channel that `softneck import --guess` would take each column for.
     """
     require_file(file)
     if html is not None:
-        if file.suffix.lower() not in _RECORDINGS:
+        if file.suffix.lower() not in _RECORDING_SUFFIXES:
             raise SettingsError(f"{file}: `--html` shows the quality of a recording (`.csv`, `.parquet`) only.")
         refuse_existing(html, force=force)
     described = _describe(file, html, force=force, quiet=as_json)
@@ -152,11 +152,11 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
 
 
 def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
-    """Return what a recording holds and its quality, and write the page."""
+    """Return the content and quality of a recording, and write the page."""
     from softneck.identification import bandwidth_of
     from softneck.signals import assess_quality, read_recording
 
-    quick = html is None and file.stat().st_size < _LARGE
+    quick = html is None and file.stat().st_size < _LARGE_FILE_BYTES
     with progress("info", quiet=quiet or quick) as report:
         report(0.0, "reading")
         recording = read_recording(file)
@@ -181,7 +181,7 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
 
 
 def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
-    """Return what a foreign log seems to hold; `error` is why a file with a recording's ending is not one."""
+    """Return the guessed content of a log; `error` is the reason that it is no recording."""
     from softneck.signals import guess_layout
 
     try:
@@ -237,7 +237,7 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 
 def _toml(file: Path) -> dict[str, Any]:
-    """Say what a TOML file is: a robot names motors, a loop a plant, a study what varies; else it must be a neck."""
+    """Describe a TOML file by its keys: robot, loop, study, layout, otherwise a neck."""
     from softneck.cosim import load_loop, load_study, python_of
     from softneck.plant import NeckParameters, VirtualNeck
     from softneck.robot import Robot
@@ -293,7 +293,7 @@ def _certificate(file: Path) -> dict[str, Any]:
 
 
 def _ssp(file: Path) -> dict[str, Any]:
-    """Return the parts of an SSP archive; what `simulate` cannot run is refused with its words."""
+    """Return the parts of an SSP archive; raise the error of `simulate` if it cannot run."""
     from softneck.cosim import load_ssp
     from softneck.loop import System
 

@@ -21,7 +21,7 @@ from .shared._groups import NearGroup, now
 # Subcommand -> module, with the command's name where it is not `command`, and what it does; imported when called, so
 # that `softneck --help` answers at once.
 _COMMANDS = {
-    "start": ("start._start", "Go from a log to a verdict in one sitting, each step a plain command."),
+    "start": ("start._start", "Go from a log to a verdict in one command, each step a plain command."),
     "demo": ("_projects:demo", "Run the main job: experiment, models, FMUs, controller, closed loop, report."),
     "doctor": ("_doctor", "Say which parts of this machine work."),
     "info": ("_info", "Say what a file is."),
@@ -116,14 +116,14 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return _missing(error)
     except OSError as error:
         return _fail(f"{error.filename or 'input/output'}: {error.strerror or error}", _BAD_INPUT)
-    except Exception as error:  # the edge: anything unforeseen is our fault, and says so
+    except Exception as error:  # the outermost frame: everything unforeseen is an internal error
         return _internal(error)
     return code if isinstance(code, int) else 0
 
 
 @contextlib.contextmanager
 def _without_remarks() -> Iterator[None]:
-    """Leave out what libraries warn of by lines of their source: what a user must know is said in our own words."""
+    """Suppress the warnings of libraries; softneck reports what matters itself."""
     with warnings.catch_warnings():
         if not os.environ.get("SOFTNECK_TRACEBACK"):
             warnings.showwarning = lambda *_, **__: None
@@ -146,7 +146,7 @@ class _Once(logging.Handler):
 
 @contextlib.contextmanager
 def _saying_which_robot() -> Iterator[None]:
-    """Say which file of a robot was found and is applied, though no option named it."""
+    """Print the robot file that was found and is applied without an option naming it."""
     log, heard = logging.getLogger("softneck.robot"), _Once()
     log.addHandler(heard)
     log.setLevel(logging.INFO)
@@ -157,7 +157,7 @@ def _saying_which_robot() -> Iterator[None]:
 
 
 def _missing(error: ModuleNotFoundError) -> int:
-    """Say which extra a missing package belongs to; any other missing module is our fault."""
+    """Name the extra of a missing package; any other missing module is an internal error."""
     line = missing_extra(error)
     return _internal(error) if line is None else _fail(line, _BAD_INPUT)
 

@@ -96,7 +96,8 @@ def command(
     require_between("--payload", payload, 0.0, 1.0, "kg")
     whose = find_robot(robot, beside=output)
     virtual = VirtualNeck.of(whose, None if neck is None else NeckParameters.preset(neck))
-    limits = SetPointLimits(**_allowed(whose) | {name: value for name, value in bounds.items() if value is not None})
+    given = {name: value for name, value in bounds.items() if value is not None}
+    limits = SetPointLimits(**_robot_limits(whose) | given)
     experiment = {"amplitude": amplitude, "band": _band(band)}
     asked = {name: value for name, value in experiment.items() if value is not None}
     if asked and (signal_name != "multisine" or duration is not None):
@@ -130,7 +131,7 @@ def command(
         print_json({**facts, "signal": signal_name, "changes": changes.as_dict()})
         return
     click.echo(f"{output}: {len(recording)} rows of {signal_name} at {1e3 * recording.sample_time:g} ms")
-    if any(value is not None for value in bounds.values()) or changes != type(changes)():
+    if given or changes != type(changes)():
         click.echo(f"set-points: {changes}")
 
 
@@ -159,7 +160,7 @@ def _band(text: str | None) -> tuple[float, float] | None:
     return low, high
 
 
-def _allowed(robot: Robot) -> dict[str, float]:
+def _robot_limits(robot: Robot) -> dict[str, float]:
     """Return the bounds on set-points that a robot gives [rad], [rad/s]."""
     motors, scale = robot.motors, to_si(robot.motors.unit)[0]
     ends = [*(motors.setpoint_min or ()), *(motors.setpoint_max or ())]
@@ -171,11 +172,11 @@ def record_next(
     source: Path, output: Path, *, duration: float, seed: int, limits: Mapping[str, float | None], robot: str | None,
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Write the set-points of the next recording, and as outputs what the members of the model expect."""
+    """Write the set-points of the next recording, with the outputs that the model expects."""
     from softneck.identification import Bounds, next_experiment
     from softneck.signals import write_recording
 
-    known = _known(source, robot)
+    known = _load_known(source, robot)
     with progress("next experiment", quiet=as_json) as report:
         bounds = Bounds.of(known.robot, _limits(known.robot, limits))
         found = next_experiment(known, duration=duration, seed=seed, bounds=bounds, progress=report)
@@ -197,12 +198,12 @@ def record_next(
     doubt = facts[f"disagreement_{unit}"]
     print_table(f"{output}: {len(found.recording)} rows", ["at [s]", "signal", "size", "speed", "why"], rows)
     click.echo(
-        f"{facts['members']}: {doubt['before']:.2g} {unit} rms over all that could be played, "
-        f"{doubt['expected_after']:.2g} {unit} expected once this is recorded"
+        f"{facts['members']}: {doubt['before']:.2g} {unit} rms over all candidate signals, "
+        f"{doubt['expected_after']:.2g} {unit} expected after this recording"
     )
 
 
-def _known(source: Path, robot: str | None) -> Known:
+def _load_known(source: Path, robot: str | None) -> Known:
     from softneck.identification import Known, Model
 
     model = load_for_robot(source, robot=robot)
@@ -212,7 +213,7 @@ def _known(source: Path, robot: str | None) -> Known:
 
 
 def _limits(robot: Robot, given: Mapping[str, float | None]) -> SetPointLimits:
-    """Return what is asked for, and what the drives of a robot allow where it names them."""
+    """Return the required limits, within those of the robot's drives if it names any."""
     from softneck.drives import drive_limits, load_drives
     from softneck.signals import SetPointLimits
 

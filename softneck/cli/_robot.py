@@ -1,4 +1,4 @@
-"""softneck robot: the file that says what a robot is."""
+"""softneck robot: show, check and write robot files."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class _RobotGroup(NearGroup):
     """A group whose argument is a file, unless it is a command."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Take what names no command for the argument of `FILE`."""
+        """Treat a word that names no command as the argument of `FILE`."""
         asked = args[0] if args else ""
-        # A shell that completes asks without a word.
+        # A completing shell calls this without a word.
         if (
             not ctx.resilient_parsing
             and asked not in {*self.commands, *ctx.help_option_names}
@@ -39,7 +39,7 @@ class _RobotGroup(NearGroup):
     "robot", cls=_RobotGroup, epilog="Example: softneck robot new --preset antagonist, then softneck robot robot.toml"
 )
 def command() -> None:
-    """Show and check what the robot is, `softneck robot FILE`, or start a file, `softneck robot new`.
+    """Show and check a robot with `softneck robot FILE`, or write a new file with `softneck robot new`.
 
     Presets: neck (the paper's), arm, antagonist, finger, trunk4. Without FILE: `robot.toml` in this folder or
     one above it, else the preset neck. Each takes `--json`.
@@ -50,9 +50,9 @@ def command() -> None:
 @click.argument("file", required=False, metavar="[FILE|PRESET]")
 @common_options()
 def show(file: str | None, as_json: bool) -> None:
-    """Show motors, outputs, directions, limits, and what is not given; check the files that it names.
+    """Show motors, outputs, directions, limits and missing keys; check the files that the robot names.
 
-    Exit code 2 where something is wrong.
+    Exit code 2 if something is wrong.
     """
     from softneck.robot import find_robot
 
@@ -75,7 +75,7 @@ def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
     if file.suffix.lower() != ".toml":
         raise SettingsError(f"{file}: must end in `.toml`, by which softneck recognises the file.")
     taken = preset not in PRESETS and Path(preset).is_file()
-    text = _moved(Path(preset), file.parent) if taken else preset_text(preset)
+    text = _text_for_folder(Path(preset), file.parent) if taken else preset_text(preset)
     with atomic_write(file, force=force) as temporary:
         temporary.write_text(text, encoding="utf-8")
     if as_json:
@@ -85,14 +85,14 @@ def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
     click.echo(f"{file}: {what}; edit it, then softneck robot {file}")
 
 
-def _moved(source: Path, folder: Path) -> str:
+def _text_for_folder(source: Path, folder: Path) -> str:
     """Return a robot file's text for another folder, from which the files that it names are found as well."""
     import tomli_w
 
     from softneck.plant import PRESETS
     from softneck.robot import Robot
 
-    Robot.read(source)  # which says what is wrong with it
+    Robot.read(source)  # reports errors
     text = settings_text(source)
     table = tomllib.loads(text)
     there = source.parent.resolve() != folder.resolve()

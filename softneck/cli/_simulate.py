@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from softneck.drives import LoggedRun, Pilot
     from softneck.loop import System
 
-# Of the worst runs so many are written as loop files: who wants more reads the table.
-_WORST = 3
+# Number of worst runs written as loop files; the table lists all.
+_WORST_RUNS = 3
 
 
 @click.command("simulate", epilog="Example: softneck simulate build/demo/loops/pitch_step.toml --html loop.html")
@@ -54,8 +54,8 @@ def command(
     X.ssp: an SSP 1.0 or 2.0 archive of FMUs for co-simulation, of any tool. A closed loop in it is judged like any
     other; the signals of other systems are named part.output in the result.
 
-    LOG.mcap: the log of `softneck drives` is replayed: what the run saw goes to the same core and controller again, and
-    every frame out is compared, bit for bit; exit code 1 with the first difference. Nothing is sent to any bus.
+    LOG.mcap: the log of `softneck drives` is replayed: its received frames go through the same master and controller
+    again, and every sent frame is compared, bit for bit. Exit code 1 with the first difference. No bus is used.
     """
     if loop_file.suffix.lower() == ".mcap":
         if output is not None or certificate is not None or html is not None:
@@ -200,9 +200,9 @@ def _value(row: dict[str, Any]) -> str:
 
 
 def replay_log(log: Path, *, as_json: bool) -> None:
-    """Feed what a run saw to the same core and controller again, and compare every frame out, bit for bit.
+    """Replay a logged run through the same master and controller, and compare every sent frame, bit for bit.
 
-    A log that is cut is replayed up to the cut, which is said. Nothing is sent to any bus.
+    A log that is cut is replayed up to the cut, with a note. Nothing is sent to any bus.
     """
     from softneck.drives import changed_files, read_run_log, replay
 
@@ -226,7 +226,7 @@ def replay_log(log: Path, *, as_json: bool) -> None:
 
 
 def _pilot(run: LoggedRun) -> Pilot | None:
-    """Return what led the run: controller and observer, a jog or an experiment.
+    """Return the pilot of the run: controller and observer, a jog or an experiment.
 
     None where the log names none, or the files of the loop are gone.
     """
@@ -279,7 +279,7 @@ def study_command(
     with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
         runs = run_study(study, folder, workers=workers, force=_anew(study, folder, output, force), report=report)
     write_page(folder / "report.html", study_page(read_description(folder), runs), force=True)
-    paths = write_worst(study, runs, folder / "worst", count=_WORST)
+    paths = write_worst(study, runs, folder / "worst", count=_WORST_RUNS)
     if as_json:
         print_json(_summary(runs, folder, study.objectives, paths))
     else:

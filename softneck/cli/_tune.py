@@ -1,4 +1,4 @@
-"""softneck tune: from requirements to the best controller, or exit code 1 with what stands in the way."""
+"""softneck tune: find the best controller for requirements, or exit with code 1 and the active requirement."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 
 _PATH = click.Path(path_type=Path)
 # As `softneck.tuning` has it, which is imported when the command runs.
-_BUDGET = 160
-# Metrics that say how far a loop is from swinging.
-_MARGINS = ("stability.", "axes.", "mimo.", "robust.")
+_DEFAULT_BUDGET = 160
+# Metrics of stability and margins.
+_MARGIN_GROUPS = ("stability.", "axes.", "mimo.", "robust.")
 
 
 @click.command("tune", epilog="Example: softneck tune family.npz greybox.npz --requirements wanted.toml -o build/tune")
 @click.argument("plants", metavar="FAMILY|MODEL...", nargs=-1, required=True, type=_PATH)
-@click.option("--requirements", type=_PATH, metavar="TOML", help="What must hold, where it differs from the defaults.")
+@click.option("--requirements", type=_PATH, metavar="TOML", help="Requirements that differ from the defaults.")
 @requirements_option("softneck.tuning._requirements:default_text")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller to search. [default: all but nmpc and custom]")
 @click.option(
-    "--budget", type=click.IntRange(min=1), default=_BUDGET, show_default=True, metavar="EVALUATIONS",
-    help="Judgements of candidates, by linear checks, loops or experiments.",
+    "--budget", type=click.IntRange(min=1), default=_DEFAULT_BUDGET, show_default=True, metavar="EVALUATIONS",
+    help="Evaluations of candidates, by linear checks, loops or experiments.",
 )  # fmt: skip
 @click.option("--observer", type=_PATH, help="Of the loop. [default: a Kalman filter over the nominal plant]")
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the search and its noise.")
@@ -59,12 +59,12 @@ def command(
     DIR gets  best.npz               the controller, and observer.npz for it
               best.certificate.json  of verify with the same requirements, if it holds
               loop.toml              a loop with both, for softneck simulate
-              pareto.csv, .json      what no other candidate beats, and report.html
-              requirements.toml      what was asked, for tune and verify
-              evaluations.json       all judgements: the same command goes on where it was
+              pareto.csv, .json      the Pareto front, and report.html
+              requirements.toml      all requirements, for tune and verify
+              evaluations.json       all evaluations: the same command continues from them
     Defaults of speed and precision that no candidate keeps are loosened to what the best keeps, by a factor of two at
-    most, and the result says so; what a --requirements file asks stands. Exit code 1 if no candidate keeps all: then it
-    says which requirement stands in the way.
+    most, and the result says so; those of a --requirements file are never loosened. Exit code 1 if no candidate keeps
+    all, with the active requirement.
     """
     from softneck.core import SettingsError
     from softneck.report import said_of, write_tuned
@@ -129,22 +129,22 @@ def _why(found: Tuned, folder: Path) -> str:
 
 
 def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:
-    """Return what to do about the requirement that binds.
+    """Return the advice on the active requirement.
 
     Args:
-        binding: the requirement; None where none is known to.
+        binding: the active requirement; None if it is not known.
         unheard: whether the data do not support it.
-        blind: whether the kind has no linear form that could be held against the data.
+        blind: whether the kind has no linear form to test against the data.
     """
     if blind:
         return "No setting fixes it: name kinds with a linear form in --kinds, such as pi or lqg"
     if binding is None:
-        return "Go on with a larger --budget"
+        return "Continue with a larger --budget"
     if unheard:
-        return "Record what is said above, no setting fixes it"
-    if binding.startswith(_MARGINS):
+        return "Record the data named above; no setting fixes it"
+    if binding.startswith(_MARGIN_GROUPS):
         return (
-            "It stands for what the models do not know: allow a slower rise, give a family of more recordings, or go "
-            "on with a larger --budget"
+            "It covers the uncertainty of the models: allow a slower rise, give a family of more recordings, or "
+            "continue with a larger --budget"
         )
-    return "Loosen it, or go on with a larger --budget"
+    return "Loosen it, or continue with a larger --budget"

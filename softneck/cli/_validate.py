@@ -1,4 +1,4 @@
-"""softneck validate: what a model is worth, beside persistence, one step and k steps ahead and in free run."""
+"""softneck validate: fits of a model one step ahead, k steps ahead and in simulation (free run), beside persistence."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from softneck.identification import Validation
 
 
-_NOTE = (
+_FIT_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %. Persistence repeats the last sample; a one-step fit that is not "
     "above it says nothing. The free run (inf) is what an FMU of the plant does. Best linear is fitted on the judged "
     "rows: no linear model of the set-points has a better free run on them."
@@ -96,7 +96,7 @@ def _print(results: list[Validation]) -> None:
     for r in results:
         for line in remarks(r):
             click.echo(f"{Path(r.model).stem} on {Path(r.data).stem}: {line}")
-    click.echo(_NOTE)
+    click.echo(_FIT_NOTE)
 
 
 def _horizons(text: str) -> tuple[int | str, ...]:

@@ -251,7 +251,7 @@ def test_the_doctor_tells_of_every_dependency(call: Call) -> None:
 
 
 def test_the_doctor_fails_when_something_is_missing(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.cli._doctor._needed", lambda: ["a-package-that-is-none"])
+    monkeypatch.setattr("softneck.cli._doctor._requirements", lambda: ["a-package-that-is-none"])
     said = call("doctor", "--json")
     assert said.code == 1
     assert json.loads(said.out)["healthy"] is False

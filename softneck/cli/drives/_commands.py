@@ -189,7 +189,7 @@ def stop_command(asked: Asked, as_json: bool) -> None:
 @drives_options()
 @common_options()
 def reset_command(asked: Asked, as_json: bool) -> None:
-    """Acknowledge latched faults; nothing else ever does, and nothing moves by it. Exit code 1 if a fault stays."""
+    """Acknowledge latched faults; no drive moves. Exit code 1 if a fault stays."""
     from softneck.drives import require_reset, reset
 
     chosen = asked.target()

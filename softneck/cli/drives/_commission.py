@@ -1,4 +1,4 @@
-"""softneck drives commission: before anything else moves, what drives, tendons and sensor really are."""
+"""softneck drives commission: check drives, tendons and sensor before anything else moves."""
 
 from __future__ import annotations
 
@@ -118,14 +118,14 @@ def _print_jog(found: JogResult, *, as_json: bool) -> None:
     print_table(f"Motor {found.motor} (node {found.node}): {found.verdict}", ["way up", "expected", "seen"], rows)
 
 
-_PARTS = ("scan", "tendons", "zero", "jog")
+_STEP_NAMES = ("scan", "tendons", "zero", "jog")
 
 
 @click.command(
     "commission",
     epilog="Example: softneck drives commission --drives drives.toml --bus socketcan:can0 --arm -o commissioned",
 )
-@click.option("--only", type=click.Choice(_PARTS), help="Do this alone.  [default: scan and tendons]")
+@click.option("--only", type=click.Choice(_STEP_NAMES), help="Do this alone.  [default: scan and tendons]")
 @click.option("--motor", "motors", multiple=True, type=click.IntRange(1, 8), metavar="N",
               help="Move these only; may be given several times.  [default: all]")  # fmt: skip
 @click.option("--travel", type=float, metavar="RAD",
@@ -139,7 +139,7 @@ def commission_command(
     asked: Asked, only: str | None, motors: tuple[int, ...], travel: float | None, output: Path | None, force: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
-    """Find out what drives, tendons and sensor really are, before anything else moves.
+    """Check drives, tendons and sensor before anything else moves.
 
     \b
     scan     lists the nodes on the bus; sends reads only
@@ -169,7 +169,7 @@ def commission_command(
 def _tendons(
     asked: Asked, motors: tuple[int, ...], travel: float, output: Path | None, *, force: bool, as_json: bool
 ) -> None:
-    """Ask who is there, move what is to be moved, and propose files."""
+    """Scan the nodes, move the motors, and propose files."""
     from softneck.drives import Guards, commission, require_folder, write_files
 
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from softneck.drives import ExperimentResult
 
 # From rest and out to it [s]: Eq. 22 begins at up to 1.9 rad, which a winch turns in half a second at the least.
-_RAMP = 2.0
+_RAMP_S = 2.0
 
 
 @click.command(
@@ -55,7 +55,7 @@ def record_command(
     chosen = asked.target()
     moved, limits = chosen.file.robot, drive_limits(chosen.file, position=max_position)
     experiment = Experiment(
-        signal=signal_name, limits=limits, duration=duration, seed=seed, ramp=_RAMP,
+        signal=signal_name, limits=limits, duration=duration, seed=seed, ramp=_RAMP_S,
         robot=moved,
         ranges=() if moved is None else chosen.file.ranges,
     )  # fmt: skip

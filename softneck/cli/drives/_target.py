@@ -1,6 +1,6 @@
-"""What the subcommands of `softneck drives` share: which drives, over which bus, with which inclinometer.
+"""Shared by the subcommands of `softneck drives`: drives, bus, inclinometer and log.
 
-And what lets drives on a bus move: --arm, and the words typed by somebody who looks at the neck.
+Drives on a bus move only with --arm and a phrase typed by a person who watches the robot.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ VARIABLE = "SOFTNECK_ARM"
 
 
 def words(bus: str) -> str:
-    """Return what is to be typed for `bus`."""
+    """Return the phrase to type for `bus`."""
     return f"MOVE {bus.partition(':')[2]}"
 
 
@@ -75,7 +75,7 @@ SAMPLE_TIME = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Which drives a command talks to; `neck` is the virtual one that was asked for, `path` that of the drives file."""
+    """The drives of a command; `neck` is the virtual plant, `path` that of the drives file."""
 
     file: DrivesFile
     bus: str | None
@@ -105,7 +105,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Asked:
-    """What the options of a command said of the drives; a command has those options that it needs."""
+    """The options of a command that choose the drives; each command has those that it needs."""
 
     drives: Path | None
     bus: str | None
@@ -131,17 +131,17 @@ class Asked:
 
 
 def drives_options(*more: str) -> Callable[[Callable], Callable]:
-    """Return a decorator that adds the options that say which drives, and `more`; all arrive as one `Asked`."""
+    """Return a decorator that adds the options of the drives and `more`; the command gets one `Asked`."""
     names = ("drives", "bus", "simulated", "robot", "arm", *more)
 
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)
-        def called(**values: Any) -> None:
+        def wrapper(**values: Any) -> None:
             function(Asked(**{name: values.pop(name) for name in names}), **values)
 
         for name in reversed(names):
-            called = _OPTIONS[name](called)
-        return called
+            wrapper = _OPTIONS[name](wrapper)
+        return wrapper
 
     return decorate
 
@@ -175,7 +175,7 @@ def target_of(
 
 @contextlib.contextmanager
 def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0) -> Iterator[CanLink | VirtualLink]:
-    """Yield the bus, or simulated drives on a virtual neck; what moves a bus must be armed."""
+    """Yield the bus, or simulated drives on a virtual neck; commands that move a bus must be armed."""
     from softneck.drives import VirtualLink, open_bus, simulated_plant
 
     if chosen.simulated:
@@ -195,7 +195,7 @@ def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0
 def moving(
     asked: Asked, chosen: Target, command: str, *, force: bool, homed: bool = False, seed: int = 0, **files: Path | str
 ) -> Iterator[tuple[Session, Keyboard]]:
-    """Yield what a master needs to move the drives, and who is at the keyboard; all are given back after the results.
+    """Yield the session of a master and the keyboard; both are closed after the results.
 
     Args:
         asked, chosen: which drives.
@@ -219,17 +219,17 @@ def moving(
         ), keyboard  # fmt: skip
 
 
-# As a shell says it of a process that SIGTERM ended: 128 + 15.
-_TERMINATED = 143
+# Exit code of a process that SIGTERM ended: 128 + 15.
+_SIGTERM_EXIT = 143
 
 
 def leave_if_asked(keyboard: Keyboard) -> None:
-    """End the command as somebody at the keyboard, or SIGTERM, asked; after its results are out."""
+    """End the command after Ctrl-C or SIGTERM, when its results are printed."""
     if keyboard.interrupted:
         raise KeyboardInterrupt
     if keyboard.terminated:
         note("ended by SIGTERM; the drives are off.")
-        click.get_current_context().exit(_TERMINATED)
+        click.get_current_context().exit(_SIGTERM_EXIT)
 
 
 def sensor_of(file: DrivesFile) -> Any:
@@ -238,12 +238,12 @@ def sensor_of(file: DrivesFile) -> Any:
     Raises:
         SoftneckError: see `open_sensor`; nothing was sent to the drives yet.
     """
-    return click.get_current_context().with_resource(_told(file))
+    return click.get_current_context().with_resource(_open_sensor(file))
 
 
 @contextlib.contextmanager
-def _told(file: DrivesFile) -> Iterator[Any]:
-    """Yield the inclinometer; say at the end what happened to it, which no drive and no watch can know."""
+def _open_sensor(file: DrivesFile) -> Iterator[Any]:
+    """Yield the inclinometer; print its problems at the end."""
     from softneck.drives import open_sensor
 
     with open_sensor(
@@ -258,7 +258,7 @@ def _told(file: DrivesFile) -> Iterator[Any]:
 
 
 class _NoSensor:
-    """In the place of an inclinometer that cannot be opened, for a check that goes on and reports it."""
+    """A silent inclinometer that carries the reason why the real one cannot be opened."""
 
     def __init__(self, problem: str) -> None:
         self.problem = problem
@@ -272,28 +272,28 @@ class _NoSensor:
 
 
 def sensor_or_reason(file: DrivesFile) -> Sensor:
-    """Return the inclinometer, or something silent that knows why there is none."""
+    """Return the inclinometer, or a silent one with the reason why it cannot be opened."""
     try:
         return sensor_of(file)
     except SoftneckError as error:
         return _NoSensor(str(error))
 
 
-# What `--log` takes for no log at all.
-_NONE = "none"
+# Value of `--log` for no log.
+_NO_LOG = "none"
 
 
 def require_log(log: str | None, *, force: bool) -> None:
-    """Raise where a log cannot be written, before anybody is asked to arm anything."""
+    """Raise if a log cannot be written, before the user is asked to arm the drives."""
     from softneck.drives import require_log_path
 
-    if log not in (None, _NONE):
+    if log not in (None, _NO_LOG):
         require_log_path(Path(log), force=force)
 
 
 @contextlib.contextmanager
 def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool) -> Iterator[RunLogger | None]:
-    """Yield a logger, None where nothing is logged; what it wrote has its names at the end.
+    """Yield a logger, or None without a log; the files get their names at the end.
 
     Args:
         chosen: the drives; where they may be real and no log is asked for, one is written to `log_folder`.
@@ -307,7 +307,7 @@ def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool)
     from softneck.drives import RunLogger
 
     own = wanted is None and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
-    path = _new_path(command) if own else None if wanted in (None, _NONE) else Path(wanted)
+    path = _new_path(command) if own else None if wanted in (None, _NO_LOG) else Path(wanted)
     if path is None:
         yield None
         return
@@ -322,7 +322,7 @@ def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool)
     try:
         yield log
     except BaseException:
-        # What went wrong is what is to be told; that its log is not complete comes before it.
+        # The error itself comes last; an incomplete log is noted before it.
         try:
             log.close()
         except OutputFileError as error:
@@ -334,14 +334,14 @@ def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool)
 
 
 def _drop_empty(log: RunLogger, *, own: bool) -> None:
-    """Remove a log that nobody asked for of a run that did not begin."""
+    """Remove an automatic log of a run that did not begin."""
     if own and not log.described and log.path.is_file():
         log.path.unlink()
         note(f"log: {log.path} is removed: nothing moved")
 
 
 def log_folder() -> Path:
-    """Return where logs go that nobody named: what systemd gives by LogsDirectory=, else the user's own."""
+    """Return the folder of automatic logs: systemd's LogsDirectory=, otherwise the user's own."""
     given = os.environ.get("LOGS_DIRECTORY", "").partition(":")[0]
     return Path(given) if given else platformdirs.user_log_path("softneck", appauthor=False)
 

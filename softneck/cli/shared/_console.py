@@ -1,4 +1,4 @@
-"""What the commands print: tables for people, one JSON object for programs, progress on stderr."""
+"""Output of the commands: tables for people, one JSON object for programs, progress on stderr."""
 
 from __future__ import annotations
 
@@ -117,10 +117,10 @@ class Stages:
         self._name = ""
 
 
-# [%] What the mean of the rows scores: a model that is further off knows less than one that never moves.
-_USELESS = 0.0
-# [%] What `design` asks for at least.
-_WORTH = 30.0
+# [%] The fit of the constant mean; a model below it is useless.
+_MIN_FIT_PCT = 0.0
+# [%] The least fit that `design` accepts.
+_MIN_DESIGN_FIT_PCT = 30.0
 
 
 def useless(r: Validation) -> str | None:
@@ -130,15 +130,15 @@ def useless(r: Validation) -> str | None:
     fits = [(fit, "in free run" if h == "inf" else f"{h} sample(s) ahead", axis)
             for h, table in r.fits.items() for axis, fit in table.items() if fit is not None]  # fmt: skip
     worst, horizon, axis = min(fits, default=(0.0, "", ""))
-    return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _USELESS else None
+    return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _MIN_FIT_PCT else None
 
 
 def left_out(r: Validation) -> str:
     """Return the advice to go on without the outputs that spoil a model of the others; "" where that is no way out."""
     fits = {axis: fit for axis, fit in r.fits.get("inf", {}).items() if fit is not None}
-    poor = [axis for axis, fit in fits.items() if fit < _USELESS]
+    poor = [axis for axis, fit in fits.items() if fit < _MIN_FIT_PCT]
     good = [axis for axis in fits if axis not in poor]
-    if r.diverged is not None or not poor or not good or min(fits[axis] for axis in good) < _WORTH:
+    if r.diverged is not None or not poor or not good or min(fits[axis] for axis in good) < _MIN_DESIGN_FIT_PCT:
         return ""
     said = "/".join(percent(fits[axis]) for axis in good)
     without = ", ".join(poor)

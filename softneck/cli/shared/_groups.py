@@ -1,4 +1,4 @@
-"""What a command is called: the one that was meant, and the kinds that a shell completes."""
+"""Groups of commands: hints for unknown and renamed commands, and completion of kinds in a shell."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _NOW = {
 
 
 def now(ctx: click.Context, name: str) -> str | None:
-    """Return what does now what command or option `name` did in the command of `ctx`; None where there was none."""
+    """Return the replacement of the former command or option `name` of `ctx`; None if there was none."""
     return _NOW.get(" ".join([*ctx.command_path.split()[1:], name]))
 
 
@@ -84,7 +84,7 @@ class NearGroup(click.Group):
 
 
 def kinds_complete(role: str, *more: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
-    """Return what completes the kinds of `role` and `more` in a shell."""
+    """Return a completion function for the kinds of `role` and `more`."""
 
     def complete(_ctx: click.Context, _param: click.Parameter, begun: str) -> list[str]:
         # Here, for it imports NumPy: the command line sets the number of its threads first.

@@ -92,7 +92,7 @@ def output_option(what: str, metavar: str, *, required: bool = False) -> Callabl
 
 
 def target(output: Path | None, default: str, *, force: bool, ending: str | None = None) -> tuple[Path, bool]:
-    """Return where to write and whether what stands there may be replaced: always under build/."""
+    """Return the output path and whether it may be replaced, which is always true under build/."""
     if output is not None and ending is not None and output.suffix.lower() != ending:
         raise SettingsError(f"{output}: must end in `{ending}`, by which softneck recognises the file.")
     return (output, force) if output is not None else (Path("build") / default, True)
@@ -150,7 +150,7 @@ def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
 
 
 def sample_time_of(text: str, option: str) -> float:
-    """Return a sample time [s] as an option says it."""
+    """Return the sample time [s] of an option."""
     value = value_of(text)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
         raise SettingsError(f"{option} takes a sample time in seconds, such as 0.02; got `{text}`.")
@@ -171,7 +171,7 @@ _GOES_ON = "    "
 
 
 def kind_command(role: str, kind: str | None = None) -> type[click.Command]:
-    """Return a command whose help lists the settings of the kind of `role` that it is asked with, else of `kind`."""
+    """Return a command whose help lists the settings of the given kind of `role`, by default of `kind`."""
 
     class KindCommand(click.Command):
         def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

@@ -1,5 +1,5 @@
-"""softneck start: from a log to a verdict in one sitting, each step a plain command.
+"""softneck start: from a log to a verdict in one run, each step a plain command.
 
-`_plan` says which commands, `_sitting` runs them and knows which are done, `_start` asks and sums up.
+`_plan` lists the commands, `_project_run` runs them and skips finished ones, `_start` asks and sums up.
 May import what other subcommands import.
 """

@@ -1,4 +1,4 @@
-"""The steps of a sitting, one after the other: each looks at the files that those before it made."""
+"""The steps of `softneck start`, in order: each reads the files of the steps before it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ STAGES = ("import", "robot", "quality", "identification", "observer", "tune", "v
 
 
 class Unmet(Enum):
-    """What a step means that ends with exit code 1."""
+    """The consequence of a step that ends with exit code 1."""
 
-    FINDING = "a result, with which the sitting goes on"
-    NO_MODEL = "nothing that comes after can be believed"
-    DONE_WITHOUT = "what comes after does without what it makes, whatever the reason"
+    FINDING = "a result; the run continues"
+    NO_MODEL = "no usable model; the run ends"
+    DONE_WITHOUT = "the later steps do without its files, whatever the reason"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,12 +36,12 @@ class Step:
     Attributes:
         stage: one of `STAGES`.
         command: its words; paths are relative to the folder.
-        makes: files by which it is known to be done.
-        reads: files that it is done again for where they change.
-        unmet: what it means where it does not hold, or where a model is refused.
-        finding: what does not hold whatever comes of it; empty where that is open.
-        settings: what it is done again for beside `reads`; the command where it says nothing.
-        resumes: file that an interrupted run leaves, with which it goes on without `--force`.
+        makes: files that exist when it is done.
+        reads: files; a change of one repeats the step.
+        unmet: the consequence if it does not hold, or if a model is refused.
+        finding: a requirement that cannot hold whatever the result; empty if there is none.
+        settings: repeats the step when it changes; the command if empty.
+        resumes: file of an interrupted run, from which it continues without `--force`.
     """
 
     stage: str
@@ -55,12 +55,12 @@ class Step:
 
     @property
     def key(self) -> str:
-        """By which the sitting's file knows it."""
+        """Key of the step in the project's file."""
         return f"{self.stage}: {self.makes[0]}"
 
     @property
-    def asked(self) -> str:
-        """What it is done again for where it changes."""
+    def depends_on(self) -> str:
+        """Settings whose change repeats the step."""
         return self.settings or self.shown
 
     @property
@@ -75,15 +75,15 @@ PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU = "fmus/Plant.fmu", "fmus/Observer.fmu",
 _FMUS = (PLANT_FMU, OBSERVER_FMU, CONTROLLER_FMU)
 # Of `tune`: without `adaptive`, which was the best on none of the foreign
 # necks `column`, `spring` and `chain`, and takes a fifth of a search with empty caches.
-_KINDS = "pi,pid,fopi,hinf,lqg"
-# Beside a family nothing is certified of it: its loops pull no tendons as the recordings do.
-_UNCERTIFIED = ",mpc"
+_CONTROLLER_KINDS = "pi,pid,fopi,hinf,lqg"
+# With a family it gets no certificate: its loops pull no tendons as the recordings do.
+_KINDS_WITHOUT_FAMILY = ",mpc"
 _TUNED_LOOP, _REQUIREMENTS = "tune/loop.toml", "tune/requirements.toml"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
-    """What the user asked for.
+class Options:
+    """The options of the user.
 
     Attributes:
         logs: absolute paths, as the commands run in the project's folder.
@@ -92,7 +92,7 @@ class Asked:
         kinds: of controllers to search; None: those of `tune` but `adaptive`.
         sample_time: of logs without a clock [s].
         motors, positions, outputs: columns of the logs that were named; () for a guess.
-        budget: of `tune`: by default half its own, so that a sitting ends within minutes.
+        budget: of `tune`: by default half its own, so that a run ends within minutes.
         seed: of kinds of models and of the search.
         yes: take all guesses.
         backend: of the FMUs.
@@ -114,36 +114,36 @@ class Asked:
     tested: bool = True
 
 
-def steps(asked: Asked) -> Iterator[Step]:
+def steps(options: Options) -> Iterator[Step]:
     """Yield the steps; the folder of the project is the working folder."""
-    if asked.robot is not None:
-        yield _robot(asked.robot)
+    if options.robot is not None:
+        yield _robot(options.robot)
     recordings = []
-    for log in asked.logs:
+    for log in options.logs:
         recordings.append(f"recordings/{Path(log).stem}.csv")
-        yield _import(log, recordings[-1], asked)
-    if asked.robot is None:
+        yield _import(log, recordings[-1], options)
+    if options.robot is None:
         # Of a log of one axis the import proposes a robot of one output.
         proposed = Path(recordings[0]).with_suffix(".robot.toml")
         yield _robot(proposed.as_posix() if proposed.is_file() else "neck")
-    yield from _with_sensor(recordings, asked)
+    yield from _with_sensor(recordings, options)
     for recording in recordings:
         page = f"build/quality/{Path(recording).stem}.html"
         command = ("softneck", "info", recording, "--html", page, "--force")
         yield Step(stage="quality", command=command, makes=(page,), reads=(recording,))
     yield from _of_one_sample_time(recordings)
-    yield from _models(recordings, asked)
-    yield from _controller(asked)
-    yield from _loops(asked)
+    yield from _models(recordings, options)
+    yield from _controller(options)
+    yield from _loops(options)
 
 
-def _with_sensor(recordings: list[str], asked: Asked) -> Iterator[Step]:
-    """Propose what `robot.toml` does not say of the sensor; recordings that say their robot then say that too."""
+def _with_sensor(recordings: list[str], options: Options) -> Iterator[Step]:
+    """Add missing sensor values to `robot.toml`, and import again the logs of a given robot."""
     from softneck.signals import read_recording
 
     proposed = propose_sensor(Path("robot.toml"), [read_recording(recording) for recording in recordings])
-    if proposed and asked.robot is not None:
-        yield from (_import(log, recording, asked) for log, recording in zip(asked.logs, recordings, strict=True))
+    if proposed and options.robot is not None:
+        yield from (_import(log, recording, options) for log, recording in zip(options.logs, recordings, strict=True))
 
 
 def _robot(source: str) -> Step:
@@ -151,26 +151,26 @@ def _robot(source: str) -> Step:
     return Step(stage="robot", command=command, makes=("robot.toml",), reads=(source,))
 
 
-def _import(log: str, recording: str, asked: Asked) -> Step:
+def _import(log: str, recording: str, options: Options) -> Step:
     from softneck.signals import is_of_another_robot, is_run_log
 
     layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
-    whose = "robot.toml" if asked.robot is not None else robot.as_posix() if robot.is_file() else None
-    page, settings = f"build/import/{Path(recording).stem}.html", f"{log} of {asked.robot}"
+    whose = "robot.toml" if options.robot is not None else robot.as_posix() if robot.is_file() else None
+    page, settings = f"build/import/{Path(recording).stem}.html", f"{log} of {options.robot}"
     if Path(log).suffix.lower() == ".mcap" and is_run_log(Path(log)):
         words: list[str] = []  # of a run on drives: its columns are known
     else:
-        guess = ["--guess", *(["--yes"] if asked.yes else [])]
-        guess += [] if asked.sample_time is None else ["--sample-time", asked.sample_time]
-        if asked.robot is None and asked.sample_time is None and is_of_another_robot(log):
+        guess = ["--guess", *(["--yes"] if options.yes else [])]
+        guess += [] if options.sample_time is None else ["--sample-time", options.sample_time]
+        if options.robot is None and options.sample_time is None and is_of_another_robot(log):
             guess = ["--robot-out", robot.as_posix()]
-        by_layout = layout.is_file() and not (asked.sample_time is not None and _lacks_clock(layout))
+        by_layout = layout.is_file() and not (options.sample_time is not None and _lacks_clock(layout))
         words = ["--layout", layout.as_posix()] if by_layout else guess
-        columns = (("--motor", asked.motors), ("--position", asked.positions), ("--output", asked.outputs))
+        columns = (("--motor", options.motors), ("--position", options.positions), ("--output", options.outputs))
         if named := [word for option, titles in columns for title in titles for word in (option, title)]:
-            words = named + ([] if asked.sample_time is None else ["--sample-time", asked.sample_time])
+            words = named + ([] if options.sample_time is None else ["--sample-time", options.sample_time])
             settings += f", {shlex.join(named)}"
-            whose = None if asked.robot is None else whose  # else it is of what was named before
+            whose = None if options.robot is None else whose  # else it is of what was named before
         words += ["--html", page] + ([] if whose is None else ["--robot", whose])
     return Step(
         stage="import", command=("softneck", "import", log, *words, "-o", recording, "--force"), makes=(recording,),
@@ -179,7 +179,7 @@ def _import(log: str, recording: str, asked: Asked) -> Step:
 
 
 def _lacks_clock(layout: Path) -> bool:
-    """Return whether a layout is a proposal whose sample time is still open; told it, it is made again."""
+    """Return whether the sample time of a proposed layout is still missing."""
     with layout.open(encoding="utf-8", errors="replace") as file:
         return "MISSING the sample time" in file.read(MOST_TOML)
 
@@ -199,14 +199,14 @@ def _of_one_sample_time(recordings: list[str]) -> Iterator[Step]:
         yield Step(stage="quality", command=command, makes=(resampled,), reads=(recording, recordings[0]))
 
 
-def _models(recordings: list[str], asked: Asked) -> Iterator[Step]:
-    """Yield what identifies, and what refuses a model of which nothing can be believed."""
-    seed = str(asked.seed)
+def _models(recordings: list[str], options: Options) -> Iterator[Step]:
+    """Yield the identification steps; `design pi` refuses a model that is too poor."""
+    seed = str(options.seed)
     command = ("softneck", "identify", "auto", *recordings, "-o", AUTO, "--html", "build/models.html", "--seed", seed,
                "--force")  # fmt: skip
     robot = Robot.read("robot.toml")
     if absent := lacking(robot):
-        note(f"robot.toml lacks {', '.join(absent)}: add them now, or the sitting ends behind the models")
+        note(f"robot.toml lacks {', '.join(absent)}: add them now, or the run ends after the models")
     yield Step(stage="identification", command=command, makes=(AUTO,), reads=tuple(recordings), unmet=Unmet.NO_MODEL)
     require_known(Robot.read("robot.toml"))
     linear = linear_model()
@@ -215,7 +215,7 @@ def _models(recordings: list[str], asked: Asked) -> Iterator[Step]:
     data = [word for recording in recordings for word in ("--data", recording)]
     command = ("softneck", "observer", linear, *data, "-o", OBSERVER, "--force")
     yield Step(stage="observer", command=command, makes=(OBSERVER,), reads=(linear, *recordings))
-    # Linear checks are then about what the recordings show, and not about one line through them.
+    # Linear checks then cover the uncertainty of the recordings, not one nominal model.
     command = ("softneck", "family", *recordings, "-o", FAMILY, "--html", "build/family.html", "--force")
     yield Step(stage="identification", command=command, makes=(FAMILY,), reads=tuple(recordings),
                unmet=Unmet.DONE_WITHOUT)  # fmt: skip
@@ -228,12 +228,12 @@ def linear_model() -> str:
 
 
 def nonlinear_model() -> str | None:
-    """Return the file of the best nonlinear model; None where no such kind ran free."""
+    """Return the file of the best nonlinear model; None if no such kind could be simulated."""
     beside = AUTO.replace(".npz", "_nonlinear.npz")
     return beside if Path(beside).is_file() else AUTO if linear_model() != AUTO else None
 
 
-def _controller(asked: Asked) -> Iterator[Step]:
+def _controller(options: Options) -> Iterator[Step]:
     from softneck.tuning import loops_start
 
     family = Path(FAMILY).is_file()
@@ -241,27 +241,27 @@ def _controller(asked: Asked) -> Iterator[Step]:
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
     if not loops_start(find_robot(beside=Path("robot.toml"))):
         plants = (linear,)
-    kinds = asked.kinds or (_KINDS if family else _KINDS + _UNCERTIFIED)
-    # What the user states stands; of the defaults what cannot be is left out, and what it asked fails.
-    finding = possible(plants) if asked.requirements is None else ""
-    stated = FILE if finding else asked.requirements
+    kinds = options.kinds or (_CONTROLLER_KINDS if family else _CONTROLLER_KINDS + _KINDS_WITHOUT_FAMILY)
+    # Requirements of the user stay; infeasible defaults are left out, and the step fails.
+    finding = possible(plants) if options.requirements is None else ""
+    stated = FILE if finding else options.requirements
     wanted = () if stated is None else (stated,)
     words = [word for name, value in (("--requirements", stated), ("--kinds", kinds),
-                                      ("--budget", asked.budget), ("--seed", asked.seed))
+                                      ("--budget", options.budget), ("--seed", options.seed))
              if value is not None for word in (name, str(value))]  # fmt: skip
-    # --force goes on with the judgements of the same search, and replaces another one. In this process: with empty
-    # caches each further one compiles the same again, which is most of what a search of 80 judgements takes.
+    # --force continues the same search, and replaces another one. In this process: with empty caches each further
+    # process compiles the same again, which takes most of the time of 80 evaluations.
     command = ("softneck", "tune", *plants, *words, "--observer", OBSERVER, "--workers", "0", "-o", "tune", "--force")
     yield Step(stage="tune", command=command, makes=(BEST, _TUNED_LOOP, "tune/report.html"),
                reads=(*plants, OBSERVER, *wanted), finding=finding)  # fmt: skip
-    eyes = (OBSERVER,) if observed() else ()
+    eyes = (OBSERVER,) if uses_observer() else ()
     certificate = "certificates/best.certificate.json"
     command = ("softneck", "verify", BEST, *plants, "--requirements", _REQUIREMENTS,
                *(word for file in eyes for word in ("--observer", file)),
                "-o", certificate, "--html", "build/verify.html", "--force")  # fmt: skip
     yield Step(stage="verify", command=command, makes=(certificate, "build/verify.html"),
                reads=(BEST, *plants, _REQUIREMENTS, *eyes))  # fmt: skip
-    made = asked.backend
+    made = options.backend
     if made == "compiled":
         robot = Robot.read("robot.toml")
         made = backend(packaged=(len(robot.motors.names), len(robot.outputs.names)) == (3, 2))
@@ -270,7 +270,7 @@ def _controller(asked: Asked) -> Iterator[Step]:
         yield Step(stage="FMUs", command=command, makes=(fmu,), reads=(file,))
 
 
-def observed() -> bool:
+def uses_observer() -> bool:
     """Return whether `tune` found the loop better with an observer."""
     try:
         return "observer" in tomllib.loads(settings_text(_TUNED_LOOP))
@@ -278,7 +278,7 @@ def observed() -> bool:
         raise SettingsError(f"{_TUNED_LOOP}: is not the loop that `softneck tune` wrote ({error}).") from error
 
 
-def _loops(asked: Asked) -> Iterator[Step]:
+def _loops(options: Options) -> Iterator[Step]:
     files = ("README.md", "loop.toml", "study.toml", "test_closed_loop.py", "pyproject.toml", ".gitignore")
     command = ("softneck", "new", ".", "--loop", _TUNED_LOOP, "--force")
     yield Step(stage="loop", command=command, makes=("loop.toml", *files), reads=(_TUNED_LOOP, "robot.toml"))
@@ -291,7 +291,7 @@ def _loops(asked: Asked) -> Iterator[Step]:
                makes=("build/study/runs.csv", "build/study/report.html"),
                reads=("study.toml", "loop.toml", *_FMUS), resumes="build/study/study.json")  # fmt: skip
     command = ("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "--junitxml", "build/test.xml")
-    if asked.tested:
+    if options.tested:
         yield Step(stage="test", command=command, makes=("build/test.xml",),
                    reads=("test_closed_loop.py", "loop.toml", *_FMUS))  # fmt: skip
     command = ("softneck", "report", ".", "-o", "build/report.html", "--force")

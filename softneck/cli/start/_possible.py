@@ -1,4 +1,4 @@
-"""What a sitting can ask of a robot: what its file has to say, and which default requirements can be kept."""
+"""Checks before the steps: disk, compiler, keys of the robot file, sensor, feasible default requirements."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from softneck.signals import Recording
 
 from ..shared._console import note
 
-# A project of 140 s of recording takes 7 MB; what is written anew beside what it replaces takes as much again.
+# A project of 140 s of recording takes 7 MB, and as much again while files are replaced.
 _LEAST_BYTES = 50_000_000
 
 
 def require_disk(folder: Path) -> None:
-    """Raise OutputFileError where a project does not fit beside what is there."""
+    """Raise OutputFileError if the disk has no space for a project."""
     there = next(path for path in (folder, *folder.parents) if path.exists())
     free = shutil.disk_usage(there).free
     if free < _LEAST_BYTES:
@@ -34,10 +34,10 @@ def require_disk(folder: Path) -> None:
 
 
 def backend(*, packaged: bool = True) -> str:
-    """Return the backend of the FMUs: "python", which is said, where none can be compiled here.
+    """Return the backend of the FMUs: "python", with a note, if no C compiler or library is found.
 
     Args:
-        packaged: whether parts are of 3 motors and 2 outputs; only libraries of those come with softneck.
+        packaged: whether the robot has 3 motors and 2 outputs; softneck contains libraries for these only.
     """
     from softneck.fmu.compiled import _library
 
@@ -52,26 +52,26 @@ def has_pytest() -> bool:
     return find_spec("pytest") is not None
 
 
-#: In the folder: what `tune` is asked where some of its defaults cannot be.
+#: In the folder: requirements of `tune` without the infeasible defaults.
 FILE = "requirements.toml"
 _METRIC = re.compile(r"`([\w.]+)`.* cannot be: ")
 
 
 def lacking(robot: Robot) -> list[str]:
-    """Return what a robot's file does not say and controller and observer ask for: of motors and sensor all."""
+    """Return the keys of motors and sensor that controller and observer need and the robot file lacks."""
     told = robot.as_dict()
     asked = [(table, key) for table in ("motors", "sensor") for key in KEYS[table] if key not in OPTIONAL]
     return [f"{table}.{key}" for table, key in asked if key not in told.get(table, {})]
 
 
 def require_known(robot: Robot) -> None:
-    """Raise SettingsError with all that a robot's file lacks at once."""
+    """Raise SettingsError with all keys that a robot file lacks."""
     if absent := lacking(robot):
         raise SettingsError(f"robot.toml: add {', '.join(absent)}; controller and observer need them.")
 
 
 def possible(plants: tuple[str, ...]) -> str:
-    """Write `FILE` without the defaults of `tune` that cannot be, and return why they cannot; empty where all can.
+    """Write `FILE` without the infeasible defaults of `tune`, and return the reasons; empty if all are feasible.
 
     Args:
         plants: files of the models that `tune` is given.
@@ -87,7 +87,7 @@ def possible(plants: tuple[str, ...]) -> str:
 
 
 def impossible(plants: tuple[str, ...]) -> dict[str, str]:
-    """Return metric -> why no controller keeps what the defaults of `tune` ask of it."""
+    """Return metric -> the reason that a default requirement of `tune` is infeasible."""
     from softneck.tuning import refuse_impossible, task_of
     from softneck.verification import named_plants
 
@@ -105,17 +105,17 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
             return refused
 
 
-# Of a channel without noise, in parts of its range: a sensor of 1,000 levels.
-_QUIET = 1e-3
+# Noise of a channel without noise, relative to its range: a sensor of 1,000 levels.
+_LEAST_NOISE_RATIO = 1e-3
 
 
 def propose_sensor(file: Path, recordings: Sequence[Recording]) -> list[str]:
-    """Add to a robot's file what its table [sensor] lacks, and return the keys; nothing where it says all."""
+    """Add the missing keys of table [sensor] to a robot file, and return them."""
     robot, table = Robot.read(file), tomllib.loads(settings_text(file))
     told = robot.as_dict().get("sensor", {})
     found = {
         "noise_std": (_noise(robot, recordings), 80, "white noise of the recordings, by their fourth differences"),
-        "delay_s": (0.0, 50, "the recordings tell only the sum with the plant's dead time, which takes all of it"),
+        "delay_s": (0.0, 50, "recordings show only its sum with the plant's dead time; all of it counts as dead time"),
         "rate_hz": (_digits(1.0 / recordings[0].sample_time), 80, "one measurement a sample of the recordings"),
     }
     proposed = {key: entry for key, entry in found.items() if key not in told}
@@ -137,7 +137,7 @@ def propose_sensor(file: Path, recordings: Sequence[Recording]) -> list[str]:
     with atomic_write(file, force=True) as temporary:
         temporary.write_text(text, encoding="utf-8")
     said = ", ".join(f"{key} = {value:g}" for key, (value, *_) in proposed.items())
-    note(f"not sure: {file} does not tell the sensor, so {said} is taken from the recordings; correct it there")
+    note(f"not sure: {file} lacks values of the sensor: {said} from the recordings; correct them there")
     return list(proposed)
 
 
@@ -152,7 +152,7 @@ def _noise(robot: Robot, recordings: Sequence[Recording]) -> float:
             # A coarse sensor is as uncertain as its steps are wide, a clean one at least as a tenth of a percent.
             steps = (channel.quantum or 0.0) / math.sqrt(12.0)
             noise = 0.0 if math.isnan(channel.noise) else channel.noise
-            levels.append(max(noise, steps) or _QUIET * (channel.highest - channel.lowest))
+            levels.append(max(noise, steps) or _LEAST_NOISE_RATIO * (channel.highest - channel.lowest))
     return _digits(max(levels) / to_si(robot.outputs.unit)[0])
 
 

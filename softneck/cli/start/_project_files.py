@@ -20,7 +20,7 @@ _OWN = {"README.md": "README.md", "test_closed_loop.py": "test_closed_loop.py"}
 # In [reference], but the sizes of the step, which a study varies.
 _NO_SIZES = ("kind", "at_s", "cocontraction", "rise_s")
 _PARTS_OF_STEP = (0.4, 0.7, 1.0)
-_RUNS = 30
+_STUDY_RUNS = 30
 
 
 def project_of_loop(loop_file: Path, folder: Path) -> dict[str, str]:
@@ -94,4 +94,4 @@ def _study(loop: dict[str, Any], robot: Robot) -> dict[str, Any]:
     first = next((key.partition(".")[0] for key in loop.get("limits", {})), robot.outputs.names[0])
     moves = next(name for name in metric_names(robot) if name.startswith("motors.total_variation_"))
     objectives = [f"{first}.settling_s", moves]
-    return {"loop": "loop.toml", "runs": _RUNS, "seed": 1, "objectives": objectives, "vary": vary}
+    return {"loop": "loop.toml", "runs": _STUDY_RUNS, "seed": 1, "objectives": objectives, "vary": vary}

@@ -1,4 +1,4 @@
-"""softneck start: one guided sitting from a log to a verdict."""
+"""softneck start: one command from a log to a verdict."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from softneck.core import (
 from .._import import is_terminal
 from ..shared._console import note, percent, print_json, print_table
 from ..shared._options import columns_options, common_options
-from ._plan import BEST, PI, STAGES, Asked, Step, linear_model, nonlinear_model, steps
+from ._plan import BEST, PI, STAGES, Options, Step, linear_model, nonlinear_model, steps
 from ._possible import backend, has_pytest, require_disk
-from ._sitting import FILE, Sitting
+from ._project_run import FILE, ProjectRun
 
 _PATH = click.Path(path_type=Path)
-_TUNED = "tune/best.certificate.json"
-_NEXT = "Record 60 s of `mixed` and start with that."
-_MIXED = (
+_CERTIFICATE_FILE = "tune/best.certificate.json"
+_NEXT_RECORDING = "Record 60 s of `mixed` and start with that."
+_MIXED_ADVICE = (
     "in `mixed` every motor moves by itself and all move together: `softneck drives record mixed` plays it on drives"
 )
-# [characters] Of the line that ends a sitting, `softneck: ` and all: two of a terminal of 80.
+# [characters] Length of the last line with `softneck: `: two lines of a terminal of 80.
 _LINE = 160 - len("softneck: ")
 _OWN_REQUIREMENTS = (
-    "requirements of your own: `softneck tune --print-requirements` shows the form; give them by --requirements"
+    "for requirements of your own see `softneck tune --print-requirements`, and pass them by --requirements"
 )
 _WITHOUT = re.compile(r"Leave .* out of `outputs\.names` in a robot\.toml")
 # Sentences end where the next begins with a capital; `0.5 %.` within one does not.
@@ -49,7 +49,7 @@ _FIRST_SENTENCE = re.compile(r"(?:[^:]*\.(?:csv|npz): )?((?s:.*?)[^.\s]\.)(?=\s+
 @click.command("start", epilog="Example: softneck start log.csv -o my_neck --yes")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=_PATH)
 @click.option("-o", "output", type=_PATH, metavar="DIR", help="Folder of the project. [default: build/start/LOG]")
-@click.option("--requirements", type=_PATH, metavar="TOML", help="What `tune` shall keep. [default: its own]")
+@click.option("--requirements", type=_PATH, metavar="TOML", help="Requirements for `tune`. [default: its own]")
 @click.option("--kinds", metavar="K,K", help="Kinds of controller to search. [default: those of `tune` but `adaptive`]")
 @click.option("--sample-time", metavar="S", help="Of logs without a clock. [default: as the log tells]")
 @click.option("--budget", type=click.IntRange(min=1), metavar="EVALUATIONS", help="Of `tune`. [default: 80]")
@@ -61,12 +61,11 @@ def command(
     kinds: str | None, sample_time: str | None, budget: int | None, seed: int | None, motors: tuple[str, ...],
     positions: tuple[str, ...], outputs: tuple[str, ...], as_json: bool,
 ) -> None:  # fmt: skip
-    """Go from LOGs to a verdict in one sitting: models, controller, certificate, FMUs, loop, study, test and page.
+    """Go from LOGs to a verdict: models, controller, certificate, FMUs, loop, study, test and page.
 
-    Each step is a plain command, printed before it runs in DIR, which becomes an ordinary project. What is done is not
-    done again unless a file that it reads changed: the same command goes on where a sitting was left, by Ctrl-C too.
-    A model that explains too little is refused with what to record next. Exit code 1: the verdict is that something
-    does not hold.
+    Each step is a plain command, printed before it runs in DIR, which becomes an ordinary project. Finished steps are
+    skipped unless a file that they read has changed: after Ctrl-C the same command continues. If the recordings hold
+    too little information, softneck says what to record. Exit code 1: a requirement or limit does not hold.
     """
     _require_logs(logs)
     _require_known(requirements, kinds)
@@ -77,24 +76,24 @@ def command(
     paths = tuple(str(log.absolute()) for log in logs)
     require_disk(folder)
     with _project(folder):
-        sitting = Sitting.read(as_json=as_json)
+        run = ProjectRun.read(as_json=as_json)
         guided = is_terminal() and not yes and not as_json
-        asked = _asked(paths, {**sitting.answers, **{k: v for k, v in given.items() if v is not None}}, yes=yes,
-                       guided=guided and not sitting.done)  # fmt: skip
-        sitting.answers = {key: value for key, value in asdict(asked).items() if key in given}
-        asked = replace(asked, backend=backend(), tested=has_pytest())
-        not_run = {} if asked.tested else {"test": "pytest is not installed"}
+        options = _read_options(paths, {**run.answers, **{k: v for k, v in given.items() if v is not None}}, yes=yes,
+                       guided=guided and not run.done)  # fmt: skip
+        run.answers = {key: value for key, value in asdict(options).items() if key in given}
+        options = replace(options, backend=backend(), tested=has_pytest())
+        not_run = {} if options.tested else {"test": "pytest is not installed"}
         for stage, why in not_run.items():
             note(f"not run: {stage}: {why}")
         if not as_json:
             click.echo(f"$ cd {folder}")
         try:
-            for step in steps(asked):
-                _before(step, sitting, guided=guided)
-                sitting.do(step)
+            for step in steps(options):
+                _before(step, run, guided=guided)
+                run.do(step)
         except SoftneckError as error:
-            raise _advised(error, sitting, folder, paths) from error
-        facts = {**_facts(sitting, folder), "not_run": not_run}
+            raise _with_advice(error, run, folder, paths) from error
+        facts = {**_facts(run, folder), "not_run": not_run}
     _tell(facts, as_json=as_json)
 
 
@@ -108,7 +107,7 @@ def _require_logs(logs: tuple[Path, ...]) -> None:
 
 
 def _require_known(requirements: Path | None, kinds: str | None) -> None:
-    """Refuse at once what `tune` would refuse after minutes."""
+    """Check at once the options that `tune` would refuse after minutes."""
     if requirements is not None:
         require_file(requirements)
     for kind in kinds.split(",") if kinds else ():
@@ -116,15 +115,15 @@ def _require_known(requirements: Path | None, kinds: str | None) -> None:
 
 
 def _robot_of(log: Path, robot: str | None) -> str | None:
-    """Return the robot as commands in another folder name it, None where nothing says whose log it is."""
+    """Return the robot's name for commands in another folder; None if no robot is given or found."""
     from softneck.robot import PRESETS, find_robot
 
-    file = find_robot(robot, beside=log).file  # which says what is wrong with it
+    file = find_robot(robot, beside=log).file  # reports errors in it
     return robot if robot in PRESETS or file is None else str(file.absolute())
 
 
-def _asked(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: bool) -> Asked:
-    """Return what is asked for; in a terminal what was not said is asked."""
+def _read_options(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: bool) -> Options:
+    """Return the options; in a terminal the user is asked for missing ones."""
     if guided and given.get("robot") is None:
         said = click.prompt("Whose log is it: neck, arm, antagonist, finger, trunk4 or a robot file", default="neck",
                             err=True)  # fmt: skip
@@ -134,58 +133,58 @@ def _asked(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: b
                             show_default=False, err=True)  # fmt: skip
         _require_known(Path(said) if said else None, None)
         given["requirements"] = said and str(Path(said).absolute())
-    known = {key: value for key, value in given.items() if key in {f.name for f in fields(Asked)}}
-    return Asked(logs=logs, yes=yes, **{key: value for key, value in known.items() if value not in (None, "")})
+    known = {key: value for key, value in given.items() if key in {f.name for f in fields(Options)}}
+    return Options(logs=logs, yes=yes, **{key: value for key, value in known.items() if value not in (None, "")})
 
 
-def _before(step: Step, sitting: Sitting, *, guided: bool) -> None:
-    """Say before a model is identified what the recordings cannot teach, and ask whether to go on."""
-    if step.stage != "identification" or any(key.startswith("identification") for key in sitting.done):
+def _before(step: Step, run: ProjectRun, *, guided: bool) -> None:
+    """Print before the identification what the recordings do not excite, and ask whether to continue."""
+    if step.stage != "identification" or any(key.startswith("identification") for key in run.done):
         return
-    lacks = _lacks(sitting)
+    lacks = _lacks(run)
     for line in lacks:
         note(line)
-    if guided and lacks and not click.confirm("The recordings lack something. Go on?", default=True, err=True):
-        raise CheckFailedError(f"stopped, as was answered. {_NEXT}")
+    if guided and lacks and not click.confirm("The recordings lack excitation. Continue?", default=True, err=True):
+        raise CheckFailedError(f"stopped by the user. {_NEXT_RECORDING}")
 
 
-def _lacks(sitting: Sitting) -> list[str]:
-    """Return what the recordings of a sitting cannot teach, where they are imported."""
+def _lacks(run: ProjectRun) -> list[str]:
+    """Return what the imported recordings do not excite."""
     from softneck.signals import poor_excitation, read_recording
 
-    files = [Path(key.partition(": ")[2]) for key in sitting.ran if key.startswith("import")]
+    files = [Path(key.partition(": ")[2]) for key in run.ran if key.startswith("import")]
     found = [(file, line) for file in files if file.is_file() for line in poor_excitation(read_recording(file))]
     return [f"{file.stem}: {line}" for file, line in found]
 
 
-def _advised(error: SoftneckError, sitting: Sitting, folder: Path, logs: tuple[str, ...]) -> SoftneckError:
-    """Return the error with the step that it ended; what else to do is noted before it, so that it stays short."""
-    if not sitting.ran:
+def _with_advice(error: SoftneckError, run: ProjectRun, folder: Path, logs: tuple[str, ...]) -> SoftneckError:
+    """Return the error with its step; print further advice before it to keep it short."""
+    if not run.ran:
         return error
-    last = next(reversed(sitting.ran))
-    stage, step = last.partition(":")[0], sitting.done[last]
+    last = next(reversed(run.ran))
+    stage, step = last.partition(":")[0], run.done[last]
     said = str(error)
     for log in logs:
         said = said.replace(log, Path(log).name)
-    between = step["ended"] and step["holds"]  # no step is at fault: the robot's file lacks something
+    between = step["ended"] and step["holds"]  # the robot file lacks something
     if last.endswith(PI) and "to design on" not in said:
         note("the models are kept: `softneck validate` and `softneck fmu` take them, and `softneck design` other kinds")
-        return type(error)(_shortened(f"first controller: {said}"))
-    if stage == "identification" and not between:  # what the recordings lack was said before it
-        note(_MIXED)
+        return type(error)(_shorten(f"first controller: {said}"))
+    if stage == "identification" and not between:  # the lacking excitation was printed before
+        note(_MIXED_ADVICE)
         first = _FIRST_SENTENCE.match(said)
         without = _WITHOUT.search(said)  # an output: that needs no other recording
         return CheckFailedError(
-            _shortened(f"{stage}: {first[1] if first else said}", f"{without[0]}." if without else _NEXT)
+            _shorten(f"{stage}: {first[1] if first else said}", f"{without[0]}." if without else _NEXT_RECORDING)
         )
     if stage == "tune":
         note(_OWN_REQUIREMENTS)
     note(f"paths are those in {folder}; fix this and run the same command again")
-    return type(error)(_shortened(f"{stage}: {said}"))
+    return type(error)(_shorten(f"{stage}: {said}"))
 
 
-def _shortened(said: str, advice: str = "") -> str:
-    """Return what was said and an advice in one line that people read; what does not fit is noted before it."""
+def _shorten(said: str, advice: str = "") -> str:
+    """Return message and advice in one short line; print the whole message before if it does not fit."""
     line = " ".join([said, *advice.split()])
     if len(line) <= _LINE:
         return line
@@ -196,11 +195,11 @@ def _shortened(said: str, advice: str = "") -> str:
 
 @contextlib.contextmanager
 def _project(folder: Path) -> Iterator[None]:
-    """Make `folder` the working folder; where nothing was made in it, nothing of it is left."""
+    """Make `folder` the working folder; remove it at the end if no step made a file."""
     if folder.exists() and not folder.is_dir():
         raise SettingsError(f"{folder}: is a file; name a folder.")
     if folder.is_dir() and any(folder.iterdir()) and not (folder / FILE).is_file():
-        raise OutputFileError(f"{folder}: is not empty, and no sitting began here; choose another folder.")
+        raise OutputFileError(f"{folder}: is not empty and holds no `start.json`; choose another folder.")
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -214,7 +213,7 @@ def _project(folder: Path) -> Iterator[None]:
 
 
 def _leave_nothing_empty(folder: Path, new: list[Path]) -> None:
-    """Remove the folders that were made, where no step made a file."""
+    """Remove the new folders if no step made a file."""
     with contextlib.suppress(OSError):
         if all(path.is_dir() or path == folder / FILE for path in folder.rglob("*")):
             (folder / FILE).unlink(missing_ok=True)
@@ -223,12 +222,12 @@ def _leave_nothing_empty(folder: Path, new: list[Path]) -> None:
                 path.rmdir()
 
 
-def _facts(sitting: Sitting, folder: Path) -> dict[str, Any]:
-    """Return what a whole sitting found."""
+def _facts(run: ProjectRun, folder: Path) -> dict[str, Any]:
+    """Return the results of all steps."""
     names = ("command", "holds", "said", "seconds")
     rows = [
-        {"stage": key.partition(":")[0], **{name: sitting.done[key][name] for name in names}, "done_before": kept}
-        for key, kept in sitting.ran.items()
+        {"stage": key.partition(":")[0], **{name: run.done[key][name] for name in names}, "done_before": kept}
+        for key, kept in run.ran.items()
     ]
     models = {"linear": linear_model(), "nonlinear": nonlinear_model()}
     return {
@@ -238,22 +237,22 @@ def _facts(sitting: Sitting, folder: Path) -> dict[str, Any]:
         "failed": [row["stage"] for row in rows if not row["holds"]],
         "models": {sort: _model(file) for sort, file in models.items() if file is not None},
         "controller": BEST,
-        "loosened": _loosened(),
+        "loosened": _read_loosened(),
         "report": "build/report.html",
         "steps": rows,
     }
 
 
-def _loosened() -> dict[str, dict[str, float]]:
-    """Return metric -> which default the tuned controller does not keep, and what it reaches."""
-    certificate = Path(_TUNED)
+def _read_loosened() -> dict[str, dict[str, float]]:
+    """Return metric -> the loosened default of the tuned controller, and the value reached."""
+    certificate = Path(_CERTIFICATE_FILE)
     if not certificate.is_file():
         return {}
     return json.loads(settings_text(certificate, MOST_JSON)).get("loosened", {})
 
 
 def _doubts() -> dict[str, list[str]]:
-    """Return layout -> what the import was not sure of, and nobody settled since."""
+    """Return layout -> the doubts of the import that are still open."""
     from softneck.signals import doubts_in
 
     files = [*sorted(Path("recordings").glob("*.layout.toml")), *filter(Path.is_file, [Path("robot.toml")])]
@@ -262,7 +261,7 @@ def _doubts() -> dict[str, list[str]]:
 
 
 def _unsure(facts: dict[str, Any]) -> str:
-    """Return in a clause what the verdict rests on and is not sure; empty where nothing is."""
+    """Return the least certain open doubt in a clause; empty if there is none."""
     doubts = [(one, name) for name, found in facts["doubts"].items() for one in found]
     if not doubts:
         return ""
@@ -301,7 +300,7 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
     if unsure and not failed:
         note(unsure)
     if failed:
-        more = f" ({len(failed)} of {len(STAGES)} steps say so: {', '.join(facts['failed'])})" if failed[1:] else ""
+        more = f" ({len(failed)} of {len(STAGES)} steps: {', '.join(facts['failed'])})" if failed[1:] else ""
         also = f" ({unsure}.)" if unsure else ""
         raise CheckFailedError(f"{failed[0]['stage']} does not hold{more}: {failed[0]['said']}{also}")
 

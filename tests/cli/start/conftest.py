@@ -1,4 +1,4 @@
-"""Short plans of cheap commands, to see how a sitting goes on, stops and resumes."""
+"""Short plans of cheap commands, to see how a run goes on, stops and resumes."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 from softneck.cli.start import _start
-from softneck.cli.start._plan import Asked, Step, Unmet
-from softneck.cli.start._sitting import Sitting
+from softneck.cli.start._plan import Options, Step, Unmet
+from softneck.cli.start._project_run import ProjectRun
 from softneck.cli.start._start import _doubts
 
 
-def short_plan(asked: Asked) -> Iterator[Step]:
+def short_plan(asked: Options) -> Iterator[Step]:
     """A robot, a copy of it, and a project of the virtual neck: plain commands, each of what the one before made."""
     first = ("softneck", "robot", "new", "robot.toml", "--preset", asked.robot or "neck", "--force")
     yield Step(stage="robot", command=first, makes=("robot.toml",), reads=asked.logs)
@@ -24,17 +24,17 @@ def short_plan(asked: Asked) -> Iterator[Step]:
     yield Step(stage="loop", command=third, makes=("project/loop.toml",), reads=("copy.toml",), unmet=Unmet.FINDING)
 
 
-def facts_of(sitting: Sitting, folder: Path) -> dict[str, Any]:
-    """What a sitting that ends before its models says of itself."""
-    rows = [{"stage": key.partition(":")[0], "done_before": kept, **sitting.done[key]}
-            for key, kept in sitting.ran.items()]  # fmt: skip
+def facts_of(run: ProjectRun, folder: Path) -> dict[str, Any]:
+    """What a run that ends before its models says of itself."""
+    rows = [{"stage": key.partition(":")[0], "done_before": kept, **run.done[key]}
+            for key, kept in run.ran.items()]  # fmt: skip
     more = {"models": {}, "report": "none", "doubts": _doubts(), "loosened": {}, "failed": [], "steps": rows}
     return {"folder": str(folder), **more}
 
 
 @pytest.fixture
 def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Let a sitting have the short plan; return a log."""
+    """Let a run have the short plan; return a log."""
     monkeypatch.setattr(_start, "steps", short_plan)
     monkeypatch.setattr(_start, "_facts", facts_of)
     path = tmp_path / "log.csv"

@@ -13,7 +13,7 @@ import pytest
 
 import softneck
 from softneck.cli.start import _plan, _start
-from softneck.cli.start._plan import Asked
+from softneck.cli.start._plan import Options
 from softneck.core import Vector
 from softneck.identification.selection import _auto
 from softneck.plant import NeckParameters
@@ -25,7 +25,7 @@ from ..conftest import Call
 from .conftest import facts_of
 
 Columns = Mapping[str, Vector]
-#: [characters] Of the last line, whatever ends a sitting.
+#: [characters] Of the last line, whatever ends a run.
 LINE = 160
 
 
@@ -172,7 +172,7 @@ ENDS: dict[str, tuple[Callable[[Path], None], str]] = {
 }
 
 
-def to_the_observer(asked: Asked) -> object:
+def to_the_observer(asked: Options) -> object:
     for step in _plan.steps(asked):
         if step.stage == "observer":
             return

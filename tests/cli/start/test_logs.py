@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 
 from softneck.cli.start import _plan, _start
-from softneck.cli.start._plan import STAGES, Asked, Step
+from softneck.cli.start._plan import STAGES, Options, Step
 from softneck.signals import read_recording
 from softneck.signals.importing._robot_guess import is_of_another_robot
 
@@ -75,10 +75,10 @@ def references_alone(path: Path) -> None:
 
 @pytest.fixture
 def until(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Let a sitting end before a stage."""
+    """Let a run end before a stage."""
 
     def cut(stage: str) -> None:
-        def first(asked: Asked) -> Iterator[Step]:
+        def first(asked: Options) -> Iterator[Step]:
             known = set(STAGES[: STAGES.index(stage)])
             yield from itertools.takewhile(lambda step: step.stage in known, _plan.steps(asked))
 

@@ -14,8 +14,8 @@ import pytest
 
 import softneck.tuning
 import softneck.tuning._tune
-from softneck.cli.start import _plan, _possible, _sitting, _start
-from softneck.cli.start._plan import PI, Asked, Step, Unmet
+from softneck.cli.start import _plan, _possible, _project_run, _start
+from softneck.cli.start._plan import PI, Options, Step, Unmet
 from softneck.core import CheckFailedError, SettingsError
 from softneck.robot import Robot
 
@@ -79,13 +79,13 @@ def test_what_is_no_requirement_s_fault_is_refused(rls_file: Path, monkeypatch: 
 def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, ends: str
 ) -> None:
-    def plan(asked: Asked) -> Iterator[Step]:
+    def plan(asked: Options) -> Iterator[Step]:
         command = ("softneck", "robot", "new", "robot.toml", "--preset", "neck", "--force")
         why = "The circle cannot be."
         yield Step(stage="tune", command=command, makes=("robot.toml",), reads=asked.logs, finding=why)
 
-    def facts(sitting: _sitting.Sitting, folder: Path) -> dict[str, Any]:
-        rows = [{"stage": "tune", "done_before": False, **entry} for entry in sitting.done.values()]
+    def facts(run: _project_run.ProjectRun, folder: Path) -> dict[str, Any]:
+        rows = [{"stage": "tune", "done_before": False, **entry} for entry in run.done.values()]
         return {
             "folder": str(folder),
             "models": {},
@@ -98,11 +98,11 @@ def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
 
     def failing(words: tuple[str, ...], *, as_json: bool) -> None:
         inner(words, as_json=as_json)
-        raise _sitting.CheckFailedError("rise_s stands in the way.")
+        raise _project_run.CheckFailedError("rise_s stands in the way.")
 
-    inner = _sitting._softneck
+    inner = _project_run._softneck
     if ends == "fails":
-        monkeypatch.setattr(_sitting, "_softneck", failing)
+        monkeypatch.setattr(_project_run, "_softneck", failing)
     monkeypatch.setattr(_start, "steps", plan)
     monkeypatch.setattr(_start, "_facts", facts)
     said = call("start", short, "-o", "p", "--yes", "--json")
@@ -117,14 +117,14 @@ def test_what_was_left_out_fails_in_the_verdict_whatever_came_of_the_rest(
 def test_a_log_is_asked_for_only_where_the_model_is_at_fault(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, why: str, records: bool
 ) -> None:
-    def plan(asked: Asked) -> Iterator[Step]:
+    def plan(asked: Options) -> Iterator[Step]:
         yield Step(stage="identification", command=("softneck", "design", "pi"), makes=(PI,), reads=asked.logs)
 
     def refuse_design(*_: Any, **__: Any) -> None:
         raise SettingsError(why)
 
     monkeypatch.setattr(_start, "steps", plan)
-    monkeypatch.setattr(_sitting, "_softneck", refuse_design)
+    monkeypatch.setattr(_project_run, "_softneck", refuse_design)
     said = call("start", short, "-o", "p", "--yes")
     assert ("Record 60 s of `mixed`" in said.err.splitlines()[-1]) == records
     assert why in said.err.splitlines()[-1]
@@ -134,9 +134,9 @@ def test_a_log_is_asked_for_only_where_the_model_is_at_fault(
 def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordings_is_left(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The sitting goes on, says why, and plans on the models alone; where it can be made it is the first plant."""
+    """The run goes on, says why, and plans on the models alone; where it can be made it is the first plant."""
 
-    def plan(asked: Asked) -> Iterator[Step]:
+    def plan(asked: Options) -> Iterator[Step]:
         Path("models").mkdir(exist_ok=True)
         Path(_plan.FAMILY).write_bytes(b"of an earlier call")
         yield Step(stage="identification", command=("softneck", "family", "log.csv"), makes=(_plan.FAMILY,),
@@ -149,19 +149,19 @@ def test_a_family_that_cannot_be_made_is_done_without_and_none_of_other_recordin
             raise SettingsError("log.csv: too short.")
         inner(words, as_json=as_json)
 
-    inner, planned = _sitting._softneck, list[tuple[str, ...]]()
+    inner, planned = _project_run._softneck, list[tuple[str, ...]]()
     monkeypatch.setattr(_start, "steps", plan)
     monkeypatch.setattr(_start, "_facts", facts_of)
-    monkeypatch.setattr(_sitting, "_softneck", refuse_family)
+    monkeypatch.setattr(_project_run, "_softneck", refuse_family)
     monkeypatch.setattr(_plan, "possible", lambda _: "")
     said = call("start", short, "-o", "p", "--yes")
     assert said.code == 0, said.err
-    assert "no models/family.npz, and what comes after does without: log.csv: too short." in " ".join(said.err.split())
+    assert "continues without models/family.npz: log.csv: too short." in " ".join(said.err.split())
     assert not Path("p", _plan.FAMILY).exists()
     assert planned[0][2:5] == ("models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg,mpc")
     Path("models").mkdir()
     Path(_plan.FAMILY).touch()
-    beside = next(_plan._controller(Asked(logs=()))).command
+    beside = next(_plan._controller(Options(logs=()))).command
     assert beside[2:6] == (_plan.FAMILY, "models/auto.npz", "--kinds", "pi,pid,fopi,hinf,lqg")
 
 
@@ -170,7 +170,7 @@ def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
 ) -> None:
     leave = "Leave yaw out of `outputs.names` in a robot.toml"
 
-    def plan(asked: Asked) -> Iterator[Step]:
+    def plan(asked: Options) -> Iterator[Step]:
         yield Step(stage="identification", command=("softneck", "identify", "auto"), makes=("m.npz",), reads=asked.logs,
                    unmet=Unmet.NO_MODEL)  # fmt: skip
 
@@ -179,7 +179,7 @@ def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
         raise CheckFailedError(f"models/auto.npz: {why} {leave}: without it pitch fits 76.5 %.")
 
     monkeypatch.setattr(_start, "steps", plan)
-    monkeypatch.setattr(_sitting, "_softneck", refuse)
+    monkeypatch.setattr(_project_run, "_softneck", refuse)
     said = call("start", short, "-o", "p", "--yes")
     last = said.err.splitlines()[-1]
     assert said.code == 1
@@ -194,13 +194,13 @@ def test_a_robots_file_that_lacks_something_is_to_be_mended_and_no_log_to_be_rec
                             "outputs": {"names": ["level"], "unit": "V"},
                             "directions": {"kind": "identified"}})  # fmt: skip
 
-    def plan(asked: Asked) -> Iterator[Step]:
+    def plan(asked: Options) -> Iterator[Step]:
         command = ("softneck", "robot", "new", "m.npz", "--preset", "neck", "--force")
         yield Step(stage="identification", command=command, makes=("m.npz",), reads=asked.logs, unmet=Unmet.NO_MODEL)
         _possible.require_known(bare)
 
     monkeypatch.setattr(_start, "steps", plan)
-    monkeypatch.setattr(_sitting, "_softneck", lambda *_, **__: Path("m.npz").touch())
+    monkeypatch.setattr(_project_run, "_softneck", lambda *_, **__: Path("m.npz").touch())
     for _ in range(2):  # and so it is where the models are kept
         said = call("start", short, "-o", "p", "--yes")
         last = said.err.splitlines()[-1]
@@ -215,8 +215,11 @@ def test_named_columns_are_given_to_the_import(tmp_path: Path, monkeypatch: pyte
     monkeypatch.chdir(tmp_path)
     log = tmp_path / "log.csv"
     log.write_text("t,u,y\n0,1,2\n")
-    asked = Asked(logs=(str(log),), motors=("u",), outputs=("y",), sample_time="0.1")
+    asked = Options(logs=(str(log),), motors=("u",), outputs=("y",), sample_time="0.1")
     step = _plan._import(str(log), "recordings/log.csv", asked)
     assert step.command[3:9] == ("--motor", "u", "--output", "y", "--sample-time", "0.1")
     # Other columns are another import.
-    assert step.asked != _plan._import(str(log), "recordings/log.csv", Asked(logs=(str(log),), motors=("y",))).asked
+    assert (
+        step.depends_on
+        != _plan._import(str(log), "recordings/log.csv", Options(logs=(str(log),), motors=("y",))).depends_on
+    )

@@ -1,4 +1,4 @@
-"""What a sitting looks at before its first step, and what it proposes of a sensor."""
+"""What a run looks at before its first step, and what it proposes of a sensor."""
 
 from __future__ import annotations
 

@@ -130,9 +130,9 @@ def test_a_robot_file_in_another_folder_names_the_same_files(call: Call, tmp_pat
 
 
 def test_the_signal_that_a_refusal_asks_for_is_one(call: Call) -> None:
-    from softneck.cli.start._start import _NEXT
+    from softneck.cli.start._start import _NEXT_RECORDING
 
-    assert "`mixed`" in _NEXT
+    assert "`mixed`" in _NEXT_RECORDING
     assert signal("mixed", duration=10.0).set_points.shape[1] == 3
 
 

@@ -1,4 +1,4 @@
-"""A whole sitting on the log of a neck whose truth is known: all twelve steps, twice."""
+"""A whole run on the log of a neck whose truth is known: all twelve steps, twice."""
 
 from __future__ import annotations
 

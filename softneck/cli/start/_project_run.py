@@ -1,4 +1,4 @@
-"""A sitting at work: runs steps in the project's folder, and knows what is done by the hashes of what was read."""
+"""Run the steps in the project's folder; finished steps are recognised by the hashes of their inputs."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from softneck.core import (
 from ..shared._console import note
 from ._plan import STAGES, Step, Unmet
 
-#: In the folder: which steps are done, from what, by which command, and what they found.
+#: In the folder: finished steps with their inputs, commands and results.
 FILE = "start.json"
-_FORMAT = 1
+_FORMAT_VERSION = 1
 
 
 @dataclass(slots=True)
-class Sitting:
-    """What was done in a folder, which is the working folder.
+class ProjectRun:
+    """The steps done in the working folder.
 
     Attributes:
-        done: key of a step -> its command, what it read (file -> SHA-256), whether it ended and held, its seconds.
-        answers: what was asked for beside the logs.
+        done: key of a step -> its command, inputs (file -> SHA-256), whether it ended and held, its seconds.
+        answers: the options beside the logs.
         as_json: print nothing but JSON.
         ran: keys of the steps of this call, in their order, each with whether it was done before.
     """
@@ -55,8 +55,8 @@ class Sitting:
     ran: dict[str, bool] = field(default_factory=dict)
 
     @classmethod
-    def read(cls, *, as_json: bool) -> Sitting:
-        """Return the sitting of the working folder, a new one where there is none."""
+    def read(cls, *, as_json: bool) -> ProjectRun:
+        """Return the run of the working folder, a new one if there is none."""
         path = Path(FILE)
         if not path.is_file():
             return cls(as_json=as_json)
@@ -64,30 +64,30 @@ class Sitting:
             content = json.loads(settings_text(path, MOST_JSON))
             steps = {str(key): dict(entry) for key, entry in content["steps"].items()}
             answers = dict(content["asked"])
-            known = content["format"] == _FORMAT and all(isinstance(e["reads"], dict) for e in steps.values())
+            known = content["format"] == _FORMAT_VERSION and all(isinstance(e["reads"], dict) for e in steps.values())
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise FileFormatError(f"{path.resolve()}: is damaged; remove it, and all steps are done again.") from error
+            raise FileFormatError(f"{path.resolve()}: is damaged; remove it to repeat all steps.") from error
         if not known:
-            raise FileFormatError(f"{path.resolve()}: is of another version; remove it, and all steps are done again.")
+            raise FileFormatError(f"{path.resolve()}: is of another version; remove it to repeat all steps.")
         return cls(steps, answers, as_json)
 
     def write(self) -> None:
-        """Write what was done."""
-        content = {"format": _FORMAT, "asked": self.answers, "steps": self.done}
+        """Write the finished steps."""
+        content = {"format": _FORMAT_VERSION, "asked": self.answers, "steps": self.done}
         with atomic_write(FILE, force=True) as temporary:
             temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
     def do(self, step: Step) -> None:
-        """Run a step unless it is done; what it found is in `done` then."""
+        """Run a step unless it is finished; its result is in `done`."""
         entry = self.done.get(step.key, {})
         reads = {name: _hash(name) for name in step.reads}
-        same = entry.get("asked") == step.asked and entry.get("reads") == reads
+        same = entry.get("asked") == step.depends_on and entry.get("reads") == reads
         kept = same and bool(entry.get("ended")) and all(Path(name).is_file() for name in step.makes)
         self.ran[step.key] = kept
         self._tell(step, kept)
         if not kept:
             begun = bool(same and entry and not entry.get("ended"))
-            self.done[step.key] = {"command": step.shown, "asked": step.asked, "reads": reads, "ended": False}
+            self.done[step.key] = {"command": step.shown, "asked": step.depends_on, "reads": reads, "ended": False}
             self.write()
             self._run(step, _words(step, begun=begun))
         said = self.done[step.key]
@@ -97,7 +97,7 @@ class Sitting:
             if not self.as_json:
                 note(f"does not hold: {said['said']}")
         elif said["said"]:
-            note(f"no {step.makes[0]}, and what comes after does without: {said['said']}")
+            note(f"continues without {step.makes[0]}: {said['said']}")
 
     def _tell(self, step: Step, kept: bool) -> None:
         line = f"[{STAGES.index(step.stage) + 1}/{len(STAGES)}] {step.stage}{' (done before)' if kept else ''}"
@@ -117,19 +117,19 @@ class Sitting:
                 raise
             ended = False
             entry["said"] = str(error)
-            for name in step.makes:  # what an earlier call made is of other recordings
+            for name in step.makes:  # files of an earlier call are of other recordings
                 Path(name).unlink(missing_ok=True)
         lacking = [name for name in step.makes if not Path(name).is_file()]
         if lacking and ended:
             raise OutputFileError(f"{lacking[0]}: was not made by `{step.shown}`.")
-        # What was read is looked at again: a layout that an import proposed is one of its files from here on.
+        # Inputs are hashed again: a layout that an import proposed is one of them from now on.
         entry |= {"reads": {name: _hash(name) for name in step.reads}, "ended": True,
                   "seconds": round(_processor_time() - begin, 2)}  # fmt: skip
         self.write()
 
 
 def _processor_time() -> float:
-    """Return what this process and those that it started and that ended took [s]."""
+    """Return the processor time of this process and its finished children [s]."""
     return sum(os.times()[:4])
 
 
@@ -138,7 +138,7 @@ def _hash(name: str) -> str:
 
 
 def _words(step: Step, *, begun: bool) -> tuple[str, ...]:
-    """Return the command's words, those that go on with what was begun where it can."""
+    """Return the command's words; without `--force` to continue an interrupted run."""
     if not (begun and step.resumes and Path(step.resumes).is_file()):
         return step.command
     return tuple(word for word in step.command if word != "--force")
@@ -167,18 +167,18 @@ def _pytest(words: tuple[str, ...], *, as_json: bool) -> None:
 
 @contextlib.contextmanager
 def _ctrl_c_ends() -> Iterator[None]:
-    """End with KeyboardInterrupt where Ctrl-C was pressed, though trainings keep their best at it and go on."""
+    """Raise KeyboardInterrupt after Ctrl-C, although a training catches it and keeps its best."""
     usual = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(usual):
         yield
         return
     pressed: list[int] = []
 
-    def heard(number: int, frame: Any) -> None:
+    def on_interrupt(number: int, frame: Any) -> None:
         pressed.append(number)
         usual(number, frame)
 
-    signal.signal(signal.SIGINT, heard)
+    signal.signal(signal.SIGINT, on_interrupt)
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""A sitting runs the commands that it prints, does nothing twice, and goes on wherever it was left."""
+"""A run runs the commands that it prints, does nothing twice, and goes on wherever it was left."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from softneck.cli.start import _sitting
+from softneck.cli.start import _project_run
 from softneck.core import CheckFailedError
 
 from ...data import neck_recording
@@ -26,13 +26,13 @@ STEPS = ["robot: robot.toml", "quality: copy.toml", "loop: project/loop.toml"]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """All files but the sitting's own, which holds seconds."""
-    files = (path for path in folder.rglob("*") if path.is_file() and path.name != _sitting.FILE)
+    """All files but the run's own, which holds seconds."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != _project_run.FILE)
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 def states(call: Call, *more: str, code: int = 0) -> list[bool]:
-    """Run the sitting and return which of its steps were done before."""
+    """Run the run and return which of its steps were done before."""
     said = call("start", "log.csv", "-o", "p", "--yes", "--json", *more)
     assert said.code == code, said.err
     return [step["done_before"] for step in json.loads(said.out)["steps"]]
@@ -97,7 +97,7 @@ def test_ctrl_c_at_any_step_ends_in_one_line_and_the_same_command_goes_on(
     call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, how: str
 ) -> None:
     assert call("start", "log.csv", "-o", "whole/p", "--yes").code == 0
-    real: Callable[..., Any] = _sitting._softneck
+    real: Callable[..., Any] = _project_run._softneck
     calls: list[int] = []
 
     def pressed(words: tuple[str, ...], *, as_json: bool) -> None:
@@ -115,28 +115,28 @@ def test_ctrl_c_at_any_step_ends_in_one_line_and_the_same_command_goes_on(
         except KeyboardInterrupt:
             real(words, as_json=as_json)
 
-    monkeypatch.setattr(_sitting, "_softneck", pressed)
+    monkeypatch.setattr(_project_run, "_softneck", pressed)
     said = call("start", "log.csv", "-o", "p", "--yes")
     assert (said.code, len(calls)) == (130, number + 1)
     assert said.error == "softneck: interrupted; files already finished are kept, none is half written"
-    monkeypatch.setattr(_sitting, "_softneck", real)
+    monkeypatch.setattr(_project_run, "_softneck", real)
     assert states(call) == [k < number for k in range(3)], "the step that was interrupted is done again"
     assert contents(tmp_path / "p") == contents(tmp_path / "whole" / "p")
 
 
-def test_ctrl_c_means_what_it_meant_before_a_sitting(call: Call, short: Path) -> None:
+def test_ctrl_c_means_what_it_meant_before_a_project_run(call: Call, short: Path) -> None:
     before = signal.getsignal(signal.SIGINT)
     states(call)
     assert signal.getsignal(signal.SIGINT) is before
 
 
-@pytest.mark.parametrize("unmet", [_sitting.Unmet.FINDING, _sitting.Unmet.NO_MODEL])
+@pytest.mark.parametrize("unmet", [_project_run.Unmet.FINDING, _project_run.Unmet.NO_MODEL])
 def test_a_check_that_does_not_hold_is_a_result_but_of_models(
-    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, unmet: _sitting.Unmet
+    call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, unmet: _project_run.Unmet
 ) -> None:
     from softneck.cli.start import _start
 
-    real: Callable[..., Any] = _sitting._softneck
+    real: Callable[..., Any] = _project_run._softneck
     plan = _start.steps
 
     def fails(words: tuple[str, ...], *, as_json: bool) -> None:
@@ -146,15 +146,15 @@ def test_a_check_that_does_not_hold_is_a_result_but_of_models(
 
     def judged(asked: Any) -> Any:
         for step in plan(asked):
-            yield _sitting.Step(**{**{name: getattr(step, name) for name in step.__slots__}, "unmet": unmet})
+            yield _project_run.Step(**{**{name: getattr(step, name) for name in step.__slots__}, "unmet": unmet})
 
-    monkeypatch.setattr(_sitting, "_softneck", fails)
+    monkeypatch.setattr(_project_run, "_softneck", fails)
     monkeypatch.setattr(_start, "steps", judged)
     for _ in range(2):  # what was found stays found
         said = call("start", "log.csv", "-o", "p", "--yes")
         assert said.code == 1
         assert "too slow." in said.err.splitlines()[-1]
-        assert Path("p/project/loop.toml").exists() == (unmet is _sitting.Unmet.FINDING)
+        assert Path("p/project/loop.toml").exists() == (unmet is _project_run.Unmet.FINDING)
 
 
 def test_json_is_one_object_on_stdout(call: Call, short: Path) -> None:
@@ -198,7 +198,7 @@ def test_a_folder_of_something_else_is_left_alone(call: Call, short: Path, tmp_p
     (tmp_path / "p").mkdir()
     (tmp_path / "p" / "mine.txt").write_text("mine")
     said = call("start", "log.csv", "-o", "p", "--yes")
-    assert (said.code, said.error.endswith("no sitting began here; choose another folder.")) == (2, True)
+    assert (said.code, said.error.endswith("holds no `start.json`; choose another folder.")) == (2, True)
     assert contents(tmp_path / "p") == {"mine.txt": b"mine"}
     assert "is a file" in call("start", "log.csv", "-o", "log.csv", "--yes").error
 
@@ -218,7 +218,7 @@ def test_a_damaged_state_is_said_and_nothing_is_done(call: Call, short: Path) ->
         '{"format": 2, "asked": {}, "steps": {}}',
     ):
         Path("p/start.json").write_text(text)
-        assert "remove it, and all steps are done again" in call("start", "log.csv", "-o", "p", "--yes").error
+        assert "remove it to repeat all steps" in call("start", "log.csv", "-o", "p", "--yes").error
 
 
 @pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS])
@@ -226,7 +226,7 @@ def test_a_damaged_state_is_said_and_nothing_is_done(call: Call, short: Path) ->
 def test_a_full_disk_or_a_read_only_one_ends_in_one_line_wherever_it_comes(
     call: Call, short: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: int, number: int
 ) -> None:
-    """The disk takes no file after the n-th, whichever file that is: those of steps, or the sitting's own."""
+    """The disk takes no file after the n-th, whichever file that is: those of steps, or the run's own."""
     real = Path.replace
     written: list[Path] = []
 
@@ -289,7 +289,7 @@ def test_a_recording_that_lacks_something_is_asked_about_before_it_is_identified
 ) -> None:
     from softneck.cli.start import _start
 
-    plan = [_sitting.Step(stage="identification", command=("softneck", "new", "q"), makes=("q/loop.toml",))]
+    plan = [_project_run.Step(stage="identification", command=("softneck", "new", "q"), makes=("q/loop.toml",))]
     monkeypatch.setattr(_start, "steps", lambda _: iter(plan))
     monkeypatch.setattr(_start, "is_terminal", lambda: True)
     monkeypatch.setattr(_start.click, "prompt", lambda *_, default, **__: default)
@@ -299,7 +299,7 @@ def test_a_recording_that_lacks_something_is_asked_about_before_it_is_identified
     said = call("start", "log.csv", "-o", "p")
     assert said.code == 1
     assert "log: a motor never moves." in said.err
-    assert "stopped, as was answered. Record 60 s" in said.err.splitlines()[-1]
+    assert "stopped by the user. Record 60 s" in said.err.splitlines()[-1]
     assert not Path("p").exists()
 
 
@@ -320,7 +320,7 @@ def test_what_a_later_step_would_refuse_is_refused_at_once(
     assert not Path("p").exists()
 
 
-@pytest.mark.parametrize(("stage", "advice"), [("tune", "give them by --requirements"), ("verify", "paths are")])
+@pytest.mark.parametrize(("stage", "advice"), [("tune", "pass them by --requirements"), ("verify", "paths are")])
 def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     call: Call, short: Path, monkeypatch: pytest.MonkeyPatch, stage: str, advice: str
 ) -> None:
@@ -330,9 +330,9 @@ def test_a_step_that_cannot_be_done_says_which_and_how_to_go_on(
     def refuses(words: tuple[str, ...], *, as_json: bool) -> None:
         raise SettingsError(f"`{words[1]}` cannot be (as JSON: {as_json}); allow it.")
 
-    plan = [_sitting.Step(stage=stage, command=("softneck", "new", "q"), makes=("q/loop.toml",))]
+    plan = [_project_run.Step(stage=stage, command=("softneck", "new", "q"), makes=("q/loop.toml",))]
     monkeypatch.setattr(_start, "steps", lambda _: iter(plan))
-    monkeypatch.setattr(_sitting, "_softneck", refuses)
+    monkeypatch.setattr(_project_run, "_softneck", refuses)
     said = call("start", "log.csv", "-o", "p", "--yes")
     assert said.code == 2
     assert said.err.splitlines()[-1].startswith(f"softneck: {stage}: `new` cannot be")
@@ -375,7 +375,7 @@ def test_ctrl_c_of_a_user_in_steps_at_work(tmp_path: Path) -> None:
 
 
 def test_a_disk_that_is_really_full_ends_in_one_line(tmp_path: Path) -> None:
-    """Files may grow to 8 KiB only, as on a small disk: the first that does not fit ends the sitting; none is half."""
+    """Files may grow to 8 KiB only, as on a small disk: the first that does not fit ends the run; none is half."""
     neck_log(tmp_path)
     limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192)); "
     words = ["start", "log.csv", "-o", "p", "--yes"]
@@ -402,8 +402,8 @@ def test_a_long_refusal_is_noted_whole_and_ends_in_a_short_line(
     def refuses(*_: Any, **__: Any) -> None:
         raise DataError(whole)
 
-    monkeypatch.setattr(_start, "steps", lambda _: iter([_sitting.Step(stage=stage, command=("a",), makes=("b",))]))
-    monkeypatch.setattr(_sitting, "_softneck", refuses)
+    monkeypatch.setattr(_start, "steps", lambda _: iter([_project_run.Step(stage=stage, command=("a",), makes=("b",))]))
+    monkeypatch.setattr(_project_run, "_softneck", refuses)
     said = call("start", "log.csv", "-o", "p", "--yes")
     *before, last = said.err.splitlines()
     assert len(last) <= 160
