@@ -1,4 +1,4 @@
-"""A model of any kind by its name, and a family, as `softneck identify KIND` and `softneck family` make them."""
+"""Identify a model by its kind, a family and a calibrated neck, as the commands of these names do."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from softneck.core import (
     resolve,
     shown_progress,
 )
-from softneck.plant import Calibration
-from softneck.plant import calibrate as calibrated
+from softneck.plant import Calibration, has_own_tendons
+from softneck.plant import calibrate as calibrate_neck
 from softneck.robot import Robot
 from softneck.signals import (
     Recording,
@@ -45,8 +45,10 @@ from .uncertainty._family_fit import FamilySettings
 from .validation._score_tables import INFINITE
 from .validation._validation import Validation, validate
 
-# What a model of the equations is asked to play [s].
-_PLAYED = 60.0
+# Length of the Eq. 22 excitation that a `greybox` is simulated on for a calibration [s].
+_EXCITATION_S = 60.0
+# A hold-out of a second or less gives no usable fit.
+_MIN_HELD_OUT_ROWS = 75
 
 
 def calibrate(
@@ -56,19 +58,20 @@ def calibrate(
     evaluations: int = 30,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Return the virtual neck whose free run is nearest to recordings, by least squares.
+    """Fit the parameters of the virtual neck to recordings by least squares of the simulation error.
 
-    Payload and geometry that the robot file gives stay as they are. The last 30 % of each run are not fitted to: they
-    judge. `save` writes the neck file.
+    Payload and geometry stay as the robot file gives them. The last 30 % of each run are held out to judge the fit.
+    `save` writes the neck file.
 
     Args:
         sources: recordings, as `identify` takes them, or models of kind `greybox`, or their files.
-        payloads: of each in turn [kg]; what their column `payload` says, else 0, if not given.
+        payloads: of each in turn [kg]; by default that of its column `payload`, else 0.
         evaluations: steps of the search.
-        progress: called with the part done and a word; a bar in a terminal if not given.
+        progress: called with the part done and a word; by default a bar in a terminal.
 
     Raises:
-        DataError: no recording, not of a neck, payloads that are not one for each, a model of another kind.
+        DataError: no recording, not one payload for each, or a model of another kind.
+        SettingsError: a robot other than a neck.
 
     Example:
         >>> import softneck
@@ -85,40 +88,40 @@ def calibrate(
     radius = parts[0].robot.winch_radius_m if parts else None
     known = {} if radius is None else {"winch_radius": radius}
     with shown_progress("calibrate", progress) as tell:
-        return calibrated(parts, given, known=known, evaluations=evaluations, progress=tell)
+        return calibrate_neck(parts, given, known=known, evaluations=evaluations, progress=tell)
 
 
 def _recording(source: Any) -> Recording:
     if isinstance(source, Model):
-        return _played(source, "the model")
+        return _simulate_eq22(source, "the model")
     if isinstance(source, str | Path) and Path(source).suffix == ".npz":
-        return _played(load(source, role="model"), source)
+        return _simulate_eq22(load(source, role="model"), source)
     return open_recording(source)
 
 
-def _played(model: Model, source: str | Path) -> Recording:
-    """Return what a model answers to Eq. 22."""
+def _simulate_eq22(model: Model, source: str | Path) -> Recording:
+    """Simulate a `greybox` model on the excitation of Eq. 22."""
     if model.kind != "greybox":
         raise DataError(f"{source}: is of kind {model.kind}; a neck is calibrated to recordings or to a `greybox`.")
-    model.robot.require_neck("a calibrated neck")
-    played = signal("eq22", duration=_PLAYED)
-    if abs(model.sample_time - played.sample_time) > 1e-9:
-        raise DataError(f"{source}: is at {model.sample_time:g} s; Eq. 22 is played at {played.sample_time:g} s.")
+    robot, excitation = model.robot, signal("eq22", duration=_EXCITATION_S)
+    if not has_own_tendons(robot):
+        raise SettingsError(
+            f"a calibrated neck has tendons at 0, 120, 240 deg and two outputs; not robot {robot.label()}."
+        )
+    if abs(model.sample_time - excitation.sample_time) > 1e-9:
+        raise DataError(
+            f"{source}: its sample time is {model.sample_time:g} s; calibration needs {excitation.sample_time:g} s."
+        )
     block = model.block()
     names = [port.name for port in block.inputs]
-    inputs = block.checked_inputs(np.tile([port.start for port in block.inputs], (len(played.time) - 1, 1)))
-    motors = model.robot.set_points
-    inputs[:, [names.index(name) for name in motors]] = played.set_points[:-1]
+    inputs = block.checked_inputs(np.tile([port.start for port in block.inputs], (len(excitation.time) - 1, 1)))
+    inputs[:, [names.index(name) for name in robot.set_points]] = excitation.set_points[:-1]
     start = block.initial_state()
     outputs = [port.name for port in block.outputs]
-    rows = [outputs.index(axis) for axis in ("pitch", "roll")]
+    rows = [outputs.index(axis) for axis in robot.outputs.names]
     Y = np.vstack([start.outputs[rows], block.run(start, inputs)[1][:, rows]])
-    channels = dict(zip((*motors, "pitch", "roll"), (*played.set_points.T, *Y.T), strict=True))
-    return Recording(played.time, played.sample_time, channels, robot=model.robot)
-
-
-# A hold-out of a second or less says nothing.
-_LEAST_HELD_OUT = 75
+    channels = dict(zip((*robot.set_points, *robot.outputs.names), (*excitation.set_points.T, *Y.T), strict=True))
+    return Recording(excitation.time, excitation.sample_time, channels, robot=robot)
 
 
 def identify(
@@ -131,19 +134,19 @@ def identify(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Model:
-    """Return the model of `kind` fitted on the first part of each run, judged on the rest.
+    """Fit a model of `kind` to the first part of each run and validate it on the rest.
 
-    It does what `softneck identify KIND` does; `summary()` and `findings["hold_out"]` tell the fit on the rest.
+    The command `softneck identify KIND` does the same. `summary()` and `findings["hold_out"]` give the fit on the rest.
 
     Args:
         kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...; "auto" compares all of them and returns the
-            best, with the reason in `findings["chosen"]` (`choose` returns the whole ranking). Of several recordings
-            it holds the last one out as a whole; its only setting is `seed`.
-        recording: what to identify from, or its file; a DataFrame; an array of a `robot`; or a list of several.
+            best, with the reason in `findings["chosen"]` (`choose` returns the whole ranking). It holds out the last
+            of several recordings as a whole; its only setting is `seed`.
+        recording: a recording, its file, a DataFrame, an array of a `robot`, or a list of several.
         train: part of each run, from its start, to train on; 1 holds nothing out.
-        robot: whose recording it is; None: `robot.toml` beside a file or above it, else what the recording says.
-        tolerance: error that `validity` allows, in the unit in which people see the outputs (a neck's 2 deg).
-        progress: called with the part done and a word; a bar in a terminal if not given.
+        robot: of the recording; None takes `robot.toml` beside a file or above it, else that of the recording.
+        tolerance: error that `validity` allows, in the display unit of the outputs (of a neck 2 deg).
+        progress: called with the part done and a word; by default a bar in a terminal.
         **settings: those of the kind's settings class, for instance `delay=0.08`; angles in rad.
 
     Raises:
@@ -172,18 +175,17 @@ def identify(
 def fit_and_validate(
     estimator: Any, whole: Recording, *, train: float, tolerance: float | None, progress: Progress
 ) -> tuple[Model, Validation | None]:
-    """Return what `estimator` makes of the first part of each run, and how it does on the rest; None: nothing is."""
+    """Fit a model to the first part of each run and validate it on the rest; None where too little is held out."""
     if isinstance(train, bool) or not isinstance(train, int | float) or not 0.0 < train <= 1.0:
         raise SettingsError(f"`train`: the part to train on must be in (0, 1]; got {train!r}.")
     if tolerance is not None:
         require_positive("tolerance", tolerance)
-    # All of it to train on leaves nothing to hold out.
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
-    # A kind of one's own need not tell how far it is.
-    told = {"progress": progress} if "progress" in signature(estimator.fit).parameters else {}
-    model: Model = estimator.fit(head, **told)
+    # A user's own kind may not report progress.
+    reported = {"progress": progress} if "progress" in signature(estimator.fit).parameters else {}
+    model: Model = estimator.fit(head, **reported)
     model = model if tolerance is None else with_tolerance(model, tolerance)
-    if tail is None or all(len(run) < _LEAST_HELD_OUT for run in tail.runs()):
+    if tail is None or all(len(run) < _MIN_HELD_OUT_ROWS for run in tail.runs()):
         return model, None
     held_out = validate(model, tail, horizons=(1, INFINITE))
     return with_fit(model, held_out), held_out
@@ -193,7 +195,7 @@ def _best_kind(
     recording: RecordingLike, *, train: float, robot: Robot | str | Path | None, tolerance: float | None,
     progress: Progress | None, seed: int = 0, **others: Any
 ) -> Model:  # fmt: skip
-    """Return the model of the kind that `auto` chooses; its only setting is `seed`."""
+    """Fit the model of the kind that `auto` chooses."""
     if others:
         raise SettingsError(f"`auto` has no setting {next(iter(others))!r}; use seed.")
     listed: Sequence[Any] = recording if isinstance(recording, list | tuple) else [recording]
@@ -210,11 +212,11 @@ def _best_kind(
 
 
 def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: int, progress: Progress) -> Choice:
-    """Return what `auto` chooses from recordings; the last of several, called `name`, is held out as a whole.
+    """Compare all kinds by `auto`; the last of several recordings, called `name`, is held out as a whole.
 
     Raises:
         SettingsError: nothing would be held out.
-        DataError: what is held out stands still, or no kind could be identified.
+        DataError: the robot stands still in the rows held out, or no kind could be identified.
     """
     head, tail, other = _split_for_choice(parts, train)
     check_training(head)
@@ -225,34 +227,34 @@ def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: in
 
 
 def _split_for_choice(parts: Sequence[Recording], train: float) -> tuple[Recording, Recording, bool]:
-    """Return what to train on, what to hold out, and whether that is another experiment."""
+    """Return the training recording, the hold-out, and whether the hold-out is another experiment."""
     if len(parts) > 1 and not _is_other_payload(parts[-1], parts[:-1]):
         return concatenate(parts[:-1]), parts[-1], True
     if not 0.0 < train < 1.0:
         raise SettingsError(f"`train`: `auto` has to hold rows out; give a part below 1, got {train:g}.")
-    # The end of each run: a model cannot know a payload that was held out whole.
+    # Hold out the end of each run: a model cannot predict with a payload that it was not trained on.
     head, tail = concatenate(parts).split(train)
     return head, tail, False
 
 
 def _is_other_payload(one: Recording, others: Sequence[Recording]) -> bool:
-    """Return whether a recording has a payload beyond those of the others."""
+    """Return whether a recording has a payload outside the range of the others."""
     known = [payload_of(run) for part in others for run in part.runs()]
     return any(not min(known) <= payload_of(run) <= max(known) for run in one.runs())
 
 
 def with_fit(model: Model, held_out: Validation | None) -> Model:
-    """Return the model with what it was worth on the rows held out, which `softneck design` asks for."""
+    """Return the model with its fit on the rows held out, which `softneck design` requires."""
     if held_out is None:
         return model
-    said = {
+    scores = {
         "fit": held_out.fits[INFINITE],
         "one_step": held_out.fits.get("1", {}),
         "persistence": held_out.persistence.get("1", {}),
         "diverged": held_out.diverged,
         "rows": held_out.rows_scored,
     }
-    return replace(model, findings={**model.findings, "hold_out": said})
+    return replace(model, findings={**model.findings, "hold_out": scores})
 
 
 def family(
@@ -262,18 +264,18 @@ def family(
     progress: Progress | None = None,
     **settings: Any,
 ) -> Family:
-    """Return the uncertain linear plant of one or several recordings, tested against them, as `softneck family` does.
+    """Fit an uncertain linear plant to recordings and test it against them, as `softneck family` does.
 
     Args:
-        recordings: as `identify` takes them; of a list each is a recording of its own, of its payload for instance.
-        robot: whose they are, as of `identify`.
-        progress: called with the part done and a word; a bar in a terminal if not given.
+        recordings: as for `identify`; each of a list may have a payload of its own.
+        robot: as for `identify`.
+        progress: called with the part done and a word; by default a bar in a terminal.
         **settings: those of `FamilySettings`.
 
     Raises:
         SettingsError: an unknown setting, or a value out of range.
         FileFormatError: no such file, or no recording.
-        DataError: too short, other sample times, or too few local models that say enough.
+        DataError: too short, unequal sample times, or too few local models with enough information.
 
     Example:
         >>> import softneck

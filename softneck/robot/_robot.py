@@ -265,11 +265,6 @@ class Robot(ReprMixin):
             raise SettingsError(f"robot {self.label()} gives no `{_file.KEY_OF[key]}`, which {what} needs; add it.")
         return value
 
-    def require_neck(self, what: str) -> None:
-        """Raise SettingsError unless this is a neck, for functions that support necks only."""
-        if not self.is_neck:
-            raise SettingsError(f"{what} takes necks only so far, not robot {self.label()}.")
-
     def label(self) -> str:
         """Return name, short hash and file, to identify a robot in messages."""
         return (

@@ -1,7 +1,7 @@
-"""Checks of a model file's arrays before compiled code indexes them; each kind has further checks of its own.
+"""Arrays and ports of an identified plant, the same for every kind (public face, "FMUs").
 
-Models may hold others: the arrays of member 0 of kind `play` are named `0.play.history` and so on, behind the model's
-own; their runtime and their start are put together here.
+Arrays are checked before compiled code indexes them; each kind has further checks of its own. A model may have other
+models as members: the arrays of member 0 of kind `play` are named `0.play.history` and so on, after the model's own.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from softneck.signals import Recording, conditions, merge_conditions
 from ._linear_systems import STATE_SPACE
 
 COMPOSED = ("guarded",)
-_LEAST_MEMBERS = 2  # a base and one other
-# Of `greybox` where the recordings had several payloads.
-LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
+_MIN_MEMBERS = 2  # a base and one other
+# Runtime of `greybox` for recordings with several payloads.
+_LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
 
-
-# What says where a model knows the robot: older files, models made by hand and members of others have none.
+# The arrays of the output `validity`: older files, models made by hand and members of others have none.
 VALIDITY = ("ground", "doubt")
-# Left out of files too: the offset of a robot that rests at zero.
+# Files also leave out the offset of a robot that rests at zero.
 _OPTIONAL = (*VALIDITY, "offset")
 
 
 def without_validity(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
-    """Return the arrays without those that only `validity` takes."""
+    """Return the arrays without those of `validity`."""
     return {name: array for name, array in arrays.items() if name.rpartition(".")[2] not in VALIDITY}
 
 
 def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
-    """Return the arrays as the runtime takes them: in its order, with what a file may leave out."""
+    """Return the arrays in the order of the runtime, with defaults for those that a file may leave out."""
     own = own_arrays(arrays)
     history = own["history"]
     outputs = int(history[1]) if len(history) > 1 else 2
@@ -53,7 +52,7 @@ def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]
 
 
 def with_validity(kind: str, arrays: Mapping[str, Matrix], ground: Matrix, doubt: Matrix) -> dict[str, Matrix]:
-    """Return the arrays with those for `validity`, in the order of a file."""
+    """Add the arrays of `validity`, in the order of a file."""
     given = {**arrays, "ground": ground, "doubt": doubt}
     inner = {name: array for name, array in arrays.items() if "." in name}
     return {**{name: given[name] for name in _names(_module_of(kind, arrays)) if name in given}, **inner}
@@ -61,7 +60,7 @@ def with_validity(kind: str, arrays: Mapping[str, Matrix], ground: Matrix, doubt
 
 @cache
 def _names(module: str) -> tuple[str, ...]:
-    """Return the names of a runtime's arrays; every step asks."""
+    """Return the names of a runtime's arrays; cached, as every step needs them."""
     return layout_of(module, Arrays).names()
 
 
@@ -69,8 +68,8 @@ def prefixed_arrays(members: list[tuple[str, Mapping[str, Matrix]]]) -> dict[str
     """Return the arrays of all members (kind, arrays) under their names in a composed model."""
     for kind, _ in members:
         if kind in COMPOSED:
-            raise SettingsError(f"a model of kind `{kind}` holds others itself and cannot be held; take its members.")
-    # The whole says how far it can be trusted, not its members.
+            raise SettingsError(f"a model of kind `{kind}` has members and cannot be a member; take its members.")
+    # The composed model has its own validity.
     return {
         f"{i}.{kind}.{name}": array
         for i, (kind, arrays) in enumerate(members)
@@ -87,7 +86,7 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
     """Return kind and arrays of each member, in order.
 
     Raises:
-        FileFormatError: members out of order, or of a kind that cannot be held.
+        FileFormatError: members out of order, or of a kind that cannot be a member.
     """
     found: list[tuple[str, dict[str, Matrix]]] = []
     for name, array in arrays.items():
@@ -98,14 +97,14 @@ def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]
             found.append((kind, {}))
         if not found or (number, kind) != (str(len(found) - 1), found[-1][0]):
             raise FileFormatError(
-                f"its array `{name}` belongs to no member in order, or to a kind that cannot be held."
+                f"its array `{name}` belongs to no member in order, or to a kind that cannot be a member."
             )
         found[-1][1][own] = array
     return found
 
 
 def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
-    """Return the name of the runtime, with those of the members (see `softneck.runtime.bundle`)."""
+    """Return the runtime's name, with those of its members in brackets (see `softneck.runtime.bundle`)."""
     history, module = arrays["history"], _module_of(kind, arrays)
     if kind not in COMPOSED:
         return sized_name(module, len(arrays["drive"]), int(history[1]) if len(history) > 1 else 2)
@@ -117,21 +116,21 @@ def runtime_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
 
 
 def _module_of(kind: str, arrays: Mapping[str, Matrix]) -> str:
-    """Return the module of the runtime: some kinds have several forms, which their arrays tell apart."""
+    """Return the module of the runtime; the arrays decide between several forms of one kind."""
     runtime = KINDS[kind].runtime
     if kind == "greybox" and "payload" in arrays:
-        return LOADED_GREYBOX
+        return _LOADED_GREYBOX
     return STATE_SPACE if "A" in arrays else runtime
 
 
 def memory_of(arrays: Mapping[str, Matrix]) -> int:
-    """Return the samples after which a held input and output have filled all that a model remembers."""
+    """Return the number of samples after which constant inputs and outputs have filled a model's memory."""
     longest = max(float(arrays["history"][0]), float(arrays.get("memory", np.zeros(1))[0]))
     return int(max([longest, *(memory_of(part) for _, part in members(arrays))]))
 
 
 def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, y: Vector) -> None:
-    """Write motors `m` (3,) and outputs `y` (2,) of now into a state, which a `step` has moved on."""
+    """Write the present motors `m` (3,) and outputs `y` (2,) into a state after a `step`."""
     runtime, arrays = runtime_of(kind, arrays).partition("(")[0], runtime_arrays(kind, arrays)
     named = layout_of(runtime, Arrays)(list(arrays.values()))
     parts = layout_of(runtime, StateVector).parts(named)
@@ -146,13 +145,13 @@ def set_now(kind: str, arrays: Mapping[str, Matrix], values: Vector, m: Vector, 
         at += size
 
 
-# A minute at 1 ms: far beyond any lag of a neck, far below what memory holds.
-_LONGEST_HISTORY = 60_000
+# A minute at 1 ms: far longer than any lag of a neck, and still small in memory.
+_MAX_HISTORY_SAMPLES = 60_000
 
 
 def memory_array(seconds: float, sample_time: float) -> Vector:
-    """Return the array `memory` of a model's file: samples in so many seconds, as far as a file goes."""
-    return np.array([float(min(np.ceil(seconds / sample_time), _LONGEST_HISTORY))])
+    """Return the array `memory`: the samples in so many seconds, limited to what a file may hold."""
+    return np.array([float(min(np.ceil(seconds / sample_time), _MAX_HISTORY_SAMPLES))])
 
 
 def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
@@ -161,22 +160,22 @@ def check_arrays(kind: str, arrays: Mapping[str, Matrix]) -> None:
         _check_composed(kind, arrays)
         return
     names = layout_of(runtime_of(kind, arrays), Arrays).names()
-    if not _named(arrays, names):
+    if not _has_names(arrays, names):
         raise FileFormatError(f"a model of kind {kind} has the arrays {', '.join(names)}; got {', '.join(arrays)}.")
     _check_numbers(kind, runtime_arrays(kind, arrays), runtime_of(kind, arrays))
 
 
-def _named(arrays: Mapping[str, Matrix], names: tuple[str, ...]) -> bool:
-    """Return whether arrays are those of a runtime in its order, but for what a file may leave out."""
+def _has_names(arrays: Mapping[str, Matrix], names: tuple[str, ...]) -> bool:
+    """Return whether the arrays are those of a runtime in its order, apart from optional ones."""
     return tuple(arrays) == tuple(name for name in names if name in arrays or name not in _OPTIONAL)
 
 
 def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
     names = layout_of(KINDS[kind].runtime, Arrays).names()
     own, parts = own_arrays(arrays), members(arrays)
-    if tuple(arrays)[: len(own)] != tuple(own) or not _named(own, names):
+    if tuple(arrays)[: len(own)] != tuple(own) or not _has_names(own, names):
         raise FileFormatError(f"a model of kind {kind} starts with the arrays {', '.join(names)}.")
-    if len(parts) < _LEAST_MEMBERS:
+    if len(parts) < _MIN_MEMBERS:
         raise FileFormatError(f"a model of kind {kind} cannot have {len(parts)} members.")
     _check_numbers(kind, runtime_arrays(kind, own), KINDS[kind].runtime)
     for member, part in parts:
@@ -184,13 +183,13 @@ def _check_composed(kind: str, arrays: Mapping[str, Matrix]) -> None:
 
 
 def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> None:
-    """Check what the declaration of a kind says of its arrays, and what the kind's own check does."""
+    """Check the arrays against the declaration of their kind and by its own check."""
     for name, array in arrays.items():
         if array.dtype != np.float64 or not np.isfinite(array).all():
             raise FileFormatError(f"its array `{name}` is not of finite floats.")
     for name, what in {"history": "its history in samples", "memory": "its memory in samples"}.items():
-        if name in arrays:  # before its number is a length of others
-            within(arrays[name], 1, _LONGEST_HISTORY, what)
+        if name in arrays:  # before other arrays' lengths are computed from it
+            within(arrays[name], 1, _MAX_HISTORY_SAMPLES, what)
     sizes = layout_of(runtime, Arrays).lengths(arrays)
     if "drive" in arrays:
         within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
@@ -208,7 +207,7 @@ def _check_validity(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> N
 
 
 def check_table(table: Matrix, sizes: Mapping[str, int]) -> None:
-    """Check rows (source, channel, lag) of a model of these sizes."""
+    """Check a regressor table with rows (source, channel, lag) against the sizes of a model."""
     within(np.array([len(table)]), 1, np.inf, "the number of regressors")
     within(table[:, 0], 0, 3, "a regressor's source")
     within(table[table[:, 0] < 3, 1], 0, sizes["motors"] - 1, "a regressor's channel")
@@ -217,22 +216,23 @@ def check_table(table: Matrix, sizes: Mapping[str, int]) -> None:
 
 
 def within(values: Matrix, low: float, high: float, what: str) -> None:
+    """Raise FileFormatError unless all values are whole numbers from `low` to `high`."""
     if (values != np.round(values)).any() or not ((values >= low) & (values <= high)).all():
         raise FileFormatError(f"{what} is not a whole number from {low:g} to {high:g}.")
 
 
-#: What may hang on the platform [kg], as on the virtual neck's.
+#: Largest payload on the platform [kg], as of the virtual neck.
 MOST_PAYLOAD = 5.0
-# What a winch may do [rad], for models that do not say what they were trained on.
+# Range of a winch [rad], for models without a recorded training range.
 _DEFAULT_RANGE_RAD = 6.0
 _RANGE_KEY = "set_points_rad"
 
 
 def _output_port(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
     unit, shown = to_si(robot.outputs.unit)[1], robot.outputs.display_unit
-    # "": what is usual for the unit, as degrees are.
-    port = Port(name=name, unit=unit, description=description, missing=missing,
-                display_unit="" if shown == "deg" else shown)  # fmt: skip
+    # An empty display unit means the usual one of the unit: degrees.
+    display = "" if shown == "deg" else shown
+    port = Port(name=name, unit=unit, description=description, missing=missing, display_unit=display)
     if unit != "rad" or missing:
         return port
     return replace(port, minimum=-np.pi, maximum=np.pi, nominal=0.2)
@@ -240,19 +240,12 @@ def _output_port(robot: Robot, name: str, description: str, *, missing: bool = F
 
 def _motor_port(robot: Robot, name: str, description: str, *, missing: bool = False) -> Port:
     unit, shown = to_si(robot.motors.unit)[1], robot.motors.unit
-    nominal = 1.0 if unit == "rad" else None
-    return Port(name=name, unit=unit, description=description, nominal=nominal, missing=missing,
-                display_unit="" if shown == unit else shown)  # fmt: skip
-
-
-def _platform(robot: Robot, name: str) -> str:
-    """Return what an output is of, for people."""
-    tendons = robot.tendon_angles is not None
-    return f"{name.capitalize()} of the platform" if tendons else f"Output `{name}` of {robot.name}"
+    nominal, display = 1.0 if unit == "rad" else None, "" if shown == unit else shown
+    return Port(name=name, unit=unit, description=description, nominal=nominal, missing=missing, display_unit=display)
 
 
 def parameter_ports(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Port, ...]:
-    """Return the parameters: the outputs' starts, whether to use measurements, noise, and the payload if it matters."""
+    """Return the parameters: start values, `use_measurement`, noise, and the payload where the model depends on it."""
     known = payloads(arrays)
     names, largest = robot.outputs.names, 0.5 if to_si(robot.outputs.unit)[1] == "rad" else None
     return (
@@ -277,45 +270,41 @@ def parameter_ports(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Por
 
 
 def payloads(arrays: Mapping[str, np.ndarray]) -> tuple[float, float] | None:
-    """Return least and most payload [kg] of a model's recordings, or of its member's; None where it knows but one."""
+    """Return the smallest and largest payload [kg] of a model's recordings; None for a single payload."""
     found = [array for name, array in arrays.items() if name.rpartition(".")[2] == "payload"]
     return (float(found[0][0]), float(found[0][1])) if found else None
 
 
 def _payload_port(least: float, most: float) -> Port:
-    seen = f"What hangs on the platform; the recordings had {least:g} to {most:g} kg, beyond which validity is 0"
-    return Port(name="payload", unit="kg", description=seen, start=least, minimum=0.0, maximum=MOST_PAYLOAD)
+    text = f"What hangs on the platform; the recordings had {least:g} to {most:g} kg, beyond which validity is 0"
+    return Port(name="payload", unit="kg", description=text, start=least, minimum=0.0, maximum=MOST_PAYLOAD)
 
 
 def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the findings that say over which set-points a model was trained, in SI (rest is among them), and how.
+    """Return the findings with the range of the training's set-points in SI, rest included, and its conditions.
 
     Args:
-        sources: recordings, and findings of models that are part of it.
+        sources: recordings, and findings of models that are members.
     """
-    seen: list[np.ndarray] = []
-    for source in sources:
-        seen.append(source.set_points if isinstance(source, Recording) else np.array(_set_point_range(source, 3)))
-    rows = np.vstack([np.zeros((1, seen[0].shape[1])), *seen])
+    parts = [s.set_points if isinstance(s, Recording) else np.array(_set_point_range(s, 3)) for s in sources]
+    rows = np.vstack([np.zeros((1, parts[0].shape[1])), *parts])
     found = {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}
     made = [conditions(part) if isinstance(part, Recording) else part.get("conditions", {}) for part in sources]
     return {_RANGE_KEY: found, "conditions": merge_conditions([part for part in made if part])}
 
 
 def trained_range(findings: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the least and largest set-points (motors,) that a model was trained on, in SI; None where it has none."""
-    seen = findings.get(_RANGE_KEY)
-    return None if seen is None else (np.array(seen["min"]), np.array(seen["max"]))
+    """Return the smallest and largest training set-points (motors,) in SI; None where the findings have none."""
+    limits = findings.get(_RANGE_KEY)
+    return None if limits is None else (np.array(limits["min"]), np.array(limits["max"]))
 
 
 def input_ports(findings: Mapping[str, Any], robot: Robot) -> tuple[Port, ...]:
-    """Return the inputs; the set-points range over what the model was trained on."""
+    """Return the inputs; the set-points have the range of the training."""
     low, high = _set_point_range(findings, len(robot.motors.names))
-    pulls = (
-        "; positive: the winch pulls"
-        if robot.tendon_angles is not None
-        else f" ({robot.motors.unit} in the robot's files)"
-    )
+    pulls = f" ({robot.motors.unit} in the robot's files)"
+    if robot.tendon_angles is not None:
+        pulls = "; positive: the winch pulls"
     return (
         *(
             replace(_motor_port(robot, name, f"Set-point of motor {j}{pulls}"), minimum=float(a), maximum=float(b))
@@ -329,28 +318,34 @@ def input_ports(findings: Mapping[str, Any], robot: Robot) -> tuple[Port, ...]:
             _motor_port(robot, name, f"Measured position of motor {j}; for use_measurement", missing=True)
             for j, name in enumerate(robot.measured_positions, start=1)
         ),
-    )  # fmt: skip
+    )
 
 
 def _set_point_range(findings: Mapping[str, Any], motors: int) -> tuple[list[float], list[float]]:
-    seen = findings.get(_RANGE_KEY, {"min": [-_DEFAULT_RANGE_RAD] * motors, "max": [_DEFAULT_RANGE_RAD] * motors})
-    return seen["min"], seen["max"]
+    limits = findings.get(_RANGE_KEY, {"min": [-_DEFAULT_RANGE_RAD] * motors, "max": [_DEFAULT_RANGE_RAD] * motors})
+    return limits["min"], limits["max"]
 
 
-#: Kinds with bounds of their outputs, which follow outputs and motors.
+#: Kinds with bounds of their outputs, listed after outputs and motors.
 BOUNDED = ("nlsm",)
 
 
 def output_ports(kind: str, robot: Robot) -> tuple[Port, ...]:
-    """Return the outputs of a kind; set membership has bounds as well, and `validity` is the last."""
+    """Return the outputs of a kind: outputs, motors, the bounds of set membership, and `validity` last."""
     names = robot.outputs.names
+    tendons = robot.tendon_angles is not None
     bounds = tuple(
         _output_port(robot, f"{name}_{side}", f"{side.capitalize()} bound of {name} by set membership (Eq. 19, 20)")
         for name in names
         for side in ("lower", "upper")
-    )  # fmt: skip
+    )
     return (
-        *(_output_port(robot, name, _platform(robot, name)) for name in names),
+        *(
+            _output_port(
+                robot, name, f"{name.capitalize()} of the platform" if tendons else f"Output `{name}` of {robot.name}"
+            )
+            for name in names
+        ),
         *(
             _motor_port(robot, name, f"Position of motor {j} by the drive model")
             for j, name in enumerate(robot.motor_positions, start=1)

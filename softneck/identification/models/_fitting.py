@@ -1,6 +1,8 @@
-"""What every estimator begins and ends with: data fit to train on, dead times to try, a model that knows its rows.
+"""Steps that all estimators share: check and scale the training data, try dead times, build the model.
 
-Rows are known by hash: a model remembers what it was trained on, so that validation can leave it out.
+A model keeps hashes of its training rows, so that validation can leave them out. Set-points, motor positions and
+outputs are scaled and rounded first. Directions and the time constant are learned from these, in samples, so that
+neither units nor pace change a bit of them. Then time is scaled, and the fitted model is converted back to SI.
 """
 
 from __future__ import annotations
@@ -37,12 +39,12 @@ from ._drive import LoadedDrive, fit_loaded_drive
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-# Less than 2 s at 20 ms says nothing about a neck with a time constant of 0.2 s.
+# 2 s at 20 ms, ten time constants of a neck (0.2 s); less does not determine a model.
 MIN_ROWS = 100
 
 
 def check_training(recording: Recording) -> None:
-    """Raise DataError for a record too short, without excitation, or with an output that never moves."""
+    """Raise DataError for a recording too short, without excitation, or with an output that never moves."""
     if len(recording) < MIN_ROWS:
         raise DataError(
             f"{len(recording)} rows are too few to identify from; at least {MIN_ROWS} are needed. Record longer."
@@ -61,16 +63,15 @@ def check_training(recording: Recording) -> None:
             raise DataError(f"`{name}` is constant; is its sensor connected?")
 
 
-# A row is told apart by itself and those before it: at rest, logged rows repeat to the last digit.
-_CONTEXT = 5
+# Each hash covers a row and the 4 before it: at rest, logged rows repeat to the last digit.
+_HASHED_ROWS = 5
 # Files round angles to degrees and back; nine digits of a radian survive that.
-_DIGITS = 9
+_HASHED_DIGITS = 9
 
 
 def row_hashes(recording: Recording) -> np.ndarray:
-    """Return one uint64 per row (time,): of its set-points and outputs and those of the 4 rows before it."""
-    parts = [_run_hashes(run) for run in recording.runs()]
-    return np.concatenate(parts)
+    """Return one uint64 hash per row (time,), of the set-points and outputs of it and the 4 rows before it."""
+    return np.concatenate([_run_hashes(run) for run in recording.runs()])
 
 
 def known_rows(recording: Recording, hashes: np.ndarray) -> np.ndarray:
@@ -79,13 +80,13 @@ def known_rows(recording: Recording, hashes: np.ndarray) -> np.ndarray:
 
 
 def _run_hashes(run: Recording) -> np.ndarray:
-    values = np.round(np.column_stack([run.set_points, run.outputs]), _DIGITS) + 0.0  # no -0.0
+    values = np.round(np.column_stack([run.set_points, run.outputs]), _HASHED_DIGITS) + 0.0  # no -0.0
     bits = np.ascontiguousarray(values, dtype=np.float64).view(np.uint64)
     single = np.zeros(len(run), dtype=np.uint64)
     for column in range(bits.shape[1]):
         single = _mix(single ^ bits[:, column])
     combined = np.zeros_like(single)
-    for back in range(min(_CONTEXT, len(run))):
+    for back in range(min(_HASHED_ROWS, len(run))):
         shifted = np.zeros_like(single)
         shifted[back:] = single[: single.size - back]
         combined = _mix(combined ^ shifted)
@@ -93,7 +94,7 @@ def _run_hashes(run: Recording) -> np.ndarray:
 
 
 def _mix(x: np.ndarray) -> np.ndarray:
-    """Finaliser of splitmix64 (Steele, Lea and Flood 2014); integer overflow is meant."""
+    """Mix bits by the finaliser of splitmix64 (Steele, Lea and Flood 2014); integers overflow on purpose."""
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
@@ -102,11 +103,7 @@ def _mix(x: np.ndarray) -> np.ndarray:
 def delay_samples(
     delay: float | None, max_delay: float, sample_time: float, runs: Sequence[tuple[Matrix, Matrix]]
 ) -> list[int]:
-    """Return the dead times to try, in samples.
-
-    Raises:
-        DataError: a given one is longer than every run.
-    """
+    """Return the dead times to try, in samples; raise DataError for a given one longer than every run."""
     longest = max(len(Y) for Y, _ in runs)
     if delay is None:
         return list(range(max(min(round(max_delay / sample_time), longest - 3), 0) + 1))
@@ -138,7 +135,7 @@ def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d:
         y = Y[:, 0]
         there = np.isfinite(y)
         total = np.zeros(len(U))
-        # The first input carries the start from the first measured output, the others start as if held before.
+        # The first input's filter starts from the first measured output, the others from rest at the first input.
         for j, b in enumerate(B):
             numerator = np.concatenate([np.zeros(1 + d), b])
             y0 = y[np.argmax(there)] if j == 0 and there.any() else 0.0
@@ -152,35 +149,29 @@ def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d:
 SAME_EXCITATION = "chosen on rows of the excitation it was trained on; a hold-out of another one chooses better"
 
 
-def one_recording(recordings: Recording | list[Recording]) -> Recording:
-    """Return all runs as one recording; they are never joined."""
-    return concatenate(recordings if isinstance(recordings, list) else [recordings])
-
-
 def training_recording(recordings: Recording | list[Recording], *, all_motors: bool = False) -> Recording:
-    """Return all runs as one recording to identify from.
+    """Return all runs, which stay separate, as one recording to identify from.
 
     Args:
         recordings: of one robot and sample time.
-        all_motors: whether the kind learns what each motor does, and so cannot cope with motors that move as one.
+        all_motors: whether the kind learns the effect of each motor, and so needs motors that move independently.
 
     Raises:
         DataError: too short, without excitation, or with an output that never moves.
     """
-    recording = one_recording(recordings)
+    recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
     check_training(recording)
     outputs, motions = len(recording.robot.outputs.names), independent_motions(recording)
     if all_motors and motions < min(outputs, len(recording.robot.motors.names)):
         raise DataError(
-            f"the motors move along {motions} direction(s) for {outputs} outputs, and this kind learns what each motor "
-            "does: it would be wrong elsewhere. Record with all motors moving independently (`eq22`, `mixed`), or take "
-            "`oe`."
+            f"the motors move along {motions} direction(s) for {outputs} outputs, too few for a kind that learns "
+            "the effect of each motor. Record with all motors moving independently (`eq22`, `mixed`), or take `oe`."
         )
     return recording
 
 
 def in_display_unit(robot: Robot, values: Vector) -> Vector:
-    """Return what is in the SI unit of the outputs in that in which people see them."""
+    """Convert values of the outputs from SI to their display unit."""
     unit = robot.outputs.display_unit
     return np.degrees(values) if unit == "deg" else values / to_si(unit)[0]
 
@@ -193,7 +184,7 @@ def fitted_model(
     arrays: Mapping[str, Matrix],
     findings: Mapping[str, Any],
 ) -> Model:
-    """Return what `settings` made of `recording`."""
+    """Build the model that `settings` fitted to `recording`, with its training range, row hashes and validity."""
     model = Model(
         kind=kind,
         sample_time=recording.sample_time,
@@ -207,7 +198,7 @@ def fitted_model(
 
 
 def payload_of(run: Recording) -> float:
-    """Return the payload of a run [kg]; none logged is none."""
+    """Return the payload of a run [kg], 0 where none was logged."""
     payload = run.channels.get("payload", np.zeros(1))
     low, high = float(np.nanmin(payload)), float(np.nanmax(payload))
     if low != high:
@@ -222,11 +213,11 @@ Convert = Callable[[Mapping[str, Matrix], Scaling], dict[str, Matrix]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaledData:
-    """A recording in SI, the same in scaled quantities, and the map between them.
+    """A training recording in SI and in scaled quantities.
 
     Attributes:
         recording: in SI.
-        data: scaled; of a robot that rests at zero, without units.
+        data: the same, scaled.
         scaling: between them.
         directions: of `data`.
     """
@@ -241,9 +232,9 @@ class ScaledData:
         """Scale a recording.
 
         Args:
-            recording: to learn from.
-            amplitudes: whether set-points and outputs are scaled too; else time alone, of equations in SI.
-            alike: whether all outputs have one unit, as the motors do.
+            recording: to train on.
+            amplitudes: scale set-points and outputs too; false scales time alone, for equations in SI.
+            alike: scale all outputs by one unit, as the motors are.
 
         Raises:
             DataError: an output follows no motor.
@@ -258,12 +249,12 @@ class ScaledData:
         plain = scale_recording(recording, replace(scaling, second=1.0))
         found = directions_of(plain, [run.set_points for run in plain.runs()], robot)
         scaling = replace(scaling, second=found.time_constant / NECK_SECONDS)
-        return cls(recording, scale_recording(recording, scaling), scaling,
-                   replace(found, seconds=found.seconds / scaling.second))  # fmt: skip
+        directions = replace(found, seconds=found.seconds / scaling.second)
+        return cls(recording, scale_recording(recording, scaling), scaling, directions)
 
     @property
     def has_time_constant(self) -> bool:
-        """Whether the robot gives its time constant, so that the paper's lags and training suit it."""
+        """Whether the robot file gives the time constant, so that the paper's lags and training suit the robot."""
         return self.recording.robot.time_constant_s is not None
 
     @property
@@ -273,47 +264,39 @@ class ScaledData:
 
     @property
     def drive(self) -> LoadedDrive:
-        """The motors' lag, and the limit that tendons share (`load` holds no rest of its own)."""
+        """The motors' lag, and the load limit of tendon robots that rest at zero."""
         tendons = self.recording.robot.tendon_angles is not None and not self.scaling.motor_rest.any()
         return fit_loaded_drive(self.data, limited=tendons)
 
     @property
     def gains(self) -> Vector:
-        """(outputs,) what a scaled gain of each output over a motor is in SI."""
+        """(outputs,) factors from scaled gains over a motor to SI."""
         return self.scaling.output_unit / self.scaling.motor_unit
 
-    def seconds(self, asked: float | None, usual: float | None = None) -> float | None:
-        """Return a setting [s] in scaled seconds, and what is usual where it is not given."""
-        return usual if asked is None else self.scaling.scale_seconds(asked)
+    def seconds(self, setting: float | None, default: float | None = None) -> float | None:
+        """Return a setting [s] in scaled seconds; the default where it is None."""
+        return default if setting is None else self.scaling.scale_seconds(setting)
 
     def findings(self) -> dict[str, object]:
-        """Return directions and time constants in SI where they were learned."""
+        """Return the directions and time constants in SI where they were learned."""
         robot = self.recording.robot
         if robot.weights() is not None and robot.time_constant_s is not None:
             return {}
         return replace(self.directions, seconds=self.scaling.second * self.directions.seconds).findings()
 
     def in_display_unit(self, values: Matrix) -> Matrix:
-        """Return scaled differences (.., outputs) of outputs in the unit in which people see them."""
+        """Convert scaled differences (.., outputs) of outputs to their display unit."""
         return in_display_unit(self.recording.robot, self.scaling.output_unit * values)
 
     def scale(self, recording: Recording) -> Recording:
-        """Return another recording of the robot in the same quantities."""
+        """Scale another recording of the robot by the same units."""
         return scale_recording(recording, self.scaling)
 
     def model(
         self, kind: str, settings: DataclassInstance, in_si: Convert, *, arrays: Mapping[str, Matrix],
         findings: Mapping[str, Any],
     ) -> Model:  # fmt: skip
-        """Return the model in SI of what `settings` made of `data`.
-
-        Args:
-            kind: name in the table of kinds.
-            settings: as asked for.
-            in_si: converts the arrays of the kind.
-            arrays: scaled.
-            findings: in SI.
-        """
+        """Build the model in SI from scaled `arrays`, which `in_si` converts, and `findings` in SI."""
         findings = {**findings, **self.findings()}
         arrays = arrays if self.scaling.is_identity else in_si(arrays, self.scaling)
         return fitted_model(kind, settings, self.recording, arrays=arrays, findings=findings)
