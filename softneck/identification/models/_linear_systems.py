@@ -1,4 +1,4 @@
-"""Linear kinds as python-control systems, and as the paper writes them (Eq. 31)."""
+"""Linear models: their arrays, python-control systems, the form of the paper (Eq. 31), and linearisation."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ UNITS = ("SI", "robot")
 def transfer_function(
     model: Any, output: str, input: str | None, angle_unit: str = "rad", units: str = "SI"
 ) -> control.TransferFunction:
-    """Return the discrete transfer function from `input` to `output`, with its delay in full.
+    """Return the discrete transfer function from `input` to `output`, with its exact dead time.
 
     Raises:
         SettingsError: the kind is not linear, or an unknown input, output or unit.
     """
-    name = _checked(model, output, input)
+    name = _checked_input(model, output, input)
     b, a, delay = _function(model, output, name)
-    # In powers of z: the numerator b_1 z^(n-1-d)... needs n = max(na, nb + d) so that no power is negative.
+    # The numerator b_1 z^(n-1-d)... has no negative power of z for n = max(na, nb + d).
     n = max(a.size, b.size + delay)
     below, above = np.zeros(n + 1), np.zeros(n + 1)
     below[: a.size + 1] = [1.0, *a]
     above[1 + delay : 1 + delay + b.size] = b
-    return _named(model, (above, below, model.sample_time), (name, output), angle_unit, units)
+    return _convert_units(model, (above, below, model.sample_time), (name, output), angle_unit, units)
 
 
-def _named(
+def _convert_units(
     model: Any, G: tuple[Any, ...], names: tuple[str, str], angle_unit: str, units: str
 ) -> control.TransferFunction:
-    """Return a transfer function in other units, with names."""
+    """Convert a transfer function in SI to other units, with names."""
     import control
 
     name, output = names
     require_one_of("angle_unit", angle_unit, ("rad", "deg"))
-    _, per_input, inputs = _shown(model.robot, [name], units)
-    per_output, _, outputs = _shown(model.robot, [output], units)
+    _, per_input, inputs = _unit_factors(model.robot, [name], units)
+    per_output, _, outputs = _unit_factors(model.robot, [output], units)
     if angle_unit == "deg" and units == "SI" and to_si(model.robot.outputs.unit)[1] == "rad":
         per_output = 180.0 / np.pi
     return control.TransferFunction(
@@ -56,10 +56,10 @@ def _named(
     )
 
 
-def _shown(robot: Robot, names: Sequence[str], units: str) -> tuple[float, float, list[str]]:
-    """Return what an output in SI and a gain over an input in SI are multiplied by, and the names of signals.
+def _unit_factors(robot: Robot, names: Sequence[str], units: str) -> tuple[float, float, list[str]]:
+    """Return the factors of outputs in SI and of gains over an input in SI, and the names of signals.
 
-    In the robot's units names say which: `pressure_setpoint [kPa]`; those of SI are the names alone.
+    In the robot's units the names include the unit: `pressure_setpoint [kPa]`.
     """
     require_one_of("units", units, UNITS)
     if units == "SI":
@@ -70,14 +70,14 @@ def _shown(robot: Robot, names: Sequence[str], units: str) -> tuple[float, float
 
 
 def state_space(model: Any, units: str = "SI") -> control.StateSpace:
-    """Return all outputs as one discrete state space, from the motors where the model has them as inputs."""
+    """Return one discrete state space of all outputs, over motors or redefined inputs as the model has them."""
     import control
 
     _require_linear(model.kind)
     robot = model.robot
-    if _over_motors(model):
+    if "A" in model.arrays and ("offset" in model.arrays or "transfer_functions" not in model.findings):
         A, B, C, _ = system_of(model.arrays)
-        A, B, C = _delayed(A, B, C, int(model.arrays["delay"][0]))
+        A, B, C = _add_input_delay(A, B, C, int(model.arrays["delay"][0]))
         inputs = robot.set_points
     else:
         parts = [control.ss(transfer_function(model, output, None)) for output in robot.outputs.names]
@@ -90,44 +90,55 @@ def state_space(model: Any, units: str = "SI") -> control.StateSpace:
 def shown_system(
     model: Any, system: tuple[Matrix, Matrix, Matrix], names: tuple[Sequence[str], Sequence[str]], name: str, units: str
 ) -> control.StateSpace:
-    """Return A, B, C in SI with the names of inputs and outputs, in other units."""
+    """Convert A, B, C in SI to a python-control system in other units, with names."""
     import control
 
     (A, B, C), robot = system, model.robot
-    _, per_input, inputs = _shown(robot, names[0], units)
-    per_output, per_motor, outputs = _shown(robot, names[1], units)
+    _, per_input, inputs = _unit_factors(robot, names[0], units)
+    per_output, per_motor, outputs = _unit_factors(robot, names[1], units)
     positions = np.isin(names[1], robot.motor_positions)  # a linearised model has these too
     C = np.where(positions, 1.0 / per_motor, per_output)[:, None] * C
     D = np.zeros((len(C), B.shape[1]))
     return control.StateSpace(A, per_input * B, C, D, model.sample_time, inputs=inputs, outputs=outputs, name=name)
 
 
-def _over_motors(model: Any) -> bool:
-    """Return whether the inputs of a model are motors, not redefined inputs."""
-    return "A" in model.arrays and ("offset" in model.arrays or "transfer_functions" not in model.findings)
-
-
 def continuous_function(
     model: Any, output: str, input: str | None, angle_unit: str, pade: int, units: str
 ) -> control.TransferFunction:
-    """Return the continuous-time transfer function behind samples held by a zero-order hold.
+    """Return the continuous-time transfer function that a zero-order hold discretizes to the model's.
 
     Raises:
-        SettingsError: a pole at zero or on the negative real axis, which no continuous system has.
+        SettingsError: a pole at zero or on the negative real axis, which no sampled continuous system has.
     """
     import control
+    from scipy.linalg import logm
 
-    name = _checked(model, output, input)
+    name = _checked_input(model, output, input)
     require_whole("pade", pade, 0, 12)
-    b, a, delay = _continuous(model, output, name)
-    G = control.TransferFunction(b, a)
-    if pade > 0 and delay > 0.0:
-        G = G * control.TransferFunction(*control.pade(delay, pade))
-    return _named(model, (np.asarray(G.num[0][0]), G.den), (name, output), angle_unit, units)
+    discrete = transfer_function(model, output, name)
+    below, above = np.asarray(discrete.den[0][0]), np.trim_zeros(np.asarray(discrete.num[0][0]), "f")
+    # Poles at zero are dead time, beyond the one sample that a strictly proper system has itself.
+    at_zero = below.size - np.trim_zeros(below, "b").size
+    delay = min(at_zero, below.size - above.size - 1) if above.size else 0
+    S: Any = control.ss(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
+    poles = np.linalg.eigvals(S.A)
+    if (np.abs(poles) < 1e-9).any() or ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
+        raise SettingsError(
+            f"{output} has no continuous-time form: a pole at zero or on the negative real axis. Lower its order."
+        )
+    n = S.A.shape[0]
+    joint = np.eye(n + 1)
+    joint[:n, :n], joint[:n, n:] = S.A, S.B
+    L = np.real(logm(joint)) / model.sample_time
+    continuous: Any = control.ss2tf(control.StateSpace(L[:n, :n], L[:n, n:], S.C, S.D))
+    G = control.TransferFunction(np.asarray(continuous.num[0][0]), np.asarray(continuous.den[0][0]))
+    if pade > 0 and delay > 0:
+        G = G * control.TransferFunction(*control.pade(delay * model.sample_time, pade))
+    return _convert_units(model, (np.asarray(G.num[0][0]), G.den), (name, output), angle_unit, units)
 
 
 def describe(model: Any) -> list[str]:
-    """Return each axis in the paper's form, `G = exp(-L s) K/(s + p)`, in the robot's units, where it has one pole."""
+    """Describe each axis in the robot's units, in the paper's form `G = exp(-L s) K/(s + p)` where it has one pole."""
     if "A" in model.arrays and "transfer_functions" not in model.findings:
         poles = np.linalg.eigvals(model.arrays["A"])
         delay = model.arrays["delay"][0] * model.sample_time
@@ -154,14 +165,14 @@ def _describe_axis(model: Any, name: str) -> str:
 def continuous_parameters(
     sample_time: float, arrays: Mapping[str, Matrix], axis: int
 ) -> tuple[float, float, float] | None:
-    """Return `one_pole` of an axis of arrays over redefined inputs; None for others."""
+    """Return `one_pole` of an axis of arrays over redefined inputs; None for other arrays."""
     if "a" not in arrays:
         return None
     return one_pole(sample_time, arrays["a"][axis], arrays["b"][axis], int(arrays["delay"][axis]))
 
 
 def one_pole(sample_time: float, a: Vector, b: Vector, delay: int) -> tuple[float, float, float] | None:
-    """Return K [of the output/(of the input s)], pole p [1/s] and dead time L [s]; None for another order."""
+    """Return K [output/(input s)], pole p [1/s] and dead time L [s] of a first-order system; None for another order."""
     if a.size != 1 or b.size != 1 or not 0.0 < -a[0] < 1.0:
         return None
     p = -np.log(-a[0]) / sample_time
@@ -169,11 +180,11 @@ def one_pole(sample_time: float, a: Vector, b: Vector, delay: int) -> tuple[floa
 
 
 def axis_functions(model: Any) -> dict[str, tuple[Vector, Vector, int]]:
-    """Return output -> a, b and dead time [samples] from its own redefined input, in SI; {} of a model over motors."""
-    said, arrays, names = model.findings.get("transfer_functions"), model.arrays, model.robot.outputs.names
-    if said is not None:
-        return {name: (np.array(said[name]["a"]), np.array(said[name]["b"]), int(said[name]["delay"]))
-                for name in names}  # fmt: skip
+    """Return a, b and dead time [samples] of each output from its redefined input, in SI; {} for models over motors."""
+    found, arrays, names = model.findings.get("transfer_functions"), model.arrays, model.robot.outputs.names
+    if found is not None:
+        parts = {name: found[name] for name in names}
+        return {name: (np.array(G["a"]), np.array(G["b"]), int(G["delay"])) for name, G in parts.items()}
     if "a" not in arrays:
         return {}
     return {name: (arrays["a"][i], arrays["b"][i], int(arrays["delay"][i])) for i, name in enumerate(names)}
@@ -183,14 +194,14 @@ def weights_of(model: Any) -> Matrix:
     """Return the weights (outputs, motors) of the motors in each output's direction, given or learned.
 
     Raises:
-        SettingsError: the robot's directions are to be identified, and the model says nothing of them.
+        SettingsError: the robot's directions are to be identified, and the model has not learned them.
     """
     weights = model.robot.weights()
     if weights is None:
         found = model.findings.get("directions")
         if found is None:
             raise SettingsError(
-                f"the model of kind `{model.kind}` says nothing of the directions of robot {model.robot.label()}, "
+                f"the model of kind `{model.kind}` has not learned the directions of robot {model.robot.label()}, "
                 'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
             )
         weights = np.array(found, dtype=np.float64)
@@ -198,20 +209,21 @@ def weights_of(model: Any) -> Matrix:
 
 
 def redefined_input(robot: Robot, output: str) -> str:
-    """Return what the redefined input of an output is called: of a neck theta_i and phi_i."""
+    """Return the name of an output's redefined input, of a neck theta_i and phi_i."""
     return robot.input_names[robot.outputs.names.index(output)]
 
 
 def _function(model: Any, output: str, name: str) -> tuple[Vector, Vector, int]:
-    """Return numerator, denominator without its leading one, and dead time [samples] to an output from any input."""
+    """Return numerator, denominator without its leading one, and dead time [samples] from any input to an output."""
     robot = model.robot
     axis, motor = robot.outputs.names.index(output), name in robot.set_points
     functions = axis_functions(model)
     if functions:
         a, b, delay = functions[output]
-        # A redefined input moves its own output alone (what Eq. 9-11 neglect).
-        weight = weights_of(model)[axis, robot.set_points.index(name)] if motor else float(
-            name == redefined_input(robot, output))  # fmt: skip
+        # By Eq. 9-11 a redefined input moves its own output alone.
+        weight = float(name == redefined_input(robot, output))
+        if motor:
+            weight = weights_of(model)[axis, robot.set_points.index(name)]
         return weight * b, a, delay
     A, B, C, _ = system_of(model.arrays)
     if motor:
@@ -225,37 +237,8 @@ def _function(model: Any, output: str, name: str) -> tuple[Vector, Vector, int]:
     return numerator[1:], denominator[1:], int(model.arrays["delay"][0])
 
 
-def _continuous(model: Any, output: str, name: str) -> tuple[Vector, Vector, float]:
-    """Undo the zero-order hold: return numerator, denominator and dead time [s]."""
-    import control
-    from scipy.linalg import logm
-
-    G = transfer_function(model, output, name)
-    below, above = np.asarray(G.den[0][0]), np.trim_zeros(np.asarray(G.num[0][0]), "f")
-    delay = _dead_time(above, below)
-    S: Any = control.ss(control.TransferFunction(above, below[: below.size - delay], model.sample_time))
-    poles = np.linalg.eigvals(S.A)
-    if (np.abs(poles) < 1e-9).any() or ((np.abs(poles.imag) < 1e-12) & (poles.real <= 0.0)).any():
-        raise SettingsError(
-            f"{output} has no continuous-time form: a pole at zero or on the negative real axis. Lower its order."
-        )
-    n = S.A.shape[0]
-    joint = np.eye(n + 1)
-    joint[:n, :n], joint[:n, n:] = S.A, S.B
-    L = np.real(logm(joint)) / model.sample_time
-    continuous: Any = control.ss2tf(control.StateSpace(L[:n, :n], L[:n, n:], S.C, S.D))
-    return np.asarray(continuous.num[0][0]), np.asarray(continuous.den[0][0]), delay * model.sample_time
-
-
-def _dead_time(numerator: Vector, denominator: Vector) -> int:
-    """Return the samples that poles at zero delay, beyond the one that a strictly proper system has itself."""
-    above = np.trim_zeros(numerator, "f")
-    at_zero = denominator.size - np.trim_zeros(denominator, "b").size
-    return min(at_zero, denominator.size - above.size - 1) if above.size else 0
-
-
-def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matrix, Matrix]:
-    """Return the system with `delay` samples of its inputs as states."""
+def _add_input_delay(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Add `delay` samples of the inputs as states."""
     n, m = B.shape
     size = n + m * delay
     F, G, H = np.zeros((size, size)), np.zeros((size, m)), np.zeros((C.shape[0], size))
@@ -268,8 +251,8 @@ def _delayed(A: Matrix, B: Matrix, C: Matrix, delay: int) -> tuple[Matrix, Matri
     return F, G, H
 
 
-def _checked(model: Any, output: str, input: str | None) -> str:
-    """Return the name of the input."""
+def _checked_input(model: Any, output: str, input: str | None) -> str:
+    """Return the name of the input; raise SettingsError for an unknown input, output or nonlinear kind."""
     _require_linear(model.kind)
     robot = model.robot
     require_one_of("output", output, robot.outputs.names)
@@ -283,18 +266,18 @@ def _require_linear(kind: str) -> None:
         raise SettingsError(f"a model of kind `{kind}` is not linear; use one of kind {', '.join(KINDS)}.")
 
 
-# Some 4 s at a time; what has not come to rest after 200 s never does.
-_SETTLE, _TIMES = 200, 50
-_REST = 1e-12
+# A model must come to rest within 50 simulations of 200 samples: 200 s at 20 ms.
+_REST_ROWS, _REST_TRIALS = 200, 50
+_REST_TOLERANCE = 1e-12
 
 
 class Jacobian(NamedTuple):
-    """What one step makes of small changes: `dx(k+1) = A dx(k) + B du(k)`, `dy(k+1) = C dx(k) + D du(k)`.
+    """Derivatives of one step: `dx(k+1) = A dx(k) + B du(k)`, `dy(k+1) = C dx(k) + D du(k)`.
 
     Attributes:
         A: (n, n), in the order of the state's `values`.
         B: (n, motors), from the motors' set-points.
-        C: (n_out, n), to the outputs that the step returns, in the order of the block's.
+        C: (n_out, n), to the outputs of the step, in the order of the block's.
         D: (n_out, motors).
     """
 
@@ -305,7 +288,7 @@ class Jacobian(NamedTuple):
 
 
 def _motor_count(block: Block) -> int:
-    """Return the number of motors: their set-points stand first among a plant's inputs."""
+    """Return the number of motors, whose set-points are the first inputs of a plant."""
     return sum(is_set_point(port.name) for port in block.inputs)
 
 
@@ -325,23 +308,23 @@ def jacobian(model: Any, state: State, inputs: ArrayLike) -> Jacobian:
     return Jacobian(X[:, :n], X[:, n:], Y[:, :n], Y[:, n:])
 
 
-def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None, units: str) -> control.StateSpace:
-    """Return the linear system that `model` is near a state; see `Model.linearize`."""
+def linearize(model: Any, at: State | Mapping[str, float] | ArrayLike | None, units: str) -> control.StateSpace:
+    """Linearize `model` at a state; see `Model.linearize`."""
     block = model.block()
     motors = _motor_count(block)
-    load_tangent(block.runtime)  # a kind without derivatives need not come to rest first
+    load_tangent(block.runtime)  # refuse a kind without derivatives before the simulation to rest
     if isinstance(at, State):
-        # The motors are told to stay where they are.
+        # The set-points are the present motor positions.
         outputs = len(block.inputs) - 2 * motors
         state, u = at, at.outputs[outputs : outputs + motors]
     else:
         u = _set_points(block, at, model.robot)
-        state = _rest(model, block, u)
+        state = _simulate_to_rest(model, block, u)
     J = jacobian(model, state, u)
-    # The last output, `validity`, is no part of the neck: a linear system has none.
+    # A linear system has no `validity`, the last output.
     J = J._replace(C=J.C[:-1], D=J.D[:-1])
     n, n_out = J.A.shape[0], J.C.shape[0]
-    # A step returns the outputs of the next sample; as states of their own they are those of the state's.
+    # A step returns the outputs of the next sample; as additional states they become those of the present one.
     A = np.block([[J.A, np.zeros((n, n_out))], [J.C, np.zeros((n_out, n_out))]])
     B, C = np.vstack([J.B, J.D]), np.hstack([np.zeros((n_out, n)), np.eye(n_out)])
     A, B, C = remove_unreachable_states(A, B, C)
@@ -350,7 +333,7 @@ def linearised(model: Any, at: State | Mapping[str, float] | ArrayLike | None, u
 
 
 def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None, robot: Robot) -> Vector:
-    """Return the motors' set-points (motors,) that are asked for."""
+    """Return the set-points (motors,) from the argument `at` of `Model.linearize`."""
     motors = _motor_count(block)
     names = [port.name for port in block.inputs[:motors]]
     if at is None:
@@ -364,29 +347,29 @@ def _set_points(block: Block, at: Mapping[str, float] | ArrayLike | None, robot:
     return finite_vector("at", at, motors)
 
 
-def _rest(model: Any, block: Block, u: Vector) -> State:
-    """Return the state in which the model stands under the set-points `u`, run free until it does."""
+def _simulate_to_rest(model: Any, block: Block, u: Vector) -> State:
+    """Simulate the model under the set-points `u` until it is at rest; return that state."""
     state = block.initial_state(use_measurement=0.0)
-    rows = np.full((_SETTLE, len(block.inputs)), np.nan)
+    rows = np.full((_REST_ROWS, len(block.inputs)), np.nan)
     rows[:, : u.size] = u
-    for _ in range(_TIMES):
+    for _ in range(_REST_TRIALS):
         state, outputs = block.run(state, rows)
-        if np.isfinite(outputs).all() and np.ptp(outputs[-_SETTLE // 4 :, :-1], axis=0).max() <= _REST:
+        if np.isfinite(outputs).all() and np.ptp(outputs[-_REST_ROWS // 4 :, :-1], axis=0).max() <= _REST_TOLERANCE:
             return state
     raise SettingsError(
         f"the model of kind {model.kind} does not come to rest under the set-points {u.tolist()} rad within "
-        f"{_SETTLE * _TIMES * block.sample_time:g} s; give `at` a state."
+        f"{_REST_ROWS * _REST_TRIALS * block.sample_time:g} s; give `at` a state."
     )
 
 
 def remove_unreachable_states(A: Matrix, B: Matrix, C: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """Return a system without the states that no input moves, or that no output shows."""
-    kept = _reached(A, B) & _reached(A.T, C.T)
+    """Remove the states that no input reaches or that reach no output."""
+    kept = _reachable_states(A, B) & _reachable_states(A.T, C.T)
     return A[kept][:, kept], B[kept], C[:, kept]
 
 
-def _reached(A: Matrix, B: Matrix) -> np.ndarray:
-    """Return which states (n,) follow from those that `B` (n, m) moves, one sample after the other."""
+def _reachable_states(A: Matrix, B: Matrix) -> np.ndarray:
+    """Return a mask (n,) of the states that inputs reach through `B` (n, m) and any power of `A`."""
     leads, reached = A != 0.0, np.count_nonzero(B, axis=1) > 0
     while True:
         more = reached | (np.count_nonzero(leads[:, reached], axis=1) > 0)
@@ -395,10 +378,10 @@ def _reached(A: Matrix, B: Matrix) -> np.ndarray:
         reached = more
 
 
-# A free run starts after 25 samples; an observer slower than this many starts from what it knows by then.
-_LONGEST_SETTLING = 200
-# What the Kalman gain of a model without a noise model takes for granted, scaled: of a neck inputs that act by 0.3 rad
-# otherwise than asked (slack, hysteresis), and 0.1 deg on the angles (the paper's inclinometer has 0.05 to 0.1).
+# Largest history for the settling of an observer; a slower one starts before it has settled.
+_MAX_SETTLING_SAMPLES = 200
+# Noise for the Kalman gain of a model without a noise model, scaled. Of a neck: 0.3 rad on the inputs (slack,
+# hysteresis) and 0.1 deg on the angles (the paper's inclinometer has 0.05 to 0.1).
 _INPUT_NOISE, _OUTPUT_NOISE = 0.3, 0.0017
 
 
@@ -412,29 +395,33 @@ def lss_arrays(
 ) -> dict[str, Matrix]:
     """Return the runtime's arrays of `x+ = A x + B u(k-delay) + K (y - C x)`, `y = C x`.
 
-    The states are changed so that the first are the outputs and all others say (y, y, ...) where the model
-    stands with outputs y: that is how the runtime starts.
+    The states are transformed so that the first are the outputs y, and all states are (y, y, ...) at rest, which is
+    how the runtime starts.
 
     Args:
         system: A (n, n), B (n, motors), C (outputs, n), K (n, outputs), with n >= outputs.
         delay: dead time of all inputs in samples.
         drive: (motors, 2), see `_narx_runtime`.
         source: 1 where u are motor positions.
-        history: samples held when a run starts; None takes as many as the observer needs to settle.
+        history: samples held when a run starts; by default as many as the observer needs to settle.
     """
     from scipy.linalg import null_space
 
     A, B, C, K = system
     n, outputs = A.shape[0], C.shape[0]
-    start = _standing(A, C)
-    other = null_space(C).T
+    # The states P with C P = I that move least in one sample.
+    P, N = np.linalg.pinv(C), null_space(C)
+    if N.shape[1]:
+        D = A - np.eye(n)
+        P = P - N @ np.linalg.lstsq(D @ N, D @ P)[0]
+    other = N.T
     wanted = np.tile(np.eye(outputs), (n // outputs + 1, 1))[outputs:n]
-    M = np.vstack([C, other + (wanted - other @ start) @ C])
+    M = np.vstack([C, other + (wanted - other @ P) @ C])
     inverse = np.linalg.inv(M)
     if history is None:
         radius = float(np.abs(np.linalg.eigvals(A - K @ C)).max(initial=0.0))
         settles = np.log(1e-3) / np.log(radius) if 0.0 < radius < 1.0 else 1.0
-        history = int(min(np.ceil(settles), _LONGEST_SETTLING))
+        history = int(min(np.ceil(settles), _MAX_SETTLING_SAMPLES))
     length = max(history, delay + 1, -(-n // outputs), int(drive[:, 1].max(initial=0.0)), 1)
     return {
         "history": history_array(length, outputs),
@@ -453,14 +440,14 @@ def system_of(arrays: Mapping[str, Matrix]) -> tuple[Matrix, Matrix, Matrix, Mat
 
 
 def history_array(length: int, outputs: int) -> Vector:
-    """Return the array `history` of a model's file: how long it is, and the number of outputs where that is not two."""
+    """Return the array `history` of a model's file: its length, and the number of outputs where that is not two."""
     return np.array([float(length)] if outputs == 2 else [float(length), float(outputs)])
 
 
 def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return the observer form of `y(k) = -sum A_i y(k-i) + sum B_i u(k-i)`, with A (p, y, y) and B (p, y, u).
 
-    Its observer is dead-beat: after p samples its prediction is that of the difference equation.
+    Its observer is dead-beat: after p samples it predicts as the difference equation does.
     """
     p, y = A.shape[:2]
     n = y * p
@@ -471,17 +458,13 @@ def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     return F + K @ C, B.reshape(n, B.shape[2]), C, K
 
 
-def axes_system(
-    a: list[Vector],
-    b: list[Vector],
-    directions: Matrix,
-) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return transfer functions over redefined inputs as one system over the motors, with a Kalman gain.
+def axes_system(a: list[Vector], b: list[Vector], directions: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+    """Join transfer functions over redefined inputs to one system over the motors, with a Kalman gain.
 
     Args:
         a: denominators without their leading ones, of each output.
         b: numerators, b_1 first.
-        directions: (outputs, motors) the redefined input of each output, of a neck theta_i and phi_i.
+        directions: (outputs, motors) from motors to redefined inputs.
     """
     from scipy.linalg import block_diag
 
@@ -504,20 +487,7 @@ def _observer_form(a: Vector, b: Vector) -> tuple[Matrix, Vector, Vector]:
     F[: a.size, 0] = -a
     G = np.zeros(n)
     G[: b.size] = b
-    # Beside the output's noise 1e-12: enough that the equation has a solution.
+    # 1e-12, far below the output noise, ensures that the equation has a solution.
     noise = _INPUT_NOISE**2 * np.outer(G, G) + 1e-12 * np.eye(n)
     P = np.asarray(solve_discrete_are(F.T, np.eye(n, 1), noise, _OUTPUT_NOISE**2 * np.eye(1)))
     return F, G, F @ P[:, 0] / (P[0, 0] + _OUTPUT_NOISE**2)
-
-
-def _standing(A: Matrix, C: Matrix) -> Matrix:
-    """Return X (n, outputs), the states with C X = I that move least in one sample."""
-    from scipy.linalg import null_space
-
-    n = A.shape[0]
-    P = np.linalg.pinv(C)
-    N = null_space(C)
-    if N.shape[1] == 0:
-        return P
-    D = A - np.eye(n)
-    return P - N @ np.linalg.lstsq(D @ N, D @ P)[0]

@@ -182,7 +182,7 @@ class Model(ReprMixin):
         Raises:
             SettingsError: a kind without derivative, or a model that does not come to rest.
         """
-        return _linear.linearised(self, at, units)
+        return _linear.linearize(self, at, units)
 
     def simulate(self, recording: RecordingLike, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
         """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.

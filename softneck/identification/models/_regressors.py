@@ -1,4 +1,4 @@
-"""Regressor matrices for training: the same lags as the runtime takes, no row across a run's border."""
+"""Regressor matrices for training, with the lags of the runtime; no row crosses the border of a run."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from softneck.signals import Recording
 
 from ._drive import DriveModel
 
-# Between the samples of u and M in Eq. 21: the neck's sample time, a tenth of its time constant.
-_APART = 0.02
+# Lag between the samples of u and M in Eq. 21 [s]: the neck's sample time, a tenth of its time constant.
+_LAG_STEP_S = 0.02
 
 
 def lag_table(
@@ -24,23 +24,20 @@ def lag_table(
     both_outputs: bool = False,
     sizes: tuple[int, int] = (3, 2),
 ) -> Matrix:
-    """Return the regressor of these lags [samples]: of the output, of all set-points and of all motor positions.
+    """Return the regressor table of these lags [samples], with rows (source, channel, lag).
 
     Args:
-        outputs: lags of y; empty for a regressor that nothing is fed back to.
+        outputs: lags of y; empty for a regressor without feedback.
         set_points: lags of u_i.
         motors: lags of M_i.
-        both_outputs: all outputs for each of them, as form `residual` takes them from its base.
+        both_outputs: take all outputs at each lag, as form `residual` does from its base.
         sizes: numbers of motors and outputs.
     """
-    own = (
-        [[3, c, lag] for lag in outputs for c in range(sizes[1])] if both_outputs else [[0, 0, lag] for lag in outputs]
-    )
-    rows = (
-        own
-        + [[1, c, lag] for c in range(sizes[0]) for lag in set_points]
-        + [[2, c, lag] for lag in motors for c in range(sizes[0])]
-    )
+    rows = [[0, 0, lag] for lag in outputs]
+    if both_outputs:
+        rows = [[3, c, lag] for lag in outputs for c in range(sizes[1])]
+    rows += [[1, c, lag] for c in range(sizes[0]) for lag in set_points]
+    rows += [[2, c, lag] for lag in motors for c in range(sizes[0])]
     return np.array(rows, dtype=np.float64)
 
 
@@ -50,21 +47,21 @@ PAPER_EQ21 = lag_table((1,), (2, 3), (3,))
 
 
 def eq21_table(recording: Recording) -> Matrix:
-    """Return the regressor of Eq. 21 for a scaled recording: y(k-1), u and M so far apart as a neck's at 20 ms."""
+    """Return the regressor of Eq. 21 for a scaled recording, with the lags in time of a neck at 20 ms."""
     sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
-    apart = max(round(_APART / recording.sample_time), 1)
+    apart = max(round(_LAG_STEP_S / recording.sample_time), 1)
     return lag_table((1,), (1 + apart, 1 + 2 * apart), (1 + 2 * apart,), sizes=sizes)
 
 
 def spread_table(recording: Recording) -> Matrix:
     """Return a regressor for a scaled recording of unknown dead time: three samples of y and of all u."""
     sizes = len(recording.robot.motors.names), len(recording.robot.outputs.names)
-    lags = [1 + i * max(round(2.0 * _APART / recording.sample_time), 1) for i in range(3)]
+    lags = [1 + i * max(round(2.0 * _LAG_STEP_S / recording.sample_time), 1) for i in range(3)]
     return lag_table(lags, lags, [], sizes=sizes)
 
 
 def regressor_scale(table: Matrix, scaling: Scaling, base_rest: Vector | float = 0.0) -> tuple[Matrix, Matrix]:
-    """Return what each regressor of each output (outputs, n) is at rest in SI, and its unit.
+    """Return rest value in SI and unit of each regressor of each output, both (outputs, n).
 
     Args:
         table: rows (source, channel, lag).
@@ -81,25 +78,20 @@ def regressor_scale(table: Matrix, scaling: Scaling, base_rest: Vector | float =
 
 
 def history_length(table: Matrix, drive: DriveModel) -> int:
-    """Return how many samples the runtime must remember for this table and drive."""
+    """Return the number of samples that the runtime must store for this table and drive."""
     return int(max(table[:, 2].max(), drive.delay.max(), 1))
 
 
 def motor_signals(recording: Recording, drive: DriveModel, *, again: bool = False) -> Recording:
-    """Return the recording with motor positions: the logged ones, else (or `again`) those of the drive model."""
+    """Add motor positions of the drive model to a recording without logged ones, or with `again` to any."""
     if recording.has_motor_positions and not again:
         return recording
-    runs = [drive.simulate(run.set_points, run.set_points[0]) for run in recording.runs()]
-    positions = np.concatenate(runs)
+    positions = np.concatenate([drive.simulate(run.set_points, run.set_points[0]) for run in recording.runs()])
     return recording.with_channels(**dict(zip(recording.robot.motor_positions, positions.T, strict=True)))
 
 
 def regression(recording: Recording, table: Matrix, axis: int) -> tuple[Matrix, Vector]:
-    """Return regressors (rows, n) and targets y(k) (rows,) of one axis; rows with a missed sample are left out.
-
-    Raises:
-        DataError: nothing is left.
-    """
+    """Return regressors (rows, n) and targets y(k) (rows,) of one axis, without rows with a missed sample."""
     if table.shape[1] != 3 or table[:, 2].min() < 1:
         raise SettingsError("each row of a regressor table is (source, channel, lag) with lag >= 1.")
     X, y = zip(*[_run_regression(run, table, axis) for run in recording.runs()], strict=True)
@@ -114,6 +106,10 @@ def _run_regression(run: Recording, table: Matrix, axis: int) -> tuple[Matrix, V
     lag = int(table[:, 2].max())
     if len(run) <= lag:
         return np.zeros((0, table.shape[0])), np.zeros(0)
-    sources = (run.outputs[:, [axis]], run.set_points, run.motor_positions)
-    columns = [sources[int(s)][lag - int(back) : len(run) - int(back), int(c)] for s, c, back in table]
-    return np.column_stack(columns), run.outputs[lag:, axis]
+    return lagged_columns(run, run.motor_positions, axis, table), run.outputs[lag:, axis]
+
+
+def lagged_columns(run: Recording, motors: Matrix, axis: int, table: Matrix) -> Matrix:
+    """Return the regressors (rows, n) of one run and axis along positions `motors` (time, motors)."""
+    lag, sources = int(table[:, 2].max()), (run.outputs[:, [axis]], run.set_points, motors)
+    return np.column_stack([sources[int(s)][lag - int(back) : len(run) - int(back), int(c)] for s, c, back in table])

@@ -8,32 +8,32 @@ from softneck.core import Vector
 
 
 def nrmse_fit(measured: Vector, predicted: Vector) -> float:
-    """Return the paper's fit, `100 (1 - |y - yhat| / |y - mean y|)` [%], over the samples that were measured.
+    """Return the paper's fit, `100 (1 - |y - yhat| / |y - mean y|)` [%], over the measured samples.
 
-    100 is perfect, 0 is as good as the mean; NaN where nothing was measured or nothing moved.
+    100 is perfect, 0 is as good as the mean. It is NaN where y was not measured or is constant.
     """
-    y, yhat = _paired(measured, predicted)
-    spread = float(np.linalg.norm(y - y.mean())) if _moves(y) else 0.0
+    y, yhat = _measured_pairs(measured, predicted)
+    spread = float(np.linalg.norm(y - y.mean())) if _varies(y) else 0.0
     return 100.0 * (1.0 - float(np.linalg.norm(y - yhat)) / spread) if spread > 0 else float("nan")
 
 
 def r_squared(measured: Vector, predicted: Vector) -> float:
-    """Return `R2 = 1 - SSE/SST = 1 - (1 - fit/100)^2`; NaN where nothing was measured or nothing moved."""
-    y, yhat = _paired(measured, predicted)
-    total = float(np.sum((y - y.mean()) ** 2)) if _moves(y) else 0.0
+    """Return `R2 = 1 - SSE/SST = 1 - (1 - fit/100)^2`; NaN where y was not measured or is constant."""
+    y, yhat = _measured_pairs(measured, predicted)
+    total = float(np.sum((y - y.mean()) ** 2)) if _varies(y) else 0.0
     return 1.0 - float(np.sum((y - yhat) ** 2)) / total if total > 0 else float("nan")
 
 
 def rmse(measured: Vector, predicted: Vector) -> float:
-    """Return the root mean square error in the unit of the arguments, over the samples that were measured."""
-    y, yhat = _paired(measured, predicted)
+    """Return the root mean square error over the measured samples, in the unit of the arguments."""
+    y, yhat = _measured_pairs(measured, predicted)
     return float(np.sqrt(np.mean((y - yhat) ** 2))) if y.size else float("nan")
 
 
 def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
-    """Return the largest absolute error, in the unit of the arguments, and its row; (NaN, -1) if nothing was measured.
+    """Return the largest absolute error and its row; (NaN, -1) without any measurement.
 
-    A prediction that is not a number is worse than any.
+    A prediction that is NaN counts as an infinite error.
     """
     size = np.abs(measured - predicted)
     size[np.isfinite(measured) & np.isnan(predicted)] = np.inf
@@ -43,11 +43,11 @@ def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
     return float(size[row]), row
 
 
-def _moves(y: Vector) -> bool:
-    # The mean of equal numbers is off by rounding: to divide by that distance made fits of -1e16 %.
+def _varies(y: Vector) -> bool:
+    # The mean of equal numbers has a rounding error; dividing by that gave fits of -1e16 %.
     return y.size > 0 and float(np.ptp(y)) > 1e-12 * float(np.abs(y).max())
 
 
-def _paired(measured: Vector, predicted: Vector) -> tuple[Vector, Vector]:
+def _measured_pairs(measured: Vector, predicted: Vector) -> tuple[Vector, Vector]:
     there = np.isfinite(measured)
     return measured[there], predicted[there]
