@@ -27,7 +27,7 @@ from softneck.identification import (
     validate,
 )
 from softneck.plant import NeckParameters, VirtualNeck, record
-from softneck.report._packaging import record_experiments
+from softneck.report._demo_steps import record_experiments
 from softneck.signals import Recording, signal
 
 

@@ -20,7 +20,7 @@ from softneck.core import Matrix, SettingsError, Vector, silent
 from softneck.identification import INFINITE, Model, Rls, validate
 from softneck.identification.models._linear_systems import continuous_parameters
 from softneck.plant import NeckParameters
-from softneck.report._packaging import Experiments, record_experiments
+from softneck.report._demo_steps import Experiments, record_experiments
 from softneck.signals import redefine
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.oracles.one_pole import (

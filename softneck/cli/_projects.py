@@ -162,7 +162,7 @@ def _print(demo: Demo) -> None:
 
     print_table("Models, ours beside the paper's (fit in %, pitch/roll)", FIT_HEAD, fit_rows(demo.judged, demo.rough))
     click.echo(FIT_NOTE + "\n")
-    print_table("FMUs in fmpy against the Python models, free run", *fmu_rows(demo.packaged))
+    print_table("FMUs in fmpy against the Python models, in simulation", *fmu_rows(demo.packaged))
     print_table("Closed loops over FMUs against the virtual neck", *loop_rows(demo.loops))
     click.echo(f"{demo.seconds:.0f} s; everything is in {demo.settings.out}, start with report.html")
 
@@ -189,7 +189,7 @@ def paper(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) 
         PAPER_HEAD,
         PAPER_NOTE,
         ReproduceSettings,
-        grouped,
+        group_entries,
         linear_facts,
         linear_rows,
         paper_entries,
@@ -216,7 +216,7 @@ def paper(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) 
             }
         )
         return
-    for title, part in grouped(rows).items():
+    for title, part in group_entries(rows).items():
         print_table(title, PAPER_HEAD, [row.row() for row in part])
     print_table("Eq. 31, in deg", LINEAR_HEAD, linear_rows(found))
     click.echo(PAPER_NOTE)

@@ -67,7 +67,7 @@ def command(
     all, with the active requirement.
     """
     from softneck.core import SettingsError
-    from softneck.report import said_of, write_tuned
+    from softneck.report import tune_verdict, write_tuned
     from softneck.tuning import task_of, tune
     from softneck.verification import is_own_plant, named_plants
 
@@ -93,13 +93,13 @@ def command(
     else:
         _print(found, output)
     if found.loosened:
-        note(f"{output}: {said_of(found)}")
+        note(f"{output}: {tune_verdict(found)}")
     if not found.holds:
         raise CheckFailedError(_why(found, output))
 
 
 def _print(found: Tuned, folder: Path) -> None:
-    from softneck.report import notes, requirement_rows
+    from softneck.report import requirement_rows, tune_notes
 
     best = found.best
     settings = ", ".join(
@@ -107,7 +107,7 @@ def _print(found: Tuned, folder: Path) -> None:
     )
     print_table(f"{folder / 'best.npz'}: {best.kind} ({settings})", ["metric", "bound", "limit", "value", ""],
                 [row[:5] for row in requirement_rows(found)])  # fmt: skip
-    for line in notes(found):
+    for line in tune_notes(found):
         click.echo(line)
     for kind, why in found.dropped.items():
         click.echo(f"left out: {kind}: {why}")
@@ -117,7 +117,7 @@ def _print(found: Tuned, folder: Path) -> None:
 
 
 def _why(found: Tuned, folder: Path) -> str:
-    from softneck.report import stands_in_the_way
+    from softneck.report import failing_requirement
     from softneck.verification import ALONE
 
     failed = found.verification.failed
@@ -125,7 +125,7 @@ def _why(found: Tuned, folder: Path) -> str:
     blind = ALONE in binds or (found.binding is None and any(item.value is None for item in failed))
     unheard = any(note.startswith("not supported by the data") for note in binds)
     way = way_on(found.binding, unheard=unheard, blind=blind)
-    return f"{folder}: the best so far does not keep all requirements. {stands_in_the_way(found)} {way}."
+    return f"{folder}: the best so far does not keep all requirements. {failing_requirement(found)} {way}."
 
 
 def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:

@@ -28,7 +28,7 @@ _PIXELS_PER_INCH = 96
 _LEFT_MARGIN_PX = 72
 # Longer curves are one pixel wide: browsers draw those 5 to 10 times faster.
 _MAX_WIDE_SAMPLES = 2_000
-_FONT = "system-ui, sans-serif"
+_FONT_NAME = "system-ui, sans-serif"
 # Names under an axis: slant [rad] and additional height [pixels].
 _TICK_SLANT, _TICK_NAMES_PX = 0.5, 60
 _DASHES = {"dashed": [6, 4], "dotted": [2, 3]}
@@ -125,8 +125,10 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
     plot.x_range.update(range_padding=0.01)
     plot.grid.grid_line_alpha = 0.4
     for axis in plot.axis:
-        axis.update(axis_label_text_font=_FONT, axis_label_text_font_style="normal", axis_label_text_font_size="12px")
-        axis.update(major_label_text_font=_FONT, major_label_text_font_size="11px", minor_tick_line_color=None)
+        axis.update(
+            axis_label_text_font=_FONT_NAME, axis_label_text_font_style="normal", axis_label_text_font_size="12px"
+        )
+        axis.update(major_label_text_font=_FONT_NAME, major_label_text_font_size="11px", minor_tick_line_color=None)
     if chart.linked and not x_label:
         # The panel below has the same axis. On a logarithmic axis Bokeh fails at size 0 (NaN box).
         plot.xaxis.major_label_text_font_size = "1px" if panel.log_x else "0px"
@@ -137,7 +139,7 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
         plot.xaxis.major_label_orientation = _TICK_SLANT
         plot.height = (plot.height or 0) + _TICK_NAMES_PX
     if panel.title:
-        plot.title = Title(text=panel.title, text_font=_FONT, text_font_size="12px")
+        plot.title = Title(text=panel.title, text_font=_FONT_NAME, text_font_size="12px")
     return plot
 
 
@@ -195,7 +197,7 @@ def _style_legend(legend: Legend) -> Legend:
     legend.update(
         orientation="horizontal", click_policy="hide", border_line_color=None, padding=2, margin=2, spacing=14
     )
-    legend.update(label_text_font=_FONT, label_text_font_size="12px", label_height=16, glyph_height=14, ncols=6)
+    legend.update(label_text_font=_FONT_NAME, label_text_font_size="12px", label_height=16, glyph_height=14, ncols=6)
     return legend
 
 

@@ -36,14 +36,9 @@ class Table(ReprMixin):
 
 
 def cell(value: Any, spec: str = ".4g") -> str:
-    """Return a value as a table cell: a float by `spec` (`%`: a fit), `-` for None and NaN.
-
-    Values of a mapping are separated by `/`, the ends of an interval by `..`.
-    """
+    """Return a value as a table cell: a float by `spec` (`%`: a fit), `-` for None and NaN, `/` between outputs."""
     if isinstance(value, Mapping):
         return "/".join(cell(item, spec) for item in value.values())
-    if isinstance(value, list | tuple):
-        return "..".join(cell(end, spec) for end in value)
     if value is None or value != value:
         return "-"
     if not isinstance(value, float):

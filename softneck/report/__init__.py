@@ -1,6 +1,6 @@
 """Pages on whole jobs: the demo, the paper, a project, a study, a validation.
 
-Computes what it shows through the subpackages below; no method lives here.
+It computes nothing but what it shows, through the subpackages below.
 May import everything but `cli`.
 """
 

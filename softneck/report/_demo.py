@@ -1,4 +1,4 @@
-"""The main job, end to end: from a recording to a verified closed loop over FMUs."""
+"""The demo: from a recording over models, FMUs and a controller to a verified closed loop over FMUs."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from softneck.plots import (
     Chart,
     Section,
     Table,
+    cell,
     loop_chart,
     neck_view,
     page,
@@ -28,7 +29,7 @@ from softneck.plots import (
 )
 from softneck.signals import write_recording
 
-from ._packaging import (
+from ._demo_steps import (
     TOLERANCE,
     DemoDesign,
     Experiments,
@@ -40,9 +41,9 @@ from ._packaging import (
     identify,
     judge,
     limits_of,
-    on_rough,
     package,
     record_experiments,
+    validate_on_rough,
 )
 from ._reproduce import FREE_RUN, FREE_RUN_MEASURED, ONE_STEP
 
@@ -51,14 +52,14 @@ FULL_DURATION = 200.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoSettings:
-    """How `softneck demo` is run: length of the experiment, training, folder.
+    """Settings of `softneck demo`.
 
     Attributes:
         out: folder for recordings, models, FMUs, loops, results and the report.
-        duration: length of the Eq. 22 experiment [s]; the paper's is 200.
+        duration: of the Eq. 22 experiment [s]; the paper's is 200.
         iterations: of the network's training, for each axis.
-        seed: of the network's start.
-        compare_rows: samples of each FMU's free run.
+        seed: of the network's initial weights.
+        compare_rows: samples in the comparison of each FMU.
     """
 
     out: Path
@@ -73,13 +74,13 @@ class DemoSettings:
 
     @classmethod
     def quick(cls, out: Path) -> DemoSettings:
-        """Return the short form: 80 s of experiment and less training."""
+        """Return the quick settings: 80 s of experiment and less training."""
         return cls(out=out, duration=80.0, iterations=10, compare_rows=300)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Demo:
-    """All that the demo found; `rough` has the free runs of what was trained anew on the preset `rough`."""
+    """Results of the demo; `rough` holds simulations of models identified anew on the preset `rough`."""
 
     settings: DemoSettings
     experiments: Experiments
@@ -93,11 +94,11 @@ class Demo:
 
     @property
     def holds(self) -> bool:
-        """Whether every FMU equals its model and every limit of every loop holds."""
+        """Whether every FMU equals its model and every loop keeps its limits."""
         return all(item.equal for item in self.packaged.values()) and all(r.holds for r in self.loops.values())
 
     def as_dict(self) -> dict:
-        """Return the demo's JSON."""
+        """Return the JSON values."""
         return demo_json(self.judged, self.rough, self.packaged, self.loops) | {
             "holds": self.holds,
             "experiment_s": self.settings.duration,
@@ -127,7 +128,7 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     for name, model in models.items():
         model.save(out / "models" / f"{name}.npz", force=True)
     judged = judge(models, experiments, tell=tell)
-    rough = on_rough(duration=settings.duration, tell=tell)
+    rough = validate_on_rough(duration=settings.duration, tell=tell)
     plants = {**models, "virtual_neck": VirtualNeck(neck)}
     compared = experiments.tests["rotation"].rows(0, settings.compare_rows)
     scores = {name: score_line(judged, name) for name in models}
@@ -141,7 +142,7 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
         write_recording(out / "results" / f"{name}.csv", recording, force=True)
         write_page(
             out / "results" / f"{name}_3d.html",
-            neck_view(recording, title=f"The neck in the loop {words(name)}"),
+            neck_view(recording, title=f"The neck in the loop {to_words(name)}"),
             force=True,
         )
     demo = Demo(
@@ -174,17 +175,17 @@ def _write_results(demo: Demo, tell: Tell) -> None:
 Head = list[str]
 Rows = list[list[str]]
 FIT_HEAD = [
-    "model on data", "persistence", "one step", "paper, one step", "free run", "paper, free run",
-    "free, measured motors", "paper, same", "free run on rough",
+    "model on data", "persistence", "one step", "paper, one step", "simulation", "paper, simulation",
+    "simulation, measured motors", "paper, same", "simulation on rough",
 ]  # fmt: skip
 FIT_NOTE = (
-    "Fit 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample: a one-step fit "
-    "that is not above it says nothing. The free run has the set-points alone; that is what an FMU of the plant does. "
-    "The paper's SM and NN figures of Tables 3 and 4 are one step ahead, its RLS figures free runs; its section 7.4 is "
-    "free run with measured motors. The paper's plant is the real neck, ours the virtual one. nlsm is set membership "
-    "over the paper's Eq. 21; nlsm_residual, which the paper does not have, is set membership on what the free run of "
-    "rls leaves over: nothing is fed back, so it cannot drift. The last column is of the same kind, identified anew on "
-    "the preset rough, which a line follows no better than the paper's neck."
+    "Fit 100 (1 - |y - yhat| / |y - mean y|) in %, pitch/roll. Persistence repeats the last sample; a one-step fit is "
+    "useful only above it. A simulation (free run) has only the set-points as input, as an FMU of the plant does. The "
+    "paper's SM and NN figures of Tables 3 and 4 are one step ahead, its RLS figures simulations; its section 7.4 is "
+    "simulation with measured motors. The paper's plant is the real neck, ours the virtual one. nlsm is set membership "
+    "over the paper's Eq. 21. nlsm_residual, which the paper does not have, is set membership on the residual of the "
+    "simulation of rls; it has no feedback, so it cannot drift. The last column is identified anew on the preset "
+    "rough, which a linear model follows no better than the paper's neck."
 )
 
 
@@ -196,21 +197,25 @@ def fit_rows(judged: Mapping[tuple[str, str], ValidationPair], rough: Mapping[tu
         rows.append(
             [
                 f"{model} on {data}",
-                _pair(result.free.persistence["1"]),
-                _pair(result.free.fits["1"]),
-                _published(ONE_STEP.get(key)),
-                _pair(result.free.fits[INFINITE]),
-                _published(FREE_RUN.get(key)),
-                _pair(result.measured.fits[INFINITE]),
-                _published(FREE_RUN_MEASURED.get(key)),
-                _pair(rough[key].fits[INFINITE]) if key in rough else "",
+                cell(result.free.persistence["1"], ".1f"),
+                cell(result.free.fits["1"], ".1f"),
+                _paper_cell(ONE_STEP.get(key)),
+                cell(result.free.fits[INFINITE], ".1f"),
+                _paper_cell(FREE_RUN.get(key)),
+                cell(result.measured.fits[INFINITE], ".1f"),
+                _paper_cell(FREE_RUN_MEASURED.get(key)),
+                cell(rough[key].fits[INFINITE], ".1f") if key in rough else "",
             ]
         )
     return rows
 
 
+def _paper_cell(pair: tuple[float, float] | None) -> str:
+    return "" if pair is None else cell(dict(enumerate(pair)), ".1f")
+
+
 def fmu_rows(packaged: Mapping[str, PackagedFmu]) -> tuple[Head, Rows]:
-    """Return one row for each FMU: how far its free run is from the Python model's."""
+    """Return one row for each FMU with its difference from the Python model in simulation."""
     rows = [
         [name, item.path.name, str(item.rows), f"{item.difference:.1e}", "holds" if item.equal else "fails"]
         for name, item in packaged.items()
@@ -223,7 +228,7 @@ def loop_rows(loops: Mapping[str, Result]) -> tuple[Head, Rows]:
     rows = [
         [
             f"{name}: {row['metric']}",
-            "-" if row["value"] is None else f"{row['value']:.3f}",
+            cell(row["value"], ".3f"),
             f"{row['limit']:g}",
             "holds" if row["holds"] else "fails",
         ]
@@ -238,7 +243,7 @@ def demo_json(
     packaged: Mapping[str, PackagedFmu],
     loops: Mapping[str, Result],
 ) -> dict[str, Any]:
-    """Return the same as JSON values."""
+    """Return the results as JSON values."""
     return {
         "models": [
             result.free.as_dict() | {"free_run_measured_motors": result.measured.fits[INFINITE]}
@@ -254,23 +259,15 @@ def demo_json(
 
 
 def score_line(judged: Mapping[tuple[str, str], ValidationPair], model: str) -> str:
-    """Return a model's free-run fits as text for its FMU."""
-    lines = ["free-run fit from set-points alone [%], pitch/roll"]
-    lines += [f"{data}: {_pair(r.free.fits[INFINITE])}" for (name, data), r in judged.items() if name == model]
+    """Return a model's simulation fits as text for its FMU."""
+    lines = ["simulation (free run) fit from set-points alone [%], pitch/roll"]
+    lines += [f"{data}: {cell(r.free.fits[INFINITE], '.1f')}" for (name, data), r in judged.items() if name == model]
     return "\n".join(lines)
 
 
-def _pair(values: Mapping[str, float | None]) -> str:
-    return "/".join("-" if value is None else f"{value:.1f}" for value in values.values())
-
-
-def _published(pair: tuple[float, float] | None) -> str:
-    return "" if pair is None else f"{pair[0]:.1f}/{pair[1]:.1f}"
-
-
-_PARTS = "Plant, observer and controller are FMUs in fmpy; the plant is the virtual neck with its inclinometer."
-# Of the tests, the one whose free runs stand beside the table: no model was trained on anything like it.
-_SHOWN = "rotation"
+_LOOP_NOTE = "Plant, observer and controller are FMUs in fmpy; the plant is the virtual neck with its inclinometer."
+# The test whose simulations are beside the table: no model was trained on a similar signal.
+_FIRST_TEST = "rotation"
 _TITLES = {
     "identification": "Identification: Eq. 22 with Table 2, the part that models are trained on",
     "validation": "Validation: the rest of Eq. 22",
@@ -285,8 +282,8 @@ def _sections(demo: Demo) -> list[Section]:
     return [
         _overview(demo, first),
         _fits(demo),
-        *(_validation_section(data, demo) for data in demo.experiments.judged if data != _SHOWN),
-        *(Section(f"Closed loop: {words(name)}", charts=[_loop(name, demo.loops[name])]) for name in others),
+        *(_validation_section(data, demo) for data in demo.experiments.judged if data != _FIRST_TEST),
+        *(Section(f"Closed loop: {to_words(name)}", charts=[_loop(name, demo.loops[name])]) for name in others),
         _design_section(demo.designed),
         _model_section(demo.models),
         _experiment_section(demo.experiments),
@@ -294,7 +291,7 @@ def _sections(demo: Demo) -> list[Section]:
 
 
 def verdict(packaged: Mapping[str, PackagedFmu], loops: Mapping[str, Result]) -> tuple[str, bool]:
-    """Return one sentence on all that had to hold, and whether it does."""
+    """Return a sentence on the limits and FMUs, and whether all of them hold."""
     rows = limits_of(loops)
     held, equal = sum(bool(row["holds"]) for _, row in rows), sum(item.equal for item in packaged.values())
     holds = held == len(rows) and equal == len(packaged)
@@ -308,16 +305,16 @@ def verdict(packaged: Mapping[str, PackagedFmu], loops: Mapping[str, Result]) ->
 def _overview(demo: Demo, first: str) -> Section:
     tables = [
         Table("Limits of the closed loops", *loop_rows(demo.loops)),
-        Table("FMUs in fmpy against the Python models, free run", *fmu_rows(demo.packaged)),
+        Table("FMUs in fmpy against the Python models, in simulation", *fmu_rows(demo.packaged)),
     ]
-    return Section("Closed loop", charts=[_loop(first, demo.loops[first])], tables=tables, method=[_PARTS])
+    return Section("Closed loop", charts=[_loop(first, demo.loops[first])], tables=tables, method=[_LOOP_NOTE])
 
 
 def _fits(demo: Demo) -> Section:
     quick = "This is the quick form: the experiment is shorter than the paper's and the training less."
     method = [*([quick] if demo.settings.duration < FULL_DURATION else []), FIT_NOTE]
     table = Table("Models, ours beside the paper's", FIT_HEAD, fit_rows(demo.judged, demo.rough))
-    return Section("Models", charts=_validation_section(_SHOWN, demo).charts[:1], method=method, tables=[table])
+    return Section("Models", charts=_validation_section(_FIRST_TEST, demo).charts[:1], method=method, tables=[table])
 
 
 def _experiment_section(experiments: Experiments) -> Section:
@@ -329,9 +326,7 @@ def _experiment_section(experiments: Experiments) -> Section:
 
 def _model_section(models: Mapping[str, Model]) -> Section:
     rows = [[name, line] for name, model in models.items() for line in model.summary().splitlines()[1:]]
-    return Section(
-        "What was identified", tables=[Table("Models and their findings", ["model", "finding"], rows, text=2)]
-    )
+    return Section("Identified models", tables=[Table("Models and their findings", ["model", "finding"], rows, text=2)])
 
 
 def _validation_section(data: str, demo: Demo) -> Section:
@@ -341,7 +336,7 @@ def _validation_section(data: str, demo: Demo) -> Section:
             for name, r in results.items()}  # fmt: skip
     one = {name: r.one_step for name, r in results.items()}
     charts = [
-        validation_chart(first.time, first.measured, free, f"Free run on {data}, from set-points alone"),
+        validation_chart(first.time, first.measured, free, f"Simulation on {data}, from set-points alone"),
         validation_chart(first.time, first.measured, one, f"One step ahead on {data}"),
     ]
     return Section(f"Models on {data}", charts=charts)
@@ -350,17 +345,17 @@ def _validation_section(data: str, demo: Demo) -> Section:
 def _design_section(designed: DemoDesign) -> Section:
     rows = [["controller", line] for line in designed.controller.summary().splitlines()]
     rows += [["observer", line] for line in designed.observer.summary().splitlines()]
-    words = ["Both were designed on the identified linear model and run below against the virtual neck, another plant."]
+    to_words = ["Both were designed on the identified linear model and simulated below with the virtual neck."]
     return Section(
-        "Design", text=words, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows, text=2)]
+        "Design", text=to_words, tables=[Table("Controller and Kalman filter", ["part", "finding"], rows, text=2)]
     )
 
 
 def _loop(name: str, result: Result) -> Chart:
-    title = f"{words(name).capitalize()} of the virtual neck"
+    title = f"{to_words(name).capitalize()} of the virtual neck"
     return loop_chart(result.signals.time, result.signals.signals, title, limits=result.bounds)
 
 
-def words(name: str) -> str:
-    """Return the name of a loop's file as words."""
+def to_words(name: str) -> str:
+    """Return a loop's file name as words."""
     return name.replace("_", " ")

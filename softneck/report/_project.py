@@ -1,11 +1,12 @@
-"""What a project folder holds: every file that softneck knows, sorted; what cannot be read is said."""
+"""The report of a project folder: all files that softneck can read, and one page on them that opens offline."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +19,34 @@ from softneck.core import (
     Progress,
     SettingsError,
     SoftneckError,
+    file_hash,
     load,
     open_zip,
     read_archive,
+    required_rows,
     settings_text,
     silent,
 )
 from softneck.cosim import Result, is_loop_file, load_loop, python_of, read_description, read_runs, read_toml, simulate
-from softneck.identification import bandwidth_of
+from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged_parts
+from softneck.plots import Chart, Section, Table, cell, loop_chart, page, recording_chart, validation_chart
 from softneck.robot import FILE
 from softneck.signals import Recording, assess_quality, doubts_in, import_log, read_layout, read_recording
 
-# Folders that are no part of a project, beside those whose name begins with a dot.
-_SKIPPED = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")
-# As an import names the layouts that it proposes.
-_LAYOUT = ".layout.toml"
-# Larger logs are no recordings to draw in a page that goes by mail.
-_LARGEST = 200_000_000
+from ._study_page import study_sections
+from ._validation_page import drawable
+
+# Folders that do not belong to a project, like those whose name begins with a dot.
+_SKIPPED_FOLDERS = ("__pycache__", "node_modules", "site-packages", "worst", "runs.parts")
+# Ending of the layouts that an import proposes.
+_LAYOUT_ENDING = ".layout.toml"
+# [bytes] Larger logs are not drawn, so that the page remains small enough for mail.
+_MAX_LOG_BYTES = 200_000_000
 
 
 @dataclass(slots=True, eq=False)
 class Project:
-    """The things of a project, by their path relative to its folder.
+    """Contents of a project, by path relative to its folder.
 
     Attributes:
         folder: of the project.
@@ -47,10 +54,10 @@ class Project:
         models, observers, controllers, families: path -> what `load` returns.
         fmus: path -> fmpy's description.
         certificates: path -> content.
-        loops: path -> result of its run.
+        loops: path -> result of its simulation.
         studies: path of the folder -> (description, runs).
-        doubts: path of a layout or robot file -> what was taken there without being sure.
-        problems: path -> why it could not be read or run.
+        doubts: path of a layout or robot file -> its uncertain decisions.
+        problems: path -> reason why it could not be read or run.
     """
 
     folder: Path
@@ -68,20 +75,20 @@ class Project:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing of ours was found."""
+        """Whether the folder has no softneck file."""
         found = (self.recordings, self.models, self.observers, self.controllers, self.families, self.fmus)
         return not any((*found, self.certificates, self.loops, self.studies, self.problems))
 
 
 def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
-    """Read all files of a project; loops are simulated unless they name Python, studies are taken as they stand.
+    """Read all files of a project; loops are simulated, except those that name Python code.
 
     Args:
         folder: of the project.
-        progress: called with the part done and a word.
+        progress: called with the finished share and a word.
 
     Raises:
-        FileFormatError: no such folder, or nothing in it that softneck knows.
+        FileFormatError: no such folder, or no softneck file in it.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -92,14 +99,14 @@ def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
         name = path.relative_to(root).as_posix()
         progress(number / len(files), name)
         try:
-            if path.name.endswith(_LAYOUT) or path.name == FILE:
+            if path.name.endswith(_LAYOUT_ENDING) or path.name == FILE:
                 if found := doubts_in(path):
                     project.doubts[name] = found
             else:
                 _READERS[path.suffix.lower()](project, path, name)
         except SoftneckError as error:
             project.problems[name] = str(error).removeprefix(f"{path}: ")
-    # What a loop of the project did in a simulation is no data: models would be judged on what they said themselves.
+    # A simulated loop is no data: its model would be judged on its own output.
     for name, (recording, _) in list(project.recordings.items()):
         if any(_is_run_of(result, recording) for result in project.loops.values()):
             del project.recordings[name]
@@ -109,7 +116,7 @@ def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
 
 
 def _is_run_of(result: Result, recording: Recording) -> bool:
-    """Return whether a recording is what `softneck simulate -o` wrote of a loop's run."""
+    """Return whether a recording is the result of a loop, written by `softneck simulate -o`."""
     signals = result.signals.signals
     return all(
         name in signals
@@ -120,24 +127,24 @@ def _is_run_of(result: Result, recording: Recording) -> bool:
 
 
 def _is_worst(entry: Path) -> bool:
-    """Return whether a folder holds the worst plants of a certificate beside it, which says what was found on them."""
+    """Return whether a folder holds the worst plants of a certificate, which has their results."""
     stem = entry.name.removesuffix("_worst")
     return stem != entry.name and entry.with_name(f"{stem}.certificate.json").is_file()
 
 
 def _is_front(entry: Path) -> bool:
-    """Return whether a table is that of a search by `softneck tune`, whose folder says the same as JSON."""
+    """Return whether a table is the front of `softneck tune`, which its folder also holds as JSON."""
     return entry.name == "pareto.csv" and entry.with_name("pareto.json").is_file()
 
 
 def _files(root: Path) -> Iterator[Path]:
-    """Yield files in the order of their names; a study's folder as its `study.json` alone."""
+    """Yield files sorted by name; of a study's folder only `study.json`."""
     entries = sorted(root.iterdir())
     if (root / "study.json").is_file() and _is_study(root / "study.json"):
         yield root / "study.json"
         entries = [entry for entry in entries if entry.is_dir()]
     for entry in entries:
-        if entry.name.startswith(".") or entry.name in _SKIPPED or entry.is_symlink() or _is_worst(entry):
+        if entry.name.startswith(".") or entry.name in _SKIPPED_FOLDERS or entry.is_symlink() or _is_worst(entry):
             continue
         if entry.is_dir():
             yield from _files(entry)
@@ -145,18 +152,18 @@ def _files(root: Path) -> Iterator[Path]:
             yield entry
 
 
-def _loop(project: Project, path: Path, name: str) -> None:
+def _read_loop(project: Project, path: Path, name: str) -> None:
     if is_loop_file(path):
-        # Whoever asks for a page on a folder that somebody sent does not ask for what stands in it to run.
+        # A report on a received folder must not run code in it.
         named = next(python_of(read_toml(path)), "")
         if named:
             raise SettingsError(f"names Python (`{named}`), which a report never runs; `softneck simulate` does.")
         project.loops[name] = simulate(load_loop(path), report=lambda _: None, compiled=True)
 
 
-def _recording(project: Project, path: Path, name: str) -> None:
-    if path.stat().st_size > _LARGEST:
-        project.problems[name] = f"larger than {_LARGEST / 1e6:.0f} MB: left out"
+def _read_recording(project: Project, path: Path, name: str) -> None:
+    if path.stat().st_size > _MAX_LOG_BYTES:
+        project.problems[name] = f"larger than {_MAX_LOG_BYTES / 1e6:.0f} MB: left out"
         return
     try:
         recording = read_recording(path)
@@ -168,15 +175,15 @@ def _recording(project: Project, path: Path, name: str) -> None:
 
 
 def _is_raw_log(path: Path) -> bool:
-    """Return whether a layout beside a table reads it: a logger's own, of which the project has the recording."""
-    for layout in sorted(path.parent.glob(f"*{_LAYOUT}")):
+    """Return whether a table is a raw log: a layout beside it reads it, and the project has the recording."""
+    for layout in sorted(path.parent.glob(f"*{_LAYOUT_ENDING}")):
         with contextlib.suppress(SoftneckError):
             import_log(path, read_layout(layout))
             return True
     return False
 
 
-def _archive(project: Project, path: Path, name: str) -> None:
+def _read_archive(project: Project, path: Path, name: str) -> None:
     header, _ = read_archive(path)
     role = {"family": project.families, "observer": project.observers, "controller": project.controllers}
     thing = load(path)
@@ -188,7 +195,7 @@ def _role(kind: str) -> str:
     return KINDS[kind].role if kind in KINDS else ""
 
 
-def _fmu(project: Project, path: Path, name: str) -> None:
+def _read_fmu(project: Project, path: Path, name: str) -> None:
     import fmpy
 
     try:
@@ -198,7 +205,7 @@ def _fmu(project: Project, path: Path, name: str) -> None:
         raise FileFormatError(f"{path}: is not an FMU ({' '.join(str(error).split())}).") from error
 
 
-def _json(project: Project, path: Path, name: str) -> None:
+def _read_json(project: Project, path: Path, name: str) -> None:
     if path.name == "study.json" and _is_study(path):
         description, runs = read_description(path.parent), read_runs(path.parent)
         project.studies[Path(name).parent.as_posix()] = (description, runs)
@@ -221,6 +228,244 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 _READERS: dict[str, Callable[[Project, Path, str], None]] = {
-    ".csv": _recording, ".parquet": _recording, ".npz": _archive, ".fmu": _fmu, ".json": _json,
-    ".toml": _loop,
+    ".csv": _read_recording, ".parquet": _read_recording, ".npz": _read_archive, ".fmu": _read_fmu, ".json": _read_json,
+    ".toml": _read_loop,
 }  # fmt: skip
+
+
+# Charts of one sort, so that the page remains small enough for mail; tables are complete.
+_MAX_CHARTS = 4
+# Recordings for the validation of each model.
+_MAX_RECORDINGS = 6
+_HORIZONS: tuple[int | str, ...] = (1, 25, INFINITE)
+_RULES = Rules(horizons=_HORIZONS)
+
+
+def project_page(project: Project, *, progress: Progress = silent) -> str:
+    """Return the HTML page of a project: results of loops and certificates, data, models, and problems."""
+    title = f"Project {project.folder.resolve().name}"
+    sections = [_loops(project), _certificates(project), _data(project), _models(project, progress)]
+    designs = _summaries("Observers and controllers", {**project.observers, **project.controllers})
+    sections += [
+        _summaries("Uncertain plant", project.families),
+        designs,
+        _fmus(project),
+        *_studies(project),
+        _problems(project),
+    ]
+    now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    kept = [section for section in sections if section is not None]
+    sentence, holds = project_verdict(project)
+    return page(
+        title, kept, verdict=sentence, holds=holds,
+        footer=f"softneck report, {now}. All plots and tables are in this file.",
+    )  # fmt: skip
+
+
+def project_verdict(project: Project) -> tuple[str, bool | None]:
+    """Return a sentence on limits and certificates, and whether all hold; None without any."""
+    loops = [result for result in project.loops.values() if result.limits]
+    held = sum(result.holds for result in loops)
+    certified = sum(_certifies(content) for content in project.certificates.values())
+    parts = [f"{held} of {len(loops)} loops keep their limits"] if loops else []
+    if project.certificates:
+        parts.append(f"{certified} of {len(project.certificates)} certificates hold")
+    if project.problems:
+        parts.append(f"{len(project.problems)} file(s) could not be read or run")
+    unsure = "".join(f" Not sure of {what}: {_shorten(doubts)}." for what, doubts in _doubts(project).items())
+    if not parts:
+        return f"No file of this project states a limit, so there is no verdict.{unsure}", None
+    good = held == len(loops) and certified == len(project.certificates) and not project.problems
+    return f"{'; '.join(parts)}.".capitalize() + unsure, good
+
+
+def _doubts(project: Project) -> dict[str, list[str]]:
+    """Return the doubts about the logs and the robots."""
+    found: dict[str, list[str]] = {}
+    for name, doubts in project.doubts.items():
+        found.setdefault("the robot" if Path(name).name == FILE else "the log", []).extend(doubts)
+    return found
+
+
+def _shorten(doubts: Sequence[str]) -> str:
+    """Return the first doubt without its reason, and the number of others."""
+    more = f" and {len(doubts) - 1} more" if doubts[1:] else ""
+    return f"{doubts[0].partition(' sure): ')[0]} sure){more}"
+
+
+def _data(project: Project) -> Section | None:
+    if not project.recordings:
+        return None
+    rows, findings, charts = [], [], []
+    for name, (recording, found) in project.recordings.items():
+        seconds = len(recording) * recording.sample_time
+        rows.append([
+            name, str(len(recording)), str(len(recording.runs())), f"{seconds:.1f}",
+            f"{1e3 * recording.sample_time:g}", found.severity,
+        ])  # fmt: skip
+        findings += [[name, str(finding)] for finding in found.findings if finding.severity != "ok"]
+        if len(charts) < _MAX_CHARTS:
+            charts.append(recording_chart(recording, name))
+    head = ["recording", "rows", "runs", "length [s]", "sample time [ms]", "worst finding"]
+    tables = [Table("Recordings", head, rows)]
+    if findings:
+        tables.append(Table("Findings", ["recording", "finding"], findings, text=2))
+    unsure = [[name, doubt] for name, found in project.doubts.items() for doubt in found]
+    if unsure:
+        tables.insert(0, Table("Uncertain decisions", ["file", "decision"], unsure, text=2))
+    return Section("Data", tables=tables, charts=charts)
+
+
+def _models(project: Project, progress: Progress) -> Section | None:
+    if not project.models:
+        return None
+    rows, charts, texts = [], [], []
+    judged_on = list(project.recordings.items())[:_MAX_RECORDINGS]
+    # Baselines depend only on the judged rows and take longer than a model, so models with the same rows share them.
+    baselines: dict[str, dict[bytes, Any]] = {data: {} for data, _ in judged_on}
+    for number, (name, model) in enumerate(project.models.items()):
+        summary = "; ".join(_lines(model)[:2])[:200]
+        texts.append([name, getattr(model, "kind", type(model).__name__), summary])
+        for count, (data, (recording, _)) in enumerate(judged_on):
+            progress((number + count / len(judged_on)) / len(project.models), f"{name} on {data}")
+            try:
+                parts = judged_parts(model, recording, _RULES, baselines[data])
+                result = judge(model, parts, _RULES, names=(name, data))
+            except (SoftneckError, AttributeError):
+                # Another sample time, or only rows that the model was trained on.
+                continue
+            rows.append([f"{name} on {data}", str(result.rows_scored), *_fits(result)])
+            if len(charts) < _MAX_CHARTS:
+                charts.append(_simulation_chart(result, f"{name} on {data}: simulation"))
+    tables = [Table("Models", ["model", "kind", "summary"], texts, text=3)]
+    if rows:
+        outputs = judged_on[0][1][0].robot.outputs  # a project has one robot
+        head = ["model on data", "rows judged", "one step", "25 steps", "simulation",
+                f"rms simulation [{outputs.display_unit}]", "persistence, one step"]  # fmt: skip
+        title = f"Fits in %, {'/'.join(outputs.names)}, on rows that the model was not trained on"
+        tables.append(Table(title, head, rows))
+    words = [] if rows else ["No recording of this project has rows on which a model can be judged."]
+    if len(project.recordings) > _MAX_RECORDINGS:
+        words.append(f"Judged on the first {_MAX_RECORDINGS} of {len(project.recordings)} recordings.")
+    return Section("Models", text=words, tables=tables, charts=charts)
+
+
+def _fits(result: Any) -> list[str]:
+    cells = [cell(result.fits[str(h)], ".1f") for h in _HORIZONS]
+    return [*cells, cell(result.rmse_deg[INFINITE], ".2f"), cell(result.persistence["1"], ".1f")]
+
+
+def _simulation_chart(result: Any, title: str) -> Chart:
+    return validation_chart(
+        result.time, result.measured, {"simulation": drawable(result, result.free_run)}, title, run=result.run,
+        robot=result.robot,
+    )  # fmt: skip
+
+
+def _summaries(title: str, things: Mapping[str, Any]) -> Section | None:
+    if not things:
+        return None
+    rows = [[name if not i else "", line] for name, thing in things.items() for i, line in enumerate(_lines(thing))]
+    return Section(title, tables=[Table(title, ["file", "summary"], rows, text=2)])
+
+
+def _lines(thing: Any) -> list[str]:
+    return [line for line in str(thing.summary()).splitlines() if line.strip()] or ["-"]
+
+
+def _certificates(project: Project) -> Section | None:
+    if not project.certificates:
+        return None
+    rows, details = [], []
+    for name, content in project.certificates.items():
+        stale = _changed_files(project.folder, name, content)
+        asked = required_rows(content)
+        verdict = "holds" if _certifies(content) else "fails"
+        rows.append([name, str(content["certificate"]), str(len(asked)), ", ".join(stale) or "none", verdict])
+        details += [_requirement(name, row) for row in asked]
+    head = ["certificate", "of", "requirements", "files changed since", "verdict"]
+    tables = [Table("Certificates", head, rows, text=2)]
+    if details:
+        tables.append(Table("Requirements", ["certificate", "metric", "value", "limit", "verdict"], details, text=2))
+    return Section("Verification", tables=tables)
+
+
+def _certifies(content: Mapping[str, Any]) -> bool:
+    """Return whether a certificate has requirements and all of them hold."""
+    return bool(content.get("holds")) and bool(required_rows(content))
+
+
+def _requirement(name: str, row: Mapping[str, Any]) -> list[str]:
+    held = row.get("holds", False)
+    verdict = "holds" if held else "not computed" if held is None else "fails"
+    return [name, str(row.get("metric", "")), cell(row.get("value")), cell(row.get("limit")), verdict]
+
+
+def _changed_files(folder: Path, name: str, content: Mapping[str, Any]) -> list[str]:
+    """Return the files of a certificate that have changed since."""
+    changed = []
+    for entry in content.get("files", {}).values():
+        path = Path(str(entry.get("path", "")))
+        places = [path, folder / path, (folder / name).parent / path]
+        there = next((place for place in places if place.is_file()), None)
+        if there is not None and file_hash(there) != entry.get("sha256"):
+            changed.append(path.name)
+    return changed
+
+
+def _fmus(project: Project) -> Section | None:
+    if not project.fmus:
+        return None
+    rows = []
+    for name, model in project.fmus.items():
+        counts = [str(sum(v.causality == c for v in model.modelVariables)) for c in ("input", "output", "parameter")]
+        rows.append([name, f"FMI {model.fmiVersion}", " ".join((model.description or "").split())[:120], *counts])
+    head = ["FMU", "version", "description", "inputs", "outputs", "parameters"]
+    return Section("FMUs", tables=[Table("FMUs", head, rows, text=3)])
+
+
+def _loops(project: Project) -> Section | None:
+    if not project.loops:
+        return None
+    metrics, limits, charts = [], [], []
+    for name, result in project.loops.items():
+        metrics.append([name, *_metrics(result)])
+        for row in result.limits:
+            verdict = "holds" if row["holds"] else "fails"
+            limits.append([name, row["metric"], cell(row["value"]), cell(row["limit"]), verdict])
+        if len(charts) < _MAX_CHARTS:
+            signals = result.signals
+            charts.append(loop_chart(signals.time, signals.signals, name, limits=result.bounds, robot=result.robot))
+    robot = next(iter(project.loops.values())).robot  # a project has one robot
+    head = ["loop", "overshoot [%]", "settling [s]", f"rms error [{robot.outputs.display_unit}]",
+            f"largest set-point [{robot.motors.unit}]"]  # fmt: skip
+    tables = [Table(f"Loops, {'/'.join(robot.outputs.names)}", head, metrics)]
+    if limits:
+        tables.append(Table("Limits", ["loop", "metric", "value", "limit", "verdict"], limits, text=2))
+    return Section("Loops", tables=tables, charts=charts, method=["Simulated for this page."])
+
+
+def _metrics(result: Result) -> list[str]:
+    """Return the cells under the head of `_loops`; names of metrics end in the robot's units."""
+    axes = [result.metrics[axis] for axis in result.robot.outputs.names]
+    cells = [
+        cell(dict(enumerate(v for table in axes for name, v in table.items() if name.startswith(start))), ".2f")
+        for start in ("overshoot_pct", "settling_s", "rms_error_")
+    ]
+    return [*cells, cell(next(v for name, v in result.metrics["motors"].items() if name.startswith("max_")))]
+
+
+def _studies(project: Project) -> list[Section]:
+    sections = []
+    for name, (description, runs) in project.studies.items():
+        for part in study_sections(description, runs) if len(runs) else []:
+            sections.append(replace(part, title=f"Study {name}: {part.title}"))
+    return sections
+
+
+def _problems(project: Project) -> Section | None:
+    if not project.problems:
+        return None
+    rows = [[name, " ".join(text.split())[:300]] for name, text in project.problems.items()]
+    table = Table("Files that could not be read or run", ["file", "why"], rows, text=2)
+    return Section("Problems", tables=[table])

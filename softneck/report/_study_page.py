@@ -1,4 +1,4 @@
-"""The report of a study: who ranks where, the Pareto front, how metrics are spread, what they depend on."""
+"""The page of a study: ranking, Pareto front, distributions of metrics, and influences on them."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softneck.cosim import grouped, pareto_front, rank, worst_runs
-from softneck.plots import Chart, Section, Table, distribution_chart, influence_chart, page, pareto_chart
+from softneck.plots import Chart, Section, Table, cell, distribution_chart, influence_chart, page, pareto_chart
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-# Numbers that varied, at most so many panels: those that matter most.
-_MOST_PANELS = 6
-_SHOWN = 10
-# The error ends in the unit of the output.
+# Panels for numbers that varied: those with the largest influence.
+_MAX_PANELS = 6
+_MAX_ROWS = 10
+# The metric ends in the unit of the output.
 _KEY_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_")
 
 
@@ -25,7 +25,7 @@ def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
     """Return the HTML page of a study.
 
     Args:
-        description: what `study.json` in its folder says.
+        description: content of the folder's `study.json`.
         runs: its table.
     """
     name = description["name"]
@@ -36,7 +36,7 @@ def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
 
 
 def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[Section]:
-    """Return the sections of a study's page; few words where no run succeeded."""
+    """Return the sections of a study's page; few if no run succeeded."""
     failed = failures(runs)
     objectives = list(description["objectives"])
     vary = description["study"]["vary"]
@@ -53,26 +53,26 @@ def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[S
 
 
 def study_verdict(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
-    """Return in a sentence how many runs keep their limits, and which is best."""
+    """Return a sentence on the runs within their limits and on the best run."""
     failed, held = sum(failures(runs)), runs["holds"].dropna().tolist()
     objectives = list(description["objectives"])
     said = f"{sum(map(bool, held))} of {len(held)} runs keep all limits" if held else f"{len(runs)} runs, no limits"
     if failed < len(runs):
         best = rank(runs, objectives).iloc[0]
-        said += f"; the best, run {best['run']}, has {objectives[0]} {_text(best[objectives[0]])}"
+        said += f"; the best, run {best['run']}, has {objectives[0]} {cell(best[objectives[0]])}"
     return said + (f"; {failed} failed with an error." if failed else ".")
 
 
 def study_rows(
-    runs: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], count: int = _SHOWN
+    runs: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], count: int = _MAX_ROWS
 ) -> list[list[str]]:
-    """Return the best runs as rows of text: number, what varied, objectives, verdict."""
+    """Return the best runs as rows of text: number, varied values, objectives, verdict."""
     return [_row(row, keys, objectives) for row in rank(runs, objectives).head(count).to_dict("records")]
 
 
 def study_head(keys: Sequence[str], objectives: Sequence[str]) -> list[str]:
     """Return the titles of `study_rows`."""
-    return ["run", *map(short, keys), *objectives, "limits"]
+    return ["run", *map(short_key, keys), *objectives, "limits"]
 
 
 def failures(runs: pd.DataFrame) -> list[bool]:
@@ -80,8 +80,8 @@ def failures(runs: pd.DataFrame) -> list[bool]:
     return [bool(error) for error in runs["error"].tolist()]
 
 
-def short(key: str) -> str:
-    """Return a key without what all keys of its part share."""
+def short_key(key: str) -> str:
+    """Return a key without `parameters`, which most keys contain."""
     return key.replace(".parameters.", ".")
 
 
@@ -93,15 +93,15 @@ def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: li
         text.append(f"{100.0 * sum(held) / len(held):.1f} % keep all limits.")
     if failed:
         text.append(f"{failed} failed with an error.")
-    rows = [[short(key), item["kind"], _range(item)] for key, item in study["vary"].items()]
+    rows = [[short_key(key), item["kind"], _range(item)] for key, item in study["vary"].items()]
     tables = [Table("What varied", ["key", "kind", "values"], rows, text=3)]
     by = _groups(study["vary"])
     if by:
         table = grouped(runs, by, objectives)
         tables.append(
-            Table("By group", list(table.columns), [[_text(v) for v in row] for row in table.to_numpy()], len(by))
+            Table("By group", list(table.columns), [[cell(v) for v in row] for row in table.to_numpy()], len(by))
         )
-    return Section("What was run", text=text, tables=tables)
+    return Section("Settings of the study", text=text, tables=tables)
 
 
 def _ranking(runs: pd.DataFrame, keys: list[str], objectives: list[str]) -> Section:
@@ -111,7 +111,7 @@ def _ranking(runs: pd.DataFrame, keys: list[str], objectives: list[str]) -> Sect
         Table("Best runs", head, study_rows(runs, keys, objectives)),
         Table("Worst runs", head, worst),
     ]
-    words = f"Ranked by limits kept, then {objectives[0]}. The worst runs stand as loop files in the folder `worst`."
+    words = f"Ranked by limits kept, then {objectives[0]}. Loop files of the worst runs are in the folder `worst`."
     return Section("Ranking", text=[words], tables=tables)
 
 
@@ -127,7 +127,7 @@ def _trade(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) -
         edge = (front[pair[0]].to_numpy(float), front[pair[1]].to_numpy(float))
         caption = f"{len(front)} runs that no other beats in both."
         charts.append(pareto_chart(groups, edge, pair, "Pareto front", caption=caption))
-    rows = [_row(row, list(vary), pair) for row in front.head(_SHOWN).to_dict("records")]
+    rows = [_row(row, list(vary), pair) for row in front.head(_MAX_ROWS).to_dict("records")]
     return Section("Pareto front", tables=[Table("On the front", study_head(list(vary), pair), rows)], charts=charts)
 
 
@@ -137,21 +137,21 @@ def _spread(runs: pd.DataFrame, vary: Mapping[str, Any], objectives: list[str]) 
     wanted = [*objectives, *(name for name in runs.columns if name.startswith(keys))]
     metrics = [name for name in dict.fromkeys(wanted) if np.isfinite(runs[name].to_numpy(float)).any()]
     values = {metric: {name: part[metric].to_numpy(float) for name, part in _split(runs, vary)} for metric in metrics}
-    return Section("Distributions", charts=[distribution_chart(values, "How the metrics are spread")])
+    return Section("Distributions", charts=[distribution_chart(values, "Distributions of the metrics")])
 
 
 def _influence(runs: pd.DataFrame, inputs: dict[str, np.ndarray], metric: str) -> Section:
     import pandas as pd
 
     y = runs[metric].to_numpy(float)
-    # Spearman's rank correlation, NaN where one does not vary.
+    # Spearman's rank correlation; NaN for a constant.
     ranked = pd.DataFrame({**inputs, metric: y}).corr(method="spearman", min_periods=3)[metric]
     found = dict(zip(inputs, np.asarray(ranked, dtype=np.float64).tolist(), strict=False))
     order = sorted(found, key=lambda key: -abs(np.nan_to_num(found[key])))
-    rows = [[short(key), _text(found[key])] for key in order]
+    rows = [[short_key(key), cell(found[key])] for key in order]
     broken = np.array(failures(runs)) | np.array([value is False for value in runs["holds"].tolist()])
-    shown = {short(key): inputs[key] for key in order[:_MOST_PANELS]}
-    chart = influence_chart(shown, (metric, y), broken, f"What {metric} depends on")
+    shown = {short_key(key): inputs[key] for key in order[:_MAX_PANELS]}
+    chart = influence_chart(shown, (metric, y), broken, f"Influences on {metric}")
     table = Table(f"Rank correlation with {metric} (Spearman)", ["key", "correlation"], rows)
     return Section("Influence", tables=[table], charts=[chart])
 
@@ -163,7 +163,7 @@ def _failures(runs: pd.DataFrame) -> Section:
 
 
 def _split(runs: pd.DataFrame, vary: Mapping[str, Any]) -> list[tuple[str, pd.DataFrame]]:
-    """Return the runs by the first key that has names for values; all together if there is none."""
+    """Return the runs grouped by the first key with names as values; else all together."""
     by = _groups(vary)
     if not by:
         return [("runs", runs)]
@@ -187,15 +187,9 @@ def _row(row: Mapping[Any, Any], keys: Sequence[str], objectives: Sequence[str])
     import pandas as pd
 
     verdict = "fails" if row["error"] else "-" if pd.isna(row["holds"]) else "holds" if row["holds"] else "fails"
-    return [str(row["run"]), *(_text(row[key]) for key in keys), *(_text(row[name]) for name in objectives), verdict]
+    return [str(row["run"]), *(cell(row[key]) for key in keys), *(cell(row[name]) for name in objectives), verdict]
 
 
 def _range(item: Mapping[str, Any]) -> str:
     values = item["labels"] or item["values"]
-    return ", ".join(_text(value) for value in values)
-
-
-def _text(value: Any) -> str:
-    if value is None or (isinstance(value, float) and np.isnan(value)):
-        return "-"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return ", ".join(cell(value) for value in values)

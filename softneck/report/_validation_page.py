@@ -1,40 +1,39 @@
-"""What `softneck validate` tells: the table of fits, remarks, and the page that shows each model beside the data."""
+"""Results of `softneck validate`: the table of fits, remarks, and the page that shows each model beside the data."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, percent, to_si
+from softneck.core import Matrix, to_si
 from softneck.identification import INFINITE, Validation
-from softneck.plots import Chart, Section, Table, page, residual_chart, validation_chart
+from softneck.plots import Chart, Section, Table, cell, page, residual_chart, validation_chart
 
 VALIDATION_NOTE = (
-    "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample: a one-step fit "
-    "that is not above it says nothing. Best linear was fitted on the judged rows themselves: no linear model of the "
-    "set-points has a better free run on them. The free run has the set-points alone (or the logged motors, if asked "
-    "for); that is what an FMU of the plant does. Rows that a model was trained on are left out."
+    "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %, {outputs}. Persistence repeats the last sample; a one-step fit "
+    "is useful only above it. Best linear is fitted on the judged rows themselves: no linear model of the set-points "
+    "has a better simulation on them. A simulation (free run) has only the set-points as input (or the logged motors, "
+    "if requested), as an FMU of the plant does. Rows that a model was trained on are left out."
 )
-_ERROR = "Error is measured minus predicted; where a row is not scored, or was not recorded, nothing is drawn."
-_RESIDUALS = (
-    "A model that has caught everything leaves white errors that no set-point foretells: 99 of 100 bars within the "
-    "dashed bounds. Positive lags: the error follows the set-point, so that a bar outside is a gain or a lag that the "
-    "model misses; slow or periodic set-points spread it over many lags, negative ones too. Set-points made by a "
-    "controller from the outputs show at negative lags."
+_ERROR_NOTE = "Error is measured minus predicted; rows that are not scored or not recorded are not drawn."
+_RESIDUAL_NOTE = (
+    "A model without missing dynamics leaves white residuals that no set-point predicts: 99 of 100 bars are within the "
+    "dashed bounds. A bar outside at a positive lag, at which the error follows the set-point, is a wrong gain or lag "
+    "of the model. Slow or periodic set-points spread it over many lags, negative ones too. Set-points of a controller "
+    "depend on the outputs and show at negative lags."
 )
-_HEAD = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst")
-# A free run beyond this has diverged [rad], of other outputs than angles beyond so many times what was measured; it is
-# not drawn from there on, for the rest to stay readable.
-_DRAWN, _DRAWN_TIMES = np.pi, 10.0
+_FIT_COLUMNS = ("model on data", "ahead", "persistence", "best linear", "model", "95 % interval", "rms", "worst")
+# A simulation has diverged beyond this [rad]; of other outputs than angles, beyond this multiple of the measured range.
+# It is not drawn from there on, so that the rest remains readable.
+_MAX_ANGLE, _MAX_RATIO = np.pi, 10.0
 
 
 def validation_page(results: Sequence[Validation], *, title: str = "Validation") -> str:
-    """Return one self-contained page with interactive plots of all results.
+    """Return the HTML page of all results, with interactive charts.
 
-    Where several models were judged on the same rows, a chart of all their free runs comes first.
+    Models that were judged on the same rows first have one chart of all their simulations.
 
     Args:
         results: of `validate`, one for each model and recording.
@@ -47,12 +46,12 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
 
 
 def _verdict(results: Sequence[Validation]) -> str:
-    """Return in a sentence which model is best on each recording, by its longest horizon."""
+    """Return a sentence on the best model for each recording, by the longest horizon."""
     said = []
     for data in dict.fromkeys(r.data for r in results):
         rivals = [r for r in results if r.data == data]
         best = max(rivals, key=lambda r: min(-np.inf if fit is None else fit for fit in _last(r).values()))
-        fits = ", ".join(f"{name} {_text(fit, 1)} %" for name, fit in _last(best).items())
+        fits = ", ".join(f"{name} {cell(fit, '%')} %" for name, fit in _last(best).items())
         ahead = list(best.fits)[-1]
         how = "Simulation fit" if ahead == INFINITE else f"Fit {ahead} samples ahead"
         diverged = [Path(r.model).stem for r in rivals if r.diverged is not None]
@@ -69,15 +68,15 @@ def _last(r: Validation) -> dict[str, float | None]:
 
 
 def fit_table(results: Sequence[Validation]) -> Table:
-    """Return the fits [%] of the outputs, a row for each horizon, beside what they must be compared with."""
+    """Return the fits [%] of the outputs, a row for each horizon, beside the baselines."""
     rows, outputs = [], results[0].robot.outputs
     for r in results:
         for h in r.fits:
-            tables = (r.persistence, r.best_linear, r.fits, r.intervals)
-            cells = [_cell(table.get(h, {}), 1) for table in tables]
-            errors = [_cell(r.rmse_deg[h], 2), _cell(r.worst_deg[h], 1)]
-            rows.append([_name(r), "free run" if h == INFINITE else h, *cells, *errors])
-    return Table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", _HEAD, rows)
+            cells = [cell(table.get(h, {}), "%") for table in (r.persistence, r.best_linear, r.fits)]
+            ends = {axis: pair and "..".join(f"{e:.1f}" for e in pair) for axis, pair in r.intervals.get(h, {}).items()}
+            errors = [cell(ends), cell(r.rmse_deg[h], ".2f"), cell(r.worst_deg[h], ".1f")]
+            rows.append([_name(r), "simulation" if h == INFINITE else h, *cells, *errors])
+    return Table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", _FIT_COLUMNS, rows)
 
 
 def _overview(results: Sequence[Validation], charts: Sequence[Chart]) -> Section:
@@ -86,7 +85,7 @@ def _overview(results: Sequence[Validation], charts: Sequence[Chart]) -> Section
 
 
 def _comparisons(results: Sequence[Validation]) -> list[Chart]:
-    """Put the free runs of models that were judged on the same rows into one chart."""
+    """Return a chart of the simulations of all models judged on the same rows, for each such group."""
     groups: dict[tuple[str, bytes, bytes], list[Validation]] = {}
     for r in results:
         if INFINITE in r.fits:
@@ -100,7 +99,7 @@ def _comparisons(results: Sequence[Validation]) -> list[Chart]:
             first = group[0]
             charts.append(
                 validation_chart(
-                    first.time, first.measured, runs, f"Free runs on {data}", run=first.run, caption=_ERROR,
+                    first.time, first.measured, runs, f"Simulations on {data}", run=first.run, caption=_ERROR_NOTE,
                     robot=first.robot,
                 )
             )  # fmt: skip
@@ -110,14 +109,14 @@ def _comparisons(results: Sequence[Validation]) -> list[Chart]:
 def _predictions(r: Validation) -> dict[str, Matrix]:
     predictions = {"one step": drawable(r, r.one_step)}
     if INFINITE in r.fits:
-        predictions["free run"] = drawable(r, r.free_run)
+        predictions["simulation"] = drawable(r, r.free_run)
     return predictions
 
 
 def curves(r: Validation) -> Chart:
-    """Return what was measured and predicted, with the bounds of the free run."""
+    """Return a chart of measured and predicted outputs, with the bounds of the simulation."""
     bounds = _bounds_of(r)
-    caption = _ERROR + (" The band holds the model's bounds of its free run." if bounds else "")
+    caption = _ERROR_NOTE + (" The band shows the model's bounds in simulation." if bounds else "")
     return validation_chart(
         r.time, r.measured, _predictions(r), f"{_name(r)}: measured and predicted", bounds=bounds, run=r.run,
         caption=caption, robot=r.robot,
@@ -125,7 +124,7 @@ def curves(r: Validation) -> Chart:
 
 
 def _section(r: Validation, *, drawn: bool) -> Section:
-    """Return all on one result; its curves unless they are `drawn` already."""
+    """Return the section of one result, with its curves unless `drawn`."""
     charts = [*([] if drawn else [curves(r)]), _residuals(r)]
     text = [f"{said[0].upper()}{said[1:]}." for said in remarks(r)]
     return Section(_name(r), text=text, tables=_run_tables(r), charts=charts)
@@ -137,28 +136,28 @@ def _residuals(r: Validation) -> Chart:
         (tests.lags, tests.autocorrelation, tests.bound),
         (tests.cross_lags, tests.cross_correlation, tests.cross_bound),
         "Residual tests of the one-step errors",
-        caption=_RESIDUALS,
+        caption=_RESIDUAL_NOTE,
         robot=r.robot,
     )
 
 
 def remarks(r: Validation) -> list[str]:
-    """Return what there is to say of a model on a recording beside its fits."""
+    """Return remarks on a model and a recording, beside its fits."""
     lines = [f"{r.rows_scored} rows judged, {r.rows_left_out} left out as the model was trained on them"]
     lost = [entry for entry in r.per_run if entry["diverged"] is not None]
-    lines += [f"the free run of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
+    lines += [f"the simulation of run {e['run']} diverged at {e['diverged']:.2f} s" for e in lost]
     if INFINITE in r.fits:
-        lines.append(f"free run {_cell(r.cold_fits, 1)} % from the first row only (cold, as an FMU starts)")
-    lines.append(_residuals_said(r))
+        lines.append(f"simulation {cell(r.cold_fits, '%')} % from the first row only (as an FMU starts)")
+    lines.append(_residual_remark(r))
     if lost:
         return lines
     if r.coverage_pct is not None and r.mean_width_deg is not None:
         lines.append(
-            f"free-run bounds hold {_cell(r.coverage_pct, 1)} % of the samples, "
-            f"{_cell(r.mean_width_deg, 1)} {r.robot.outputs.display_unit} wide"
+            f"bounds in simulation hold {cell(r.coverage_pct, '.1f')} % of the samples, "
+            f"{cell(r.mean_width_deg, '.1f')} {r.robot.outputs.display_unit} wide"
         )
     if r.outside_pct is not None:
-        lines.append(f"{_cell(r.outside_pct, 1)} % of the samples lie outside what the model has seen")
+        lines.append(f"{cell(r.outside_pct, '.1f')} % of the samples are outside the training range")
     if r.validity is not None:
         v = r.validity
         lines.append(
@@ -166,22 +165,22 @@ def remarks(r: Validation) -> list[str]:
             f"samples were within the tolerance (Brier score {v['brier']:.3f}, of that share alone "
             f"{v['brier_base_rate']:.3f})"
         )
-    return [*lines, *r.bounds_remarks, *_calibrated(r)]
+    return [*lines, *r.bounds_remarks, *_calibrated_remarks(r)]
 
 
-def _residuals_said(r: Validation) -> str:
+def _residual_remark(r: Validation) -> str:
     p_value = r.residual_tests.p_value
     if np.isnan(p_value).any():
-        return "too few one-step errors to test whether they are white"
+        return "too few residuals for a test of whiteness"
     p_values = "/".join("<0.001" if p < 1e-3 else f"{p:.3f}" for p in p_value)
-    return (
-        f"one-step errors are {'' if r.white else 'not '}white (p {p_values}) and "
-        f"{'do not follow' if r.uncorrelated else 'follow'} the inputs (99 %)"
-    )
+    own = "white" if r.white else "correlated with each other"
+    inputs = "not correlated" if r.uncorrelated else "correlated"
+    cause = "" if r.white and r.uncorrelated else ": the model misses dynamics"
+    return f"the residuals are {own} (p {p_values}) and {inputs} with the inputs (99 %){cause}"
 
 
-def _calibrated(r: Validation) -> list[str]:
-    """Return the bounds that whole records allow, or why there are none."""
+def _calibrated_remarks(r: Validation) -> list[str]:
+    """Return the error bounds from whole records, or why there are none."""
     found, unit = r.calibrated_bounds, r.robot.outputs.display_unit
     lines = []
     for what, of in (("pointwise", "any sample"), ("path", "all samples")):
@@ -203,28 +202,16 @@ def _calibrated(r: Validation) -> list[str]:
 
 
 def _run_tables(r: Validation) -> list[Table]:
-    """Return the scores of each stretch, where there are several."""
+    """Return a table of the fits of each run, if there are several."""
     if len(r.per_run) < 2:
         return []
     horizons = [str(horizon) for horizon in r.fits]
-    head = ["run", "from [s]", "rows", *("free run" if h == INFINITE else f"{h} ahead" for h in horizons)]
+    head = ["run", "from [s]", "rows", *("simulation" if h == INFINITE else f"{h} ahead" for h in horizons)]
     rows = [
-        [str(e["run"]), f"{e['start_s']:.2f}", str(e["rows_scored"]), *(_cell(e["fits"][h], 1) for h in horizons)]
+        [str(e["run"]), f"{e['start_s']:.2f}", str(e["rows_scored"]), *(cell(e["fits"][h], "%") for h in horizons)]
         for e in r.per_run
     ]
     return [Table(f"Fit [%] of each run, {'/'.join(r.robot.outputs.names)}", head, rows)]
-
-
-def _cell(values: dict[str, Any], digits: int) -> str:
-    return "/".join(_text(value, digits) for value in values.values())
-
-
-def _text(value: float | Iterable[float] | None, digits: int) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, float | int):
-        return percent(value) if digits == 1 else f"{value:.{digits}f}"
-    return "..".join(f"{edge:.{digits}f}" for edge in value)
 
 
 def _name(r: Validation) -> str:
@@ -232,13 +219,13 @@ def _name(r: Validation) -> str:
 
 
 def drawable(r: Validation, values: Matrix) -> Matrix:
-    """Return outputs without what has diverged."""
-    most = _DRAWN if _turns(r) else _DRAWN_TIMES * float(np.nanmax(np.abs(r.measured), initial=0.0))
+    """Replace diverged outputs by NaN."""
+    most = _MAX_ANGLE if _has_angles(r) else _MAX_RATIO * float(np.nanmax(np.abs(r.measured), initial=0.0))
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < most, values, np.nan)
 
 
-def _turns(r: Validation) -> bool:
+def _has_angles(r: Validation) -> bool:
     """Return whether the outputs are angles."""
     return to_si(r.robot.outputs.unit)[1] == "rad"
 

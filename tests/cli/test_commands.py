@@ -141,7 +141,7 @@ def test_people_get_a_table_and_progress_stays_on_stderr(call: Call, recording: 
     assert "identify rls ..." in said.err
     table = call("validate", rls_file, "--data", recording, "--html", "page.html")
     assert "best linear" in table.out
-    assert "free run" in table.out
+    assert "simulation" in table.out
     assert "rows judged, 0 left out as the model was trained on them" in table.out
     assert max(len(line) for line in table.out.splitlines() if line[:1] in "┏┃┡│└") <= 120
     page = own_text(Path("page.html").read_text(encoding="utf-8"))

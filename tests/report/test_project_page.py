@@ -10,8 +10,7 @@ import pytest
 
 from softneck.cosim import Result
 from softneck.loop import LoopResult, metrics
-from softneck.report._project import read_project
-from softneck.report._project_page import _metrics, _sentence
+from softneck.report._project import _metrics, project_verdict, read_project
 from softneck.robot import Robot
 from softneck.signals import write_recording
 
@@ -49,7 +48,7 @@ def test_what_is_not_sure_of_log_and_robot_is_in_the_heading(tmp_path: Path) -> 
     (tmp_path / "log.layout.toml").write_text("# NOT SURE (80 %): the only column in rad\npitch = 'tilt'\n")
     sensor = "".join(f"# NOT SURE ({sure} %): why\n{key} = 0.1\n" for key, sure in (("noise_std", 80), ("delay_s", 50)))
     (tmp_path / "robot.toml").write_text(f'extends = "neck"\n[sensor]\n{sensor}')
-    sentence, _ = _sentence(read_project(tmp_path))
+    sentence, _ = project_verdict(read_project(tmp_path))
     assert sentence.endswith(
         " Not sure of the log: pitch (80 % sure). Not sure of the robot: noise_std (80 % sure) and 1 more."
     )

@@ -10,8 +10,7 @@ import pytest
 from softneck.core import silent
 from softneck.identification import nrmse_fit
 from softneck.report import ReproduceSettings, paper_page, reproduce
-from softneck.report._paper_page import grouped, linear_facts, paper_charts
-from softneck.report._reproduce import Reproduction, paper_entries
+from softneck.report._reproduce import Reproduction, group_entries, linear_facts, paper_charts, paper_entries
 
 pytestmark = pytest.mark.slow
 
@@ -24,7 +23,7 @@ def found() -> Reproduction:
 
 def test_every_published_fit_stands_beside_ours(found: Reproduction) -> None:
     rows = paper_entries(found)
-    parts = grouped(rows)
+    parts = group_entries(rows)
     # Table 3: 3 models, 2 axes; Table 4: the same over 3 tests; section 7.4: SM and NN on two tests.
     assert [len(part) for part in parts.values()] == [6, 18, 8]
     assert sum(len(part) for part in parts.values()) == len(rows)

@@ -54,7 +54,7 @@ def test_the_page_tells_every_fit_beside_persistence(results: Sequence[Validatio
     for r in results:
         name = f"{Path(r.model).stem} on neck"
         for horizon, fits in r.fits.items():
-            row = by_name[name, "free run" if horizon == INFINITE else horizon]
+            row = by_name[name, "simulation" if horizon == INFINITE else horizon]
             assert row[model] == "/".join("-" if v is None else f"{v:.1f}" for v in fits.values())
             held = r.persistence.get(horizon, {})
             assert row[persistence] == "/".join("-" if v is None else f"{v:.1f}" for v in held.values())
@@ -62,9 +62,9 @@ def test_the_page_tells_every_fit_beside_persistence(results: Sequence[Validatio
 
 def test_all_free_runs_come_first_and_then_each_model(html: str) -> None:
     headings = _headings(html)
-    assert headings[:2] == ["Fits", "Free runs on neck"]
+    assert headings[:2] == ["Fits", "Simulations on neck"]
     names = ("rls", "nlsm", "nn")
-    assert [h for h in headings if h.endswith(" on neck")] == ["Free runs on neck", *(f"{n} on neck" for n in names)]
+    assert [h for h in headings if h.endswith(" on neck")] == ["Simulations on neck", *(f"{n} on neck" for n in names)]
     assert [h for h in headings if h.endswith("measured and predicted")] == [
         f"{name} on neck: measured and predicted" for name in names
     ]
@@ -73,11 +73,11 @@ def test_all_free_runs_come_first_and_then_each_model(html: str) -> None:
 
 def test_one_model_or_other_rows_are_not_compared(results: Sequence[Validation], models: dict, neck: Recording) -> None:
     alone = _headings(validation_page(results[:1]))
-    assert "Free runs on neck" not in alone
+    assert "Simulations on neck" not in alone
     assert alone[:2] == ["Fits", "rls on neck: measured and predicted"]
     assert sum(h.endswith("measured and predicted") for h in alone) == 1
     other = validate(models["rls"], neck.rows(1400, 2000), names=("rls.npz", "neck.csv"))
-    assert "Free runs on neck" not in _headings(validation_page([results[1], other]))
+    assert "Simulations on neck" not in _headings(validation_page([results[1], other]))
 
 
 def test_the_verdict_names_the_model_of_the_best_free_run(results: Sequence[Validation], html: str) -> None:
@@ -133,7 +133,7 @@ def test_a_browser_draws_all_of_it_in_silence(html: str, browser: Browser, tmp_p
 def test_bounds_are_a_band_where_a_model_has_them(results: Sequence[Validation]) -> None:
     banded = [np.isfinite(r.lower).any() for r in results]
     assert any(banded)
-    assert [("The band holds" in validation_page([r])) for r in results] == banded
+    assert [("The band shows" in validation_page([r])) for r in results] == banded
 
 
 def test_residual_tests_and_scores_of_each_run_are_told(models: dict[str, Model], neck: Recording) -> None:
@@ -143,6 +143,6 @@ def test_residual_tests_and_scores_of_each_run_are_told(models: dict[str, Model]
     assert "Residual tests of the one-step errors" in _headings(html)
     head, *rows = _tables(html)[1]
     assert len(rows) == len(r.per_run) == 2
-    free = head.index("free run")
+    free = head.index("simulation")
     for row, entry in zip(rows, r.per_run, strict=True):
         assert row[free] == "/".join(f"{fit:.1f}" for fit in entry["fits"][INFINITE].values())

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from softneck.core import FileFormatError, SettingsError
 from softneck.estimation import LinearNeck
 from softneck.loop.default_limits import NECK_RISE_S
-from softneck.report._tune_files import _told
+from softneck.report._tune import _toml_table
 from softneck.robot import Robot
 from softneck.tuning._beforehand import refuse_impossible
 from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements
@@ -68,7 +68,7 @@ def test_what_is_written_asks_tune_and_verify_for_the_same_again(tmp_path: Path,
     }  # fmt: skip
     asked = make_tune_requirements(table, stepping=stepping)
     path = tmp_path / "requirements.toml"
-    path.write_text(tomli_w.dumps(_told(asked.table)))
+    path.write_text(tomli_w.dumps(_toml_table(asked.table)))
     # Limits are as they were asked, the reserve is beside them.
     written = tomllib.loads(path.read_text())
     assert written["require"]["sim.rise_s"] == {"max": 0.5}

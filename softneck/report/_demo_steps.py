@@ -1,4 +1,4 @@
-"""Step 4 of the demo: every model and the neck as FMUs, each equal to its Python model in free run."""
+"""Steps of the demo and of the reproduction: experiments, models, validation, FMUs, and closed loops."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from softneck.runtime import Block
 from softneck.signals import Recording, signal
 
 TESTS = ("steps", "sine", "rotation")
-# Section 5: 7,000 of 10,000 samples identify, the rest validates.
+# Section 5: 7,000 of 10,000 samples for identification, the rest for validation.
 TRAIN = 0.7
-# Noise differs between experiments, and between any two runs of the demo it does not.
+# Noise differs between experiments, but not between runs of the demo.
 _SEEDS = {"eq22": 1, "steps": 2, "sine": 3, "rotation": 4}
 
 Tell = Callable[[str], Progress]
@@ -30,7 +30,7 @@ Tell = Callable[[str], Progress]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Experiments:
-    """What was recorded: Eq. 22 split into its two parts, and the three tests."""
+    """Recordings: Eq. 22 split into its two parts, and the three tests."""
 
     identification: Recording
     validation: Recording
@@ -38,13 +38,13 @@ class Experiments:
 
     @property
     def judged(self) -> dict[str, Recording]:
-        """All recordings that no model was trained on, by the paper's names."""
+        """All recordings on which no model was trained, by the paper's names."""
         return {"validation": self.validation, **self.tests}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ValidationPair:
-    """One model on one recording: from set-points alone, and with measured motors (paper, section 7.4)."""
+    """Validation of a model on a recording: from set-points alone, and with measured motors (paper, section 7.4)."""
 
     free: Validation
     measured: Validation
@@ -63,7 +63,7 @@ def record_experiments(neck: NeckParameters, *, duration: float, tell: Tell) -> 
 
 
 def identify(recording: Recording, *, iterations: int, seed: int, tell: Tell) -> dict[str, Model]:
-    """Identify the paper's three models from one recording, and set membership's feed-forward form beside its own."""
+    """Identify the paper's three models from one recording, and set membership on the residual of rls."""
     estimators = {
         "rls": Rls(),
         "nlsm": SetMembership(form="paper_eq21"),
@@ -73,9 +73,11 @@ def identify(recording: Recording, *, iterations: int, seed: int, tell: Tell) ->
     return {name: estimator.fit(recording, progress=tell(f"identify {name}")) for name, estimator in estimators.items()}
 
 
-def on_rough(*, duration: float, tell: Tell) -> dict[tuple[str, str], Validation]:
-    """Identify rls and the feed-forward set membership anew on the preset `rough`, which a line follows no better than
-    the paper's neck, and validate their free runs there."""
+def validate_on_rough(*, duration: float, tell: Tell) -> dict[tuple[str, str], Validation]:
+    """Identify rls and residual set membership on the preset `rough`, and validate their simulations there.
+
+    A linear model follows `rough` no better than the paper's neck.
+    """
     experiments = record_experiments(
         NeckParameters.rough(), duration=duration, tell=lambda text: tell(f"{text}, preset rough")
     )
@@ -94,7 +96,7 @@ def on_rough(*, duration: float, tell: Tell) -> dict[tuple[str, str], Validation
 def judge(
     models: Mapping[str, Model], experiments: Experiments, *, tell: Tell
 ) -> dict[tuple[str, str], ValidationPair]:
-    """Validate every model on every recording it has not seen."""
+    """Validate every model on every recording that it was not trained on."""
     report = tell("validate")
     judged: dict[tuple[str, str], ValidationPair] = {}
     pairs = [(model, data) for model in models for data in experiments.judged]
@@ -107,18 +109,18 @@ def judge(
     return judged
 
 
-# A free run in another process feeds its rounding back; what is left of it stays far below a micro-degree.
+# Rounding in another process accumulates in a simulation, but stays far below a micro-degree.
 TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class PackagedFmu:
-    """An FMU and how far its free run is from the Python model's.
+    """An FMU and its largest difference from the Python model in simulation.
 
     Attributes:
         path: of the FMU.
-        rows: samples compared.
-        difference: the largest over all outputs, in their SI units.
+        rows: number of compared samples.
+        difference: largest over all outputs, in their SI units.
     """
 
     path: Path
@@ -127,15 +129,15 @@ class PackagedFmu:
 
     @property
     def equal(self) -> bool:
-        """Whether the FMU is the model."""
+        """Whether the FMU equals its model."""
         return self.difference <= TOLERANCE
 
 
 def package(
     things: Mapping[str, Buildable], folder: Path, recording: Recording, *, scores: Mapping[str, str], tell: Tell
 ) -> dict[str, PackagedFmu]:
-    """Build an FMU of each plant and compare their free runs over `recording` with Python's."""
-    report = tell("build FMUs and compare free runs")
+    """Build an FMU of each plant and compare its simulation over `recording` with Python's."""
+    report = tell("build FMUs and compare simulations")
     packaged: dict[str, PackagedFmu] = {}
     for number, (name, thing) in enumerate(things.items()):
         report(number / len(things), name)
@@ -148,7 +150,7 @@ def package(
 
 
 def python_free_run(block: Block, recording: Recording) -> Matrix:
-    """Return a plant's outputs (time, n_out) from rest, by a recording's set-points; row 0 is the start."""
+    """Return a plant's outputs (time, n_out) from rest, driven by a recording's set-points; row 0 is the start."""
     start = block.initial_state()
     inputs = np.tile([port.start for port in block.inputs], (len(recording), 1))
     inputs[:, :3] = recording.set_points
@@ -163,7 +165,7 @@ def _camel(name: str) -> str:
 # 15 deg as in the lab's own tests.
 _STEPS = {"pitch_step": (15.0, 0.0), "roll_step": (0.0, 15.0), "oblique_step": (10.6, 10.6)}
 
-_LOOP = """# Written by `softneck demo`; run it again with `softneck simulate {name}.toml`.
+_LOOP_TOML = """# Written by `softneck demo`; run it again with `softneck simulate {name}.toml`.
 duration_s = 8.0
 sample_time_s = {sample_time:g}
 
@@ -197,7 +199,7 @@ class DemoDesign:
 
 
 def design(model: Model, fmus: Path) -> DemoDesign:
-    """Design both on an identified linear model and package them as FMUs in folder `fmus`."""
+    """Design a controller and an observer on an identified linear model; write their FMUs to folder `fmus`."""
     controller = PiSettings().design(model)
     observer = KalmanSettings(sensor="paper").design(model)
     build_fmu(controller.block(), fmus / "Pi.fmu", info=fmu_info(controller), force=True)
@@ -206,27 +208,29 @@ def design(model: Model, fmus: Path) -> DemoDesign:
 
 
 def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Result]:
-    """Write the loop files to `folder` and simulate each."""
+    """Write the loop files to `folder` and simulate them."""
     report = tell("close the loop over FMUs")
     results: dict[str, Result] = {}
     for number, (name, (pitch, roll)) in enumerate(_STEPS.items()):
         path = folder / f"{name}.toml"
-        text = _LOOP.format(name=name, sample_time=sample_time, pitch=pitch, roll=roll, limits=_limits(pitch, roll))
+        text = _LOOP_TOML.format(
+            name=name, sample_time=sample_time, pitch=pitch, roll=roll, limits=_limits(pitch, roll)
+        )
         with atomic_write(path, force=True) as temporary:
             temporary.write_text(text, encoding="utf-8")
-        results[name] = simulate(load_loop(path), report=_part(report, number, name))
+        results[name] = simulate(load_loop(path), report=_loop_progress(report, number, name))
     return results
 
 
 def _limits(pitch: float, roll: float) -> str:
     stepped = [axis for axis, size in (("pitch", pitch), ("roll", roll)) if size]
     lines = [f'"{axis}.{metric}" = {limit}' for axis in stepped for metric, limit in default_limits.LOOP.items()]
-    # An axis without a step shall stay where it is.
+    # An axis without a step must stay in place.
     lines += [f'"{axis}.rms_error_deg" = 1.0' for axis, size in (("pitch", pitch), ("roll", roll)) if not size]
     return "\n".join(lines)
 
 
-def _part(report: Progress, number: int, name: str) -> Callable[[float], None]:
+def _loop_progress(report: Progress, number: int, name: str) -> Callable[[float], None]:
     return lambda done: report((number + done) / len(_STEPS), name)
 
 

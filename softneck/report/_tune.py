@@ -1,0 +1,275 @@
+"""The results of `softneck tune`: its folder with the best controller and the Pareto front, and its page."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import tomli_w
+
+from softneck.core import atomic_write, file_hash, write_certificate
+from softneck.design import assumed_lines
+from softneck.loop import error_unit
+from softneck.plots import GREY, Chart, Curve, Panel, Section, Table, cell, curve_styles, page, write_page
+from softneck.tuning import step_response
+from softneck.verification import metric_title, nominal_plants, sources_of, write_linear
+
+if TYPE_CHECKING:
+    from softneck.tuning import Candidate, Tuned
+
+BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificate.json", "loop.toml"
+_LOOP_AT, _LOOP_TAUT = 1.0, 3.0
+
+
+def write_tuned(
+    found: Tuned, folder: Path, files: Mapping[str, Path], steps: Mapping[str, Path | str]
+) -> dict[str, Any]:
+    """Write all files of a tuning and return its JSON values.
+
+    Args:
+        found: the result.
+        folder: target; files of an earlier run are replaced, and its certificate is removed if this one does not hold.
+        files: role -> path of an input file, for the certificate.
+        steps: name -> file, or preset, of the simulation models.
+    """
+    found.controller.save(folder / BEST, force=True)
+    if found.observer is not None:
+        found.observer.save(folder / OBSERVER, force=True)
+    requirements = folder / "requirements.toml"
+    _write(requirements, tomli_w.dumps(_toml_table(found.task.asked.table)))
+    read = {"controller": folder / BEST, "requirements": requirements, **files}
+    verification = replace(
+        found.verification, files={role: (str(path), file_hash(path)) for role, path in read.items()}
+    )
+    certificate = folder / CERTIFICATE
+    if found.holds:  # includes [track], which `verify` does not check
+        write_certificate(certificate, {**verification.contents(), "loosened": _loosened_values(found)}, force=True)
+    else:
+        certificate.unlink(missing_ok=True)
+    _write_loop(found, folder, steps)
+    values = tuned_values(found, folder / BEST)
+    _write(folder / "pareto.json", json.dumps(values["pareto"], indent=1) + "\n")
+    _write(folder / "pareto.csv", _csv(found))
+    write_page(folder / "report.html", tune_page(found), force=True)
+    return values
+
+
+def tuned_values(found: Tuned, path: Path) -> dict[str, Any]:
+    """Return the JSON values of a tuning."""
+    return {
+        "best": {"kind": found.best.kind, "file": str(path), "metrics": _metrics(found.best), "holds": found.holds,
+                 "settings": dict(found.best.settings)},
+        "pareto": [{"kind": item.kind, "settings": dict(item.settings), "metrics": _metrics(item)}
+                   for item in found.front],
+        "binding": found.binding,
+        "requirements": found.task.asked.lines(),
+        "loosened": _loosened_values(found),
+        "evaluations": found.evaluations,
+        "dropped": dict(found.dropped),
+    }  # fmt: skip
+
+
+def _loosened_values(found: Tuned) -> dict[str, dict[str, float]]:
+    return {metric: asdict(one) for metric, one in found.loosened.items()}
+
+
+def _metrics(item: Candidate) -> dict[str, float | None]:
+    return {name: value if math.isfinite(value) else None for name, value in sorted(item.metrics.items())}
+
+
+def _csv(found: Tuned) -> str:
+    """Return the front as a table: kind, settings as JSON, objectives, then all other metrics."""
+    names = [*found.objectives, *sorted({n for item in found.front for n in item.metrics} - set(found.objectives))]
+    lines = [",".join(["kind", *names, "settings"])]
+    for item in found.front:
+        settings = json.dumps(dict(item.settings), sort_keys=True).replace('"', '""')
+        values = [f"{item.metrics[name]:.6g}" if name in item.metrics else "" for name in names]
+        lines.append(",".join([item.kind, *values, f'"{settings}"']))
+    return "\n".join(lines) + "\n"
+
+
+def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> None:
+    """Write a loop file with the best controller and the first simulation model, else the nominal linear model."""
+    task = found.task
+    robot = task.robot
+    if not steps:
+        source = sources_of(task.linear, task.asked.certificate)[0]
+        plant = nominal_plants([source])[0]
+        facts = {"name": plant.names[0], "numerator": plant.numerator[0].tolist(),
+                 "denominator": plant.denominator[0].tolist(), "delay": plant.delay[0].tolist(),
+                 "cross": plant.cross[0].tolist(), "sample_time": plant.sample_time, "axis": 0}  # fmt: skip
+        write_linear(folder, "loop", facts, controller=folder / BEST, asked=task.asked.certificate,
+                     block=found.controller.block(), weights=source.weights, force=True)  # fmt: skip
+        return
+    name, path = next(iter(steps.items()))
+    taut = task.cocontraction is not None
+    at = _LOOP_TAUT if taut else _LOOP_AT
+    neck = task.asked.certificate.sim
+    first, unit = robot.outputs.names[0], error_unit(robot)[0]
+    table: dict[str, Any] = {
+        "duration_s": at + float(neck["duration_s"]),
+        "plant": {_plant_key(path): _relative(path, folder)},
+        **({"observer": {"file": OBSERVER}} if found.observed else {}),
+        "controller": {"file": BEST},
+        "reference": {"kind": "step", f"{first}_{unit}": float(neck["size_deg"]), "at_s": at},
+    }  # fmt: skip
+    if any(plant.payload and plant.name == name for plant in found.own):
+        table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}
+    if taut and "least_cocontraction" not in found.best.settings:
+        table["reference"]["cocontraction"] = task.said_cocontraction
+    asked = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
+             if b.metric.startswith("sim.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
+    known = ("rise_s", "steady_rms_") + (("overshoot_pct", "settling_s") if task.asked.told() else ())
+    table["limits"] = {f"{first}.{key}": limit for key, limit in asked.items() if key.startswith(known)}
+    words = "" if found.observed else (
+        "\n# Without observer.npz: with it a requirement on the steps fails, or none was designed."
+    )  # fmt: skip
+    _write(folder / LOOP, f"# The best of `softneck tune` over {name}.{words}\n{tomli_w.dumps(table)}")
+
+
+def _plant_key(path: Path | str) -> str:
+    text = str(path)
+    return "fmu" if text.endswith(".fmu") else "model" if text.endswith(".npz") else "neck"
+
+
+def _relative(path: Path | str, folder: Path) -> str:
+    return path if isinstance(path, str) else Path(os.path.relpath(path, folder)).as_posix()
+
+
+def _toml_table(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a requirements table as TOML values, without empty tables."""
+    return {key: dict(value) if isinstance(value, Mapping) else value for key, value in table.items() if value != {}}
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_write(path, force=True) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+_MAX_FRONT_ROWS = 30
+_MAX_STEPS = 6
+_SIGNS = {"min": ">=", "max": "<=", "below": "<"}
+
+
+def tune_page(found: Tuned) -> str:
+    """Return the HTML page of a tuning."""
+    items = [found.best, *(item for item in found.front if item is not found.best)]
+    return page(
+        f"Controller for {found.task.robot.label()}, tuned",
+        [_result(found, _steps(found, items)), _front(found), _given_requirements(found)],
+        verdict=tune_verdict(found) if found.holds else f"Not all requirements hold. {failing_requirement(found)}",
+        holds=found.holds,
+        footer="Written by softneck tune.",
+    )
+
+
+def tune_verdict(found: Tuned) -> str:
+    """Return the verdict on a search whose certificate holds."""
+    if not found.loosened:
+        return "All requirements hold."
+    return f"All requirements hold but {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
+
+
+def requirement_rows(found: Tuned) -> list[list[str]]:
+    """Return a row for each requirement: metric, bound, limit, value of the best, verdict, note."""
+    rows = []
+    for verdict in found.verification.verdicts:
+        item, value, holds = verdict.requirement, verdict.value, verdict.holds
+        seen = found.best.metrics.get(item.metric)
+        if value is not None and seen is not None and item.metric.startswith("sim.") and seen > value:
+            # Loops of tuning alone: with noise, or with another dead time.
+            value, holds = seen, bool(holds) and item.holds(seen)
+        rows.append((item, value, holds, verdict.note))
+    for item in found.task.asked.bounds:
+        if item.metric.startswith("track."):
+            value = found.best.metrics.get(item.metric)
+            rows.append((item, value, None if value is None else item.holds(value), ""))
+    return [
+        [metric_title(item.metric), _SIGNS[item.bound], f"{item.limit:g}", cell(value, ".3g"),
+         "-" if holds is None else "holds" if holds else "fails", note]
+        for item, value, holds, note in rows
+    ]  # fmt: skip
+
+
+def tune_notes(found: Tuned) -> list[str]:
+    """Return the notes on requirements, each once with its metrics, and the assumptions of the design."""
+    told: dict[str, list[str]] = {}
+    for row in requirement_rows(found):
+        if row[5]:
+            told.setdefault(row[5], []).append(row[0])
+    reasons = [f"{', '.join(metrics)}: {note}." for note, metrics in told.items()]
+    limits = getattr(found.controller, "limits", None)
+    motors = [] if limits is None else limits.lines(found.controller.sample_time)
+    return reasons + [line.strip() for line in (*motors, *assumed_lines(found.assumed))]
+
+
+def failing_requirement(found: Tuned) -> str:
+    """Return a sentence or two on the requirement that fails."""
+    if found.holds:
+        return ""
+    unknown = [item for item in found.verification.failed if item.value is None]
+    if found.binding is None and unknown:
+        metrics = ", ".join(verdict.requirement.metric for verdict in unknown)
+        return f"{metrics} of {found.best.kind} cannot be computed: {unknown[0].note}."
+    if found.binding is None:
+        # Unlike `verify`, tuning has loops with noise, smaller steps and a circle.
+        asked = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
+        looped = ", ".join(metric for metric in asked if metric.startswith(("sim.", "track.")))
+        return f"The budget of {found.evaluations} ended before all loops were simulated: {looped} are not computed."
+    if found.nearest is None:
+        return f"{found.binding} fails, by the largest factor."
+    sign, limit = next((b.bound, b.limit) for b in found.task.asked.bounds if b.metric == found.binding)
+    return f"Only {found.binding} fails: {found.nearest:.3g}, required {_SIGNS[sign]} {limit:.3g}."
+
+
+def _result(found: Tuned, steps: Chart) -> Section:
+    best = found.best
+    text = [
+        f"{best.kind}: " + ", ".join(f"{name} {cell(value, '.3g')}" for name, value in best.settings.items()) + ".",
+        f"{found.evaluations} evaluations of {len({(i.kind, str(i.settings)) for i in found.candidates})} candidates "
+        "that were simulated in loops, and of others that were rejected before.",
+    ]
+    text += [f"{kind} was left out: {why}" for kind, why in found.dropped.items()]
+    rows = requirement_rows(found)
+    tables = [Table("Requirements", ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
+    text += tune_notes(found)
+    return Section("Best controller", charts=[steps], tables=tables, method=text)
+
+
+def _given_requirements(found: Tuned) -> Section:
+    return Section("Requirements as given", text=["; ".join(found.task.asked.lines()) + "."])
+
+
+def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:
+    curves: list[Curve] = []
+    for item, (colour, style) in zip(items[:_MAX_STEPS], curve_styles(), strict=False):
+        time, y, reference = step_response(found.task, item)
+        if not curves:
+            curves.append(Curve(time, reference, "reference", GREY, "step"))
+        curves.append(Curve(time, y, _label(found, item), colour, style, 2.0 if item is found.best else 1.0))
+    outputs = found.task.robot.outputs
+    where = "with the heaviest payload" if found.task.own else "of the nominal plant"
+    panel = Panel(curves, f"{outputs.names[0]} [{outputs.display_unit}]")
+    return Chart(f"Steps {where}: the best, and others on the front", [panel], row_height=4.0)
+
+
+def _front(found: Tuned) -> Section:
+    rows = [
+        [item.kind, *(cell(item.metrics[name], ".3g") for name in found.objectives),
+         ", ".join(f"{name} {cell(value, '.3g')}" for name, value in item.settings.items())]
+        for item in found.front[:_MAX_FRONT_ROWS]
+    ]  # fmt: skip
+    more = len(found.front) - _MAX_FRONT_ROWS
+    text = [f"{len(found.front)} candidates that none beats in every objective; all are in pareto.csv."]
+    text += [f"The first {_MAX_FRONT_ROWS} by {found.objectives[0]}."] if more > 0 else []
+    return Section("Pareto front", text=text, tables=[Table("", ["kind", *found.objectives, "settings"], rows)])
+
+
+def _label(found: Tuned, item: Candidate) -> str:
+    number = next((k for k, other in enumerate(found.front, start=1) if other is item), 0)
+    return f"best: {item.kind}" if item is found.best else f"{item.kind} {number}"
