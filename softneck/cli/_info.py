@@ -238,7 +238,7 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 def _toml(file: Path) -> dict[str, Any]:
     """Describe a TOML file by its keys: robot, loop, study, layout, otherwise a neck."""
-    from softneck.cosim import load_loop, load_study, python_of
+    from softneck.cosim import find_python, load_loop, load_study
     from softneck.plant import NeckParameters, VirtualNeck
     from softneck.robot import Robot
     from softneck.signals import read_layout
@@ -251,7 +251,7 @@ def _toml(file: Path) -> dict[str, Any]:
         robot = Robot.read(file)
         return {"type": "robot", "robot": robot.name, "hash": robot.hash, "summary": robot.summary()}
     if "plant" in table:
-        if not next(python_of(table), ""):  # nothing of a file that is only asked about is run
+        if not next(find_python(table), ""):  # nothing of a file that is only asked about is run
             load_loop(file)
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
     if "vary" in table:

@@ -45,6 +45,7 @@ from ._display import ReprMixin as ReprMixin
 from ._display import percent as percent
 from ._display import shown_progress as shown_progress
 from ._errors import did_you_mean as did_you_mean
+from ._errors import error_reason as error_reason
 from ._errors import missing_extra as missing_extra
 from ._errors import require_package as require_package
 from ._files import MOST_JSON as MOST_JSON

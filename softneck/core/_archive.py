@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ._errors import FileFormatError
+from ._errors import FileFormatError, error_reason
 from ._files import MOST_JSON, as_path, atomic_write, open_zip, require_file
 
 FORMAT_VERSION = 1
@@ -59,7 +59,7 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
     except FileFormatError:
         raise
     except Exception as error:  # damaged bytes raise all kinds of errors in zipfile, its decompressors, numpy and json
-        raise FileFormatError(f"{source}: is not a softneck file or is damaged ({_short(error)}).") from error
+        raise FileFormatError(f"{source}: is not a softneck file or is damaged ({error_reason(error)}).") from error
     _check_header(source, header)
     return header, contents
 
@@ -73,7 +73,3 @@ def _check_header(source: Path, header: object) -> None:
             f"{source}: has format version {version}; this softneck reads {FORMAT_VERSION}. "
             "Write it again with this version or use the softneck that wrote it."
         )
-
-
-def _short(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:120]

@@ -51,6 +51,11 @@ def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     return f"did you mean `{prefix}{near[0]}`? " if near else ""
 
 
+def error_reason(error: BaseException) -> str:
+    """Return the first line of an error's text, at most 120 characters; its type if the text is empty."""
+    return (str(error).splitlines() or [type(error).__name__])[0][:120]
+
+
 # Package as it is imported -> (extra of `pip install`, its purpose). README uses the extra `drives` only.
 EXTRAS = {
     "pyarrow": ("files", "Parquet files"),

@@ -7,7 +7,7 @@ from .loops._simulate import simulate as simulate
 from .loops._write_ssp import write_ssp as write_ssp
 from .parts._fmu_part import FmuError as FmuError
 from .parts._fmu_part import FmuPart as FmuPart
-from .parts._fmu_part import simulate_fmu_free_run as simulate_fmu_free_run
+from .parts._fmu_part import simulate_fmu as simulate_fmu
 from .parts._isolated import IsolatedPart as IsolatedPart
 from .studies._run_study import study as study
 from .studies._store import grouped as grouped
@@ -21,12 +21,12 @@ from .studies._study import make_study as make_study
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
 from .loops._loop_file import LoopSetup as LoopSetup
+from .loops._loop_file import find_python as find_python
 from .loops._loop_file import is_loop_file as is_loop_file
-from .loops._loop_file import python_of as python_of
 from .loops._loop_file import reference_of as reference_of
 from .loops._loop_file import require_trusted as require_trusted
 from .loops._loop_parts import read_toml as read_toml
-from .loops._simulate import reach_beyond as reach_beyond
+from .loops._simulate import describe_excess_range as describe_excess_range
 from .loops._simulate import run_setup as run_setup
 from .studies._run_study import Crew as Crew
 from .studies._run_study import crew as crew

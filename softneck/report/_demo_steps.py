@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from softneck.core import Matrix, Progress, atomic_write
-from softneck.cosim import Result, load_loop, simulate, simulate_fmu_free_run
+from softneck.cosim import Result, load_loop, simulate, simulate_fmu
 from softneck.design import LinearController, PiSettings
 from softneck.estimation import KalmanObserver, KalmanSettings
 from softneck.fmu import Buildable, build_fmu, fmu_info
@@ -143,7 +143,7 @@ def package(
         report(number / len(things), name)
         info = fmu_info(thing, scores=scores.get(name, ""), stop_time=30.0)
         path = build_fmu(thing.block(), folder / f"{_camel(name)}.fmu", info=info, force=True)
-        table = simulate_fmu_free_run(path, recording)
+        table = simulate_fmu(path, recording)
         difference = float(np.abs(table - python_free_run(thing.block(), recording)).max())
         packaged[name] = PackagedFmu(path, len(recording), difference)
     return packaged

@@ -27,7 +27,16 @@ from softneck.core import (
     settings_text,
     silent,
 )
-from softneck.cosim import Result, is_loop_file, load_loop, python_of, read_description, read_runs, read_toml, simulate
+from softneck.cosim import (
+    Result,
+    find_python,
+    is_loop_file,
+    load_loop,
+    read_description,
+    read_runs,
+    read_toml,
+    simulate,
+)
 from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged_parts
 from softneck.plots import Chart, Section, Table, cell, loop_chart, page, recording_chart, validation_chart
 from softneck.robot import FILE
@@ -155,7 +164,7 @@ def _files(root: Path) -> Iterator[Path]:
 def _read_loop(project: Project, path: Path, name: str) -> None:
     if is_loop_file(path):
         # A report on a received folder must not run code in it.
-        named = next(python_of(read_toml(path)), "")
+        named = next(find_python(read_toml(path)), "")
         if named:
             raise SettingsError(f"names Python (`{named}`), which a report never runs; `softneck simulate` does.")
         project.loops[name] = simulate(load_loop(path), report=lambda _: None, compiled=True)

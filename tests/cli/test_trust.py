@@ -60,7 +60,7 @@ def test_python_of_elsewhere_asks_for_trust(
     said = call(*words)
     assert said.code == 2
     assert (
-        f"python = `{module}:make` is not in the loop's folder; it would run with your rights. Say --trust" in said.err
+        f"python = `{module}:make` is not in the loop's folder and would run with your rights; use --trust" in said.err
     )
     assert not ran.exists()
     call(*words, "--trust")

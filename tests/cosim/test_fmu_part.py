@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError
-from softneck.cosim import FmuError, FmuPart, simulate_fmu_free_run
+from softneck.cosim import FmuError, FmuPart, simulate_fmu
 from softneck.cosim.parts._fmu_part import drive_fmu
 from softneck.loop import BlockPart, Part
 from softneck.signals import Recording
@@ -123,7 +123,7 @@ def _description(old: bytes, new: bytes) -> Callable[[str, bytes], tuple[str, by
         (b"<ModelVariables>", b"<ModelVariables", FileFormatError, "cannot be read"),
         (b' stepSize="0.02"', b"", SettingsError, "states no step size"),
         (b' stepSize="0.02"', b' stepSize="0. 02"', FileFormatError, "`0. 02` where a number is needed"),
-        (b'Tool name="softneck"', b'Tool name="else"', SettingsError, "say its role in the loop"),
+        (b'Tool name="softneck"', b'Tool name="else"', SettingsError, "give its role in the loop"),
     ],
     ids=["version", "exchange", "damaged", "step", "no number", "role"],
 )
@@ -199,7 +199,7 @@ def test_a_free_run_starts_anew_with_each_run(fmus: Path, toys: Any, recording: 
         _, outputs = block.run(state, np.column_stack([run.set_points, np.zeros(len(run))]))
         expected.append(np.vstack([state.outputs, outputs[:-1]]))
     done: list[float] = []
-    table = simulate_fmu_free_run(fmus / "Neck.fmu", recording, parameters={"pitch_start": 0.1}, report=done.append)
+    table = simulate_fmu(fmus / "Neck.fmu", recording, parameters={"pitch_start": 0.1}, report=done.append)
     np.testing.assert_array_equal(table, np.concatenate(expected))
     assert done[-1] == 1.0
 
@@ -214,7 +214,7 @@ def test_driving_with_wrong_names_lengths_or_sample_times_is_refused(fmus: Path,
         drive_fmu(path, {"payload": np.zeros(2)}, outputs=("yaw",))
     slow = Recording(2.0 * recording.time, 0.04, recording.channels, recording.run)
     with pytest.raises(DataError, match=r"runs at 0\.02 s and the recording is at 0\.04 s"):
-        simulate_fmu_free_run(path, slow)
+        simulate_fmu(path, slow)
 
 
 def test_an_fmu_in_a_folder_with_any_name_runs(fmus: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from softneck.core import Matrix, OutputFileError, SettingsError, SoftneckError, Vector, load
-from softneck.cosim.parts._linearize import SavedBlock, linearize, realised
+from softneck.cosim.parts._linearize import SavedBlock, linearize, realize
 from softneck.fmu import build_compiled_fmu, build_fmu
 from softneck.runtime import Block
 from softneck.signals import redefinition_matrix
@@ -120,7 +120,7 @@ def test_pulses_and_derivatives_say_the_same() -> None:
     part.start(0.0, {})
     for k in range(50):
         part.advance(k * TS, held)
-    A, B, C, D, error = realised(part, 50, held, [0, 1, 2], [6.0] * 3, [0, 1, 2, 3, 4], "rls")
+    A, B, C, D, error = realize(part, 50, held, [0, 1, 2], [6.0] * 3, [0, 1, 2, 3, 4], "rls")
     assert error < 1e-9
     found = control.StateSpace(A, B, C, D, TS)
     np.testing.assert_allclose(response(found), response(exact.ss()), rtol=0, atol=1e-8)
@@ -165,7 +165,7 @@ def test_any_linear_system_is_found_again(seed: int, order: int, inputs: int, ou
     A *= rng.uniform(0.3, 0.95) / np.abs(np.linalg.eigvals(A)).max()
     B, C = rng.standard_normal((order, inputs)), rng.standard_normal((outputs, order))
     D = rng.standard_normal((outputs, inputs))
-    a, b, c, d, error = realised(
+    a, b, c, d, error = realize(
         Toy(A, B, C, D), 0, np.zeros(inputs), list(range(inputs)), [1.0] * inputs, list(range(outputs)), "toy"
     )
     assert len(a) <= order
@@ -180,9 +180,9 @@ def test_any_linear_system_is_found_again(seed: int, order: int, inputs: int, ou
 def test_what_moves_nothing_is_said() -> None:
     quiet = Toy(np.eye(1), np.zeros((1, 1)), np.ones((1, 1)), np.zeros((1, 1)))
     with pytest.raises(SettingsError, match="no input moves an output"):
-        realised(quiet, 0, np.zeros(1), [0], [1.0], [0], "toy")
+        realize(quiet, 0, np.zeros(1), [0], [1.0], [0], "toy")
     with pytest.raises(SettingsError, match="has no input that is a number"):
-        realised(quiet, 0, np.zeros(1), [], [], [0], "toy")
+        realize(quiet, 0, np.zeros(1), [], [], [0], "toy")
 
 
 def test_a_file_is_what_its_block_is(tmp_path: Path) -> None:
@@ -234,7 +234,7 @@ def test_files_that_cannot_be(tmp_path: Path) -> None:
         (tmp_path / "absent.fmu", r"absent\.fmu"),
         (tmp_path / "D.fmu", "is a folder; name a file"),
         (tmp_path / "D.npz", "is a folder; name a file"),
-        (tmp_path / "none.ssp", "is several FMUs; unzip it"),
+        (tmp_path / "none.ssp", "holds several FMUs; unzip it"),
         (GOLDEN / "family.npz", "is not a model, observer or controller"),
     ):
         with pytest.raises(SoftneckError, match=words):

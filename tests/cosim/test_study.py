@@ -281,7 +281,7 @@ def test_worst_cases_are_loop_files_with_the_same_metrics(place: Path) -> None:
     ("key", "message"),
     [
         ("plant.parameters.mass", "no key `plant.parameters.mass`: the plant has deadly, fails, gain"),
-        ("plant.mass", "written plant.parameters.NAME"),
+        ("plant.mass", "write plant.parameters.NAME"),
         ("observer.parameters.noise_std", "no observer"),
         ("reference.yaw_deg", "`yaw_deg` is not part of a step reference"),
         ("fault.0.payload_kg", "`payload_kg` is not part of a sensor_bias"),

@@ -109,5 +109,5 @@ def test_a_limit_on_what_a_plant_does_not_say_is_refused(plant: Model) -> None:
     signals = {name: values for name, values in result.signals.items() if name != "validity"}
     other = LoopResult(result.time, signals, {}, TS, result.robot)
     assert "validity" not in metrics(other)
-    with pytest.raises(SettingsError, match="this plant has no output `validity`"):
+    with pytest.raises(SettingsError, match="the plant has no output `validity`"):
         check_limits(metrics(other), {"validity.min": 0.5})

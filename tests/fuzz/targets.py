@@ -19,7 +19,7 @@ from softneck.core import FileFormatError, load, read_certificate, write_certifi
 from softneck.core._certificate import certificate_contents
 from softneck.cosim import load_loop, load_ssp, load_study
 from softneck.cosim.parts._fmu_part import FmuPart
-from softneck.cosim.parts._variables import block_of
+from softneck.cosim.parts._variables import read_block
 from softneck.cosim.studies._store import read_description, read_runs
 from softneck.drives.bus._read import load_drives
 from softneck.drives.logs._cycle import Cycle
@@ -229,7 +229,7 @@ TARGETS: dict[str, Target] = {
     "mcap": Target(".mcap", sniff, [lambda path: log_writers.write_mcap(path, columns())]),
     "run_log": Target(".mcap", read_run_log, [run_log]),
     "fmu": Target(".fmu", lambda path: FmuPart(path, role="plant"), [fmu], zipped=True),
-    "our_fmu": Target(".fmu", block_of, [our_fmu], zipped=True),
+    "our_fmu": Target(".fmu", read_block, [our_fmu], zipped=True),
     "ssp": Target(".ssp", load_ssp, [ssp], zipped=True),
     "loop": Target(".toml", load_loop, [text(LOOP)]),
     "study": Target(

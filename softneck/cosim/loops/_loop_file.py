@@ -1,4 +1,4 @@
-"""Loop files: a TOML text that describes a loop; and whose Python it would run."""
+"""Loop files: TOML files that describe a loop, and the check of the Python that they would run."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener, links, number, nu
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class LoopSetup(ReprMixin):
-    """A loop with what is asked of it; a loop file describes one.
+    """A loop with its limits; a loop file describes one.
 
     Attributes:
         loop: the parts, the reference, the order.
-        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0; of "validity.min" a lower one.
-        files: what was read for it: role -> (path, SHA-256).
-        angle: which outputs the metrics judge: "true" (where the plant offers it) or "measured".
+        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0; that of "validity.min" is a lower one.
+        files: role -> (path, SHA-256) of each file that was read.
+        angle: the outputs of the metrics: "true" (if the plant has them) or "measured".
     """
 
     loop: Loop
@@ -47,33 +47,34 @@ class LoopSetup(ReprMixin):
         require_one_of("angle", self.angle, ("true", "measured"))
 
 
-_TOP = (
+_LOOP_KEYS = (
     "duration_s", "sample_time_s", "order", "plant", "observer", "controller", "reference", "part", "connections",
     "fault", "limits", "angle", "folder", "drives", "robot",
 )  # fmt: skip
-# What a file may say of the loop in an archive that it names.
-_BESIDE = ("ssp", "duration_s", "fault", "limits", "angle", "robot")
+# Keys of a loop file that names an SSP archive.
+_SSP_KEYS = ("ssp", "duration_s", "fault", "limits", "angle", "robot")
+# Relative tolerance of sample times: rounding of decimal numbers in files.
 _SAME_SAMPLE_TIME = 1e-6
 
 
 def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
-    """Read a loop file and open all it names; relative paths start at the file's folder.
+    """Read a loop file and open all files in it; relative paths start at the file's folder.
 
     Args:
         path: of the file, or of an SSP archive of a closed loop.
-        robot: a preset or a robot file, in the place of the file's `robot`; every part must be of it.
+        robot: a preset or a robot file that replaces the file's `robot`; every part must be of it.
 
     Raises:
-        FileFormatError: no such file or no TOML.
-        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+        FileFormatError: no such file, or not TOML.
+        SettingsError: unknown or missing keys, or invalid values; the message names the key.
     """
     source = Path(path)
     if source.suffix == ".ssp":
-        return _of_structure(source, robot)
+        return _load_ssp_loop(source, robot)
     table = read_toml(source)
     try:
         if "ssp" in table:
-            return _of_archive(table, source, robot)
+            return _load_ssp_file(table, source, robot)
         return _setup(table if robot is None else {**table, "robot": find_robot(robot)}, source)
     except SoftneckError as error:
         if str(error).startswith(str(source)):
@@ -88,16 +89,16 @@ def load_ssp(path: str | Path) -> LoopSetup | System:
         path: of the archive; its FMUs are unpacked until this process ends.
 
     Returns:
-        A loop where the FMUs are one plant, one controller and one reference (of softneck, or so named), and
-        perhaps an observer and others; else a system, whose signals are named "part.output".
+        A loop if the FMUs are one plant, one controller and one reference (of softneck, or with these names), and
+        perhaps an observer and others; else a system, with signals "part.output".
 
     Raises:
-        FileFormatError: no archive, or one that is damaged, reaches out of itself or lacks what it names.
-        SettingsError: what a loop cannot carry, such as signal dictionaries; the line names it.
+        FileFormatError: no archive, a damaged one, or one that names files that are missing or outside of it.
+        SettingsError: features that a loop does not have, such as signal dictionaries; the message names them.
     """
     read = read_ssp(path)
     if read.closed:
-        return _of_structure(Path(path), None, read)
+        return _load_ssp_loop(Path(path), None, read)
     opener = PartOpener(Path())
     entries = {entry["name"]: entry for entry in read.table["part"]}
     parts = {name: opener.other(name, entry) for name, entry in entries.items()}
@@ -112,24 +113,24 @@ def load_ssp(path: str | Path) -> LoopSetup | System:
     )
 
 
-def _of_archive(table: Mapping[str, Any], source: Path, robot: str | None) -> LoopSetup:
-    """Return the loop of the archive that a loop file names, with what the file says of it."""
-    refuse_unknown("a file with `ssp`", table, _BESIDE)
-    said = {key: value for key, value in table.items() if key not in ("ssp", "robot")}
-    setup = _of_structure(source.parent / str(table["ssp"]), robot or table.get("robot"), None, said)
+def _load_ssp_file(table: Mapping[str, Any], source: Path, robot: str | None) -> LoopSetup:
+    """Return the loop of the SSP archive that a loop file names, with the other keys of the file."""
+    refuse_unknown("a file with `ssp`", table, _SSP_KEYS)
+    keys = {key: value for key, value in table.items() if key not in ("ssp", "robot")}
+    setup = _load_ssp_loop(source.parent / str(table["ssp"]), robot or table.get("robot"), None, keys)
     return replace(setup, files={"loop": (str(source), file_hash(source)), **setup.files})
 
 
-def _of_structure(
-    source: Path, robot: str | None, read: StructureTable | None = None, said: Mapping[str, Any] | None = None
+def _load_ssp_loop(
+    source: Path, robot: str | None, read: StructureTable | None = None, keys: Mapping[str, Any] | None = None
 ) -> LoopSetup:
     read = read_ssp(source) if read is None else read
     if not read.closed:
         raise SettingsError(
-            f"{source}: is no closed loop: its FMUs are not one plant whose set-points are fed, one controller and one "
-            "reference; `softneck simulate` runs it, and `load_ssp` returns it as a system."
+            f"{source}: is no closed loop of one plant with connected set-points, one controller and one reference; "
+            "`softneck simulate` runs it, and `load_ssp` returns it as a system."
         )
-    table = {**read.table, **(said or {}), "robot": find_robot(robot, beside=source)}
+    table = {**read.table, **(keys or {}), "robot": find_robot(robot, beside=source)}
     try:
         setup = _setup(table, source.parent)
     except SoftneckError as error:
@@ -148,24 +149,23 @@ def is_loop_file(path: Path) -> bool:
 
 
 def reference_of(path: str | Path, *, robot: str | None = None) -> ReferenceBlock:
-    """Return the [reference] of a loop file as a block, of which `build_fmu` makes a reference FMU.
+    """Return the [reference] of a loop file as a block, from which `build_fmu` makes a reference FMU.
 
-    Its sample time is the file's `sample_time_s`, 20 ms if it states none; its other parts are not opened. The
-    reference of another robot than the neck is written down over the file's `duration_s`.
+    Its sample time is the file's `sample_time_s`, 20 ms by default; the other parts are not opened. References of
+    other robots than the neck are tabulated over the file's `duration_s`.
 
     Args:
         path: of the file.
-        robot: a preset or a robot file, in the place of the file's `robot` or of one beside it.
+        robot: a preset or a robot file that replaces the file's `robot` or the one beside it.
 
     Raises:
-        SettingsError: the reference is an FMU already, or wrong.
+        SettingsError: the reference is an FMU already, or invalid.
     """
     source = Path(path)
     table = read_toml(source)
     try:
-        said = table.get("robot") if robot is None else robot
         opener = PartOpener(source.parent)
-        whose = opener.robot(said, source)
+        whose = opener.robot(table.get("robot") if robot is None else robot, source)
         reference = opener.reference(table["reference"], robot=whose)
         if isinstance(reference, AheadReference):
             reference = reference.reference
@@ -180,27 +180,27 @@ def reference_of(path: str | Path, *, robot: str | None = None) -> ReferenceBloc
 
 
 def make_loop(table: Mapping[str, Any], folder: str | Path = ".", *, opened: dict[Any, Any] | None = None) -> LoopSetup:
-    """Return the loop that a table with the keys of a loop file describes; relative paths start at `folder`.
+    """Return the loop of a table with the keys of a loop file; relative paths start at `folder`.
 
-    From Python, plant, observer, controller and reference may also be the things themselves: a part, a block, what
-    has a `block()` such as a model or `VirtualNeck`, the path of an FMU or a file, a reference. `opened` remembers
-    files and FMUs for the next loop of the same.
+    Plant, observer, controller and reference may also be Python objects: a part, a block, an object with `block()` such
+    as a model or `VirtualNeck`, the path of an FMU or a file, a reference. `opened` caches files and FMUs between
+    loops.
 
     Raises:
-        SettingsError: unknown or missing keys, or values that do not fit; the line names the key.
+        SettingsError: unknown or missing keys, or invalid values; the message names the key.
     """
     return _setup(normal_table(table), Path(folder), opened)
 
 
 def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None = None) -> LoopSetup:
-    """Return the loop of a normal table; `source` is its file, or the folder at which its paths start."""
-    refuse_unknown("the file", table, _TOP)
+    """Return the loop of a normal table; `source` is its file, or the folder where its paths start."""
+    refuse_unknown("the file", table, _LOOP_KEYS)
     for key in ("duration_s", "plant", "controller", "reference"):
         if key not in table:
             raise SettingsError(f"`{key}` is missing.")
     folder = source if source.is_dir() else source.parent
     step = number("sample_time_s", table.get("sample_time_s", 0.02))
-    if step > 0.0:  # before the parts are opened, which takes longer; with all columns it is judged again
+    if step > 0.0:  # checked before the parts are opened, which takes longer; the run checks it with all columns
         require_steps("duration_s", number("duration_s", table["duration_s"]), step)
     opener = PartOpener(folder / str(table.get("folder", ".")), step=step, opened=opened)
     if not source.is_dir():
@@ -215,7 +215,7 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
     robot = opener.robot(table.get("robot"), None if source.is_dir() else source)
     _check_fmus(parts, robot)
     parts["plant"] = opener.plant_of(robot, parts["plant"])
-    parts = {name: opener.called(name, part, robot) for name, part in parts.items()}
+    parts = {name: opener.with_robot_names(name, part, robot) for name, part in parts.items()}
     reference = opener.reference(table["reference"], parts["controller"].sample_time, robot)
     if isinstance(reference, FmuPart | IsolatedPart):
         parts["reference"], described["reference"] = reference, table["reference"]
@@ -244,20 +244,20 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
 
 
 def _check_fmus(parts: Mapping[str, Part], robot: Robot) -> None:
-    """Raise SettingsError where an FMU of ours says that it is of another robot; foreign ones say nothing."""
+    """Raise SettingsError if an FMU of softneck has the annotation of another robot."""
     for name, part in parts.items():
-        whose, told = part.robot_told if isinstance(part, FmuPart | IsolatedPart) else ("", "")
-        if told and told != robot.hash:
+        whose, digest = part.annotated_robot if isinstance(part, FmuPart | IsolatedPart) else ("", "")
+        if digest and digest != robot.hash:
             raise SettingsError(
-                f"[{name}] is an FMU of robot `{whose}` ({told[:8]}) and the loop of robot {robot.label()}; a loop is "
-                "of one. Where its parts do not say it, `robot` does."
+                f"[{name}] is an FMU of robot `{whose}` ({digest[:8]}) and the loop of robot {robot.label()}; use "
+                "parts of one robot, or set `robot`."
             )
 
 
 def _constants(
     parts: Mapping[str, Part], described: Mapping[str, Any]
 ) -> tuple[dict[str, dict[str, float]], dict[str, dict[str, float]]]:
-    """Return constant inputs and parameters by part: what the file calls a parameter may be one of a part's inputs."""
+    """Return constant inputs and parameters by part; the file has both under `parameters`."""
     inputs, parameters = {}, {}
     for name, part in parts.items():
         chosen = numbers(f"[{name}] parameters", described[name].get("parameters", {}))
@@ -268,7 +268,7 @@ def _constants(
 
 
 def normal_table(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a loop's table in which every part is a table, as in a loop file."""
+    """Return a loop's table with a table for each part, as in a loop file."""
     made = dict(table)
     for name in ("plant", "observer", "controller", "reference"):
         value = made.get(name)
@@ -317,66 +317,64 @@ def _check_sample_time(loop: Loop, given: Any) -> None:
         return
     step = min(part.sample_time for part in loop.parts.values())
     if abs(number("sample_time_s", given) - step) > _SAME_SAMPLE_TIME * step:
-        raise SettingsError(f"`sample_time_s` is {given:g}, but the fastest part runs at {step:g} s; state that.")
+        raise SettingsError(f"`sample_time_s` is {given:g}, but the fastest part runs at {step:g} s; use that.")
 
 
-# Our own package runs anyway; loops of worst plants name it.
-_OURS = "softneck"
-
-
-def python_of(table: Any) -> Iterator[str]:
-    """Yield each `python = "package.module:factory"` of a table, at any depth; dotted keys of a study too."""
+def find_python(table: Any) -> Iterator[str]:
+    """Yield each `python = "package.module:factory"` of a table, at any depth, also for dotted keys of a study."""
     if isinstance(table, Mapping):
         for key, value in table.items():
             if str(key).rpartition(".")[2] == "python":
-                yield from _texts(value)
+                yield from _iterate_texts(value)
             else:
-                yield from python_of(value)
+                yield from find_python(value)
     elif isinstance(table, list):
         for item in table:
-            yield from python_of(item)
+            yield from find_python(item)
 
 
-def _texts(value: Any) -> Iterator[str]:
-    """Yield the texts in a value: one, or the choices of a study."""
+def _iterate_texts(value: Any) -> Iterator[str]:
+    """Yield the texts in a value: itself, or the choices of a study."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, Mapping | list):
         for item in value.values() if isinstance(value, Mapping) else value:
-            yield from _texts(item)
+            yield from _iterate_texts(item)
 
 
 def foreign_python(source: Path) -> str:
     """Return the first `python =` of a loop or study file whose module is not in the loop's folder, else "".
 
     Raises:
-        FileFormatError: no such file or no TOML.
+        FileFormatError: no such file, or not TOML.
     """
     table = read_toml(source)
-    loop, named = table.get("loop"), list(python_of(table))
+    loop, named = table.get("loop"), list(find_python(table))
     project = source.resolve().parent
     if isinstance(loop, str) and (source.parent / loop).is_file():
         project = (source.parent / loop).resolve().parent
         loop = read_toml(source.parent / loop)
-        named += python_of(loop)
+        named += find_python(loop)
     start = loop if isinstance(loop, Mapping) else table
     folder = project / str(start.get("folder", "."))
-    return next((path for path in named if not _lies_in(project, folder, path.partition(":")[0].partition(".")[0])), "")
+    return next(
+        (path for path in named if not _is_in_project(project, folder, path.partition(":")[0].partition(".")[0])), ""
+    )
 
 
 def require_trusted(source: Path, *, trust: bool) -> None:
-    """Raise SettingsError if a loop or study file would run Python of outside its folder, unless it is trusted."""
+    """Raise SettingsError if a loop or study file would run Python from outside its folder, unless `trust`."""
     path = "" if trust else foreign_python(source)
     if path:
         raise SettingsError(
-            f"{source}: python = `{path}` is not in the loop's folder; it would run with your rights. Say --trust if "
-            "it may. Nothing was run."
+            f"{source}: python = `{path}` is not in the loop's folder and would run with your rights; use --trust to "
+            "allow it. Nothing was run."
         )
 
 
-def _lies_in(project: Path, folder: Path, package: str) -> bool:
-    """Return whether the import of `package`, looked for in `folder` first, would run a file of `project`."""
-    if package == _OURS:
+def _is_in_project(project: Path, folder: Path, package: str) -> bool:
+    """Return whether the import of `package`, searched in `folder` first, would run a file of `project`."""
+    if package == "softneck":  # runs anyway; loops of worst plants name it
         return True
     loaded = sys.modules.get(package)
     if loaded is not None:

@@ -1,6 +1,6 @@
-"""The parts that a loop's table names: softneck files, FMUs, necks, and what Python makes.
+"""Open the parts of a loop's table: softneck files, FMUs, necks, and Python factories.
 
-Each value of a table is checked as it is read; a wrong one is a line that names its key.
+Each value is checked as it is read; the error of an invalid one names its key.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..parts._isolated import IsolatedPart
 
 
 def read_toml(source: Path) -> dict[str, Any]:
-    """Return the content of a TOML file; raise FileFormatError if there is none."""
+    """Return the content of a TOML file; raise FileFormatError if it cannot be read."""
     require_file(source)
     try:
         return tomllib.loads(settings_text(source))
@@ -66,7 +66,7 @@ def texts(where: str, table: Any) -> dict[str, str]:
 
 
 def links(table: Any, robot: Robot) -> dict[str, str | Link]:
-    """Return [connections]: each a name, or {from = name, factor, offset}, which stands for any conversion of units."""
+    """Return [connections]: names, or tables {from = name, factor, offset}, which replace the conversion of units."""
     if not isinstance(table, dict):
         raise SettingsError(f"[connections] must be a table; got {table!r}.")
 
@@ -97,38 +97,38 @@ def tables(key: str, listed: Any) -> list[Mapping[str, Any]]:
     return listed
 
 
-# Table -> (the keys that say where the part comes from, the role of a file of ours).
+# Table -> (keys for the source of the part, role of a softneck file).
 SOURCES = {
     "plant": (("fmu", "model", "neck", "python"), "model"),
     "observer": (("fmu", "file", "python"), "observer"),
     "controller": (("fmu", "file", "python"), "controller"),
 }
 _OTHER_SOURCES = ("fmu", "file", "python")
-# A table from Python may hold the part itself.
+# A table from Python may hold the part itself under this key.
 OBJECT = "object"
-# What may stand beside `fmu`: how an FMU that nobody here wrote becomes a part, and where it runs.
+# Keys beside `fmu`: names, units and step for an FMU of another tool, and whether it runs in a process of its own.
 _FMU_KEYS = ("names", "units", "sample_time_s", "isolated", "timeout_s")
 _NECK = Robot.preset("neck")
-_REFERENCES = ("step", "ramp", "sine", "rotation", "recording")
+_REFERENCE_KINDS = ("step", "ramp", "sine", "rotation", "recording")
 
 
 class PartOpener:
-    """Opens what the tables of one loop name, and remembers the hash of each file."""
+    """Opens the parts in the tables of one loop, and keeps the hash of each file."""
 
     def __init__(self, folder: Path, *, step: float = 0.02, opened: dict[Any, Any] | None = None) -> None:
-        """Open relative to `folder`; necks step every `step` [s], `opened` remembers parts for the next loop."""
+        """Open relative to `folder`, with necks that step every `step` [s]; `opened` caches parts between loops."""
         self.folder, self.files = folder, dict[str, tuple[str, str]]()
-        # Part -> whose it is, where it says so.
+        # Part -> its robot, if it has one.
         self.robots: dict[str, Robot] = {}
-        # Of the virtual neck, where the plant is one.
+        # Of the plant, if it is a virtual neck.
         self._physics: NeckParameters | None = None
         self._step, self._opened = step, opened
 
     def robot(self, given: Any, beside: Path | None) -> Robot:
-        """Return whose loop it is: as its parts say, else the one that is `given`, else the one beside the file.
+        """Return the robot of the loop: that of its parts, else `given`, else the one beside the file.
 
         Raises:
-            SettingsError: two of them are of two robots; the line names both.
+            SettingsError: parts of two robots; the message names both.
         """
         if given is not None and not isinstance(given, str | Robot):
             raise SettingsError(f"`robot` must be a preset or a robot file; got {given!r}.")
@@ -141,27 +141,27 @@ class PartOpener:
         for name, other in self.robots.items():
             if other.hash != robot.hash:
                 raise SettingsError(
-                    f"[{name}] is of robot {other.label()} and [{first}] of robot {robot.label()}; a loop is of one."
+                    f"[{name}] is of robot {other.label()} and [{first}] of robot {robot.label()}; use one robot."
                 )
         return robot
 
     def part(self, name: str, table: Any) -> Part:
         """Return plant, observer or controller."""
         keys, role = SOURCES[name]
-        return self._made(name, table, keys, role, as_role=name)
+        return self._open_part(name, table, keys, role, as_role=name)
 
     def other(self, name: str, table: Mapping[str, Any]) -> Part:
-        """Return what a [[part]] describes."""
+        """Return the part of a [[part]] table."""
         rest = {key: value for key, value in table.items() if key not in ("name", "role")}
-        return self._made(name, rest, _OTHER_SOURCES, None, as_role=str(table.get("role", "controller")))
+        return self._open_part(name, rest, _OTHER_SOURCES, None, as_role=str(table.get("role", "controller")))
 
     def reference(self, table: Any, sample_time: float = 0.02, robot: Robot = _NECK) -> Reference | Part:
-        """Return what the table [reference] describes; with `ahead_s` a part that tells it so long before."""
+        """Return the reference of the table [reference]; with `ahead_s` a part with preview."""
         if isinstance(table, dict) and "ahead_s" in table:
             rest = {key: value for key, value in table.items() if key != "ahead_s"}
             made = self.reference(rest, sample_time, robot)
             if hasattr(made, "advance"):
-                raise SettingsError("[reference] ahead_s: an FMU cannot be asked what it will say; leave it out.")
+                raise SettingsError("[reference] ahead_s: an FMU has no preview; leave it out.")
             ahead = number("[reference] ahead_s", table["ahead_s"])
             return AheadReference(made, ahead, sample_time=sample_time, robot=robot)  # pyright: ignore[reportArgumentType]
         if isinstance(table, dict) and OBJECT in table:
@@ -169,9 +169,9 @@ class PartOpener:
             part: Any = given if callable(given) else _part_of("reference", given)
             return part
         if isinstance(table, dict) and "fmu" in table:
-            return self._made("reference", table, ("fmu",), None, as_role="reference")
-        if not isinstance(table, dict) or table.get("kind") not in _REFERENCES:
-            raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCES)}.")
+            return self._open_part("reference", table, ("fmu",), None, as_role="reference")
+        if not isinstance(table, dict) or table.get("kind") not in _REFERENCE_KINDS:
+            raise SettingsError(f"[reference] kind must be one of {', '.join(_REFERENCE_KINDS)}.")
         values = {key: value for key, value in table.items() if key != "kind"}
         if table["kind"] != "recording":
             return make_reference(table["kind"], values, robot)
@@ -179,17 +179,17 @@ class PartOpener:
         recording = read_recording(self._file("reference", str(values.get("file", ""))))
         require_same_robot(robot, recording.robot, "[reference] file and the loop")
         if len(recording.runs()) > 1:
-            raise DataError("[reference] file: the recording has several runs; cut out the one to follow.")
+            raise DataError("[reference] file: the recording has several runs; use a recording of one run.")
         time = recording.time - recording.time[0]
         return RecordingReference.of(time, recording.channels, robot.outputs.names)
 
     def drives(self, name: Any) -> None:
-        """Remember the drives file that the loop is meant for; nothing here reads it, certificates are bound to it."""
+        """Keep the hash of the loop's drives file for certificates; the file is not read here."""
         if not isinstance(name, str):
             raise SettingsError(f"`drives` must be the name of a drives file; got {name!r}.")
         self._file("drives", name)
 
-    def _made(self, name: str, table: Any, keys: tuple[str, ...], role: str | None, *, as_role: str) -> Part:
+    def _open_part(self, name: str, table: Any, keys: tuple[str, ...], role: str | None, *, as_role: str) -> Part:
         if not isinstance(table, dict):
             raise SettingsError(f"`{name}` must be a table: [{name}].")
         extra = (OBJECT,) if OBJECT in table else _FMU_KEYS if "fmu" in table else ()
@@ -202,7 +202,7 @@ class PartOpener:
         key, value = given[0], table[given[0]]
         if key == OBJECT:
             value = own_controller(value) if name == "controller" else value
-            self._says(name, value)
+            self._note_robot(name, value)
             return _part_of(name, value)
         if not isinstance(value, str):
             raise SettingsError(f"[{name}] {key} must be a text; got {value!r}.")
@@ -215,24 +215,24 @@ class PartOpener:
             return self._virtual(NeckParameters.from_toml(file))
         settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
         if key == "fmu":
-            return self._open((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
-        thing = self._open((role, file), lambda: load(file, role=role))
-        self._says(name, thing)
+            return self._cached((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
+        thing = self._cached((role, file), lambda: load(file, role=role))
+        self._note_robot(name, thing)
         return BlockPart(thing.block())
 
     def _virtual(self, parameters: NeckParameters) -> Part:
-        """Return the virtual neck; `plant_of` makes another robot's of its physics."""
+        """Return the virtual neck; `plant_of` makes that of another robot."""
         self._physics = parameters
         return BlockPart(VirtualNeck(parameters).block(sample_time=self._step))
 
     def plant_of(self, robot: Robot, made: Part) -> Part:
-        """Return the plant of a loop of `robot`: the one that was `made`, or its virtual plant of the same physics."""
+        """Return the plant of a loop of `robot`: `made`, or the robot's virtual plant with the same physics."""
         if self._physics is None:
             return made
         return BlockPart(VirtualNeck.of(robot, self._physics).block(sample_time=self._step))
 
-    def called(self, name: str, part: Part, robot: Robot) -> Part:
-        """Return a part whose motors' ports have `robot`'s names, no numbers, and no names of its own robot."""
+    def with_robot_names(self, name: str, part: Part, robot: Robot) -> Part:
+        """Return a part whose motor ports have the names of `robot`, not numbers or names of its own robot."""
         names = {port.name: robot.own(port.name) for port in (*part.inputs, *part.outputs)}
         if name in self.robots:
             whose = self.robots[name]
@@ -244,17 +244,17 @@ class PartOpener:
             ports = {"inputs": _with_names(block.inputs, names), "outputs": _with_names(block.outputs, names)}
             return BlockPart(replace(block, **ports))
         if isinstance(part, FmuPart | IsolatedPart):
-            return part.called(names) if names else part
-        made: Any = _CalledPart(part, names) if names else part
+            return part.with_names(names) if names else part
+        made: Any = _RenamedPart(part, names) if names else part
         return made
 
-    def _says(self, name: str, thing: Any) -> None:
-        """Remember whose a part is, if it says so."""
+    def _note_robot(self, name: str, thing: Any) -> None:
+        """Keep the robot of a part, if it has one."""
         if isinstance(robot := getattr(thing, "robot", None), Robot):
             self.robots[name] = robot
 
-    def _open(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
-        """Return what `make` opens, remembered if this reader shares what it opens; a changed file is opened again."""
+    def _cached(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+        """Return the result of `make`, from the cache if there is one and the file has not changed."""
         if self._opened is None:
             return make()
         stat = key[1].stat()
@@ -282,20 +282,20 @@ class PartOpener:
         path = self.folder / name
         if not path.is_file():
             raise FileFormatError(f"[{role}]: there is no file {path}.")
-        self.files[role] = (str(path), self._open(("hash", path), lambda: file_hash(path)))
+        self.files[role] = (str(path), self._cached(("hash", path), lambda: file_hash(path)))
         return path
 
 
-class _CalledPart:
-    """A part of one's own whose ports have other names."""
+class _RenamedPart:
+    """A user's part with other names for its ports."""
 
     def __init__(self, part: Part, names: Mapping[str, str]) -> None:
-        """Rename the ports by `names`: old name -> new name."""
+        """Rename the ports by `names`, old name -> new name."""
         self._part, self.sample_time, self.role = part, part.sample_time, part.role
         self.inputs, self.outputs = (_with_names(ports, names) for ports in (part.inputs, part.outputs))
 
     def __getattr__(self, name: str) -> Any:
-        """Leave all else to the part itself."""
+        """Return all other attributes of the part."""
         return getattr(self._part, name)
 
 
@@ -304,7 +304,7 @@ def _with_names(ports: tuple[Port, ...], names: Mapping[str, str]) -> tuple[Port
 
 
 def _part_of(name: str, made: Any, said: str = " is") -> Part:
-    """Return a part out of a part, a block, what has a block, or a controller of one's own."""
+    """Return a part from a part, a block, an object with `block()`, or a controller of the user."""
     made = own_controller(made) if name == "controller" else made
     made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
     if isinstance(made, Block):

@@ -1,4 +1,4 @@
-"""Loops as tables: the table of a loop object, dotted keys into it, and the same table with other values."""
+"""Loops as tables: the table of a loop object, and changes of its values by dotted keys."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 from softneck.core import SettingsError
 from softneck.loop import (
     BlockPart,
-    Link,
     Loop,
     Part,
     fault_field,
@@ -23,23 +22,22 @@ from softneck.robot import Robot
 from ..parts._fmu_part import FmuPart
 from ..parts._isolated import IsolatedPart
 from ._loop_file import LoopSetup, normal_table
-from ._loop_parts import OBJECT
+from ._loop_parts import OBJECT, SOURCES
 
 _NECK = Robot.preset("neck")
-_PARTS = ("plant", "observer", "controller")
-_SOURCES = ("fmu", "model", "file", "neck", "python", OBJECT)
-_PLAIN = ("duration_s", "order", "angle", "sample_time_s")
+_SOURCE_KEYS = ("fmu", "model", "file", "neck", "python", OBJECT)
+_TOP_KEYS = ("duration_s", "order", "angle", "sample_time_s")
 
 
 def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
-    """Return the table of which `make_loop` makes `loop` again; parts that no file describes stand in it themselves."""
+    """Return the table from which `make_loop` makes `loop`; it holds parts without a file as objects."""
     setup = loop if isinstance(loop, LoopSetup) else LoopSetup(loop=loop)
     plain = setup.loop
     table: dict[str, Any] = {"duration_s": plain.duration, "order": plain.order, "angle": setup.angle}
     parameters, constants = plain.parameters, plain.constants
     for name, part in plain.parts.items():
         chosen = {**parameters.get(name, {}), **constants.get(name, {})}
-        described = {**_described(part), **({"parameters": chosen} if chosen else {})}
+        described = {**_describe_part(part), **({"parameters": chosen} if chosen else {})}
         if name in plain.others:
             table.setdefault("part", []).append({"name": name, "role": part.role, **described})
         else:
@@ -52,7 +50,9 @@ def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
         table["fault"] = [fault_keys(fault) for fault in plain.faults]
     if plain.connections:
         table["connections"] = {
-            target: origin if isinstance(origin, str) else {"from": origin.origin, **_line(origin)}
+            target: origin
+            if isinstance(origin, str)
+            else {"from": origin.origin, "factor": origin.factor, "offset": origin.offset}
             for target, origin in plain.connections.items()
         }
     if setup.limits:
@@ -60,12 +60,8 @@ def loop_table(loop: Loop | LoopSetup) -> dict[str, Any]:
     return table
 
 
-def _line(link: Link) -> dict[str, float]:
-    return {"factor": link.factor, "offset": link.offset}
-
-
 def with_values(table: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the loop's table with other values under dotted keys; whole parts are replaced first."""
+    """Return the loop's table with other values at dotted keys; whole parts are replaced first."""
     made = {key: copy.copy(value) for key, value in table.items()}
     for key in sorted(values, key=lambda key: key.count(".")):
         _put(made, key, values[key])
@@ -73,19 +69,21 @@ def with_values(table: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str
 
 
 def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] | None], robot: Robot = _NECK) -> None:
-    """Raise SettingsError unless `key` leads to something in the loop.
+    """Raise SettingsError unless the loop has the key.
 
     Args:
         table: of the loop.
         key: dotted, such as "plant.parameters.payload", "reference.pitch_deg", "fault.0.start_s".
-        names: part -> parameters and inputs that may be set; None where the part does not say.
-        robot: whose loop it is.
+        names: part -> parameters and inputs that may be set; None if the part does not list them.
+        robot: of the loop.
     """
     head, _, rest = key.partition(".")
     if not rest:
-        if head in (*_PLAIN, *_PARTS, "reference"):
+        if head in (*_TOP_KEYS, *SOURCES, "reference"):
             return
-        raise SettingsError(f"the loop has no key `{key}`; it has {', '.join((*_PLAIN, *_PARTS))} and keys below them.")
+        raise SettingsError(
+            f"the loop has no key `{key}`; it has {', '.join((*_TOP_KEYS, *SOURCES))} and keys below them."
+        )
     if head in ("fault", "part"):
         entry, _, rest = _entry(table, key)
         if head == "fault":
@@ -105,7 +103,7 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
 
 
 def _field(kind: str, key: str, robot: Robot) -> str | None:
-    """Return what a key sets in a reference of `kind`, if there is something."""
+    """Return the value that a key sets in a reference of `kind`; None for an unknown key."""
     try:
         return reference_key(kind, key, robot)[0]
     except SettingsError:
@@ -113,25 +111,25 @@ def _field(kind: str, key: str, robot: Robot) -> str | None:
 
 
 def set_sources(key: str) -> bool:
-    """Return whether `key` says which part stands in the loop."""
+    """Return whether `key` chooses a part or the reference of the loop."""
     parts = key.split(".")
-    return parts[0] in (*_PARTS, "reference", "part") and (len(parts) == 1 or parts[-1] in _SOURCES)
+    return parts[0] in (*SOURCES, "reference", "part") and (len(parts) == 1 or parts[-1] in _SOURCE_KEYS)
 
 
 def settable(part: Part) -> set[str] | None:
-    """Return the names of a part's parameters and inputs; None if the part does not say its parameters."""
+    """Return the names of a part's parameters and inputs; None if the part does not list its parameters."""
     block = getattr(part, "block", None)
     parameters = getattr(part, "parameters", getattr(block, "parameters", None))
     return None if parameters is None else {port.name for port in (*parameters, *part.inputs)}
 
 
 def _check_part_key(key: str, part: str, rest: str, names: Mapping[str, set[str] | None]) -> None:
-    if rest in _SOURCES or rest in ("sample_time_s", "names", "units"):
+    if rest in _SOURCE_KEYS or rest in ("sample_time_s", "names", "units"):
         return
     group, _, name = rest.partition(".")
     known = names.get(part, set())
     if group != "parameters" or not name:
-        raise SettingsError(f"the loop has no key `{key}`; what a part takes is written {part}.parameters.NAME.")
+        raise SettingsError(f"the loop has no key `{key}`; write {part}.parameters.NAME.")
     if known is not None and name not in known:
         raise SettingsError(
             f"the loop has no key `{key}`: the {part} has {', '.join(sorted(known)) or 'no parameters'}."
@@ -144,7 +142,7 @@ def _check_field(key: str, rest: str, field: str | None, where: str) -> None:
 
 
 def _entry(table: Mapping[str, Any], key: str) -> tuple[dict[str, Any], int, str]:
-    """Return the table of a list that a key such as "fault.0.start_s" leads to, its place, and the rest of the key."""
+    """Return the list entry of a key such as "fault.0.start_s", its position, and the rest of the key."""
     head, _, below = key.partition(".")
     place, _, rest = below.partition(".")
     entries = table.get(head, [])
@@ -169,12 +167,12 @@ def _put(table: dict[str, Any], key: str, value: Any) -> None:
     else:
         changed = table[head] = dict(table.get(head, {}))
     if head in ("fault", "reference"):
-        # The same in another unit gives way.
+        # Replaces the same quantity in another unit.
         for old in [k for k in changed if k != "kind" and same_quantity(k, rest)]:
             del changed[old]
         changed[rest] = value
-    elif rest in _SOURCES:
-        for source in _SOURCES:
+    elif rest in _SOURCE_KEYS:
+        for source in _SOURCE_KEYS:
             changed.pop(source, None)
         changed[rest] = value
     else:
@@ -185,8 +183,8 @@ def _put(table: dict[str, Any], key: str, value: Any) -> None:
             changed[group] = value
 
 
-def _described(part: Part) -> dict[str, Any]:
-    """Return how a table names a part; an FMU by its file, so that other processes can open it."""
+def _describe_part(part: Part) -> dict[str, Any]:
+    """Return the table of a part; an FMU by its file, so that other processes can open it."""
     if isinstance(part, FmuPart | IsolatedPart):
         names = {theirs: ours for ours, theirs in part.native_names.items()}
         table = {"fmu": str(part.path.resolve()), "sample_time_s": part.sample_time, "names": names}

@@ -35,23 +35,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Rows of a run that its certificate keeps, spread over all of it: what goes another way is elsewhere in one of them.
+# Rows of a run in its certificate, at equal distances: another run differs in some of them.
 _TRACE_ROWS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class Result(ReprMixin):
-    """One simulated loop: its signals, its metrics, and whether it keeps its limits.
+    """One simulated loop: its signals, metrics and limits.
 
     Attributes:
         signals: all signals, named as in a recording, with their units.
-        bounds: metric -> limit, as in the loop file: an upper one, of `validity.min` a lower one.
-        wall_time: what the run took [s].
-        files: what it was told to read: role -> (path, SHA-256).
+        bounds: metric -> limit, as in the loop file; that of `validity.min` is a lower one.
+        wall_time: duration of the computation [s].
+        files: role -> (path, SHA-256) of each file that was read.
         order: "sequential" or "jacobi".
-        angle: which outputs the metrics judge, "true" or "measured".
-        closed: whether it was a closed loop; other systems have signals and no metrics.
-        remarks: what there is to warn of, one line each: where the plant is a model and knows itself to be wrong.
+        angle: the outputs of the metrics, "true" or "measured".
+        closed: whether it was a closed loop; other systems have signals but no metrics.
+        remarks: warnings, one line each, such as where the plant's model is not valid.
     """
 
     signals: LoopResult
@@ -64,10 +64,10 @@ class Result(ReprMixin):
     remarks: tuple[str, ...] = ()
 
     def summary(self) -> str:
-        """Return two lines: what ran, and whether it keeps its limits."""
+        """Return a line on the run, one on its limits, and the remarks."""
         rows, failed = self.limits, [row["metric"] for row in self.limits if not row["holds"]]
-        said = f"fails {', '.join(failed)}" if failed else f"keeps {len(rows)} limits" if rows else "no limits stated"
-        return f"{self.signals.summary()}\n{said}" + "".join(f"\n{remark}" for remark in self.remarks)
+        text = f"fails {', '.join(failed)}" if failed else f"keeps {len(rows)} limits" if rows else "no limits stated"
+        return f"{self.signals.summary()}\n{text}" + "".join(f"\n{remark}" for remark in self.remarks)
 
     def __getitem__(self, name: str) -> Vector:
         """Return one signal (N,) in SI."""
@@ -75,12 +75,12 @@ class Result(ReprMixin):
 
     @property
     def robot(self) -> Robot:
-        """Whose loop it was."""
+        """The robot of the loop."""
         return self.signals.robot
 
     @property
     def metrics(self) -> dict[str, dict[str, float | None]]:
-        """Rise, settling, overshoot and errors of each axis, and what the motors did."""
+        """Rise, settling, overshoot and errors of each axis, and the use of the motors."""
         return metrics(self.signals, angle=self.angle) if self.closed else {}
 
     @property
@@ -95,17 +95,17 @@ class Result(ReprMixin):
 
     @property
     def real_time_factor(self) -> float:
-        """Simulated time over the time it took."""
+        """Simulated time divided by the duration of the computation."""
         return len(self.signals.time) * self.signals.sample_time / max(self.wall_time, 1e-9)
 
     @property
     def frame(self) -> pd.DataFrame:
-        """All signals as a table; the columns say their unit as in a recording's file."""
+        """All signals as a table; column names have units as in a recording's file."""
         import pandas as pd
 
         columns = {"time [s]": self.signals.time}
         for name, values in self.signals.signals.items():
-            unit, factor = _shown(name, self.signals.units[name], self.robot)
+            unit, factor = _table_unit(name, self.signals.units[name], self.robot)
             columns[f"{name} [{unit}]"] = values * factor
         return pd.DataFrame(columns)
 
@@ -118,11 +118,8 @@ class Result(ReprMixin):
         return dataset(self.signals.time, self.signals.signals, self.signals.units)
 
     def plot(self, title: str = "") -> Figure:
-        """Return a matplotlib figure: references, outputs and motors of a closed loop; of others all signals."""
-        from softneck.plots import (
-            chart_figure,  # matplotlib takes a while to import
-            loop_chart,
-        )
+        """Return a matplotlib figure: references, outputs and motors of a closed loop, or all signals of a system."""
+        from softneck.plots import chart_figure, loop_chart  # imports matplotlib
 
         time, signals = self.signals.time, self.signals.signals
         if not self.closed:
@@ -130,7 +127,7 @@ class Result(ReprMixin):
         return chart_figure(loop_chart(time, signals, title, limits=self.bounds, robot=self.robot))
 
     def recording(self) -> Recording:
-        """Return the run as a recording: its channels of those names, with pitch and roll true where offered."""
+        """Return the run as a recording, with true outputs if the plant has them."""
         known = set(known_channels(self.robot))
         channels = {name: values for name, values in self.signals.signals.items() if name in known}
         for axis in self.robot.outputs.names:
@@ -142,10 +139,10 @@ class Result(ReprMixin):
         return {"metrics": self.metrics, "limits": self.limits, "real_time_factor": self.real_time_factor}
 
     def trace(self) -> dict[str, list[Any]]:
-        """Return some rows of the run, by which it is known again: their numbers, set-points and outputs.
+        """Return some rows of the run, which identify it: row numbers, set-points and outputs.
 
-        The keys are "row", "motor_setpoint_1" to 3 and "pitch", "roll", or another robot's set-points and outputs; the
-        values have shape (rows,), in SI; an output that was not measured there is None.
+        The keys are "row" and the robot's set-points and outputs; the values have shape (rows,), in SI, None where an
+        output was not measured.
         """
         rows = np.unique(np.linspace(0, len(self.signals.time) - 1, _TRACE_ROWS).astype(int))
         kept = {name: self.signals[name] for name in self.robot.set_points}
@@ -154,13 +151,13 @@ class Result(ReprMixin):
         return {"row": rows.tolist(), **cells}
 
     def certificate(self) -> dict[str, Any]:
-        """Return what held, with the hash of every file that was read.
+        """Return the certificate's JSON: limits, metrics, and the hash of every file that was read.
 
         Raises:
-            SettingsError: the loop has no limits, so nothing can hold.
+            SettingsError: the loop has no limits.
         """
         if not self.bounds:
-            raise SettingsError("the loop has no [limits]: a certificate of it would show nothing; state some.")
+            raise SettingsError("the loop has no [limits]: its certificate would certify nothing; add limits.")
         more = {
             "trace": self.trace(),
             "limits": self.limits,
@@ -174,12 +171,12 @@ class Result(ReprMixin):
         return certificate_contents("simulate", holds=self.holds, files=self.files, more=more)
 
 
-def _shown(name: str, unit: str, robot: Robot) -> tuple[str, float]:
-    """Return the unit in which a table shows a signal, and the factor to it."""
+def _table_unit(name: str, unit: str, robot: Robot) -> tuple[str, float]:
+    """Return the unit of a signal in tables, and the factor to it."""
     try:
         to_unit, si = to_si(unit or "1")
     except DataError:
-        return unit, 1.0  # a foreign FMU's own unit stays as it is
+        return unit, 1.0  # an unknown unit of another tool's FMU
     shown = file_unit(name, robot) if name in known_channels(robot) else {"rad": "deg", "rad/s": "deg/s"}.get(si, si)
     return (shown, to_unit / to_si(shown)[0]) if to_si(shown)[1] == si else (unit or "1", 1.0)
 
@@ -196,21 +193,21 @@ def simulate(
     """Run a loop from t = 0 to its end.
 
     Args:
-        loop: a plain loop, one with limits as `load_loop` returns it, a loop file, an SSP archive, a system as
-            `load_ssp` returns it, or a table of a loop file's keys, whose relative paths start at the working folder
-            and which may hold objects (see `make_loop`).
-        report: called now and then with the done fraction; a bar in a terminal if not given.
+        loop: a loop, with limits as from `load_loop` or without; a loop file; an SSP archive; a system as from
+            `load_ssp`; or a table with the keys of a loop file, which may hold objects (see `make_loop`) and whose
+            relative paths start at the working folder.
+        report: called regularly with the done fraction; default: a progress bar in a terminal.
         on_step: called after each row with a `LoopStep`; it stops the run by returning True.
-        pace: run at this multiple of real time; as fast as possible if not given.
-        keep: leave the FMUs loaded, so that the next run of the same loop resets them; `loop.close()` ends it.
-        compiled: run loops whose parts are all blocks (softneck files, the virtual neck, no FMUs) as one compiled
-            function: the same bits, sooner after a second of compiling, which is kept.
+        pace: run at this multiple of real time; default: as fast as possible.
+        keep: leave the FMUs loaded, so that the next run of the same loop resets them; `loop.close()` frees them.
+        compiled: run loops of blocks only (softneck files, the virtual neck, no FMUs) as one compiled function; the
+            results are the same to the bit.
 
-    Where the plant's `validity` falls under 0.5 it warns once (`Result.remarks`).
+    It warns once if the plant's `validity` falls under 0.5 (`Result.remarks`).
 
     Raises:
-        SettingsError: parts that do not fit together, or what `make_loop` refuses.
-        DataError: a part returned what is not a number.
+        SettingsError: parts that do not fit together, or an error of `make_loop`.
+        DataError: a part returned NaN or infinity.
         FmuError: an FMU refused a call.
 
     Example:
@@ -227,11 +224,9 @@ def simulate(
         (True, ['pitch', 'roll'])
     """
     with shown_progress("simulate", None if report is None else lambda done, _: report(done)) as tell:
-        result = run_setup(
-            _opened(loop), report=None if tell is silent else lambda done: tell(done, ""), on_step=on_step, pace=pace,
-            keep=keep, compiled=compiled,
-        )  # fmt: skip
-    # A plant without validity is told in `remarks` and by the command: no warning for every model made by hand.
+        inner = None if tell is silent else lambda done: tell(done, "")
+        result = run_setup(_open_loop(loop), report=inner, on_step=on_step, pace=pace, keep=keep, compiled=compiled)
+    # No warning for models made by hand, without validity: `remarks` and the command mention it.
     for remark in result.remarks if np.any(result.signals.signals.get("validity", 0.0)) else ():
         warnings.warn(remark, stacklevel=2)
     return result
@@ -246,7 +241,7 @@ def run_setup(
     keep: bool = False,
     compiled: bool = False,
 ) -> Result:
-    """Run a loop as `simulate` does, whose remarks the caller tells."""
+    """Run a loop as `simulate` does, without warnings for its remarks."""
     plain = setup if isinstance(setup, System) else setup.loop
     begin = time.perf_counter()
     signals = run_loop(plain, report, on_step=on_step, pace=pace, keep=keep, compiled=compiled)
@@ -254,7 +249,7 @@ def run_setup(
     if isinstance(setup, System):
         return Result(signals=signals, wall_time=wall, order=plain.order, closed=False)
     loop = setup.loop
-    beyond = reach_beyond(loop.controller, loop.controller_parameters, loop.robot)
+    beyond = describe_excess_range(loop.controller, loop.controller_parameters, loop.robot)
     return Result(
         signals=signals,
         bounds=setup.limits,
@@ -266,7 +261,7 @@ def run_setup(
     )
 
 
-def _opened(loop: Any) -> LoopSetup | System:
+def _open_loop(loop: Any) -> LoopSetup | System:
     if isinstance(loop, LoopSetup | System):
         return loop
     if isinstance(loop, Loop):
@@ -278,42 +273,42 @@ def _opened(loop: Any) -> LoopSetup | System:
     raise SettingsError(f"`loop` must be a Loop, a loop file or a table of its keys; got a {type(loop).__name__}.")
 
 
-# Below it the model is more often wrong than right by its tolerance.
-_DOUBTFUL = 0.5
+# Below this validity the model's error is more often above its tolerance than below.
+_MIN_VALIDITY = 0.5
 
 
 def validity_remarks(result: LoopResult, plant: Part) -> tuple[str, ...]:
-    """Return the warning about the plant's `validity`: its first sample under 0.5 and the input to blame; or nothing.
+    """Return the warning for the first sample with the plant's `validity` under 0.5, and its cause; empty if none.
 
     Args:
         result: all signals of the run.
-        plant: its ports, and where it is a model what it knows.
+        plant: with the ranges of its training.
     """
     if "validity" not in result.signals:
         return ()
     validity = result["validity"]
-    # A model that knows where it was trained is never certain to be wrong.
+    # Only a model without a training region has validity 0 everywhere.
     if not validity.any():
         return ("no validity in this file: identify it again; how far the plant can be trusted here is not known.",)
-    doubtful = np.flatnonzero(validity < _DOUBTFUL)
+    doubtful = np.flatnonzero(validity < _MIN_VALIDITY)
     if not doubtful.size:
         return ()
     row = int(doubtful[0])
     return (
-        f"the plant's validity falls under {_DOUBTFUL:g} at t = {result.time[row]:.2f} s "
-        f"(least {validity.min():.2f}): {_why(result, plant, row)}.",
+        f"the plant's validity falls under {_MIN_VALIDITY:g} at t = {result.time[row]:.2f} s "
+        f"(least {validity.min():.2f}): {_validity_cause(result, plant, row)}.",
     )
 
 
-def reach_beyond(controller: Part, parameters: Mapping[str, float], robot: Robot) -> str:
-    """Return where a controller may send a motor beyond the range that `robot` has, in a line; "" if nowhere.
+def describe_excess_range(controller: Part, parameters: Mapping[str, float], robot: Robot) -> str:
+    """Return a line if a controller may send a motor outside the range of `robot`, else "".
 
-    Robots that differ in limits alone fit each other's files: a controller may be of one that goes further.
+    A controller fits robots that differ only in limits, so it may be designed for wider ones.
 
     Args:
-        controller: its outputs' ranges, and `position_limit` among its parameters.
-        parameters: as the loop sets them.
-        robot: whose motors are moved.
+        controller: with the ranges of its outputs and the parameter `position_limit`.
+        parameters: of the loop.
+        robot: of the loop.
     """
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     if motors.setpoint_min is None or motors.setpoint_max is None:
@@ -335,10 +330,9 @@ def reach_beyond(controller: Part, parameters: Mapping[str, float], robot: Robot
     return ""
 
 
-def _why(result: LoopResult, plant: Part, row: int) -> str:
-    """Return which input is to blame at a row, and how far it is outside."""
-    beyond = _beyond_training(result, plant, row)
-    if beyond:
+def _validity_cause(result: LoopResult, plant: Part, row: int) -> str:
+    """Return the motor outside the training region at a row, and by how much."""
+    if beyond := _outside_training(result, plant, row):
         return beyond
     robot, unit = result.robot, result.robot.motors.unit
     motors = np.column_stack([result[name] for name in robot.motor_positions])
@@ -348,19 +342,19 @@ def _why(result: LoopResult, plant: Part, row: int) -> str:
     what = "has been held around" if stays else "is at"
     place = f"`{robot.motor_positions[motor]}` {what} {value / to_si(unit)[0]:.3g} {unit}"
     if times <= 1.0:
-        return f"{place}, together with the others as it was not in training"
+        return f"{place}, a combination with the others that was not in training"
     return f"{place}, {times:.1f} times as far from its mean as most of the training"
 
 
 def _nearest_end(plant: Part, places: Vector, robot: Robot) -> str:
-    """Return which motor has been held nearest to an end of its training: an FMU tells no more of it than its range.
+    """Return the motor that was held nearest to an end of its training range, which is all that an FMU has.
 
     Args:
-        plant: its set-points' minimum and maximum.
-        places: (motors,) where they have been held.
-        robot: whose motors.
+        plant: with minimum and maximum of its set-points.
+        places: (motors,) where the motors were held.
+        robot: of the loop.
     """
-    unit, worst, found = robot.motors.unit, -1.0, "its motors move together, or are held, as they were not in training"
+    unit, worst, found = robot.motors.unit, -1.0, "its motors have a combination of values that was not in training"
     ports = {port.name: port for port in plant.inputs}
     for name, motor, place in zip(robot.set_points, robot.motor_positions, places, strict=True):
         low, high = (ports[name].minimum, ports[name].maximum) if name in ports else (None, None)
@@ -372,13 +366,13 @@ def _nearest_end(plant: Part, places: Vector, robot: Robot) -> str:
             place, low, high = (value / to_si(unit)[0] for value in (place, low, high))
             found = (
                 f"`{motor}` has been held around {place:.3g} {unit}, which is within the {low:.3g} to {high:.3g} "
-                f"{unit} of its training: there it was not held, or not together with the others"
+                f"{unit} of its training, but it was not held there, or not with these values of the others"
             )
     return found
 
 
-def _beyond_training(result: LoopResult, plant: Part, row: int) -> str:
-    """Return the set-point farthest beyond the range that the plant was trained on, up to a row; "" if none is."""
+def _outside_training(result: LoopResult, plant: Part, row: int) -> str:
+    """Return the set-point farthest outside the plant's training range up to a row; "" if none is."""
     robot: Robot = result.robot
     unit = robot.motors.unit
     scale, found, worst = to_si(unit)[0], "", 0.0

@@ -1,4 +1,4 @@
-"""An FMU as a part of a loop, or driven by recorded signals, through fmpy's FMI calls."""
+"""An FMU as a part of a loop, or simulated with recorded signals, by the FMI calls of fmpy."""
 
 from __future__ import annotations
 
@@ -29,14 +29,13 @@ from ._variables import Description, number_of, read_description
 if TYPE_CHECKING:
     from fmpy.fmi1 import FMICallException
 
-
 _ROLES = ("plant", "observer", "controller", "reference")
-# What pythonfmu's binary says of every Python exception; the reason stands in the line before.
+# The message of pythonfmu's binary for every Python exception; the reason is in the line before.
 _NO_REASON = "Fatal py exception encountered"
 
 
 class FmuError(SoftneckError):
-    """An FMU refused a call; the line carries the FMU's own reason."""
+    """An FMU refused a call; the message has the FMU's own reason."""
 
 
 class FmuPart:
@@ -47,9 +46,9 @@ class FmuPart:
         inputs, outputs, parameters: ports, in the FMU's order; Booleans are 0.0 and 1.0.
         sample_time: [s].
         role: "plant", "observer", "controller" or "reference".
-        native_names: our name -> the FMU's, where the mapping renames.
+        native_names: our name -> the FMU's name, for renamed variables.
         units: our name -> unit, as the caller gave them.
-        robot_told: name and hash of the robot that the FMU says it is of, "" where it says none.
+        annotated_robot: name and hash of the robot in the FMU's annotation, "" without one.
         messages: the last lines of the FMU's log, as (status, text).
     """
 
@@ -62,18 +61,18 @@ class FmuPart:
         names: Mapping[str, str] | None = None,
         units: Mapping[str, str] | None = None,
     ) -> None:
-        """Read the FMU's description; it is unpacked and loaded at `start`.
+        """Read the FMU's description; `start` unpacks and loads it.
 
         Args:
             path: the `.fmu` file.
-            role: what it is in the loop; softneck's own FMUs know it themselves.
-            sample_time: [s]; the step of the FMU's default experiment if not given.
-            names: the FMU's variable name -> ours, for FMUs that use other names.
+            role: in the loop; softneck's FMUs state their own.
+            sample_time: [s]; default: the step of the FMU's default experiment.
+            names: the FMU's variable name -> ours, for FMUs with other names.
             units: our name -> unit, for FMUs that state none or a wrong one.
 
         Raises:
             FileFormatError: no FMI 2.0 or 3.0 Co-Simulation FMU for this platform.
-            SettingsError: neither FMU nor caller say role or sample time.
+            SettingsError: neither FMU nor caller states role or sample time.
         """
         self.path = Path(path)
         with unpacked(self.path) as folder:
@@ -81,10 +80,10 @@ class FmuPart:
             _check_platform(self._description, folder)
         self.native_names = {ours: theirs for theirs, ours in (names or {}).items()}
         self.units = dict(units or {})
-        self.robot_told = self._description.annotation.robot
+        self.annotated_robot = self._description.annotation.robot
         self.role = role or self._description.annotation.role
         if not self.role:
-            raise SettingsError(f"{self.path}: say its role in the loop ({', '.join(_ROLES)}).")
+            raise SettingsError(f"{self.path}: give its role in the loop ({', '.join(_ROLES)}).")
         require_one_of("role", self.role, _ROLES)
         self.sample_time = _sample_time(self._description, sample_time)
         self.inputs = self._description.ports("input")
@@ -97,36 +96,36 @@ class FmuPart:
         self._folder: Path | None = None
         self._broken = False
 
-    def called(self, names: Mapping[str, str]) -> FmuPart:
-        """Return the same part with other names for its variables: what they are called here -> what there."""
+    def with_names(self, names: Mapping[str, str]) -> FmuPart:
+        """Return the same part with other names for its variables: name here -> new name."""
         settings = {"role": self.role, "sample_time": self.sample_time}
-        return FmuPart(self.path, **settings, **renamed(self, names))  # pyright: ignore[reportArgumentType]
+        return FmuPart(self.path, **settings, **naming_arguments(self, names))  # pyright: ignore[reportArgumentType]
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
         """Instantiate and initialise the FMU at `time` [s]; return its outputs (n_out,) there.
 
-        An instance that is still loaded is reset and used again, which costs less and leaks nothing.
+        A loaded instance is reset and used again, which costs less than a new one.
 
         Raises:
             SettingsError: a parameter that the FMU does not have.
-            FmuError: the FMU refused; the line says why.
+            FmuError: the FMU refused; the message says why.
         """
         bank, values = self._parameter_bank(parameters)
         self.messages.clear()
-        native = self._fresh()
-        self._do("setup", native.setup, time)
+        native = self._prepare_instance()
+        self._call("setup", native.setup, time)
         bank.bind(native)
-        self._do("parameters", bank.write, values)
-        self._do("inputs", self._inputs.write, np.array([port.start for port in self.inputs]))
-        self._do("initialisation", native.enter, time)
-        self._do("initialisation", native.exit)
-        return self._do("outputs", self._outputs.read)
+        self._call("parameters", bank.write, values)
+        self._call("inputs", self._inputs.write, np.array([port.start for port in self.inputs]))
+        self._call("initialisation", native.enter, time)
+        self._call("initialisation", native.exit)
+        return self._call("outputs", self._outputs.read)
 
     def advance(self, time: float, inputs: Vector) -> Vector:
         """Step one sample from `time` [s] with `inputs` (n_in,); return the outputs (n_out,) after it.
 
         Raises:
-            FmuError: the FMU refused; the line says why.
+            FmuError: the FMU refused; the message says why.
         """
         native = self._native
         if native is None:
@@ -136,16 +135,16 @@ class FmuPart:
             native.step(time, self.sample_time)
             return self._outputs.read()
         except CallError as error:
-            raise self._refused(f"in the step from t = {time:g} s", error) from error
+            raise self._call_error(f"in the step from t = {time:g} s", error) from error
 
     def close(self) -> None:
-        """Terminate the FMU, free it and remove what was unpacked."""
+        """Terminate the FMU, free it and remove its unpacked files."""
         native, self._native = self._native, None
         folder, self._folder = self._folder, None
         broken, self._broken = self._broken, False
         try:
             if native is not None:
-                native.release(broken=broken, ours=bool(self._description.annotation.role))
+                native.release(broken=broken, is_softneck=bool(self._description.annotation.role))
         finally:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
@@ -159,13 +158,13 @@ class FmuPart:
         experiment: Any = self._description.model.coSimulation
         if not (experiment.canGetAndSetFMUstate and experiment.canSerializeFMUstate) or self._native is None:
             raise SettingsError(f"{self.path}: cannot save its state; its canSerializeFMUstate is false.")
-        return self._do("its state", self._native.get_state)
+        return self._call("its state", self._native.get_state)
 
     def set_state(self, state: bytes) -> None:
-        """Go on from a state that `get_state` returned, here or in another process."""
+        """Continue from a state of `get_state`, of this or another process."""
         if self._native is None:
             raise FmuError(f"{self.path}: is not running; call `start` first.")
-        self._do("its state", self._native.set_state, state)
+        self._call("its state", self._native.set_state, state)
 
     def __enter__(self) -> FmuPart:
         """Return the part itself."""
@@ -175,8 +174,8 @@ class FmuPart:
         """Close."""
         self.close()
 
-    def _fresh(self) -> Native:
-        """Return an instance before its initialisation."""
+    def _prepare_instance(self) -> Native:
+        """Return an instance that is not initialised yet."""
         from fmpy.fmi1 import FMICallException
 
         if self._native is not None and not self._broken:
@@ -191,7 +190,7 @@ class FmuPart:
             self._native = Native(self._description, self._folder, lambda *line: self.messages.append(line))
         except Exception as error:  # fmpy raises nothing narrower
             raise FileFormatError(f"{self.path}: its binary cannot be loaded ({error}).") from error
-        self._do("it could not be instantiated", self._native.instantiate)
+        self._call("it could not be instantiated", self._native.instantiate)
         self._inputs.bind(self._native)
         self._outputs.bind(self._native)
         return self._native
@@ -207,19 +206,18 @@ class FmuPart:
                 raise SettingsError(f"`{name}` is not a parameter of {self.path}; it has {listed}.")
         return self._bank(parameters), np.array([float(value) for value in parameters.values()])
 
-    def _do(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
+    def _call(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
         from fmpy.fmi1 import FMICallException
 
         try:
             return call(*arguments)
         except (FMICallException, CallError) as error:
-            raise self._refused(f"at {what}", error) from error
-        except Exception as error:
-            # fmpy's own answer to a null instance
+            raise self._call_error(f"at {what}", error) from error
+        except Exception as error:  # of fmpy, for a null instance
             self._broken = True
             raise FmuError(f"{self.path}: {what}: {self._reason() or error}") from error
 
-    def _refused(self, when: str, error: FMICallException | CallError) -> FmuError:
+    def _call_error(self, when: str, error: FMICallException | CallError) -> FmuError:
         self._broken = self._broken or error.status >= FATAL
         return FmuError(f"{self.path}: {when}: {self._reason() or error}")
 
@@ -228,8 +226,8 @@ class FmuPart:
         return lines[-1] if lines else ""
 
 
-def renamed(part: Any, names: Mapping[str, str]) -> dict[str, Any]:
-    """Return the arguments `names` and `units` of an FMU's part for variables with other names."""
+def naming_arguments(part: Any, names: Mapping[str, str]) -> dict[str, Any]:
+    """Return the arguments `names` and `units` of an FMU's part whose variables get other names."""
     native = {**{name: name for name in names}, **part.native_names}
     return {
         "names": {theirs: names.get(ours, ours) for ours, theirs in native.items()},
@@ -259,15 +257,7 @@ def _sample_time(description: Description, given: float | None) -> float:
     return float(step)
 
 
-def check_outputs(part: FmuPart, names: tuple[str, ...]) -> list[int]:
-    """Return the positions of the outputs `names`; raise DataError if the FMU lacks one."""
-    known = [port.name for port in part.outputs]
-    for name in names:
-        if name not in known:
-            raise DataError(f"`{name}` is not an output of {part.path}; it has {', '.join(known)}.")
-    return [known.index(name) for name in names]
-
-
+# Relative tolerance of sample times: rounding of decimal numbers in files.
 _SAME_SAMPLE_TIME = 1e-6
 
 
@@ -282,24 +272,28 @@ def drive_fmu(
 ) -> Matrix:
     """Step an FMU through rows of inputs and return its outputs (rows, n_out); row k is at t_k.
 
-    A plant's row 0 holds its outputs at the start, and row k those that the inputs up to row k - 1 caused.
-    The rows of an observer or controller hold what it returns at once for the inputs of that row.
+    Row 0 of a plant has its outputs at the start, row k its outputs after the inputs up to row k - 1. Row k of an
+    observer or controller has its outputs for the inputs of row k.
 
     Args:
         path: the FMU.
-        inputs: input name -> (rows,); an input that is not here keeps its start value.
+        inputs: input name -> (rows,); other inputs keep their start values.
         parameters: values by name.
-        outputs: names of those to return; all, in the FMU's order, if not given.
+        outputs: names; default: all, in the FMU's order.
         start_time: [s].
-        report: called now and then with the done fraction.
+        report: called regularly with the done fraction.
 
     Raises:
         DataError: inputs of different lengths or unknown names.
-        FmuError: the FMU refused; the line says why.
+        FmuError: the FMU refused; the message says why.
     """
     part = FmuPart(path)
     rows = _rows(part, inputs)
-    chosen = check_outputs(part, outputs) if outputs is not None else list(range(len(part.outputs)))
+    known = [port.name for port in part.outputs]
+    for name in outputs or ():
+        if name not in known:
+            raise DataError(f"`{name}` is not an output of {path}; it has {', '.join(known)}.")
+    chosen = [known.index(name) for name in (known if outputs is None else outputs)]
     stride = max(1, len(rows) // 100)
     table = np.empty((len(rows), len(part.outputs)))
     plant = part.role == "plant"
@@ -314,7 +308,7 @@ def drive_fmu(
     return table[:, chosen]
 
 
-def simulate_fmu_free_run(
+def simulate_fmu(
     path: str | Path,
     recording: Recording,
     *,
@@ -322,20 +316,20 @@ def simulate_fmu_free_run(
     outputs: tuple[str, ...] | None = None,
     report: Callable[[float], None] | None = None,
 ) -> Matrix:
-    """Return the outputs (time, n_out) of a plant FMU run free from a recording's set-points.
+    """Simulate a plant FMU (free run) with a recording's set-points; return its outputs (time, n_out).
 
-    Row k is at the recording's row k; each of its runs starts anew.
+    Row k is at the recording's row k; each run of the recording starts from the initial state.
 
     Args:
         path: the FMU.
-        recording: whose set-points drive it.
+        recording: with the set-points.
         parameters: values by name, such as `pitch_start` [rad].
-        outputs: names of those to return; all if not given.
-        report: called now and then with the done fraction.
+        outputs: names; default: all.
+        report: called regularly with the done fraction.
 
     Raises:
         DataError: another sample time than the FMU's, or unknown names.
-        FmuError: the FMU refused; the line says why.
+        FmuError: the FMU refused; the message says why.
     """
     part = FmuPart(path)
     if not np.isclose(part.sample_time, recording.sample_time, rtol=_SAME_SAMPLE_TIME):
@@ -357,7 +351,7 @@ def _rows(part: FmuPart, inputs: Mapping[str, Vector]) -> Matrix:
     sizes = {len(column) for column in inputs.values()}
     if len(sizes) != 1 or 0 in sizes:
         raise DataError(f"the inputs must have one common length of at least 1; got {sorted(sizes)}.")
-    # What no column gives was not measured, where that is allowed.
+    # Inputs without a column are "not measured" where that is allowed.
     held = [np.nan if port.missing else port.start for port in part.inputs]
     rows = np.tile(np.array(held), (sizes.pop(), 1))
     for name, column in inputs.items():

@@ -1,6 +1,6 @@
-"""An FMU in a process of its own: a crash or a hang costs one run, not the program.
+"""An FMU in a process of its own, so that a crash or a hang ends one run and not the program.
 
-The other side of the pipe is `python -m softneck.cosim.parts._isolated IN OUT` with two inherited file descriptors.
+The child is `python -m softneck.cosim.parts._isolated IN OUT` with two inherited file descriptors.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from softneck.core import (
     require_positive,
 )
 
-from ._fmu_part import FmuError, FmuPart, renamed
+from ._fmu_part import FmuError, FmuPart, naming_arguments
 
 _ERRORS: dict[str, type[SoftneckError]] = {
     kind.__name__: kind for kind in (FmuError, DataError, FileFormatError, OutputFileError, SettingsError)
 }
-# Importing softneck in the child and loading the FMU take a second or two on a busy machine.
-_START_TIMEOUT = 60.0
+# The import of softneck in the child and the FMU's loading take a second or two on a busy machine.
+_START_TIMEOUT_S = 60.0
 
 
 class IsolatedPart:
-    """An FMU as a part like `FmuPart`, run by a child process that is kept until `close`.
+    """An FMU as a part like `FmuPart`, run by a child process that lives until `close`.
 
     Attributes:
-        path, inputs, outputs, parameters, sample_time, role, native_names, units: as of `FmuPart`.
+        path, inputs, outputs, parameters, sample_time, role, native_names, units: as in `FmuPart`.
         timeout: longest wait for one step [s].
     """
 
@@ -57,10 +57,10 @@ class IsolatedPart:
         units: Mapping[str, str] | None = None,
         timeout: float = 10.0,
     ) -> None:
-        """Read the FMU's description; the child starts with `start`. Arguments and errors are those of `FmuPart`."""
+        """Read the FMU's description; `start` starts the child. Arguments and errors are those of `FmuPart`."""
         require_positive("timeout", timeout, "s")
         described = FmuPart(path, role=role, sample_time=sample_time, names=names, units=units)
-        self.robot_told = described.robot_told
+        self.annotated_robot = described.annotated_robot
         self.path, self.role, self.sample_time = described.path, described.role, described.sample_time
         self.inputs, self.outputs, self.parameters = described.inputs, described.outputs, described.parameters
         self.native_names, self.units, self.timeout = described.native_names, described.units, timeout
@@ -70,24 +70,24 @@ class IsolatedPart:
         }  # fmt: skip
         self._child: _Child | None = None
 
-    def called(self, names: Mapping[str, str]) -> IsolatedPart:
-        """Return the same part with other names for its variables, as of `FmuPart`."""
+    def with_names(self, names: Mapping[str, str]) -> IsolatedPart:
+        """Return the same part with other names for its variables, as `FmuPart.with_names`."""
         settings: Any = {"role": self.role, "sample_time": self.sample_time, "timeout": self.timeout}
-        return IsolatedPart(self.path, **settings, **renamed(self, names))
+        return IsolatedPart(self.path, **settings, **naming_arguments(self, names))
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:
-        """Begin a run as `FmuPart.start` does; a FmuError also says that the FMU crashed or hung."""
+        """Start a run as `FmuPart.start`; raise FmuError also if the FMU crashed or hung."""
         if self._child is None:
             self._child = _Child()
-            self._ask(json.dumps(self._settings).encode(), "while loading", _START_TIMEOUT)
+            self._request(json.dumps(self._settings).encode(), "while loading", _START_TIMEOUT_S)
         plain = {name: float(value) for name, value in parameters.items()}
         message = b"S" + struct.pack("<d", time) + json.dumps(plain).encode()
-        return np.frombuffer(self._ask(message, "at the start", _START_TIMEOUT)).copy()
+        return np.frombuffer(self._request(message, "at the start", _START_TIMEOUT_S)).copy()
 
     def advance(self, time: float, inputs: Vector) -> Vector:
-        """Step as `FmuPart.advance` does; a FmuError also says that the FMU crashed or hung."""
+        """Step as `FmuPart.advance`; raise FmuError also if the FMU crashed or hung."""
         message = b"A" + np.concatenate([[time], inputs]).astype("<f8").tobytes()
-        return np.frombuffer(self._ask(message, f"in the step from t = {time:g} s", self.timeout)).copy()
+        return np.frombuffer(self._request(message, f"in the step from t = {time:g} s", self.timeout)).copy()
 
     def close(self) -> None:
         """End the child process."""
@@ -95,12 +95,12 @@ class IsolatedPart:
         if child is not None:
             child.end(self.timeout)
 
-    def _ask(self, message: bytes, when: str, timeout: float) -> bytes:
+    def _request(self, message: bytes, when: str, timeout: float) -> bytes:
         child = self._child
         if child is None:
             raise FmuError(f"{self.path}: is not running; call `start` first.")
         try:
-            child.asked.send_bytes(message)
+            child.requests.send_bytes(message)
             if not child.answers.poll(timeout):
                 self._kill()
                 raise FmuError(f"{self.path}: hung {when}: no answer within {timeout:g} s; its process was ended.")
@@ -122,24 +122,24 @@ class IsolatedPart:
 
 
 class _Child:
-    """The process, its two pipes, its temporary folder and what it wrote to stderr."""
+    """The process with its two pipes, its temporary folder and its stderr."""
 
     def __init__(self) -> None:
-        (asked_out, asked_in), (answers_out, answers_in) = os.pipe(), os.pipe()
-        self.asked = Connection(asked_in, readable=False)
+        (requests_out, requests_in), (answers_out, answers_in) = os.pipe(), os.pipe()
+        self.requests = Connection(requests_in, readable=False)
         self.answers = Connection(answers_out, writable=False)
         self.folder = tempfile.mkdtemp(prefix="softneck-child-")
         self.stderr: IO[Any] = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the process
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "softneck.cosim.parts._isolated", str(asked_out), str(answers_in)],
-                pass_fds=(asked_out, answers_in), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+                [sys.executable, "-m", "softneck.cosim.parts._isolated", str(requests_out), str(answers_in)],
+                pass_fds=(requests_out, answers_in), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
                 stderr=self.stderr,
-                # What was unpacked goes with the folder, however the process ends.
+                # The unpacked FMU is removed with the folder, however the process ends.
                 env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": self.folder},
             )  # fmt: skip
         finally:
-            os.close(asked_out)
+            os.close(requests_out)
             os.close(answers_in)
 
     def death(self) -> str:
@@ -152,8 +152,8 @@ class _Child:
         return f"{how} ({last})" if last else how
 
     def end(self, patience: float) -> None:
-        """Close the pipes, wait, and end the process by force if it does not end itself."""
-        self.asked.close()
+        """Close the pipes, wait for the process, and kill it if it does not end."""
+        self.requests.close()
         try:
             self.process.wait(timeout=patience)
         except subprocess.TimeoutExpired:
@@ -166,11 +166,11 @@ class _Child:
 
 def main(arguments: list[str]) -> None:
     """Serve one FMU until the pipe closes."""
-    asked, answers = (Connection(int(text)) for text in arguments)
+    requests, answers = (Connection(int(text)) for text in arguments)
     part: FmuPart | None = None
     while True:
         try:
-            message = asked.recv_bytes()
+            message = requests.recv_bytes()
         except EOFError:
             break
         try:

@@ -1,6 +1,6 @@
-"""The C calls of a Co-Simulation FMU, the same few for FMI 2.0 and FMI 3.0.
+"""The C calls of a Co-Simulation FMU, for FMI 2.0 and FMI 3.0.
 
-fmpy loads and instantiates; the calls of every step go straight to the library with buffers made once.
+fmpy loads and instantiates; the calls of each step go directly to the library, with buffers made once.
 """
 
 from __future__ import annotations
@@ -21,21 +21,19 @@ from ._variables import Description, types_of
 if TYPE_CHECKING:
     from fmpy.model_description import ScalarVariable
 
-
 OK_OR_WARNING, ERROR, FATAL = 1, 3, 4
-_STATUS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
+_STATUS_TEXTS = ("OK", "a warning", "discard", "an error", "a fatal error", "pending")
 Log = Callable[[int, str], None]
-# fmpy changes the directory of the process while it loads a library: two threads would leave it in the wrong one.
+# fmpy changes the working directory while it loads a library, so only one thread may load at a time.
 _LOADING = threading.Lock()
 
 
 class CallError(RuntimeError):
-    """A C call returned a bad status; `_fmu_part` turns it into an `FmuError` with the FMU's own reason."""
+    """A C call returned a bad status; `_fmu_part` raises an `FmuError` with the FMU's own reason."""
 
     def __init__(self, name: str, status: int) -> None:
-        """Name the call and its status."""
-        said = _STATUS[status] if 0 <= status < len(_STATUS) else f"status {status}"
-        super().__init__(f"{name} returned {said}")
+        text = _STATUS_TEXTS[status] if 0 <= status < len(_STATUS_TEXTS) else f"status {status}"
+        super().__init__(f"{name} returned {text}")
         self.status = status
 
 
@@ -48,7 +46,7 @@ class Native:
     """
 
     def __init__(self, description: Description, folder: Path, log: Log) -> None:
-        """Load the library that lies in `folder` and instantiate; raise what fmpy raises if that fails."""
+        """Load the library in `folder`; errors are those of fmpy."""
         from fmpy.fmi2 import FMU2Slave
         from fmpy.fmi3 import FMU3Slave
 
@@ -76,17 +74,17 @@ class Native:
         )
 
         if self.version == 2:
-            # Without fmpy's logger proxy: that is one for the process, and an FMU's log would reach another part.
+            # Not fmpy's logger proxy: there is one for the process, and the log would reach another part.
             callbacks = fmi2CallbackFunctions()
-            callbacks.logger = fmi2CallbackLoggerTYPE(lambda _e, _i, status, _c, text: self._tell(status, text))
+            callbacks.logger = fmi2CallbackLoggerTYPE(lambda _e, _i, status, _c, text: self._write_log(status, text))
             callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
             callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
             self.fmu.instantiate(False, callbacks, True)
         else:
-            self.fmu.instantiate(loggingOn=True, logMessage=lambda _e, status, _c, text: self._tell(status, text))
+            self.fmu.instantiate(loggingOn=True, logMessage=lambda _e, status, _c, text: self._write_log(status, text))
         self._step, self._step_rest = self._step_call()
 
-    def _tell(self, status: int, message: bytes) -> None:
+    def _write_log(self, status: int, message: bytes) -> None:
         self._log(status, " ".join((message or b"").decode("utf-8", "replace").replace("%%", "%").split()))
 
     def _step_call(self) -> tuple[Callable[..., int], tuple[Any, ...]]:
@@ -94,9 +92,9 @@ class Native:
             types = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_int]
             return self.function("fmi2DoStep", types), (1,)
         flags = [ctypes.c_bool() for _ in range(3)]
-        self._held = (*flags, ctypes.c_double())
+        self._step_outputs = (*flags, ctypes.c_double())
         types = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool] + [ctypes.c_void_p] * 4
-        return self.function("fmi3DoStep", types), (True, *(ctypes.addressof(item) for item in self._held))
+        return self.function("fmi3DoStep", types), (True, *(ctypes.addressof(item) for item in self._step_outputs))
 
     def function(self, name: str, types: list[Any]) -> Callable[..., int]:
         """Return the C function `name` of the library with those argument types."""
@@ -112,7 +110,7 @@ class Native:
             self.fmu.enterInitializationMode(startTime=time)
 
     def setup(self, time: float) -> None:
-        """Tell FMI 2.0 the start time; FMI 3.0 hears it on entering initialisation."""
+        """Set the start time of FMI 2.0; FMI 3.0 gets it on entering initialisation."""
         if self.version == 2:
             self.fmu.setupExperiment(None, time, None)
 
@@ -130,36 +128,36 @@ class Native:
         """Return to the state after instantiation."""
         self.fmu.reset()
 
-    def release(self, *, broken: bool, ours: bool) -> None:
+    def release(self, *, broken: bool, is_softneck: bool) -> None:
         """Terminate and free the instance as far as FMI allows."""
         if self.fmu.component is None:
             return
         if not broken:
             try:
                 self.fmu.terminate()
-            except Exception as error:  # a failing end is no reason to lose the run
+            except Exception as error:  # a failing end does not make the run invalid
                 broken = getattr(error, "status", 0) >= FATAL
-        # After "fatal" FMI allows no further call; our own slave stays sound and is freed.
-        if not broken or ours:
+        # After "fatal" FMI allows no further call; softneck's own FMU stays valid and is freed.
+        if not broken or is_softneck:
             self.fmu.freeInstance()
 
     def get_state(self) -> bytes:
         """Return the serialised state."""
-        state = self._named("get")()
+        state = self._state_function("get")()
         try:
-            return bytes(self._named("serialize")(state))
+            return bytes(self._state_function("serialize")(state))
         finally:
-            self._named("free")(state)
+            self._state_function("free")(state)
 
     def set_state(self, data: bytes) -> None:
         """Restore a serialised state."""
-        state = self._named("deSerialize")(data)
+        state = self._state_function("deSerialize")(data)
         try:
-            self._named("set")(state)
+            self._state_function("set")(state)
         finally:
-            self._named("free")(state)
+            self._state_function("free")(state)
 
-    def _named(self, verb: str) -> Callable[..., Any]:
+    def _state_function(self, verb: str) -> Callable[..., Any]:
         # fmpy spells it `...FMUstate` for FMI 2.0 and `...FMUState` for FMI 3.0.
         wanted = f"{verb}FMUState".lower()
         return getattr(self.fmu, next(name for name in dir(self.fmu) if name.lower() == wanted))
@@ -167,7 +165,7 @@ class Native:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Group:
-    """Variables of one FMI type: where they stand in the vector, and the buffers the C calls use."""
+    """Variables of one FMI type: their positions in the vector, and the buffers of the C calls."""
 
     places: Any
     references: Any
@@ -179,7 +177,7 @@ class _Group:
 
 
 class Bank:
-    """Some variables of an FMU, moved from and to a vector with one C call for each type."""
+    """Some variables of an FMU, read into and written from a vector with one C call for each type."""
 
     def __init__(self, variables: list[ScalarVariable], version: int) -> None:
         """Prepare the buffers for `variables`, in the vector's order."""

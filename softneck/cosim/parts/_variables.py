@@ -1,4 +1,4 @@
-"""The variables of an FMU as ports, the calls that move them, and the block inside an FMU of ours."""
+"""The variables of an FMU as ports, their C types, and the block inside an FMU of softneck."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import FileFormatError, SettingsError
+from softneck.core import FileFormatError, SettingsError, error_reason
 from softneck.fmu import node_of, unpacked
 from softneck.runtime import Block, Port, bundle, compiled_name
 
 if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ScalarVariable
-
 
 # FMI type -> (C type, numpy type, name in fmi2Get... or fmi3Get...); FMI 2.0 above, FMI 3.0 below.
 TYPES: dict[str, tuple[Any, Any, str]] = {
@@ -48,12 +47,12 @@ def types_of(version: int) -> dict[str, tuple[Any, Any, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """What softneck's FMUs say about themselves beyond FMI; empty for others.
+    """The annotation of softneck in its FMUs; empty for others.
 
     Attributes:
-        kind, role: of the block, "" for foreign FMUs.
+        kind, role: of the block, "" for other FMUs.
         missing: names of variables whose NaN means "not measured".
-        robot: name and hash of the robot that it is of, "" for necks and foreign FMUs.
+        robot: name and hash of its robot, "" for necks and other FMUs.
     """
 
     kind: str = ""
@@ -64,15 +63,15 @@ class Annotation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Description:
-    """An FMU's description as far as a loop needs it.
+    """The parts of an FMU's description that a loop needs.
 
     Attributes:
         path: of the FMU.
-        model: fmpy's own description.
+        model: fmpy's description.
         annotation: see `Annotation`.
-        variables: our name -> variable, for all that can be numbers.
+        variables: our name -> variable, for all numbers.
         version: of FMI, 2 or 3.
-        units: our name -> unit, where the user knows better than the FMU.
+        units: our name -> unit, which replace those of the FMU.
     """
 
     path: Path
@@ -105,8 +104,8 @@ class Description:
             maximum=number_of(variable.max if variable.max is not None else getattr(declared, "max", None), None),
             nominal=number_of(variable.nominal, None),
             boolean=variable.type == "Boolean",
-            integer=variable.type
-            not in ("Real", "Float64", "Float32", "Boolean"),  # an enumeration is a number of a list
+            # An enumeration is the number of an item.
+            integer=variable.type not in ("Real", "Float64", "Float32", "Boolean"),
             missing=variable.name in self.annotation.missing,
         )
 
@@ -119,7 +118,7 @@ def read_description(
     Args:
         path: for messages.
         folder: where it is unpacked.
-        names: the FMU's variable name -> ours, for FMUs that use others.
+        names: the FMU's variable name -> ours, for FMUs with other names.
         units: our name -> unit, for FMUs that state none or a wrong one.
 
     Raises:
@@ -130,8 +129,7 @@ def read_description(
     try:
         model = fmpy.read_model_description(str(folder), validate=False)
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({reason}).") from error
+        raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({error_reason(error)}).") from error
     version = {"2": 2, "3": 3}.get(str(model.fmiVersion).partition(".")[0])
     if version is None:
         raise FileFormatError(f"{path}: is an FMI {model.fmiVersion} FMU; softneck runs FMI 2.0 and 3.0.")
@@ -153,7 +151,7 @@ def read_description(
             raise FileFormatError(f"{path}: a unit is given for `{name}`, which is not one of its variables.")
     try:
         annotation = _annotation(folder)
-    except ET.ParseError as error:  # fmpy's parser mends more than Python's
+    except ET.ParseError as error:  # fmpy's parser accepts more than Python's
         raise FileFormatError(f"{path}: its modelDescription.xml cannot be read ({error}).") from error
     return Description(path, model, annotation, variables, version, units or {})
 
@@ -180,11 +178,11 @@ def number_of(text: Any, default: Any) -> Any:
         raise FileFormatError(f"modelDescription.xml has the attribute `{text}` where a number is needed.") from None
 
 
-def block_of(path: Path) -> Block | None:
+def read_block(path: Path) -> Block | None:
     """Return the block in an FMU of this softneck that runs Python; None for any other.
 
     Raises:
-        FileFormatError: no FMU, or what lies in it is damaged.
+        FileFormatError: no FMU, or a damaged one.
     """
     with unpacked(path) as folder:
         try:
@@ -194,24 +192,23 @@ def block_of(path: Path) -> Block | None:
 
 
 def python_block(path: Path, folder: Path, description: Description) -> Block | None:
-    """Return the block in an FMU of ours that runs Python, unpacked in `folder`; None for any other FMU.
+    """Return the block in a Python FMU of softneck, unpacked in `folder`; None for any other FMU.
 
     Raises:
         SettingsError: it was made by another version of softneck.
-        FileFormatError: what lies in it is damaged.
+        FileFormatError: it is damaged.
     """
     if not description.annotation.role or not (folder / "resources" / "block.json").is_file():
         return None
     try:
-        return _stored(path, folder, description)
+        return _read_block(path, folder, description)
     except SettingsError:
         raise
-    except Exception as error:  # json, numpy and Block raise whatever damaged bytes lead to
-        said = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise FileFormatError(f"{path}: what softneck left in it is damaged ({said}).") from error
+    except Exception as error:  # json, numpy and Block raise many errors for damaged bytes
+        raise FileFormatError(f"{path}: its block is damaged ({error_reason(error)}).") from error
 
 
-def _stored(path: Path, folder: Path, description: Description) -> Block:
+def _read_block(path: Path, folder: Path, description: Description) -> Block:
     file = folder / "resources" / "block.json"
     facts = json.loads(file.read_text(encoding="utf-8"))
     runtime = facts.get("module_of_runtime", "")
@@ -219,7 +216,7 @@ def _stored(path: Path, folder: Path, description: Description) -> Block:
     ends = np.cumsum([math.prod(shape) for shape in facts["shapes"]])
     parts = np.split(flat, ends[:-1]) if len(ends) else []
     arrays = tuple(part.reshape(shape) for part, shape in zip(parts, facts["shapes"], strict=True))
-    # The table of kinds comes first: the name of a module from a file is not to be imported unseen.
+    # A module that a file names is imported only if the table of kinds has it.
     if runtime:
         node_of(runtime, arrays)
     if not runtime or compiled_name(bundle(runtime)) != facts["runtime"]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from softneck.core import CheckFailedError, load
-from softneck.cosim import FmuPart, LoopSetup, reach_beyond
+from softneck.cosim import FmuPart, LoopSetup, describe_excess_range
 from softneck.loop import BlockPart, Loop, Part
 from softneck.plant import NeckParameters, has_own_tendons
 from softneck.robot import Robot, is_set_point
@@ -62,7 +62,7 @@ def prepare(setup: LoopSetup, controller: Path | None = None, robot: Robot | Non
             require_same_robot(robot or NECK, getattr(found, "robot", NECK), f"{controller} and drives")
             part = BlockPart(found.block())
         loop = replace(loop, controller=part)
-    beyond = "" if robot is None else reach_beyond(loop.controller, loop.controller_parameters, robot)
+    beyond = "" if robot is None else describe_excess_range(loop.controller, loop.controller_parameters, robot)
     if beyond:
         raise CheckFailedError(f"{beyond}, and so were its certificates. Design and certify it for that robot.")
     if loop.faults:
