@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from softneck import identification, plots, signals
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 
 from .shared._console import left_out, note, percent, print_json, print_table, progress, useless
 from .shared._options import target
 
 if TYPE_CHECKING:
-    from softneck.identification import Choice, KindTrial, Model, Validation
     from softneck.robot import Robot
 
 
@@ -40,10 +40,6 @@ def identify_auto(
     as_json: bool,
 ) -> None:
     """Try the kinds, save the chosen model, and explain."""
-    from softneck.identification import choose_kind, with_fit, with_tolerance
-    from softneck.plots import write_page
-    from softneck.signals import read_recording
-
     path, overwrite = target(output, "models/auto.npz", force=force)
     # Linear kinds are what `design` and `observer` take; the best of the others is the better plant for loops.
     beside = {name: path.with_name(f"{path.stem}_{name}.npz") for name in _OTHER}
@@ -51,24 +47,26 @@ def identify_auto(
         refuse_existing(file, force=overwrite)
     if html is not None:
         refuse_existing(html, force=force)
-    parts = [read_recording(source, robot=robot) for source in recordings]
+    parts = [signals.read_recording(source, robot=robot) for source in recordings]
     with progress("identify auto", quiet=as_json) as report:
-        choice = choose_kind(parts, name=str(recordings[-1]), train=train, seed=seed or 0, progress=report)
+        choice = identification.choose_kind(
+            parts, name=str(recordings[-1]), train=train, seed=seed or 0, progress=report
+        )
     others = _others(choice)
     saved = {path: choice, **{beside[sort]: other for sort, other in others.items()}}
-    models: list[Model] = []
+    models: list[identification.Model] = []
     for file, taken in saved.items():
         model = _model(taken)
         if tolerance is not None:
-            model = with_tolerance(model, tolerance)
-        models.append(with_fit(model, taken.chosen.judged))
+            model = identification.with_tolerance(model, tolerance)
+        models.append(identification.with_fit(model, taken.chosen.judged))
         models[-1].save(file, force=overwrite)
     for file in beside.values():
         if file not in saved:
             file.unlink(missing_ok=True)  # of another choice, which --force replaces
     said = [_OTHER[sort].format(kind=other.chosen.kind, path=beside[sort]) for sort, other in others.items()]
     if html is not None:
-        write_page(html, _page(choice), force=force)
+        plots.write_page(html, _page(choice), force=force)
     judged = choice.chosen.judged
     why = None if judged is None else useless(judged)
     if as_json:
@@ -84,24 +82,22 @@ def identify_auto(
     _refuse_useless(path, why, judged)
 
 
-def _refuse_useless(path: Path, why: str | None, judged: Validation | None) -> None:
+def _refuse_useless(path: Path, why: str | None, judged: identification.Validation | None) -> None:
     """Raise CheckFailedError where the best of all kinds is no model."""
     if why is not None:
         advice = (judged and left_out(judged)) or "`softneck info REC` says what it lacks."
         raise CheckFailedError(f"{path}: no kind is a model of the rows held out: {why}. {advice}")
 
 
-def _model(choice: Choice) -> Model:
+def _model(choice: identification.Choice) -> identification.Model:
     if choice.chosen.model is None:
         raise SettingsError("the chosen kind has no model.")
     return choice.chosen.model
 
 
-def _others(choice: Choice) -> dict[str, Choice]:
+def _others(choice: identification.Choice) -> dict[str, identification.Choice]:
     """Return the choices of the best kinds of other sorts, by their sort."""
-    from softneck.identification import best_others
-
-    found = best_others(choice.ranking, choice.chosen)
+    found = identification.best_others(choice.ranking, choice.chosen)
     return {sort: replace(choice, chosen=one) for sort, one in found.items() if one.model is not None}
 
 
@@ -109,12 +105,11 @@ def _title(robot: Robot) -> str:
     return _TABLE_TITLE.format(names=" and ".join(robot.outputs.names))
 
 
-def _rows(choice: Choice) -> list[list[str]]:
+def _rows(choice: identification.Choice) -> list[list[str]]:
     return [_row(one, one is choice.chosen) for one in choice.ranking]
 
 
-def _row(one: KindTrial, chosen: bool) -> list[str]:
-    from softneck.identification import COLD, HOLD_OUT
+def _row(one: identification.KindTrial, chosen: bool) -> list[str]:
 
     if one.model is None:
         return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", one.failure[:60]]
@@ -124,15 +119,15 @@ def _row(one: KindTrial, chosen: bool) -> list[str]:
         percent(one.fit) + ("" if error is None else f" +- {error:.1f}"),
         one.worst,
         f"{percent(one.fit)}..{percent(max(scores.values()))}",
-        percent(scores[HOLD_OUT]),
-        percent(scores[COLD]) if COLD in scores else "-",
+        percent(scores[identification.HOLD_OUT]),
+        percent(scores[identification.COLD]) if identification.COLD in scores else "-",
         f"{one.seconds:.1f} s",
         f"{one.numbers} numbers",
         "chosen" if chosen else "" if one.whole else "stopped early",
     ]
 
 
-def _facts(choice: Choice, path: Path) -> dict:
+def _facts(choice: identification.Choice, path: Path) -> dict:
     return {
         "model": str(path),
         "chosen": choice.chosen.kind,
@@ -156,19 +151,20 @@ def _facts(choice: Choice, path: Path) -> dict:
     }
 
 
-def _page(choice: Choice) -> str:
-    from softneck.plots import Section, Table, page
+def _page(choice: identification.Choice) -> str:
     from softneck.report import curves
 
-    table = Table(_title(_model(choice).robot), _TABLE_HEAD, _rows(choice))
+    table = plots.Table(_title(_model(choice).robot), _TABLE_HEAD, _rows(choice))
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
     each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
-    all_scores = Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)
+    all_scores = plots.Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)
     charts = [] if choice.chosen.judged is None else [curves(choice.chosen.judged)]
     found = _model(choice).summary().splitlines()
     sections = [
-        Section("Which kind of model", charts=charts, tables=[table, all_scores], text=choice.remarks, method=found)
+        plots.Section(
+            "Which kind of model", charts=charts, tables=[table, all_scores], text=choice.remarks, method=found
+        )
     ]
-    return page(
+    return plots.page(
         "Models of all kinds, ranked", sections, verdict=choice.why, footer="Written by softneck identify auto."
     )

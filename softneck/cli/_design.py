@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from softneck import design, estimation, signals
 from softneck.core import KINDS, SettingsError, find_kind, kinds_of, refuse_existing, resolve, to_si
 from softneck.robot import load_for_robot
 
 from .shared._console import note, print_json, progress
 from .shared._groups import kinds_complete
 from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
-
-if TYPE_CHECKING:
-    from softneck.estimation import FittedObserver
 
 _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("controller"))
 
@@ -51,12 +49,10 @@ def command(
     as_json: bool,
 ) -> None:
     """Design a controller of KIND on identified linear models or a family."""
-    from softneck.design import linear_plant
-
     entry = find_kind(kind, "controller")
     path, replace = target(output, f"controllers/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    plants = [linear_plant(model, any_fit=any_fit, robot=robot) for model in models]
+    plants = [design.linear_plant(model, any_fit=any_fit, robot=robot) for model in models]
     asked = apply_settings(resolve(entry.settings), settings)
     if observer is not None:
         if not hasattr(asked, "over"):
@@ -106,13 +102,11 @@ def observer_command(
     one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
     state.
     """
-    from softneck.estimation import design_observer
-
     kind = find_kind("kalman", "observer")
     path, replace = target(output, "observers/kalman.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     chosen = apply_settings(resolve(kind.settings), settings)
-    observer = design_observer(chosen, model, robot)
+    observer = estimation.design_observer(chosen, model, robot)
     told: dict[str, Any] = {}
     lines: list[str] = []
     if data:
@@ -140,14 +134,14 @@ def observer_command(
     click.echo("\n".join([str(path), observer.summary(), *lines]))
 
 
-def _fit(observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]) -> tuple[FittedObserver, list[str]]:
+def _fit(
+    observer: Any, data: tuple[Path, ...], robot: str | None, named: set[str]
+) -> tuple[estimation.FittedObserver, list[str]]:
     """Fit the observer to the recordings; return it and the lines to print."""
     # Imported here: `softneck --help` must not wait for scipy's optimisers.
-    from softneck.estimation import consistency, fit_observer
-    from softneck.signals import read_recording
 
-    recordings = [read_recording(path, robot=robot) for path in data]
-    found = fit_observer(observer, recordings, named)
+    recordings = [signals.read_recording(path, robot=robot) for path in data]
+    found = estimation.fit_observer(observer, recordings, named)
     unit = observer.robot.outputs.display_unit
     before, after = found.fit.log_likelihood
     lines = [
@@ -160,5 +154,8 @@ def _fit(observer: Any, data: tuple[Path, ...], robot: str | None, named: set[st
     verdict = "no better, so the defaults are kept" if found.kept == "default" else f"{found.kept} kept"
     lines.append(f"  error [{unit}] of the look ahead on {found.rows} rows held out: {errors}: {verdict}")
     for path, recording in zip(data, recordings, strict=True):
-        lines += [f"  {path.name}: {line}" for line in consistency(found.observer, recording).summary().splitlines()]
+        lines += [
+            f"  {path.name}: {line}"
+            for line in estimation.consistency(found.observer, recording).summary().splitlines()
+        ]
     return found, lines

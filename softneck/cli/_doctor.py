@@ -13,6 +13,9 @@ from importlib import metadata
 
 import click
 
+from softneck import fmu
+from softneck.core import FileFormatError
+
 from .shared._console import print_json, print_table
 from .shared._options import common_options
 
@@ -76,16 +79,14 @@ def _fmu_platform() -> dict[str, str]:
 
 
 def _compiled_fmus() -> dict[str, str]:
-    from softneck.core import FileFormatError
-    from softneck.fmu import PLATFORMS, platforms_built
 
     try:
-        built, how = platforms_built()
+        built, how = fmu.platforms_built()
     except FileFormatError as error:
         return _check("compiled FMUs", "missing", str(error))
     if not built:
         return _check("compiled FMUs", "optional", how)
-    state = "ok" if len(built) == len(PLATFORMS) else "optional"
+    state = "ok" if len(built) == len(fmu.PLATFORMS) else "optional"
     return _check("compiled FMUs", state, f"{', '.join(built)} ({how})")
 
 

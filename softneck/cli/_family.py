@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
 
+from softneck import identification, plots, signals
 from softneck.core import CheckFailedError, refuse_existing, to_si
 
 from .shared._console import print_json, progress
 from .shared._options import apply_settings, common_options, kind_command, output_option, set_option, target
-
-if TYPE_CHECKING:
-    from softneck.identification import Family
 
 
 @click.command(
@@ -51,23 +49,20 @@ def command(
     It is tested against the recordings: a weight covers the frequency responses that they show, at every amplitude and
     payload among them, in the band that they excite. Exit code 1 if a recording of --test needs more than the weight.
     """
-    from softneck.identification import FamilySettings
     from softneck.identification import family as made_family
-    from softneck.plots import write_page
-    from softneck.signals import read_recording
 
-    chosen = apply_settings(FamilySettings, settings)
+    chosen = apply_settings(identification.FamilySettings, settings)
     path, replace = target(output, "families/family.npz", force=force)
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
-    judges = [read_recording(source) for source in tests]
+    judges = [signals.read_recording(source) for source in tests]
     with progress("family", quiet=as_json) as report:
         family = made_family(list(recordings), robot=robot, progress=report, **asdict(chosen))
     lines, needed = family.invalidated_by(judges, [str(source) for source in tests]) if judges else ([], {})
     family.save(path, force=replace)
     if html is not None:
-        write_page(html, _page(family), force=force)
+        plots.write_page(html, _page(family), force=force)
     if as_json:
         print_json({**_facts(path, family), **({"test": {"lines": lines, "needed": needed}} if judges else {})})
     else:
@@ -78,7 +73,7 @@ def command(
         click.echo("not invalidated by --test (which does not say that the family explains it)")
 
 
-def _facts(path: Path, family: Family) -> dict[str, Any]:
+def _facts(path: Path, family: identification.Family) -> dict[str, Any]:
     axes = {
         name: {
             "nominal": _parameters(axis.nominal),
@@ -119,24 +114,23 @@ def _parameters(numbers: np.ndarray) -> dict[str, float]:
     return dict(zip(("static_gain", "pole", "delay_s"), numbers.tolist(), strict=True))
 
 
-def _page(family: Family) -> str:
-    from softneck.plots import Section, Table, cover_chart, page
+def _page(family: identification.Family) -> str:
 
     outputs, motors = family.robot.outputs, family.robot.motors
     unit, gain = f"{outputs.display_unit}/{motors.unit}", to_si(motors.unit)[0] / to_si(outputs.display_unit)[0]
     sections = []
     for name, axis in family.axes.items():
-        chart = cover_chart(family.frequency, *_cover(family, name), f"{name}: the weight over its samples")
+        chart = plots.cover_chart(family.frequency, *_cover(family, name), f"{name}: the weight over its samples")
         head = ["", f"static gain [{unit}]", "pole [1/s]", "dead time [ms]"]
         parts = {"least": axis.box[0], "largest": axis.box[1], "nominal": axis.nominal}
         rows = [[label, *_numbers(row, gain)] for label, row in parts.items()]
-        sections.append(Section(name, tables=[Table("Box", head, rows)], charts=[chart]))
-    sections.append(Section("In numbers", text=family.summary().splitlines()))
+        sections.append(plots.Section(name, tables=[plots.Table("Box", head, rows)], charts=[chart]))
+    sections.append(plots.Section("In numbers", text=family.summary().splitlines()))
     verdict = " ".join(_verdict(family, name, gain, unit) for name in family.axes)
-    return page("Family of linear models", sections, verdict=verdict, footer="Written by softneck family.")
+    return plots.page("Family of linear models", sections, verdict=verdict, footer="Written by softneck family.")
 
 
-def _verdict(family: Family, name: str, gain: float, unit: str) -> str:
+def _verdict(family: identification.Family, name: str, gain: float, unit: str) -> str:
     """Return the band in which the weight covers the measured responses, and the range of the plant."""
     low, high = (_numbers(row, gain) for row in family.axes[name].box)
     span = f"its static gain is {low[0]} to {high[0]} {unit} and its dead time {low[2]} to {high[2]} ms"
@@ -149,7 +143,7 @@ def _verdict(family: Family, name: str, gain: float, unit: str) -> str:
     )
 
 
-def _cover(family: Family, name: str) -> tuple[np.ndarray, np.ndarray]:
+def _cover(family: identification.Family, name: str) -> tuple[np.ndarray, np.ndarray]:
     s = 1j * family.frequency
     above, below = family.axes[name].weight
     return family.errors(name), np.abs(np.polyval(above, s) / np.polyval(below, s))

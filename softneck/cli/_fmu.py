@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from softneck import cosim, identification, plant, runtime, signals
 from softneck.core import FileFormatError, SettingsError, file_hash, load
 from softneck.fmu import PLATFORMS
 
@@ -15,8 +16,6 @@ from .shared._options import common_options, output_option, target
 
 if TYPE_CHECKING:
     from softneck.fmu import Buildable
-    from softneck.identification import Validation
-    from softneck.runtime import Block
 
 
 @click.command("fmu", epilog="Example: softneck fmu build/demo/models/rls.npz -o Rls.fmu")
@@ -111,15 +110,14 @@ def command(
 
 def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bool, as_json: bool) -> None:
     """Write a loop as an SSP archive."""
-    from softneck.cosim import load_loop, load_ssp, write_ssp
     from softneck.loop import System
 
     if file.suffix.lower() not in (".toml", ".ssp"):
         raise SettingsError(f"{file}: an SSP file is made of a loop file (.toml) or of another archive (.ssp).")
     with progress("build SSP", quiet=as_json):
         plain = file.suffix.lower() == ".ssp" and robot is None
-        setup = load_ssp(file) if plain else load_loop(file, robot=robot)
-        write_ssp(setup, path, force=force, compiled=compiled)
+        setup = cosim.load_ssp(file) if plain else cosim.load_loop(file, robot=robot)
+        cosim.write_ssp(setup, path, force=force, compiled=compiled)
     loop = setup if isinstance(setup, System) else setup.loop
     parts = [*loop.parts, *(["reference"] if loop is not setup and "reference" not in loop.parts else [])]
     if as_json:
@@ -132,17 +130,18 @@ def _ssp(file: Path, path: Path, robot: str | None, *, compiled: bool, force: bo
 
 def open_buildable(source: str | Path, robot: str | None = None) -> Buildable:
     """Return the softneck file, neck or robot that `source` names, by its file or preset."""
-    from softneck.cosim import is_loop_file, reference_of
     from softneck.fmu import buildable
 
-    return reference_of(Path(source), robot=robot) if is_loop_file(Path(source)) else buildable(source, robot)
+    return (
+        cosim.reference_of(Path(source), robot=robot) if cosim.is_loop_file(Path(source)) else buildable(source, robot)
+    )
 
 
 def _can_be_fmu(source: str | Path) -> bool:
     return Path(source).suffix != ".npz" or hasattr(load(source), "block")
 
 
-def _has_sensitivities(block: Block) -> bool:
+def _has_sensitivities(block: runtime.Block) -> bool:
     """Return whether an FMU of `block` can have sensitivities; print a warning if not."""
     from softneck.fmu import next_outputs
 
@@ -153,15 +152,14 @@ def _has_sensitivities(block: Block) -> bool:
         return False
 
 
-def _judge(thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None) -> Validation | None:
+def _judge(
+    thing: Buildable, source: str | Path, data: tuple[Path, ...], robot: str | None
+) -> identification.Validation | None:
     """Validate a model on all recordings together; return None if `thing` is no model."""
-    from softneck.identification import Model, validate
-    from softneck.signals import open_recording
-
-    if not isinstance(thing, Model):
+    if not isinstance(thing, identification.Model):
         return None
     names = (Path(source).name, ", ".join(path.name for path in data))
-    return validate(thing, open_recording(data, robot), names=names)
+    return identification.validate(thing, signals.open_recording(data, robot), names=names)
 
 
 def _what(files: tuple[str, ...], output: Path | None, *, force: bool) -> tuple[list[tuple[str | Path, Path]], bool]:
@@ -195,9 +193,8 @@ def _inside(folder: Path) -> list[Path]:
 def _is_neck(path: Path) -> bool:
     """Return whether a file has the keys of a neck file; reading it checks the rest."""
     from softneck.fmu import has_keys
-    from softneck.plant import NeckParameters
 
-    return has_keys(path, {"preset", *NeckParameters.names()})
+    return has_keys(path, {"preset", *plant.NeckParameters.names()})
 
 
 def _stem(file: str) -> str:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+from softneck import identification, signals
 from softneck.core import (
     KINDS,
     CheckFailedError,
@@ -33,9 +33,6 @@ from .shared._options import (
     target,
     tolerance_option,
 )
-
-if TYPE_CHECKING:
-    from softneck.identification import Model, Validation
 
 _ADVICE = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
@@ -82,9 +79,6 @@ def command(
     as_json: bool,
 ) -> None:
     """Identify a model of KIND from one or more recordings."""
-    from softneck.identification import fit_and_validate
-    from softneck.signals import open_recording, poor_excitation, why_at_rest
-
     if tolerance is not None:
         require_positive("--tolerance", tolerance)
     if old is not None:
@@ -108,12 +102,14 @@ def command(
     estimator = apply_settings(resolve(entry.settings), settings, seed=seed)
     path, replace = target(output, f"models/{kind}.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
-    whole = open_recording(recordings, robot)
+    whole = signals.open_recording(recordings, robot)
     with progress(f"identify {kind}", quiet=as_json) as report:
-        model, held_out = fit_and_validate(estimator, whole, train=train, tolerance=tolerance, progress=report)
+        model, held_out = identification.fit_and_validate(
+            estimator, whole, train=train, tolerance=tolerance, progress=report
+        )
     model.save(path, force=replace)
     head, tail = (whole, None) if train == 1.0 else whole.split(train)
-    poor = poor_excitation(head)
+    poor = signals.poor_excitation(head)
     if as_json:
         print_json(_facts(path, model, held_out) | {"excitation": poor})
     else:
@@ -123,13 +119,13 @@ def command(
         click.echo("\n".join(poor), nl=bool(poor))
     why = None if held_out is None else useless(held_out)
     if why is not None:
-        still = tail and why_at_rest(tail, whole)
+        still = tail and signals.why_at_rest(tail, whole)
         why, advice = still or why, "" if still or held_out is None else left_out(held_out)
         advice = advice or (poor[0] if poor else _ADVICE)
         raise CheckFailedError(f"{path}: no model of the rows held out: {why}. {advice}")
 
 
-def _facts(path: Path, model: Model, held_out: Validation | None) -> dict:
+def _facts(path: Path, model: identification.Model, held_out: identification.Validation | None) -> dict:
     return {
         "model": str(path),
         "kind": model.kind,
@@ -154,8 +150,6 @@ def adapt(
     robot: str | None, force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Refit MODEL to the latest data, starting from its present parameters; write the result and print the fits."""
-    from softneck.signals import open_recording
-
     path, replace = target(output, f"models/{model.stem}_adapted.npz", force=force, ending=".npz")
     refuse_existing(path, force=replace)
     old = load_for_robot(model, "model", robot)
@@ -163,7 +157,7 @@ def adapt(
         raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; a refitted model keeps its kind.")
     window = float(apply_settings(_Adaptation, settings).window)
     require_positive("window", window, "s")
-    new = old.adapted(open_recording(recordings, robot), window=window)
+    new = old.adapted(signals.open_recording(recordings, robot), window=window)
     new.save(path, force=replace)
     said = new.findings["adaptation"]
     if as_json:

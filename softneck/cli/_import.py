@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from softneck import drives, plots, signals
 from softneck.core import DataError, SettingsError, atomic_write, refuse_existing
 
 from .shared._console import note, print_json
@@ -19,7 +20,6 @@ from .shared._options import columns_options, common_options, sample_time_of, ta
 
 if TYPE_CHECKING:
     from softneck.robot import Robot
-    from softneck.signals import Guess, ImportResult, Layout, NamedColumns
 
 
 def is_terminal() -> bool:
@@ -27,7 +27,7 @@ def is_terminal() -> bool:
     return bool(sys.stdin and sys.stdin.isatty() and sys.stderr.isatty())
 
 
-def settle(guess: Guess, log: Path, proposal: Path) -> Guess:
+def settle(guess: signals.Guess, log: Path, proposal: Path) -> signals.Guess:
     """Ask the user about all doubts and the sample time of a log without a clock; return the settled guess.
 
     Raises:
@@ -79,7 +79,7 @@ class _Job:
     as_json: bool = False
     sample_time: str | None = None
     clock: float | None = None
-    named: NamedColumns | None = None
+    named: signals.NamedColumns | None = None
     texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
 
     def beside(self, ending: str) -> Path:
@@ -154,11 +154,10 @@ def command(
     `softneck drives run --log` needs neither layout nor guess.
     """
     from softneck.robot import find_robot, robot_file_of
-    from softneck.signals import NamedColumns, import_log, is_run_log, read_layout, recording_suffix, robot_in_file
 
-    named = NamedColumns(motors, outputs, positions) if motors or outputs or positions else None
+    named = signals.NamedColumns(motors, outputs, positions) if motors or outputs or positions else None
     asked = guess or layout_file is not None or robot_out is not None or named is not None
-    ours = log.suffix.lower() == ".mcap" and (not asked or is_run_log(log))
+    ours = log.suffix.lower() == ".mcap" and (not asked or signals.is_run_log(log))
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     known = None if clock is None else sample_time_of(clock, "--sample-time")
     if known is not None and not guess and named is None:
@@ -177,13 +176,13 @@ def command(
             raise SettingsError("--robot-out guesses robot and layout; leave out --guess, --layout and --robot.")
         if robot_out.suffix.lower() != ".toml":
             raise SettingsError(f"{robot_out}: must end in `.toml`, by which softneck recognises the file.")
-        if (said := robot_in_file(log, log.suffix.lower())) is not None:
+        if (said := signals.robot_in_file(log, log.suffix.lower())) is not None:
             raise SettingsError(f"{log}: is a recording of robot {said.label()} already, which commands take as it is.")
         guess = named is None
     if not alone and named is None and guess == (layout_file is not None):
         what = "both were given" if guess else "neither was given (a recording needs --resample)"
         raise SettingsError(f"import needs either --layout LAYOUT.toml or --guess; {what}.")
-    recording_suffix(path)
+    signals.recording_suffix(path)
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
@@ -201,55 +200,44 @@ def command(
         proposed, imported, facts = _by_guess(job, whose)
         layout = proposed.layout
     else:
-        layout, proposed = read_layout(layout_file, robot=whose), None
-        imported = import_log(log, layout)
+        layout, proposed = signals.read_layout(layout_file, robot=whose), None
+        imported = signals.import_log(log, layout)
     _finish(job, imported, facts, layout, proposed)
 
 
 def _can_guess(robot: Robot) -> bool:
     """Return whether a log without titles can be guessed for this robot: it has the neck's channels."""
-    from softneck.signals import OUTPUTS, SET_POINTS
-
-    return (robot.set_points, robot.outputs.names) == (SET_POINTS, OUTPUTS)
+    return (robot.set_points, robot.outputs.names) == (signals.SET_POINTS, signals.OUTPUTS)
 
 
-def _read_recorded(log: Path, robot: str | None) -> tuple[ImportResult, dict[str, Any]]:
+def _read_recorded(log: Path, robot: str | None) -> tuple[signals.ImportResult, dict[str, Any]]:
     """Return a recording to be resampled."""
-    from softneck.signals import ImportResult, read_recording
-
-    before = read_recording(log, robot=robot)
-    return ImportResult(before, ()), {"sample_time_before_s": before.sample_time}
+    before = signals.read_recording(log, robot=robot)
+    return signals.ImportResult(before, ()), {"sample_time_before_s": before.sample_time}
 
 
-def _run_log(log: Path) -> tuple[ImportResult, dict[str, Any]]:
+def _run_log(log: Path) -> tuple[signals.ImportResult, dict[str, Any]]:
     """Return the recording of a run on drives."""
-    from softneck.drives import read_run_log  # the drives take a while to import
-    from softneck.signals import ImportResult
-
-    run = read_run_log(log)
+    run = drives.read_run_log(log)
     notes = (f"{log}: {run.cut}: imported up to the cut",) if run.cut else ()
-    return ImportResult(run.recording(), notes), {}
+    return signals.ImportResult(run.recording(), notes), {}
 
 
 def _finish(
-    job: _Job, imported: ImportResult, facts: dict[str, Any], layout: Layout | None = None,
-    proposed: Guess | None = None,
+    job: _Job, imported: signals.ImportResult, facts: dict[str, Any], layout: signals.Layout | None = None,
+    proposed: signals.Guess | None = None,
 ) -> None:  # fmt: skip
     """Resample if required, write all files, and print a summary."""
-    from softneck.signals import write_recording
-
     imported = _at_sample_time(job, imported)
     if job.html is not None and layout is not None:
         job.texts[job.html] = (_preview(job, layout, proposed, imported), job.force)
         facts["html"] = str(job.html)
-    job.write({job.path: (lambda path: write_recording(path, imported.recording, force=True), job.replace)})
+    job.write({job.path: (lambda path: signals.write_recording(path, imported.recording, force=True), job.replace)})
     _tell(job.path, imported, facts, job.as_json)
 
 
-def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
+def _at_sample_time(job: _Job, imported: signals.ImportResult) -> signals.ImportResult:
     """Return the import at the required sample time."""
-    from softneck.signals import ImportResult, resampled
-
     if job.sample_time is None:
         return imported
     recording = imported.recording
@@ -258,17 +246,16 @@ def _at_sample_time(job: _Job, imported: ImportResult) -> ImportResult:
     else:
         asked = sample_time_of(job.sample_time, "--resample")
     told = f"resampled from {1e3 * recording.sample_time:.6g} to {1e3 * asked:.6g} ms"
-    return ImportResult(resampled(recording, asked), (*imported.notes, told))
+    return signals.ImportResult(signals.resampled(recording, asked), (*imported.notes, told))
 
 
-def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: ImportResult | None) -> str:
+def _preview(
+    job: _Job, layout: signals.Layout, proposed: signals.Guess | None, imported: signals.ImportResult | None
+) -> str:
     """Return the page that shows the log's columns and their channels."""
-    from softneck.plots import import_page  # the charts take a while to import
-    from softneck.signals import read_log
-
-    return import_page(
+    return plots.import_page(
         job.log,
-        read_log(job.log, layout),
+        signals.read_log(job.log, layout),
         layout,
         recording=None if imported is None else imported.recording,
         doubts=() if proposed is None else proposed.doubts,
@@ -277,14 +264,12 @@ def _preview(job: _Job, layout: Layout, proposed: Guess | None, imported: Import
     )
 
 
-def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, Any]]:
+def _by_guess(job: _Job, whose: Robot) -> tuple[signals.Guess, signals.ImportResult, dict[str, Any]]:
     """Guess a layout, ask about its doubts, and import by it."""
     import tomli_w
 
-    from softneck.signals import guess_layout, import_log
-
     proposal = job.beside(".layout.toml")
-    guess = guess_layout(job.log, robot=whose)
+    guess = signals.guess_layout(job.log, robot=whose)
     if job.clock is not None:
         if guess.layout.time is not None:
             raise SettingsError(f"{job.log}: has a clock; leave out --sample-time, or say --resample {job.clock:g}.")
@@ -310,7 +295,7 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, A
         job.texts[robot_file] = (text + tomli_w.dumps(guess.layout.robot.as_dict()), job.replace)
         facts["robot_file"] = str(robot_file)
     try:
-        return guess, import_log(job.log, guess.layout), facts
+        return guess, signals.import_log(job.log, guess.layout), facts
     except DataError as error:
         job.write()
         raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error
@@ -318,29 +303,27 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[Guess, ImportResult, dict[str, A
 
 def _of_robot(
     job: _Job, robot: Robot, robot_out: Path | None, *, known: bool
-) -> tuple[ImportResult, Layout, dict[str, Any]]:
+) -> tuple[signals.ImportResult, signals.Layout, dict[str, Any]]:
     """Import by columns or titles a log of `robot`, or of the one that they speak of; propose that, to be written.
 
     `known` is whether somebody said that it is of `robot`.
     """
     import tomli_w
 
-    from softneck.signals import guess_robot, import_log, layout_for, layout_toml, robot_of_columns
-
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
     remarks: dict[str, str] = {}
     found = None
     if job.named is not None:
-        found = robot_of_columns(job.log, job.named, robot=robot if known else None, sample_time=job.clock)
+        found = signals.robot_of_columns(job.log, job.named, robot=robot if known else None, sample_time=job.clock)
     elif robot_out is not None:
         refuse_existing(robot_out, force=job.force)
-        found = guess_robot(job.log)
+        found = signals.guess_robot(job.log)
         remarks[found.robot.set_points[0]] = found.remark
         facts["reasons"] = list(found.lines)
         for line in found.lines:
             note(line)
-    layout = layout_for(job.log, robot) if found is None else found.layout
+    layout = signals.layout_for(job.log, robot) if found is None else found.layout
     if found is not None and (robot_out is not None or found.robot.hash != robot.hash):
         file = robot_out or job.beside(".robot.toml")
         force = job.replace if robot_out is None else job.force
@@ -348,13 +331,13 @@ def _of_robot(
         text = f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
         job.texts[file] = (text + tomli_w.dumps(found.robot.as_dict()), force)
         facts["robot_file"] = str(file)
-    text = layout_toml(layout, remarks=remarks)
+    text = signals.layout_toml(layout, remarks=remarks)
     job.texts[proposal] = (text, job.replace)
-    imported = import_log(job.log, layout)
+    imported = signals.import_log(job.log, layout)
     return imported, layout, {**facts, "layout": tomllib.loads(text), "robot": imported.recording.robot.label()}
 
 
-def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: bool) -> None:
+def _tell(path: Path, imported: signals.ImportResult, more: dict[str, Any], as_json: bool) -> None:
     recording = imported.recording
     missed = int((recording.outputs != recording.outputs).any(axis=1).sum())
     facts = {
@@ -384,7 +367,5 @@ def _tell(path: Path, imported: ImportResult, more: dict[str, Any], as_json: boo
 
 def _one_output(more: dict[str, Any]) -> str:
     """Return the end of the last line for a log taken as that of a robot with one output."""
-    from softneck.signals import ONE_AXIS
-
-    taken = [doubt["taken"] for doubt in more.get("doubts", ()) if doubt["about"] == ONE_AXIS]
+    taken = [doubt["taken"] for doubt in more.get("doubts", ()) if doubt["about"] == signals.ONE_AXIS]
     return f"; NOT SURE: {taken[0]}, as no column is the other angle" if taken else ""

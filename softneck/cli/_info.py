@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from softneck import cosim, drives, identification, loop, plant, signals
 from softneck.core import (
     CERTIFICATE_KINDS,
     KINDS,
@@ -33,14 +34,11 @@ from .shared._options import common_options
 
 if TYPE_CHECKING:
     from softneck.drives.master import Frame
-    from softneck.signals import Guess
 
 
 def describe_log(file: Path) -> dict[str, Any]:
     """Return the content of a drives log: cycles, frames, duration, nodes, first error, and its cut."""
-    from softneck.drives import read_run_log
-
-    log = read_run_log(file)
+    log = drives.read_run_log(file)
     cycles, frames = log.cycles, log.frames()
     begin = cycles[0].time if cycles else 0.0
     settings, files = log.settings(), log.facts.get("files", {})
@@ -63,10 +61,9 @@ def describe_log(file: Path) -> dict[str, Any]:
 
 
 def _stops(name: str) -> bool:
-    from softneck.drives import RULES, Reaction
 
-    rule = RULES.get(name)
-    return rule is not None and rule.reaction in (Reaction.STOP, Reaction.RETREAT)
+    rule = drives.RULES.get(name)
+    return rule is not None and rule.reaction in (drives.Reaction.STOP, drives.Reaction.RETREAT)
 
 
 def _first_error(frames: Sequence[tuple[float, bool, Frame]]) -> str:
@@ -153,15 +150,12 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
 
 def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dict[str, Any]:
     """Return the content and quality of a recording, and write the page."""
-    from softneck.identification import bandwidth_of
-    from softneck.signals import assess_quality, read_recording
-
     quick = html is None and file.stat().st_size < _LARGE_FILE_BYTES
     with progress("info", quiet=quiet or quick) as report:
         report(0.0, "reading")
-        recording = read_recording(file)
+        recording = signals.read_recording(file)
         report(0.6, "checking")
-        found = assess_quality(recording, bandwidth=bandwidth_of(recording))
+        found = signals.assess_quality(recording, bandwidth=identification.bandwidth_of(recording))
         if html is not None:
             from softneck.plots import quality_page, write_page  # matplotlib takes a while to import
 
@@ -182,10 +176,8 @@ def _recording(file: Path, html: Path | None, *, force: bool, quiet: bool) -> di
 
 def _log(file: Path, html: Path | None, error: DataError | FileFormatError | None) -> dict[str, Any]:
     """Return the guessed content of a log; `error` is the reason that it is no recording."""
-    from softneck.signals import guess_layout
-
     try:
-        guess = guess_layout(file)
+        guess = signals.guess_layout(file)
     except (DataError, FileFormatError) as reason:
         raise error or FileFormatError(
             f"{file}: by its ending not a file of softneck, nor is it a log ({str(reason).removeprefix(f'{file}: ')})"
@@ -202,12 +194,10 @@ def _log(file: Path, html: Path | None, error: DataError | FileFormatError | Non
     }
 
 
-def _is_titled(guess: Guess) -> bool:
+def _is_titled(guess: signals.Guess) -> bool:
     """Whether a table has the form and the titles of a recording: a fault in it is for its user to fix."""
-    from softneck.signals import Layout
-
     titled = [line for line in guess.lines if "titled as in a recording" in line]
-    return guess.layout.form == Layout(channels={}).form and len(titled) > 0
+    return guess.layout.form == signals.Layout(channels={}).form and len(titled) > 0
 
 
 def _fmu(file: Path) -> dict[str, Any]:
@@ -238,10 +228,7 @@ def _fmu(file: Path) -> dict[str, Any]:
 
 def _toml(file: Path) -> dict[str, Any]:
     """Describe a TOML file by its keys: robot, loop, study, layout, otherwise a neck."""
-    from softneck.cosim import find_python, load_loop, load_study
-    from softneck.plant import NeckParameters, VirtualNeck
     from softneck.robot import Robot
-    from softneck.signals import read_layout
 
     try:
         table = tomllib.loads(settings_text(file))
@@ -251,18 +238,18 @@ def _toml(file: Path) -> dict[str, Any]:
         robot = Robot.read(file)
         return {"type": "robot", "robot": robot.name, "hash": robot.hash, "summary": robot.summary()}
     if "plant" in table:
-        if not next(find_python(table), ""):  # nothing of a file that is only asked about is run
-            load_loop(file)
+        if not next(cosim.find_python(table), ""):  # nothing of a file that is only asked about is run
+            cosim.load_loop(file)
         return {"type": "loop", "parts": ", ".join(name for name in table if isinstance(table[name], dict))}
     if "vary" in table:
-        study = load_study(file)
+        study = cosim.load_study(file)
         return {"type": "study", "runs": len(study.points), "varies": ", ".join(study.vary)}
     if "channels" in table:
-        layout = read_layout(file)
+        layout = signals.read_layout(file)
         tilt = ["pitch, roll (from the tilt)"] if layout.inclination else []
         return {"type": "layout", "channels": ", ".join([*layout.channels, *tilt])}
-    neck = NeckParameters.from_toml(file)
-    return {"type": "neck", "summary": VirtualNeck(neck).summary()}
+    neck = plant.NeckParameters.from_toml(file)
+    return {"type": "neck", "summary": plant.VirtualNeck(neck).summary()}
 
 
 def _certificate(file: Path) -> dict[str, Any]:
@@ -294,10 +281,7 @@ def _certificate(file: Path) -> dict[str, Any]:
 
 def _ssp(file: Path) -> dict[str, Any]:
     """Return the parts of an SSP archive; raise the error of `simulate` if it cannot run."""
-    from softneck.cosim import load_ssp
-    from softneck.loop import System
-
-    read = load_ssp(file)
-    if isinstance(read, System):
+    read = cosim.load_ssp(file)
+    if isinstance(read, loop.System):
         return {"type": "SSP", "system": "no closed loop", "parts": ", ".join(read.parts)}
     return {"type": "SSP", "system": "closed loop", "robot": read.loop.robot.label()}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from softneck import plots
 from softneck.core import CheckFailedError, OutputFileError, atomic_write, refuse_existing
 
 from .shared._console import Stages, note, print_json, print_table, progress
@@ -96,14 +97,15 @@ def report(folder: Path, output: Path | None, force: bool, as_json: bool) -> Non
     controllers, certificates, FMUs, loops (run anew) and studies, with interactive plots; it opens offline. Files that
     cannot be read are listed in it.
     """
-    from softneck.plots import write_page
     from softneck.report import project_page, read_project
 
     path, replace = target(output, "report.html", force=force, ending=".html")
     refuse_existing(path, force=replace)
     with progress("report", quiet=as_json) as tell:
         project = read_project(folder, progress=lambda done, word: tell(0.4 * done, word))
-        write_page(path, project_page(project, progress=lambda done, word: tell(0.4 + 0.5 * done, word)), force=replace)
+        plots.write_page(
+            path, project_page(project, progress=lambda done, word: tell(0.4 + 0.5 * done, word)), force=replace
+        )
     if as_json:
         print_json({"report": str(path), **_counts(project), "problems": project.problems})
         return
@@ -183,7 +185,6 @@ def paper(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) 
     Records Eq. 22 and the three tests, identifies set membership, network and RLS, and prints our figures
     beside the paper's, like with like. Takes about a minute.
     """
-    from softneck.plots import write_page
     from softneck.report import (
         LINEAR_HEAD,
         PAPER_HEAD,
@@ -203,7 +204,7 @@ def paper(html: Path | None, seed: int, necks: int, force: bool, as_json: bool) 
         found = reproduce(ReproduceSettings(seed=seed, other_necks=necks), tell=stages.begin)
         if html is not None:
             stages.begin("draw the figures")
-            write_page(html, paper_page(found), force=force)
+            plots.write_page(html, paper_page(found), force=force)
     rows = paper_entries(found)
     if as_json:
         print_json(

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from softneck import drives, identification, plant, signals
 from softneck.core import SettingsError, refuse_existing, require_between, require_finite, to_si
 from softneck.robot import Robot, find_robot, load_for_robot
 from softneck.signals import (
     Excitation,
-    SetPointLimits,
     concatenate,
     multisine_experiments,
     prepare,
@@ -28,9 +28,7 @@ from .shared._console import print_json, print_table, progress
 from .shared._options import common_options, output_option
 
 if TYPE_CHECKING:
-    from softneck.identification import Known
     from softneck.robot import Robot
-    from softneck.signals import SetPointLimits
 
 
 @click.command(
@@ -80,10 +78,7 @@ def command(
     as_json: bool,
 ) -> None:
     """Record SIGNAL on the virtual neck or robot."""
-    from softneck.plant import NeckParameters, VirtualNeck, record
-    from softneck.signals import recording_suffix
-
-    recording_suffix(output)
+    signals.recording_suffix(output)
     refuse_existing(output, force=force)
     bounds = {"position": max_position}
     if Path(signal_name).suffix.lower() == ".npz":
@@ -95,9 +90,9 @@ def command(
         return
     require_between("--payload", payload, 0.0, 1.0, "kg")
     whose = find_robot(robot, beside=output)
-    virtual = VirtualNeck.of(whose, None if neck is None else NeckParameters.preset(neck))
+    virtual = plant.VirtualNeck.of(whose, None if neck is None else plant.NeckParameters.preset(neck))
     given = {name: value for name, value in bounds.items() if value is not None}
-    limits = SetPointLimits(**_robot_limits(whose) | given)
+    limits = signals.SetPointLimits(**_robot_limits(whose) | given)
     experiment = {"amplitude": amplitude, "band": _band(band)}
     asked = {name: value for name, value in experiment.items() if value is not None}
     if asked and (signal_name != "multisine" or duration is not None):
@@ -122,7 +117,7 @@ def command(
     with progress("record", quiet=as_json) as report:
         runs = []
         for number, (excitation, _) in enumerate(prepared):
-            runs.append(record(excitation, virtual, seed=seed + number, payload=payload))
+            runs.append(plant.record(excitation, virtual, seed=seed + number, payload=payload))
             report((number + 1) / len(prepared), f"run {number + 1} of {len(prepared)}")
         recording = runs[0] if len(runs) == 1 else concatenate(runs)
     write_recording(output, recording, force=force)
@@ -173,14 +168,11 @@ def record_next(
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Write the set-points of the next recording, with the outputs that the model expects."""
-    from softneck.identification import Bounds, next_experiment
-    from softneck.signals import write_recording
-
     known = _load_known(source, robot)
     with progress("next experiment", quiet=as_json) as report:
-        bounds = Bounds.of(known.robot, _limits(known.robot, limits))
-        found = next_experiment(known, duration=duration, seed=seed, bounds=bounds, progress=report)
-    write_recording(output, found.recording, force=force)
+        bounds = identification.Bounds.of(known.robot, _limits(known.robot, limits))
+        found = identification.next_experiment(known, duration=duration, seed=seed, bounds=bounds, progress=report)
+    signals.write_recording(output, found.recording, force=force)
     facts = {
         "next": str(output),
         "rows": len(found.recording),
@@ -203,21 +195,17 @@ def record_next(
     )
 
 
-def _load_known(source: Path, robot: str | None) -> Known:
-    from softneck.identification import Known, Model
+def _load_known(source: Path, robot: str | None) -> identification.Known:
 
     model = load_for_robot(source, robot=robot)
-    if not isinstance(model, Model):
+    if not isinstance(model, identification.Model):
         raise SettingsError(f"{source}: is no model; give one of kind `guarded`.")
-    return Known.of_model(model)
+    return identification.Known.of_model(model)
 
 
-def _limits(robot: Robot, given: Mapping[str, float | None]) -> SetPointLimits:
+def _limits(robot: Robot, given: Mapping[str, float | None]) -> signals.SetPointLimits:
     """Return the required limits, within those of the robot's drives if it names any."""
-    from softneck.drives import drive_limits, load_drives
-    from softneck.signals import SetPointLimits
-
     if robot.drives is not None and robot.folder is not None:
-        return drive_limits(load_drives(robot.folder / robot.drives), **given)
+        return drives.drive_limits(drives.load_drives(robot.folder / robot.drives), **given)
     asked = {name: value for name, value in given.items() if value is not None}
-    return SetPointLimits(**{"position": float("inf"), **asked})
+    return signals.SetPointLimits(**{"position": float("inf"), **asked})

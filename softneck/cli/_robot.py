@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from softneck import plant
 from softneck.core import SettingsError, atomic_write, settings_text
 
 from .shared._console import print_json
@@ -89,7 +90,6 @@ def _text_for_folder(source: Path, folder: Path) -> str:
     """Return a robot file's text for another folder, from which the files that it names are found as well."""
     import tomli_w
 
-    from softneck.plant import PRESETS
     from softneck.robot import Robot
 
     Robot.read(source)  # reports errors
@@ -99,18 +99,19 @@ def _text_for_folder(source: Path, folder: Path) -> str:
     named = [(part, key) for part, key in (("plant", "neck"), ("drives", "file")) if key in table.get(part, {})]
     for part, key in named if there else []:
         name = table[part][key]
-        if name not in PRESETS and not Path(name).is_absolute():
+        if name not in plant.PRESETS and not Path(name).is_absolute():
             table[part][key] = Path(os.path.relpath((source.parent / name).resolve(), folder.resolve())).as_posix()
     return text if table == tomllib.loads(text) else tomli_w.dumps(table)
 
 
 def _check_files(robot: Robot) -> None:
-    from softneck.plant import PRESETS, NeckParameters, VirtualNeck
 
     folder = robot.folder or Path()
     if robot.neck is not None:
         # The file is there and holds a neck, and the robot is one that tendons on winches bend.
-        VirtualNeck.of(robot, NeckParameters.preset(robot.neck if robot.neck in PRESETS else str(folder / robot.neck)))
+        plant.VirtualNeck.of(
+            robot, plant.NeckParameters.preset(robot.neck if robot.neck in plant.PRESETS else str(folder / robot.neck))
+        )
     if robot.drives is not None:
         from softneck.drives import load_drives
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from markupsafe import Markup
 
+from softneck import cosim, drives, plots, signals
 from softneck.core import (
     CheckFailedError,
     FileFormatError,
@@ -15,6 +16,7 @@ from softneck.core import (
     SoftneckError,
     atomic_write,
     refuse_existing,
+    to_si,
     write_certificate,
 )
 
@@ -24,8 +26,6 @@ from .shared._options import common_options, output_option, target, trust_option
 if TYPE_CHECKING:
     import pandas as pd
 
-    from softneck.cosim import Result, Study
-    from softneck.drives import LoggedRun, Pilot
     from softneck.loop import System
 
 # Number of worst runs written as loop files; the table lists all.
@@ -62,27 +62,28 @@ def command(
             raise SettingsError(f"{loop_file}: is replayed, which writes nothing; `softneck import` makes a recording.")
         replay_log(loop_file, as_json=as_json)
         return
-    from softneck.cosim import load_loop, load_ssp, require_trusted, run_setup
     from softneck.loop import System
-    from softneck.plots import neck_view, why_not_drawn, write_page
-    from softneck.signals import recording_suffix, write_recording
 
     path, replace = target(output, f"results/{loop_file.stem}.csv", force=force)
-    recording_suffix(path)
+    signals.recording_suffix(path)
     refuse_existing(path, force=replace)
     for extra in (certificate, html):
         if extra is not None:
             refuse_existing(extra, force=force)
     if loop_file.suffix == ".ssp" and robot is None:
-        setup = load_ssp(loop_file)
+        setup = cosim.load_ssp(loop_file)
         if isinstance(setup, System):
             _simulate_system(setup, loop_file, path, certificate, html, force=replace, as_json=as_json)
             return
     else:
         if loop_file.suffix != ".ssp":
-            require_trusted(loop_file, trust=trust)
-        setup = load_loop(loop_file, robot=robot)
-    view = html.with_name(f"{html.stem}_3d.html") if html is not None and not why_not_drawn(setup.loop.robot) else None
+            cosim.require_trusted(loop_file, trust=trust)
+        setup = cosim.load_loop(loop_file, robot=robot)
+    view = (
+        html.with_name(f"{html.stem}_3d.html")
+        if html is not None and not plots.why_not_drawn(setup.loop.robot)
+        else None
+    )
     if view is not None:
         refuse_existing(view, force=force)
     if certificate is not None and not setup.limits:
@@ -93,16 +94,16 @@ def command(
             f'"pitch.overshoot_pct" = {LOOP["overshoot_pct"]}.'
         )
     with progress("simulate", quiet=as_json) as report:
-        result = run_setup(setup, report=lambda done: report(done, loop_file.name))
+        result = cosim.run_setup(setup, report=lambda done: report(done, loop_file.name))
     for remark in result.remarks:
         click.echo(f"warning: {remark}", err=True)
-    write_recording(path, result.recording(), force=replace)
+    signals.write_recording(path, result.recording(), force=replace)
     if certificate is not None:
         write_certificate(certificate, result.certificate(), force=force)
     if view is not None:
-        write_page(view, neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
+        plots.write_page(view, plots.neck_view(result.recording(), title=f"Loop {loop_file.stem}"), force=force)
     if html is not None:
-        write_page(html, _page(loop_file.stem, result, view), force=force)
+        plots.write_page(html, _page(loop_file.stem, result, view), force=force)
     if as_json:
         print_json(result.report())
     else:
@@ -116,14 +117,12 @@ def _simulate_system(
     system: System, source: Path, path: Path, certificate: Path | None, html: Path | None, *, force: bool, as_json: bool
 ) -> None:
     """Run FMUs that are no closed loop; the result is a table of all their outputs."""
-    from softneck.cosim import run_setup
-
     if certificate is not None or html is not None:
         raise SettingsError(f"{source}: is no closed loop, of which alone there are pages and certificates.")
     if path.suffix != ".csv":
         raise SettingsError(f"{path}: the outputs of a system that is no closed loop go to a .csv file.")
     with progress("simulate", quiet=as_json) as report:
-        result = run_setup(system, report=lambda done: report(done, source.name))
+        result = cosim.run_setup(system, report=lambda done: report(done, source.name))
     with atomic_write(path, force=force) as temporary:
         result.frame.to_csv(temporary, index=False)
     if as_json:
@@ -132,21 +131,21 @@ def _simulate_system(
     click.echo(f"{path}: {len(result.signals.signals)} signals, {result.real_time_factor:.0f} times real time")
 
 
-def _print(path: Path, result: Result) -> None:
+def _print(path: Path, result: cosim.Result) -> None:
     print_table(str(path), *_metrics(result))
     if result.limits:
         print_table("Limits", *_limits(result))
     click.echo(f"{result.real_time_factor:.0f} times real time")
 
 
-def _metrics(result: Result) -> tuple[list[str], list[list[str]]]:
+def _metrics(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
     rows = []
     for part, values in result.metrics.items():
         rows += [[f"{part}.{name}", "-" if value is None else f"{value:.3f}"] for name, value in values.items()]
     return ["metric", "value"], rows
 
 
-def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
+def _limits(result: cosim.Result) -> tuple[list[str], list[list[str]]]:
     rows = []
     for row in result.limits:
         value = "-" if row["value"] is None else f"{row['value']:.3f}"
@@ -154,14 +153,12 @@ def _limits(result: Result) -> tuple[list[str], list[list[str]]]:
     return ["metric", "limit", "value", "verdict"], rows
 
 
-def _page(name: str, result: Result, view: Path | None) -> str:
-    from softneck.core import to_si
-    from softneck.plots import Section, Table, loop_chart, page, why_not_drawn
+def _page(name: str, result: cosim.Result, view: Path | None) -> str:
 
-    tables = [Table("Metrics", *_metrics(result))]
+    tables = [plots.Table("Metrics", *_metrics(result))]
     if result.limits:
-        tables.insert(0, Table("Limits", *_limits(result)))
-    chart = loop_chart(
+        tables.insert(0, plots.Table("Limits", *_limits(result)))
+    chart = plots.loop_chart(
         result.signals.time, result.signals.signals, "Reference, outputs and motors", limits=result.bounds,
         robot=result.robot,
     )  # fmt: skip
@@ -173,15 +170,15 @@ def _page(name: str, result: Result, view: Path | None) -> str:
     if view is not None:
         method.append(Markup('<a href="{}">The robot in 3-D</a>').format(view.name))
     else:
-        method.append(why_not_drawn(result.robot))
-    return page(
+        method.append(plots.why_not_drawn(result.robot))
+    return plots.page(
         "Closed loop" if name == "loop" else f"Closed loop: {name.replace('_', ' ')}",
-        [Section("Response", charts=[chart], tables=tables, method=method)],
+        [plots.Section("Response", charts=[chart], tables=tables, method=method)],
         verdict=_verdict(result), holds=result.holds if result.limits else None, footer="Written by softneck simulate.",
     )  # fmt: skip
 
 
-def _verdict(result: Result) -> str:
+def _verdict(result: cosim.Result) -> str:
     """Return in one sentence whether the loop keeps its limits, and which it breaks."""
     rows = result.limits
     broken = [f"{row['metric']} is {_value(row)}, limit {row['limit']:.4g}" for row in rows if not row["holds"]]
@@ -204,14 +201,12 @@ def replay_log(log: Path, *, as_json: bool) -> None:
 
     A log that is cut is replayed up to the cut, with a note. Nothing is sent to any bus.
     """
-    from softneck.drives import changed_files, read_run_log, replay
-
-    run = read_run_log(log)
-    notes = changed_files(run)
+    run = drives.read_run_log(log)
+    notes = drives.changed_files(run)
     pilot = _pilot(run)
     if pilot is None:
         notes.append("the controller was not computed again: its logged answers were used")
-    result = replay(run, pilot, notes)
+    result = drives.replay(run, pilot, notes)
     for text in result.notes:
         note(text)
     if as_json:
@@ -225,28 +220,25 @@ def replay_log(log: Path, *, as_json: bool) -> None:
     result.require()
 
 
-def _pilot(run: LoggedRun) -> Pilot | None:
+def _pilot(run: drives.LoggedRun) -> drives.Pilot | None:
     """Return the pilot of the run: controller and observer, a jog or an experiment.
 
     None where the log names none, or the files of the loop are gone.
     """
-    from softneck.cosim import load_loop
-    from softneck.drives import Experiment, LoopPilot, jog_pilot, prepare
-
     try:
         if "jog" in run.facts:
-            return jog_pilot(**run.facts["jog"])
+            return drives.jog_pilot(**run.facts["jog"])
         if "record" in run.facts:
             channels = run.settings().channels
             robot, ranges = (None, ()) if channels is None else (run.robot, channels.ranges)
-            return Experiment.of(run.facts["record"], robot, ranges).pilot()
+            return drives.Experiment.of(run.facts["record"], robot, ranges).pilot()
     except (SoftneckError, TypeError) as error:
         raise FileFormatError(f"{run.path}: what it played does not fit this softneck ({error}).") from error
     files = {role: Path(str(entry.get("path"))) for role, entry in run.facts.get("files", {}).items()}
     loop, controller = files.get("loop"), files.get("controller")
     if loop is None or controller is None or not (loop.is_file() and controller.is_file()):
         return None
-    return LoopPilot(prepare(load_loop(loop), controller, run.robot).loop, run.robot)
+    return drives.LoopPilot(drives.prepare(cosim.load_loop(loop), controller, run.robot).loop, run.robot)
 
 
 @click.command("study", epilog="Example: softneck study study.toml -o build/study --workers 2")
@@ -269,17 +261,15 @@ def study_command(
               worst/         the worst runs as loop files for softneck simulate
     Ctrl-C or a crash loses no finished run: the same command goes on where it was.
     """
-    from softneck.cosim import load_study, read_description, require_trusted, run_study, write_worst
-    from softneck.plots import write_page
     from softneck.report import failures, study_head, study_page, study_rows
 
-    require_trusted(study_file, trust=trust)
-    study = load_study(study_file)
+    cosim.require_trusted(study_file, trust=trust)
+    study = cosim.load_study(study_file)
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
     with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
-        runs = run_study(study, folder, workers=workers, force=_anew(study, folder, output, force), report=report)
-    write_page(folder / "report.html", study_page(read_description(folder), runs), force=True)
-    paths = write_worst(study, runs, folder / "worst", count=_WORST_RUNS)
+        runs = cosim.run_study(study, folder, workers=workers, force=_anew(study, folder, output, force), report=report)
+    plots.write_page(folder / "report.html", study_page(cosim.read_description(folder), runs), force=True)
+    paths = cosim.write_worst(study, runs, folder / "worst", count=_WORST_RUNS)
     if as_json:
         print_json(_summary(runs, folder, study.objectives, paths))
     else:
@@ -291,16 +281,13 @@ def study_command(
         raise CheckFailedError(f"{study_file}: every run failed; the first said: {runs['error'].iloc[0]}")
 
 
-def _anew(study: Study, folder: Path, output: Path | None, force: bool) -> bool:
+def _anew(study: cosim.Study, folder: Path, output: Path | None, force: bool) -> bool:
     """Return whether an existing study may be replaced: under build/, or with --force."""
-    from softneck.cosim import DESCRIPTION, read_description
-
-    there = output is None and (folder / DESCRIPTION).is_file()
-    return force or (there and read_description(folder).get("digest") != study.digest)
+    there = output is None and (folder / cosim.DESCRIPTION).is_file()
+    return force or (there and cosim.read_description(folder).get("digest") != study.digest)
 
 
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:
-    from softneck.cosim import pareto_front, rank
     from softneck.report import failures
 
     held = runs["holds"].dropna().tolist()
@@ -310,7 +297,7 @@ def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], wors
         "failed": sum(failures(runs)),
         "holds_share": sum(held) / len(held) if held else None,
         "objectives": list(objectives),
-        "best": [int(run) for run in rank(runs, objectives)["run"].head(10)],
-        "pareto_front": [int(run) for run in pareto_front(runs, objectives)["run"]],
+        "best": [int(run) for run in cosim.rank(runs, objectives)["run"].head(10)],
+        "pareto_front": [int(run) for run in cosim.pareto_front(runs, objectives)["run"]],
         "worst": [str(path) for path in worst],
     }

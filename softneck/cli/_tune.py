@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from softneck.core import CheckFailedError, file_hash
+from softneck import tuning, verification
+from softneck.core import CheckFailedError, SettingsError, file_hash
 from softneck.robot import load_for_robot
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, requirements_option
-
-if TYPE_CHECKING:
-    from softneck.tuning import Tuned
 
 _PATH = click.Path(path_type=Path)
 # As `softneck.tuning` has it, which is imported when the command runs.
@@ -66,27 +63,24 @@ def command(
     most, and the result says so; those of a --requirements file are never loosened. Exit code 1 if no candidate keeps
     all, with the active requirement.
     """
-    from softneck.core import SettingsError
     from softneck.report import tune_verdict, write_tuned
-    from softneck.tuning import task_of, tune
-    from softneck.verification import is_own_plant, named_plants
 
     if output.exists() and not output.is_dir():
         raise SettingsError(f"{output}: is a file; name a folder.")
-    things = named_plants(list(plants), robot)
-    asked = task_of(things, requirements, seed).asked
+    things = verification.named_plants(list(plants), robot)
+    asked = tuning.task_of(things, requirements, seed).asked
     if not as_json:
         note("requirements: " + "; ".join(asked.lines()))
     eyes = None if observer is None else load_for_robot(observer, "observer", robot)
     files = {f"plant {k}": item for k, item in enumerate(plants, start=1) if item.is_file()}
     with progress("tune", quiet=as_json) as report:
-        found = tune(
+        found = tuning.tune(
             things, asked, kinds=() if kinds is None else tuple(kinds.split(",")), budget=budget, observer=eyes,
             seed=seed, workers=workers, folder=output, force=force, progress=report,
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
     steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)
-             if is_own_plant(things[name])}  # fmt: skip
+             if verification.is_own_plant(things[name])}  # fmt: skip
     values = write_tuned(found, output, files, steps)
     if as_json:
         print_json(values)
@@ -98,7 +92,7 @@ def command(
         raise CheckFailedError(_why(found, output))
 
 
-def _print(found: Tuned, folder: Path) -> None:
+def _print(found: tuning.Tuned, folder: Path) -> None:
     from softneck.report import requirement_rows, tune_notes
 
     best = found.best
@@ -116,13 +110,12 @@ def _print(found: Tuned, folder: Path) -> None:
     )
 
 
-def _why(found: Tuned, folder: Path) -> str:
+def _why(found: tuning.Tuned, folder: Path) -> str:
     from softneck.report import failing_requirement
-    from softneck.verification import ALONE
 
     failed = found.verification.failed
     binds = [item.note for item in failed if item.requirement.metric == found.binding]
-    blind = ALONE in binds or (found.binding is None and any(item.value is None for item in failed))
+    blind = verification.ALONE in binds or (found.binding is None and any(item.value is None for item in failed))
     unheard = any(note.startswith("not supported by the data") for note in binds)
     way = way_on(found.binding, unheard=unheard, blind=blind)
     return f"{folder}: the best so far does not keep all requirements. {failing_requirement(found)} {way}."

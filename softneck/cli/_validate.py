@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+from softneck import identification, plots, signals
 from softneck.core import CheckFailedError, SettingsError, refuse_existing
 from softneck.robot import load_for_robot
 
 from .shared._console import print_json, print_table, progress, useless
 from .shared._options import common_options, tolerance_option
-
-if TYPE_CHECKING:
-    from softneck.identification import Validation
-
 
 _FIT_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %. Persistence repeats the last sample; a one-step fit that is not "
@@ -57,10 +53,6 @@ def command(
 
     Exit code 1 if a free run diverges or a fit is below 0 %.
     """
-    from softneck.identification import Rules, compare
-    from softneck.plots import write_page
-    from softneck.signals import read_recording
-
     horizons = _horizons(horizon)
     if html is not None:
         refuse_existing(html, force=force)
@@ -70,15 +62,15 @@ def command(
     if not models:
         raise SettingsError("recordings only; expected a model before them: softneck validate MODEL --data REC...")
     loaded = {str(path): load_for_robot(path, "model", robot) for path in models}
-    recordings = {str(path): read_recording(path, robot=robot) for path in data}
-    rules = Rules(horizons, motors, include_training, tolerance=tolerance)
+    recordings = {str(path): signals.read_recording(path, robot=robot) for path in data}
+    rules = identification.Rules(horizons, motors, include_training, tolerance=tolerance)
     with progress("validate", quiet=as_json) as report:
-        comparison = compare(loaded, recordings, rules=rules, progress=report)
+        comparison = identification.compare(loaded, recordings, rules=rules, progress=report)
     results = list(comparison.validations)
     if html is not None:
         from softneck.report import validation_page  # it draws in all of the project, which the table does not need
 
-        write_page(html, validation_page(results), force=force)
+        plots.write_page(html, validation_page(results), force=force)
     if as_json:
         print_json(comparison.as_dict())
     else:
@@ -88,7 +80,7 @@ def command(
         raise CheckFailedError(f"no model of this data: {'; '.join(found)}.")
 
 
-def _print(results: list[Validation]) -> None:
+def _print(results: list[identification.Validation]) -> None:
     from softneck.report import fit_table, remarks
 
     table = fit_table(results)
@@ -100,12 +92,11 @@ def _print(results: list[Validation]) -> None:
 
 
 def _horizons(text: str) -> tuple[int | str, ...]:
-    from softneck.identification import INFINITE
 
     horizons: list[int | str] = []
     for word in text.split(","):
-        if word.strip() == INFINITE:
-            horizons.append(INFINITE)
+        if word.strip() == identification.INFINITE:
+            horizons.append(identification.INFINITE)
         elif word.strip().isdecimal() and 1 <= int(word) <= 10_000:
             horizons.append(int(word))
         else:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
+from softneck import estimation, verification
 from softneck.core import CERTIFICATE_ENDING, CheckFailedError, file_hash, refuse_existing, write_certificate
 from softneck.loop import ORDERS
 from softneck.robot import load_for_robot
 
 from .shared._console import note, print_json, print_table, progress
 from .shared._options import common_options, output_option, requirements_option, target
-
-if TYPE_CHECKING:
-    from softneck.verification import Verification
-
 
 _PATH = click.Path(path_type=Path)
 
@@ -55,20 +51,17 @@ def command(
     Writes a certificate: each requirement with its value, limit and worst plant, and the hashes of all files read;
     beside it a loop file for every worst plant, for `softneck simulate`. Exit code 1 if a requirement does not hold.
     """
-    from softneck.estimation import robot_of
-    from softneck.verification import left_to_tune, named_plants, neck_file_of, read_requirements, verify
-
     path, replace = target(output, f"certificates/{controller.stem}{CERTIFICATE_ENDING}", force=force, ending=".json")
     refuse_existing(path, force=replace)
     if html is not None:
         refuse_existing(html, force=force)
     judged = load_for_robot(controller, "controller", robot)
-    whose = robot_of(judged)
-    asked = read_requirements(requirements, robot=whose)
-    if left := left_to_tune(asked.own):
+    whose = estimation.robot_of(judged)
+    asked = verification.read_requirements(requirements, robot=whose)
+    if left := verification.left_to_tune(asked.own):
         note(f"{requirements}: {', '.join(left)} not looked at; `softneck tune` alone closes those loops.")
     things, eyes = (
-        named_plants(list(plants), robot),
+        verification.named_plants(list(plants), robot),
         None if observer is None else load_for_robot(observer, "observer", robot),
     )
     files = {
@@ -77,10 +70,10 @@ def command(
     }
     files |= {} if requirements is None else {"requirements": requirements}
     files |= {} if observer is None else {"observer": observer}
-    neck_file = neck_file_of(whose, asked)
+    neck_file = verification.neck_file_of(whose, asked)
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
     with progress("verify", quiet=as_json) as report:
-        found = verify(
+        found = verification.verify(
             judged, things, asked, order=order, observer=eyes, progress=report,
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
@@ -102,10 +95,9 @@ def command(
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
 
 
-def _print(path: Path, found: Verification, folder: Path) -> None:
-    from softneck.verification import verdict_table
+def _print(path: Path, found: verification.Verification, folder: Path) -> None:
 
-    table = verdict_table(found)
+    table = verification.verdict_table(found)
     print_table(str(path), table.head, table.rows)
     for name, why in found.evidence.not_computed.items():
         click.echo(f"not computed: {name}: {why}")

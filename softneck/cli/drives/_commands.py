@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import click
 
+from softneck import cosim, drives, signals
 from softneck.core import SettingsError, refuse_existing
 
 from ..shared._console import note, print_json, print_table, progress
@@ -27,9 +28,6 @@ from ._target import (
     sensor_or_reason,
     target_of,
 )
-
-if TYPE_CHECKING:
-    from softneck.drives import CanLink, DrivesResult, Report
 
 
 @click.group(
@@ -54,17 +52,15 @@ def check_command(asked: Asked, as_json: bool) -> None:
 
     Writes the configuration, moves nothing. Exit code 1 if a check does not hold.
     """
-    from softneck.drives import preflight
-
     chosen = asked.target()
     with open_link(chosen, moves=False, homed=True) as link:
         sensor = None if chosen.simulated else sensor_or_reason(chosen.file)
-        report = preflight(link, chosen.file, override=asked.override, sensor=sensor)
+        report = drives.preflight(link, chosen.file, override=asked.override, sensor=sensor)
     _show(report, as_json=as_json)
     report.require()
 
 
-def _show(report: Report, *, as_json: bool) -> None:
+def _show(report: drives.Report, *, as_json: bool) -> None:
     if as_json:
         print_json(report.table())
         return
@@ -97,66 +93,56 @@ def run_command(
     plant, does the same. Exit code 1 if anything stopped it, or a drive did not confirm that it is off; 143 if SIGTERM
     ended it (to rest, then off).
     """
-    from softneck.cosim import load_loop, require_trusted
-    from softneck.drives import (
-        Keyboard,
-        neck_of,
-        prepare,
-        require_certified,
-        require_same_again,
-        run_on_bus,
-        run_simulated,
-    )
-    from softneck.signals import recording_suffix, write_recording
-
     path, replace = target(output, f"results/drives_{loop_file.stem}.csv", force=force)
-    recording_suffix(path)
+    signals.recording_suffix(path)
     refuse_existing(path, force=replace)
     require_log(asked.log, force=force)
-    require_trusted(loop_file, trust=trust)
-    setup = load_loop(loop_file)
+    cosim.require_trusted(loop_file, trust=trust)
+    setup = cosim.load_loop(loop_file)
     drives_file = asked.drives
     if drives_file is None and "drives" in setup.files:
         drives_file = Path(setup.files["drives"][0])
-    virtual = neck_of(setup.loop)
+    virtual = drives.neck_of(setup.loop)
     moves: Any = asked.robot or (setup.loop.robot if setup.loop.robot.in_header() else None)
     chosen = target_of(drives_file, asked.bus, asked.simulated, asked.arm, neck=virtual, robot=moves)
     if not controller.is_file():
         raise SettingsError(f"{controller}: no such file.")
     moved = chosen.file.moves
-    certified = require_certified(setup, controller, certificates, asked.override, drives=chosen.path, robot=moved)
-    deployed = prepare(setup, controller, moved)
+    certified = drives.require_certified(
+        setup, controller, certificates, asked.override, drives=chosen.path, robot=moved
+    )
+    deployed = drives.prepare(setup, controller, moved)
     for text in deployed.notes:
         note(text)
     if certified is not None:
-        again = require_same_again(deployed.loop, certified[1])
+        again = drives.require_same_again(deployed.loop, certified[1])
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, chosen.path)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file)
     with contextlib.ExitStack() as stack:
-        link = None if chosen.simulated else cast("CanLink", stack.enter_context(open_link(chosen, moves=True)))
+        link = None if chosen.simulated else cast("drives.CanLink", stack.enter_context(open_link(chosen, moves=True)))
         log = stack.enter_context(opened_log(chosen, "run", asked.log, force=force))
-        with progress("drives", quiet=as_json) as tell, Keyboard() as keyboard:
+        with progress("drives", quiet=as_json) as tell, drives.Keyboard() as keyboard:
             report = lambda done: tell(done, controller.name)  # noqa: E731
             if link is None:
-                result = run_simulated(
+                result = drives.run_simulated(
                     deployed, chosen.file, neck=virtual, override=asked.override, pace=asked.pace,
                     report=report, operator=keyboard, log=log, files=files,
                 )  # fmt: skip
             else:
-                result = run_on_bus(
+                result = drives.run_on_bus(
                     deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=keyboard,
                     log=log, files=files,
                 )  # fmt: skip
         # Before the log is closed: a full disk must not cost the recording and the result as well.
         if len(result.signals.time) > 1:
-            write_recording(path, result.recording(), force=replace)
+            signals.write_recording(path, result.recording(), force=replace)
         _print_run(path, result, as_json=as_json)
         leave_if_asked(keyboard)
         result.require()
 
 
-def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
+def _print_run(path: Path, result: drives.DrivesResult, *, as_json: bool) -> None:
     values: dict[str, Any] = result.table()
     if as_json:
         print_json(values)
@@ -176,13 +162,11 @@ def _print_run(path: Path, result: DrivesResult, *, as_json: bool) -> None:
 @common_options()
 def stop_command(asked: Asked, as_json: bool) -> None:
     """Quick stop, then no voltage, for every drive; always allowed. Exit code 1 if one may still have power."""
-    from softneck.drives import require_stopped, stop
-
     chosen = asked.target()
     with open_link(chosen, moves=False) as link:
-        states = stop(link, chosen.file)
+        states = drives.stop(link, chosen.file)
     _states(states, "stopped", as_json=as_json)
-    require_stopped(states)
+    drives.require_stopped(states)
 
 
 @command.command("reset")
@@ -190,13 +174,11 @@ def stop_command(asked: Asked, as_json: bool) -> None:
 @common_options()
 def reset_command(asked: Asked, as_json: bool) -> None:
     """Acknowledge latched faults; no drive moves. Exit code 1 if a fault stays."""
-    from softneck.drives import require_reset, reset
-
     chosen = asked.target()
     with open_link(chosen, moves=False) as link:
-        states = reset(link, chosen.file)
+        states = drives.reset(link, chosen.file)
     _states(states, "reset", as_json=as_json)
-    require_reset(states)
+    drives.require_reset(states)
 
 
 def _states(states: dict[int, str], what: str, *, as_json: bool) -> None:

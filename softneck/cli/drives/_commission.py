@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from softneck import drives, plant
 from softneck.core import CheckFailedError, SettingsError
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._options import common_options
 from ._target import SAMPLE_TIME, Asked, Target, drives_options, leave_if_asked, moving, open_link, require_log
 
-if TYPE_CHECKING:
-    from softneck.drives import Commissioned, JogResult, Reading
-
 
 def scan_step(asked: Asked, *, as_json: bool) -> None:
     """List the nodes on the bus; sends reads only. Fails if none answers, or several devices at one number."""
-    from softneck.drives import default_drives, scan, several_devices
-
     nameless = asked.bus is not None and asked.drives is None
-    chosen = Target(default_drives(), asked.bus, False, asked.arm) if nameless else asked.target()
+    chosen = Target(drives.default_drives(), asked.bus, False, asked.arm) if nameless else asked.target()
     with open_link(chosen, moves=False) as link:
-        found = scan(link, bit_rate=chosen.file.bit_rate)
+        found = drives.scan(link, bit_rate=chosen.file.bit_rate)
     if as_json:
         print_json({"nodes": found})
     else:
@@ -36,7 +32,7 @@ def scan_step(asked: Asked, *, as_json: bool) -> None:
             f"{asked.bus or 'the bus'}: no node answers. Are the drives on, is the bit rate right, is the line "
             "terminated (60 ohm between CAN_H and CAN_L)?"
         )
-    shared = [(item["node"], several_devices(item["serials"])) for item in found]
+    shared = [(item["node"], drives.several_devices(item["serials"])) for item in found]
     listed = "; ".join(f"node {node}: {told}" for node, told in shared if told)
     if listed:
         raise CheckFailedError(f"{listed}. Give each device a node number of its own.")
@@ -48,26 +44,24 @@ def _serials(serials: list[int | None]) -> str:
 
 def zero_step(asked: Asked, *, force: bool, as_json: bool) -> None:
     """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
-    from softneck.drives import LOOK, VirtualLink, look_at, preflight, run_facts, zero
-
     chosen = asked.target()
     require_log(asked.log, force=force)
     with moving(asked, chosen, "zero", force=force) as (session, keyboard):
         link, sensor = session.link, session.sensor
-        report = preflight(link, chosen.file, override=asked.override)
+        report = drives.preflight(link, chosen.file, override=asked.override)
         report.require()
         if session.log is not None:
             # It has no cycles: what was set up, and the frames.
             settings = chosen.file.master_settings(SAMPLE_TIME, guarding=report.guarding)
-            session.log.describe(run_facts(settings, session.files, simulated=chosen.simulated))
+            session.log.describe(drives.run_facts(settings, session.files, simulated=chosen.simulated))
 
-        def look() -> Reading | None:
-            if isinstance(link, VirtualLink):
+        def look() -> drives.Reading | None:
+            if isinstance(link, drives.VirtualLink):
                 return link.newest
-            return None if sensor is None else look_at(sensor, link, LOOK)
+            return None if sensor is None else drives.look_at(sensor, link, drives.LOOK)
 
         try:
-            zeroed = zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
+            zeroed = drives.zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
         except CheckFailedError as error:
             if keyboard.interrupted or keyboard.terminated:
                 note(str(error))
@@ -85,19 +79,16 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
 
     Fails if that is not where the tendon's angle says: nodes swapped, a sign reversed, a tendon that hangs.
     """
-    from softneck.drives import jog, physics_of
-    from softneck.plant import has_own_tendons, tendons_of
-
     require_log(asked.log, force=force)
     chosen = asked.target()
     if motor > len(chosen.file.nodes):
         raise click.BadParameter(f"{motor} is not in the range 1<=x<={len(chosen.file.nodes)}.", param_hint="'--motor'")
     # A neck's tendons stand where its own file says.
-    physics = physics_of(chosen.file.moves) if has_own_tendons(chosen.file.moves) else None
-    angles = physics and tendons_of(chosen.file.moves, physics)
+    physics = drives.physics_of(chosen.file.moves) if plant.has_own_tendons(chosen.file.moves) else None
+    angles = physics and plant.tendons_of(chosen.file.moves, physics)
     with moving(asked, chosen, "jog", force=force, homed=True) as (session, keyboard):
         with progress("jog", quiet=as_json) as tell:
-            found = jog(
+            found = drives.jog(
                 motor, session, tendon_angles=angles, amplitude=amplitude,
                 report=lambda done: tell(done, f"motor {motor}"),
             )  # fmt: skip
@@ -106,7 +97,7 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
         found.require()
 
 
-def _print_jog(found: JogResult, *, as_json: bool) -> None:
+def _print_jog(found: drives.JogResult, *, as_json: bool) -> None:
     values = found.table()
     if as_json:
         print_json(values)
@@ -170,23 +161,21 @@ def _tendons(
     asked: Asked, motors: tuple[int, ...], travel: float, output: Path | None, *, force: bool, as_json: bool
 ) -> None:
     """Scan the nodes, move the motors, and propose files."""
-    from softneck.drives import Guards, commission, require_folder, write_files
-
     folder, replace = (Path("build") / "commission", True) if output is None else (output, force)
     require_log(asked.log, force=force)
     chosen = asked.target()
-    guards = Guards.of(chosen.file.watch.gain, travel=travel)
-    require_folder(folder, force=replace)
+    guards = drives.Guards.of(chosen.file.watch.gain, travel=travel)
+    drives.require_folder(folder, force=replace)
     with moving(asked, chosen, "commission", force=force) as (session, keyboard):
         with progress("commission", quiet=as_json) as tell:
-            result = commission(session, guards=guards, motors=motors, report=tell, where=asked.bus or "the bus")
-        written = write_files(folder, result, force=replace)
+            result = drives.commission(session, guards=guards, motors=motors, report=tell, where=asked.bus or "the bus")
+        written = drives.write_files(folder, result, force=replace)
         _print(result, written, as_json=as_json)
         leave_if_asked(keyboard)
         result.require()
 
 
-def _print(result: Commissioned, written: dict[str, str], *, as_json: bool) -> None:
+def _print(result: drives.Commissioned, written: dict[str, str], *, as_json: bool) -> None:
     values: dict[str, Any] = {**result.table(), "files": written}
     if as_json:
         print_json(values)

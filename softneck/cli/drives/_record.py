@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from softneck import drives, signals
 from softneck.core import refuse_existing, require_between
 from softneck.signals import signal_names, write_recording
 
 from ..shared._console import note, print_json, progress
 from ..shared._options import common_options, output_option
 from ._target import Asked, drives_options, leave_if_asked, moving, require_log
-
-if TYPE_CHECKING:
-    from softneck.drives import ExperimentResult
 
 # From rest and out to it [s]: Eq. 22 begins at up to 1.9 rad, which a winch turns in half a second at the least.
 _RAMP_S = 2.0
@@ -45,16 +43,13 @@ def record_command(
     force: bool, as_json: bool,
 ) -> None:  # fmt: skip
     """Record SIGNAL on the drives."""
-    from softneck.drives import Experiment, VirtualLink, drive_limits, record_signal
-    from softneck.signals import recording_suffix
-
-    recording_suffix(output)
+    signals.recording_suffix(output)
     refuse_existing(output, force=force)
     require_log(asked.log, force=force)
     require_between("--payload", payload, 0.0, 1.0, "kg")
     chosen = asked.target()
-    moved, limits = chosen.file.robot, drive_limits(chosen.file, position=max_position)
-    experiment = Experiment(
+    moved, limits = chosen.file.robot, drives.drive_limits(chosen.file, position=max_position)
+    experiment = drives.Experiment(
         signal=signal_name, limits=limits, duration=duration, seed=seed, ramp=_RAMP_S,
         robot=moved,
         ranges=() if moved is None else chosen.file.ranges,
@@ -62,10 +57,10 @@ def record_command(
     prepared = experiment.prepared()
     files = {"signal": signal_name} if Path(signal_name).is_file() else {}
     with moving(asked, chosen, "record", force=force, homed=True, seed=seed, **files) as (session, keyboard):
-        if isinstance(session.link, VirtualLink):
+        if isinstance(session.link, drives.VirtualLink):
             session.link.neck.set(payload=payload)
         with progress("record", quiet=as_json) as tell:
-            recorded = record_signal(
+            recorded = drives.record_signal(
                 [excitation for excitation, _ in prepared],
                 replace(session, facts={"record": experiment.facts()}),
                 report=lambda done: tell(done, signal_name),
@@ -80,7 +75,7 @@ def record_command(
 
 
 def _print_record(
-    output: Path, recorded: ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
+    output: Path, recorded: drives.ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
 ) -> None:  # fmt: skip
     if as_json:
         where = None if recorded.recording is None else str(output)

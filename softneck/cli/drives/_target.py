@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import platformdirs
 
+from softneck import cosim, plant
 from softneck.core import OutputFileError, SettingsError, SoftneckError, require_between
 from softneck.drives import HARMLESS, OVERRIDES
 
@@ -25,10 +26,8 @@ from ..shared._console import note
 from ..shared._options import COMMON
 
 if TYPE_CHECKING:
-    from softneck.cosim import LoopSetup
     from softneck.drives import CanLink, DrivesFile, Keyboard, RunLogger, Sensor, Session, VirtualLink
     from softneck.drives.master import Frame, Tilt
-    from softneck.plant import NeckParameters
     from softneck.robot import Robot
 
 # For a service, where nobody can type: the same words.
@@ -81,7 +80,7 @@ class Target:
     bus: str | None
     simulated: bool
     arm: bool
-    neck: NeckParameters | None = None
+    neck: plant.NeckParameters | None = None
     path: Path | None = None
 
 
@@ -147,7 +146,7 @@ def drives_options(*more: str) -> Callable[[Callable], Callable]:
 
 
 def target_of(
-    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: NeckParameters | None = None,
+    drives_file: Path | None, bus: str | None, simulated: bool, arm: bool, *, neck: plant.NeckParameters | None = None,
     robot: str | Path | Robot | None = None,
 ) -> Target:  # fmt: skip
     """Return which drives the options mean; simulated ones without a file are set up for the virtual `neck`.
@@ -360,7 +359,7 @@ def _new_path(command: str) -> Path:
 
 
 def acting_files(
-    setup: LoopSetup, loop_file: Path, controller: Path, drives_file: Path | None
+    setup: cosim.LoopSetup, loop_file: Path, controller: Path, drives_file: Path | None
 ) -> Mapping[str, str | Path]:
     """Return role -> path of all files that act in a run, for its log."""
     files: dict[str, str | Path] = {role: path for role, (path, _) in setup.files.items()}

@@ -8,16 +8,14 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from softneck import identification
 from softneck.core import Progress, silent
 from softneck.core import Progress as ProgressCallback
 from softneck.core import percent as percent
-
-if TYPE_CHECKING:
-    from softneck.identification import Validation
 
 
 def print_json(value: Any) -> None:
@@ -123,7 +121,7 @@ _MIN_FIT_PCT = 0.0
 _MIN_DESIGN_FIT_PCT = 30.0
 
 
-def useless(r: Validation) -> str | None:
+def useless(r: identification.Validation) -> str | None:
     """Return why a model is no model of the rows that it was judged on, or None."""
     if r.diverged is not None:
         return f"its free run diverges at {r.diverged:.2f} s"
@@ -133,7 +131,7 @@ def useless(r: Validation) -> str | None:
     return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _MIN_FIT_PCT else None
 
 
-def left_out(r: Validation) -> str:
+def left_out(r: identification.Validation) -> str:
     """Return the advice to go on without the outputs that spoil a model of the others; "" where that is no way out."""
     fits = {axis: fit for axis, fit in r.fits.get("inf", {}).items() if fit is not None}
     poor = [axis for axis, fit in fits.items() if fit < _MIN_FIT_PCT]

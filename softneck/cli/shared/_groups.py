@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import click
 
+from softneck import core
 from softneck.core import did_you_mean
 
 # Command, or command and option, as they were -> what to call instead.
@@ -88,8 +89,7 @@ def kinds_complete(role: str, *more: str) -> Callable[[click.Context, click.Para
 
     def complete(_ctx: click.Context, _param: click.Parameter, begun: str) -> list[str]:
         # Here, for it imports NumPy: the command line sets the number of its threads first.
-        from softneck.core import kinds_of
 
-        return [name for name in (*kinds_of(role), *more) if name.startswith(begun)]
+        return [name for name in (*core.kinds_of(role), *more) if name.startswith(begun)]
 
     return complete

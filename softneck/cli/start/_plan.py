@@ -10,6 +10,7 @@ from enum import Enum
 from math import isclose
 from pathlib import Path
 
+from softneck import signals, tuning
 from softneck.core import MOST_TOML, SettingsError, settings_text
 from softneck.robot import Robot, find_robot
 
@@ -139,9 +140,7 @@ def steps(options: Options) -> Iterator[Step]:
 
 def _with_sensor(recordings: list[str], options: Options) -> Iterator[Step]:
     """Add missing sensor values to `robot.toml`, and import again the logs of a given robot."""
-    from softneck.signals import read_recording
-
-    proposed = propose_sensor(Path("robot.toml"), [read_recording(recording) for recording in recordings])
+    proposed = propose_sensor(Path("robot.toml"), [signals.read_recording(recording) for recording in recordings])
     if proposed and options.robot is not None:
         yield from (_import(log, recording, options) for log, recording in zip(options.logs, recordings, strict=True))
 
@@ -152,17 +151,16 @@ def _robot(source: str) -> Step:
 
 
 def _import(log: str, recording: str, options: Options) -> Step:
-    from softneck.signals import is_of_another_robot, is_run_log
 
     layout, robot = (Path(recording).with_suffix(ending) for ending in (".layout.toml", ".robot.toml"))
     whose = "robot.toml" if options.robot is not None else robot.as_posix() if robot.is_file() else None
     page, settings = f"build/import/{Path(recording).stem}.html", f"{log} of {options.robot}"
-    if Path(log).suffix.lower() == ".mcap" and is_run_log(Path(log)):
+    if Path(log).suffix.lower() == ".mcap" and signals.is_run_log(Path(log)):
         words: list[str] = []  # of a run on drives: its columns are known
     else:
         guess = ["--guess", *(["--yes"] if options.yes else [])]
         guess += [] if options.sample_time is None else ["--sample-time", options.sample_time]
-        if options.robot is None and options.sample_time is None and is_of_another_robot(log):
+        if options.robot is None and options.sample_time is None and signals.is_of_another_robot(log):
             guess = ["--robot-out", robot.as_posix()]
         by_layout = layout.is_file() and not (options.sample_time is not None and _lacks_clock(layout))
         words = ["--layout", layout.as_posix()] if by_layout else guess
@@ -186,13 +184,11 @@ def _lacks_clock(layout: Path) -> bool:
 
 def _of_one_sample_time(recordings: list[str]) -> Iterator[Step]:
     """Bring recordings to the sample time of the first, in `recordings`, where they differ."""
-    from softneck.signals import read_recording
-
     if len(recordings) < 2:
         return
-    first = read_recording(recordings[0]).sample_time
+    first = signals.read_recording(recordings[0]).sample_time
     for number, recording in enumerate(recordings):
-        if isclose(read_recording(recording).sample_time, first, rel_tol=1e-6):  # as `identify` has it
+        if isclose(signals.read_recording(recording).sample_time, first, rel_tol=1e-6):  # as `identify` has it
             continue
         recordings[number] = resampled = f"{recording.removesuffix('.csv')}_resampled.csv"
         command = ("softneck", "import", recording, "--resample", repr(first), "-o", resampled, "--force")
@@ -234,12 +230,11 @@ def nonlinear_model() -> str | None:
 
 
 def _controller(options: Options) -> Iterator[Step]:
-    from softneck.tuning import loops_start
 
     family = Path(FAMILY).is_file()
     linear, nonlinear = FAMILY if family else linear_model(), nonlinear_model()
     plants = (linear, nonlinear or linear_model()) if family or nonlinear else (linear,)
-    if not loops_start(find_robot(beside=Path("robot.toml"))):
+    if not tuning.loops_start(find_robot(beside=Path("robot.toml"))):
         plants = (linear,)
     kinds = options.kinds or (_CONTROLLER_KINDS if family else _CONTROLLER_KINDS + _KINDS_WITHOUT_FAMILY)
     # Requirements of the user stay; infeasible defaults are left out, and the step fails.

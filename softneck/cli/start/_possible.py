@@ -12,6 +12,7 @@ from pathlib import Path
 
 import tomli_w
 
+from softneck import signals, tuning, verification
 from softneck.core import OutputFileError, SettingsError, atomic_write, settings_text, to_si
 from softneck.robot import KEYS, OPTIONAL, Robot
 from softneck.signals import Recording
@@ -88,14 +89,11 @@ def possible(plants: tuple[str, ...]) -> str:
 
 def impossible(plants: tuple[str, ...]) -> dict[str, str]:
     """Return metric -> the reason that a default requirement of `tune` is infeasible."""
-    from softneck.tuning import refuse_impossible, task_of
-    from softneck.verification import named_plants
-
-    things, refused = named_plants(list(plants)), dict[str, str]()
+    things, refused = verification.named_plants(list(plants)), dict[str, str]()
     while True:
-        task = task_of(things, {"require": dict.fromkeys(refused, False)}, 0)
+        task = tuning.task_of(things, {"require": dict.fromkeys(refused, False)}, 0)
         try:
-            refuse_impossible(task.asked, task.plant)
+            tuning.refuse_impossible(task.asked, task.plant)
         except SettingsError as error:
             metric = _METRIC.match(str(error))
             if metric is None or metric[1] in refused:
@@ -143,12 +141,10 @@ def propose_sensor(file: Path, recordings: Sequence[Recording]) -> list[str]:
 
 def _noise(robot: Robot, recordings: Sequence[Recording]) -> float:
     """Return the largest noise of an output, in the unit of the robot's outputs."""
-    from softneck.signals import check_channel
-
     levels = []
     for recording in recordings:
         for name in robot.outputs.names:
-            channel = check_channel(recording, name)
+            channel = signals.check_channel(recording, name)
             # A coarse sensor is as uncertain as its steps are wide, a clean one at least as a tenth of a percent.
             steps = (channel.quantum or 0.0) / math.sqrt(12.0)
             noise = 0.0 if math.isnan(channel.noise) else channel.noise

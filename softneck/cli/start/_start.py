@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from softneck import signals
 from softneck.core import (
     MOST_JSON,
     CheckFailedError,
@@ -19,6 +20,7 @@ from softneck.core import (
     SettingsError,
     SoftneckError,
     find_kind,
+    load,
     require_file,
     settings_text,
 )
@@ -150,10 +152,13 @@ def _before(step: Step, run: ProjectRun, *, guided: bool) -> None:
 
 def _lacks(run: ProjectRun) -> list[str]:
     """Return what the imported recordings do not excite."""
-    from softneck.signals import poor_excitation, read_recording
-
     files = [Path(key.partition(": ")[2]) for key in run.ran if key.startswith("import")]
-    found = [(file, line) for file in files if file.is_file() for line in poor_excitation(read_recording(file))]
+    found = [
+        (file, line)
+        for file in files
+        if file.is_file()
+        for line in signals.poor_excitation(signals.read_recording(file))
+    ]
     return [f"{file.stem}: {line}" for file, line in found]
 
 
@@ -253,10 +258,8 @@ def _read_loosened() -> dict[str, dict[str, float]]:
 
 def _doubts() -> dict[str, list[str]]:
     """Return layout -> the doubts of the import that are still open."""
-    from softneck.signals import doubts_in
-
     files = [*sorted(Path("recordings").glob("*.layout.toml")), *filter(Path.is_file, [Path("robot.toml")])]
-    found = {path.as_posix(): doubts_in(path) for path in files}
+    found = {path.as_posix(): signals.doubts_in(path) for path in files}
     return {name: list(doubts) for name, doubts in found.items() if doubts}
 
 
@@ -272,7 +275,6 @@ def _unsure(facts: dict[str, Any]) -> str:
 
 
 def _model(file: str) -> dict[str, Any]:
-    from softneck.core import load
 
     model = load(file, role="model")
     return {"file": file, "kind": model.kind, "fit": model.findings.get("hold_out", {}).get("fit", {})}
