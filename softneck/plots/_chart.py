@@ -49,7 +49,6 @@ class Curve(ReprMixin):
         y: (n,); of a `band` the lower edge, of `bars` and `stems` the heights.
         label: in the legend, if not empty. Curves of one label are shown and hidden together in a chart.
         colour: as #rrggbb, or "black".
-        style: one of `STYLES`.
         width: of lines, or of the points' diameter / 3 [points].
         upper: (n,) upper edge of a `band`; None for other styles.
     """
@@ -89,9 +88,6 @@ class Level:
     Attributes:
         value: y of a horizontal line, x of a `vertical` one.
         label: in the legend, if not empty.
-        colour: as #rrggbb.
-        dashed: whether the line is dashed.
-        vertical: whether the line is vertical.
     """
 
     value: float
@@ -109,11 +105,7 @@ class Panel(ReprMixin):
         curves: in drawing order, the last on top.
         y_label: with its unit, such as "pitch [deg]".
         x_label: with its unit; if empty, that of the chart under its lowest panels.
-        levels: straight lines.
-        title: above the panel; may be empty.
-        legend: whether the panel has a legend.
         y_range: initial limits of y; None fits the curves.
-        log_x, log_y: logarithmic axes.
         equal: one unit has the same length on both axes, as for a path over pitch and roll.
         ticks: names at x = 0, 1, ... instead of numbers.
     """
@@ -136,12 +128,9 @@ class Chart(ReprMixin):
     """Panels that belong together, in one or more columns.
 
     Attributes:
-        title: above the panels.
-        panels: row by row.
         x_label: of the lowest panels without their own.
         columns: number of panels in a row.
         linked: whether all panels share and zoom one x axis.
-        caption: text under the chart in a page.
         row_height: of one panel [inch].
     """
 

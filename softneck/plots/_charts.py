@@ -118,7 +118,8 @@ def recording_chart(recording: Recording, title: str) -> Chart:
         Curve(line.x, line.spread(in_display_unit(outputs[:, i], robot)), name, colour, width=0.9)
         for i, (name, colour) in enumerate(zip(robot.outputs.names, _OUTPUT_COLOURS, strict=False))
     ]
-    borders, what = _borders(line), "angle" if drawn == "deg" else "output"
+    borders = [Level(float(x), colour=GREY, vertical=True) for x in line.starts]
+    what = "angle" if drawn == "deg" else "output"
     panels = [Panel(motors, f"set-point [{unit}]", levels=borders), Panel(angles, f"{what} [{drawn}]", levels=borders)]
     return Chart(title, panels, line.x_label)
 
@@ -140,10 +141,8 @@ def validation_chart(
         time: (time,) [s].
         measured: (time, outputs) in SI; NaN for rows that are not scored.
         predictions: name -> (time, outputs); NaN for missing ones.
-        title: of the chart.
         bounds: lower and upper (time, outputs) of a model, drawn as a band.
         run: (time,) segment numbers, which no line connects; None breaks lines where the time jumps.
-        caption: text under the chart.
         robot: of the outputs; gives their display unit.
     """
     line = timeline(time, run)
@@ -191,9 +190,7 @@ def loop_chart(
         time: (time,) [s].
         signals: name -> (time,) in SI: outputs (and their _reference, _measured, _estimate), motor_setpoint_1..n,
             motor_position_1..n, tension_1..n [N].
-        title: of the chart.
         limits: metric -> limit; those of overshoot and settling time are drawn for a step.
-        caption: text under the chart.
         robot: of the loop; gives the display units.
     """
     panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
@@ -262,10 +259,6 @@ def _step_limits(
     return levels
 
 
-def _borders(line: Timeline) -> tuple[Level, ...]:
-    return tuple(Level(float(x), colour=GREY, vertical=True) for x in line.starts)
-
-
 def residual_chart(
     autocorrelation: tuple[np.ndarray, Matrix, Vector],
     cross_correlation: tuple[np.ndarray, Matrix, Matrix],
@@ -281,9 +274,6 @@ def residual_chart(
             which is 1, is not drawn.
         cross_correlation: with the motors' set-points: lags (m,) [samples], values (outputs, motors, m), bounds
             (outputs, motors).
-        title: of the chart.
-        caption: text under the chart.
-        robot: of the outputs and motors.
     """
     lags, values, bounds = autocorrelation
     cross_lags, cross, cross_bounds = cross_correlation
@@ -343,8 +333,6 @@ def frequency_response_chart(
         response: (n,) complex, NaN if unknown.
         radius: (n,) radius of the 95 % confidence circles.
         coherence: (n,) 0 to 1.
-        title: of the chart.
-        unit: of `response`.
         models: name -> (n,) complex.
     """
     size = np.abs(response)
@@ -405,9 +393,6 @@ def pareto_chart(
     Args:
         groups: name -> (x, y) of its runs; only finite ones are drawn.
         front: (x, y) of the front, by rising x.
-        labels: of the axes.
-        title: of the chart.
-        caption: text under the chart.
     """
     curves = []
     for (name, (x, y)), (colour, _) in zip(groups.items(), curve_styles(), strict=False):
@@ -425,8 +410,6 @@ def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *
 
     Args:
         values: metric -> group -> (n,); only finite values count.
-        title: of the chart.
-        caption: text under the chart.
     """
     panels = []
     for metric, groups in values.items():
@@ -448,8 +431,6 @@ def influence_chart(
         inputs: key -> (n,) values.
         metric: label and (n,) values.
         failed: (n,) whether a run breaks a limit, which has another colour.
-        title: of the chart.
-        caption: text under the chart.
     """
     label, y = metric
     bad = np.asarray(failed, dtype=bool)

@@ -29,7 +29,6 @@ def neck_view(recording: Recording, *, title: str = "The neck") -> str:
 
     Args:
         recording: of a robot bent by tendons.
-        title: of the page.
 
     Raises:
         DataError: no sample of the angles, a tilt beyond 90 deg, or another kind of robot.

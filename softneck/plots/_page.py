@@ -23,9 +23,6 @@ class Table(ReprMixin):
     """A table of text; cells "holds" and "fails" are coloured.
 
     Attributes:
-        caption: above it.
-        head: titles of the columns.
-        rows: rows of cells.
         text: number of left columns with words instead of numbers.
     """
 
@@ -51,10 +48,7 @@ class Section(ReprMixin):
     """A part of a page: charts first, then numbers, then methods.
 
     Attributes:
-        title: of the part.
-        text: paragraphs.
         tables: under the charts.
-        charts: interactive ones.
         findings: (severity, sentence) pairs, a numbered list; severity is ok, note or warning.
         method: paragraphs at the end: definitions and methods of the numbers.
     """
@@ -75,7 +69,6 @@ def page(
     Its content security policy forbids every request.
 
     Args:
-        title: subject of the page.
         sections: the first one shows the evidence for the verdict.
         verdict: one sentence, at the top.
         holds: whether the verdict is good or bad; None: neither.

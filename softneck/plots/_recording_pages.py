@@ -34,9 +34,6 @@ def import_page(
     """Return the HTML page of an import.
 
     Args:
-        log: file of the log.
-        frame: its table.
-        layout: its layout.
         recording: the result; None if something is missing.
         doubts: of the guess, the least certain first.
         lines: of the guess, and notes of the import.

@@ -7,7 +7,6 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -58,7 +57,6 @@ class DemoSettings:
         out: folder for recordings, models, FMUs, loops, results and the report.
         duration: of the Eq. 22 experiment [s]; the paper's is 200.
         iterations: of the network's training, for each axis.
-        seed: of the network's initial weights.
         compare_rows: samples in the comparison of each FMU.
     """
 
@@ -99,7 +97,17 @@ class Demo:
 
     def as_dict(self) -> dict:
         """Return the JSON values."""
-        return demo_json(self.judged, self.rough, self.packaged, self.loops) | {
+        return {
+            "models": [
+                result.free.as_dict() | {"free_run_measured_motors": result.measured.fits[INFINITE]}
+                for result in self.judged.values()
+            ],
+            "models_on_rough": [result.as_dict() for result in self.rough.values()],
+            "fmus": {
+                name: {"fmu": str(item.path), "rows": item.rows, "max_difference": item.difference, "holds": item.equal}
+                for name, item in self.packaged.items()
+            },
+            "loops": {name: result.report() for name, result in self.loops.items()},
             "holds": self.holds,
             "experiment_s": self.settings.duration,
             "shortened": self.settings.duration < FULL_DURATION,
@@ -235,27 +243,6 @@ def loop_rows(loops: Mapping[str, Result]) -> tuple[Head, Rows]:
         for name, row in limits_of(loops)
     ]
     return ["loop and metric", "value", "limit", "verdict"], rows
-
-
-def demo_json(
-    judged: Mapping[tuple[str, str], ValidationPair],
-    rough: Mapping[tuple[str, str], Validation],
-    packaged: Mapping[str, PackagedFmu],
-    loops: Mapping[str, Result],
-) -> dict[str, Any]:
-    """Return the results as JSON values."""
-    return {
-        "models": [
-            result.free.as_dict() | {"free_run_measured_motors": result.measured.fits[INFINITE]}
-            for result in judged.values()
-        ],
-        "models_on_rough": [result.as_dict() for result in rough.values()],
-        "fmus": {
-            name: {"fmu": str(item.path), "rows": item.rows, "max_difference": item.difference, "holds": item.equal}
-            for name, item in packaged.items()
-        },
-        "loops": {name: result.report() for name, result in loops.items()},
-    }
 
 
 def score_line(judged: Mapping[tuple[str, str], ValidationPair], model: str) -> str:

@@ -118,7 +118,6 @@ class PackagedFmu:
     """An FMU and its largest difference from the Python model in simulation.
 
     Attributes:
-        path: of the FMU.
         rows: number of compared samples.
         difference: largest over all outputs, in their SI units.
     """
@@ -142,7 +141,7 @@ def package(
     for number, (name, thing) in enumerate(things.items()):
         report(number / len(things), name)
         info = fmu_info(thing, scores=scores.get(name, ""), stop_time=30.0)
-        path = build_fmu(thing.block(), folder / f"{_camel(name)}.fmu", info=info, force=True)
+        path = build_fmu(thing.block(), folder / f"{name.title().replace('_', '')}.fmu", info=info, force=True)
         table = simulate_fmu(path, recording)
         difference = float(np.abs(table - python_free_run(thing.block(), recording)).max())
         packaged[name] = PackagedFmu(path, len(recording), difference)
@@ -156,10 +155,6 @@ def python_free_run(block: Block, recording: Recording) -> Matrix:
     inputs[:, :3] = recording.set_points
     _, outputs = block.run(start, inputs)
     return np.vstack([start.outputs, outputs[:-1]])
-
-
-def _camel(name: str) -> str:
-    return "".join(word.capitalize() for word in name.split("_"))
 
 
 # 15 deg as in the lab's own tests.

@@ -58,11 +58,9 @@ class Project:
     """Contents of a project, by path relative to its folder.
 
     Attributes:
-        folder: of the project.
         recordings: path -> (recording, its quality).
         models, observers, controllers, families: path -> what `load` returns.
         fmus: path -> fmpy's description.
-        certificates: path -> content.
         loops: path -> result of its simulation.
         studies: path of the folder -> (description, runs).
         doubts: path of a layout or robot file -> its uncertain decisions.
@@ -93,7 +91,6 @@ def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
     """Read all files of a project; loops are simulated, except those that name Python code.
 
     Args:
-        folder: of the project.
         progress: called with the finished share and a word.
 
     Raises:

@@ -46,7 +46,6 @@ class ReproduceSettings:
 
     Attributes:
         iterations: of the network's training, for each axis.
-        seed: of the network's initial weights.
         other_necks: number of other plants, to separate effects of the plant: the presets `rough` and `lab`, then necks
             sampled around `paper` (20 % spread).
         duration: of Eq. 22 [s]; the paper's is 200.
@@ -71,7 +70,6 @@ class Reproduction:
         models: nlsm, nn and rls, trained on them.
         judged: (model, data) -> validation on the preset `paper`.
         others: name of another neck -> its validations.
-        seconds: duration of the whole run.
     """
 
     settings: ReproduceSettings
@@ -181,7 +179,6 @@ class Entry:
     """A published figure beside ours.
 
     Attributes:
-        where: in the paper.
         model, data, axis, configuration: subject of the figure.
         persistence: of the same rows one step ahead [%], for figures one step ahead.
         paper, ours: fits [%]; ours is None if the simulation diverged.

@@ -159,9 +159,10 @@ _SIGNS = {"min": ">=", "max": "<=", "below": "<"}
 def tune_page(found: Tuned) -> str:
     """Return the HTML page of a tuning."""
     items = [found.best, *(item for item in found.front if item is not found.best)]
+    given = Section("Requirements as given", text=["; ".join(found.task.asked.lines()) + "."])
     return page(
         f"Controller for {found.task.robot.label()}, tuned",
-        [_result(found, _steps(found, items)), _front(found), _given_requirements(found)],
+        [_result(found, _steps(found, items)), _front(found), given],
         verdict=tune_verdict(found) if found.holds else f"Not all requirements hold. {failing_requirement(found)}",
         holds=found.holds,
         footer="Written by softneck tune.",
@@ -239,10 +240,6 @@ def _result(found: Tuned, steps: Chart) -> Section:
     tables = [Table("Requirements", ["metric", "bound", "limit", "value", "verdict"], [row[:5] for row in rows])]
     text += tune_notes(found)
     return Section("Best controller", charts=[steps], tables=tables, method=text)
-
-
-def _given_requirements(found: Tuned) -> Section:
-    return Section("Requirements as given", text=["; ".join(found.task.asked.lines()) + "."])
 
 
 def _steps(found: Tuned, items: Sequence[Candidate]) -> Chart:

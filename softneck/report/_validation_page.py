@@ -37,7 +37,6 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
 
     Args:
         results: of `validate`, one for each model and recording.
-        title: of the page.
     """
     together = _comparisons(results)
     sections = [_overview(results, together or [curves(results[0])])]
@@ -220,14 +219,10 @@ def _name(r: Validation) -> str:
 
 def drawable(r: Validation, values: Matrix) -> Matrix:
     """Replace diverged outputs by NaN."""
-    most = _MAX_ANGLE if _has_angles(r) else _MAX_RATIO * float(np.nanmax(np.abs(r.measured), initial=0.0))
+    angles = to_si(r.robot.outputs.unit)[1] == "rad"
+    most = _MAX_ANGLE if angles else _MAX_RATIO * float(np.nanmax(np.abs(r.measured), initial=0.0))
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < most, values, np.nan)
-
-
-def _has_angles(r: Validation) -> bool:
-    """Return whether the outputs are angles."""
-    return to_si(r.robot.outputs.unit)[1] == "rad"
 
 
 def _bounds_of(r: Validation) -> tuple[Matrix, Matrix] | None:

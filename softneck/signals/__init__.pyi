@@ -15,14 +15,14 @@ from .importing._log import import_log as import_log
 from .quality._findings import Quality as Quality
 from .quality._findings import assess_quality as assess_quality
 from .recording._channels import SET_POINTS as SET_POINTS
+from .recording._channels import TENDON_ANGLES as TENDON_ANGLES
+from .recording._channels import motors_from as motors_from
+from .recording._channels import redefine as redefine
+from .recording._channels import redefinition_matrix as redefinition_matrix
 from .recording._files import read_recording as read_recording
 from .recording._files import write_recording as write_recording
 from .recording._recording import Recording as Recording
 from .recording._recording import concatenate as concatenate
-from .recording._redefinition import TENDON_ANGLES as TENDON_ANGLES
-from .recording._redefinition import motors_from as motors_from
-from .recording._redefinition import redefine as redefine
-from .recording._redefinition import redefinition_matrix as redefinition_matrix
 from .recording._resampling import resampled as resampled
 
 # isort: split

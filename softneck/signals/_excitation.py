@@ -49,7 +49,6 @@ class Excitation(ReprMixin):
     """Motor set-points over time.
 
     Attributes:
-        name: of the signal.
         time: (time,) [s].
         set_points: (time, motors) in SI, of the neck (time, 3) [rad].
         sample_time: [s].
@@ -279,8 +278,6 @@ def multisine_experiments(
     Args:
         amplitude: largest value of any direction's input, in the motors' unit.
         band: lowest and highest frequency [rad/s]; a period is one cycle of the lowest.
-        realisations: draws of the phases.
-        seed: of the phases.
         robot: whose directions and motors move, at its sample time.
 
     Raises:
@@ -415,8 +412,6 @@ def prepare(
     Samples within the limits are unchanged; preparing twice changes nothing more.
 
     Args:
-        excitation: to prepare.
-        limits: None for none.
         ramp_s: time from and to rest [s]; 0 for no ramps.
 
     Raises:

@@ -24,8 +24,7 @@ from softneck.signals import (
 )
 from softneck.signals.importing._guess_shapes import find_outputs, find_rates, max_correlation
 from softneck.signals.importing._layout import Source, Term
-from softneck.signals.recording._channels import MOTOR_POSITIONS, known_channels, si_unit
-from softneck.signals.recording._redefinition import redefine
+from softneck.signals.recording._channels import MOTOR_POSITIONS, known_channels, redefine, si_unit
 
 from ..data import LAYOUTS, TS, neck_recording
 

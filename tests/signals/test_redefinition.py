@@ -45,7 +45,7 @@ def test_turning_the_neck_turns_the_inputs() -> None:
 
 @pytest.mark.parametrize("angles", [[0, 0, 1], [0, np.nan, 1], [0, 1]])
 def test_angles_that_do_not_span_the_plane_are_refused(angles: list[float]) -> None:
-    with pytest.raises(SettingsError, match=r"three (finite )?tendon angles (that span the plane )?are needed"):
+    with pytest.raises(SettingsError, match="three tendon angles that span the plane are needed"):
         redefinition_matrix(np.array(angles))
 
 

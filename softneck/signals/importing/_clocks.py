@@ -58,6 +58,7 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
 
     Rates that are differences lack motion faster than their step, so both sides are averaged. Both carry noise, so T is
     the ratio of their lengths (the geometric mean of the two regressions).
+
     Args:
         channels: with motor_position_j [rad] and motor_velocity_j [rad/s], each (time,).
         run: (time,) run numbers.

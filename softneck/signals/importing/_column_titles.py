@@ -132,9 +132,6 @@ class Title:
     Attributes:
         role: time, run, set-point, position, velocity, pitch, ..., ignored, or unknown.
         family: words without number and unit; columns of the motors share it.
-        motor: number in the title, or None.
-        unit: unit in the title, or None.
-        why: reason for the role.
         rank: clarity of the reason; smaller is clearer.
     """
 

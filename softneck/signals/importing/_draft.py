@@ -37,9 +37,7 @@ class Pick:
 
     Attributes:
         terms: of a weighted sum of columns.
-        why: reason of the choice.
         unit: named by the title, or None.
-        sign: 1 or -1.
         confidence: probability that the columns are right, by names and data.
         unit_sure: whether the title's unit is unambiguous: `Grad` means degrees in German.
         integrate: whether the columns are rates to integrate.

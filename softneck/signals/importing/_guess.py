@@ -11,8 +11,7 @@ import numpy as np
 from softneck.core import DataError, ReprMixin, SettingsError
 from softneck.robot import Robot
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS
-from ..recording._redefinition import redefine
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS, redefine
 from ..recording._resampling import jitter
 from ._clocks import SampleTime, estimate_sample_time
 from ._draft import Draft, say
@@ -37,10 +36,8 @@ class Doubt:
 
     Attributes:
         about: subject, in words.
-        channels: of the recording.
         taken: the choice made.
         confidence: probability that it is right, 0 to 1.
-        why: its reason.
         choices: alternatives for `settle_doubt`; without any, the columns have to be edited in the layout.
     """
 
@@ -225,7 +222,6 @@ def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
     """Return a layout for an unknown log: a text, spreadsheet, Parquet, MAT or MCAP file.
 
     Args:
-        path: the log.
         robot: the neck of the log, for its motors' range.
 
     Raises:

@@ -11,8 +11,7 @@ import numpy as np
 from softneck.core import SoftneckError
 from softneck.robot import Robot
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column
-from ..recording._redefinition import redefine
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column, redefine
 from ._clocks import axis_rotations, velocity_period
 from ._column_titles import plain
 from ._draft import Draft, Pick, say

@@ -9,8 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, Vector
 
-from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS
-from ..recording._redefinition import redefine
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, redefine
 from ._clocks import velocity_period
 from ._draft import Draft, Pick
 from ._layout import Column, Term

@@ -68,7 +68,6 @@ class Layout(ReprMixin):
     """How to read a log: its format, and the source and unit of each channel.
 
     Attributes:
-        channels: channel name -> source.
         inclination, orientation: sources of a tilt vector, instead of pitch and roll.
         quaternion: of the sensor, instead of pitch and roll.
         time: the time column's source, or None; its unit may be `date`.
@@ -80,14 +79,11 @@ class Layout(ReprMixin):
         run: the column of run numbers, or None.
         variable: the matrix of a MAT file; None takes its vectors by name.
         sheet: of a spreadsheet; None takes the largest.
-        encoding: of a text.
         header: whether the first line names the columns.
         delimiter: between cells, one character or `whitespace`.
         decimal: the decimal mark, `.` or `,`.
-        skip: lines before the table.
         unit_row: whether a line of units follows the names; it is skipped.
         rows: first and last row (not included).
-        robot: the robot of the channels.
     """
 
     channels: Mapping[str, Source]
@@ -315,7 +311,6 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
     """Return a layout as TOML text; the inverse of `parse_layout`.
 
     Args:
-        layout: to write.
         remarks: channel (or `time`, `file`, `inclination`, `orientation`) -> comment.
         open_ends: comments for the end: entries to fill in.
 
@@ -332,7 +327,7 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
     blocks.append(lines)
     for name, source in layout.channels.items():
         if name not in simple:
-            blocks.append([*_comment(why.get(name)), f"[channels.{name}]", *_sum(source)])
+            blocks.append([*_comment(why.get(name)), f"[channels.{name}]", *_entries(source)])
     if layout.inclination is not None and layout.orientation is not None:
         tilt = ["[tilt]"]
         for name, source in (("inclination", layout.inclination), ("orientation", layout.orientation)):
@@ -357,12 +352,7 @@ def _time(layout: Layout, why: Mapping[str, str]) -> list[str]:
     if layout.time is not None:
         if not layout.time.terms or layout.time.sign != 1.0:
             raise SettingsError("the time of a layout is one column without a sign; use its factor.")
-        if len(layout.time.terms) == 1:
-            term = layout.time.terms[0]
-            lines += [f"column = {_text(term.column)}", f"unit = {_text(layout.time.unit)}"]
-            lines += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
-        else:
-            lines += _sum(layout.time)
+        lines += _entries(layout.time)
     lines += _comment(why.get("sample_time"))
     if layout.estimate:
         lines.append('sample_time_s = "estimate"')
@@ -375,24 +365,19 @@ def _time(layout: Layout, why: Mapping[str, str]) -> list[str]:
 
 
 def _inline(source: Source) -> str:
-    if len(source.terms) != 1:
-        return "{ " + ", ".join(_sum(source)) + " }"
-    term = source.terms[0]
-    parts = [f"column = {_text(term.column)}", f"unit = {_text(source.unit)}"]
-    parts += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
-    parts += [f"sign = {source.sign:g}"] if source.sign != 1.0 else []
-    parts += ["integrate = true"] if source.integrate else []
-    return "{ " + ", ".join(parts) + " }"
+    return "{ " + ", ".join(_entries(source)) + " }"
 
 
-def _sum(source: Source) -> list[str]:
-    terms = ", ".join(f"{{ column = {_text(t.column)}, factor = {t.factor!r} }}" for t in source.terms)
-    return [
-        f"unit = {_text(source.unit)}",
-        f"terms = [{terms}]",
-        *([f"sign = {source.sign:g}"] if source.sign != 1.0 else []),
-        *(["integrate = true"] if source.integrate else []),
-    ]
+def _entries(source: Source) -> list[str]:
+    unit, first = f"unit = {_text(source.unit)}", source.terms[0]
+    if len(source.terms) == 1:
+        entries = [f"column = {_text(first.column)}", unit]
+        entries += [f"factor = {first.factor!r}"] if first.factor != 1.0 else []
+    else:
+        terms = ", ".join(f"{{ column = {_text(t.column)}, factor = {t.factor!r} }}" for t in source.terms)
+        entries = [unit, f"terms = [{terms}]"]
+    entries += [f"sign = {source.sign:g}"] if source.sign != 1.0 else []
+    return entries + (["integrate = true"] if source.integrate else [])
 
 
 def _text(value: str | int | tuple[int, int]) -> str:

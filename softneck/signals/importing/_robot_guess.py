@@ -103,7 +103,6 @@ def robot_of_columns(
     """Return robot and layout of a log whose columns the user named.
 
     Args:
-        path: of the log.
         named: its columns, in the order of the robot's channels.
         robot: None takes the neck if the columns fit it, else proposes a robot.
         sample_time: [s] of a log without a clock.
@@ -224,7 +223,10 @@ def _layout(
     default = dict.fromkeys(robot.set_points, robot.motors.unit) | dict.fromkeys(
         robot.outputs.names, robot.outputs.display_unit
     )
-    time = None if clock[0] is None else Source((Term(clock[0]),), _clock_unit(table, clock[0]))
+    time = None
+    if clock[0] is not None:
+        unit = DATE if clock[0] in table.dates else read_title(str(clock[0])).unit or "s"
+        time = Source((Term(clock[0]),), unit)
     return replace(
         table.form,
         channels={name: Source((Term(title),), _unit_of(table, title) or default[name]) for name, title in pairs},
@@ -233,11 +235,6 @@ def _layout(
         run=clock[1],
         robot=robot,
     )
-
-
-def _clock_unit(table: SniffResult, column: Column) -> str:
-    """Return the unit of a time column; `date` for dates."""
-    return DATE if column in table.dates else read_title(str(column)).unit or "s"
 
 
 def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column]) -> str:

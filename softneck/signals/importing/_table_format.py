@@ -48,10 +48,8 @@ class SniffResult:
             several clocks each column holds its last value.
         words: columns without numbers.
         form: a layout without channels: the format of the file; `merge` if rows may be of several clocks.
-        lines: reasons.
         units: column -> unit in a line of units, if there is one.
         dates: columns of dates or times of day.
-        frame: the table.
     """
 
     columns: dict[Column, Vector]

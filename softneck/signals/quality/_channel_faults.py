@@ -11,7 +11,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from softneck.core import Vector, to_si
-from softneck.robot import Robot
 
 from ..recording._channels import file_unit
 from ..recording._recording import Recording
@@ -66,7 +65,6 @@ class ChannelQuality:
     """One channel; values in SI.
 
     Attributes:
-        unit: unit in files.
         rows: number of samples, missed ones included.
         lowest, highest: range of the finite samples; NaN without any.
         missed: segments without a sample.
@@ -161,17 +159,13 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
             if chance or _relative_motion(inputs[flat[0] : flat[1] - _DEAD_SAMPLES], std) > _MIN_MOTION
         )
         clipped = _find_clipping(recording, y, flats, quantum or 0.0, inputs, chance)
-        if name in _inertial_channels(recording.robot):
+        # Unlike rates, tensions and velocities, positions have inertia and cannot jump for one sample.
+        if name.removesuffix("_measured") in (*recording.robot.motor_positions, *recording.robot.outputs.names):
             outliers = _find_spikes(recording, y, quantum or 0.0, 0.0 if np.isnan(noise) else noise)
         edge = {(segment.start, segment.stop) for segment in clipped}
         frozen = tuple(segment for segment in frozen if (segment.start, segment.stop) not in edge)
     low, high = float(y[good].min()), float(y[good].max())
     return ChannelQuality(name, unit, y.size, low, high, missed, frozen, clipped, outliers, quantum, repeats, noise)
-
-
-def _inertial_channels(robot: Robot) -> set[str]:
-    """Return the channels that have inertia and cannot jump for one sample, unlike rates, tensions and velocities."""
-    return {*robot.motor_positions, *robot.outputs.names, *(f"{name}_measured" for name in robot.outputs.names)}
 
 
 def is_command(name: str) -> bool:

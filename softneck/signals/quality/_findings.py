@@ -38,8 +38,6 @@ class Finding:
     Attributes:
         severity: ok, note (for information) or warning (fix it, or expect a worse model).
         topic: such as "dropouts" or "excitation".
-        channel: its channel, or empty.
-        message: one sentence.
         advice: what to do; may be empty.
         time: [s] of the first place in its run; None without a place.
     """
@@ -66,8 +64,6 @@ class Quality(ReprMixin):
     """The result of `assess_quality`; arrays in SI.
 
     Attributes:
-        robot: of the recording.
-        rows: of the recording.
         sample_time: [s].
         channels: name -> faults of that channel.
         spectrum: of the redefined inputs, or of the set-points of a robot without directions.
@@ -147,7 +143,6 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
     """Assess a recording's channels and the excitation by its inputs; no check crosses the border of two runs.
 
     Args:
-        recording: to check.
         bandwidth: of the outputs [rad/s]; None derives it from the robot's time constant (neck: 4, section 3.1).
             Without either the spectrum is not judged.
 
@@ -191,8 +186,28 @@ _CLEAN = {
 }
 
 
+# Fault of a channel -> topic, message and advice.
+_FAULTS = {
+    "frozen": (
+        "frozen",
+        "repeats one value for 20 samples or more while its input moves, {places}; longest {longest:.2f} s.",
+        "Check the sensor and its line, and leave those rows empty.",
+    ),
+    "clipped": (
+        "clipping",
+        "has flat tops at the edge of its range, {places}.",
+        "Widen the sensor's range or move less; leave those rows empty.",
+    ),
+    "outliers": (
+        "outliers",
+        "has spikes of one or two samples, {places}.",
+        "Leave those samples empty; a single spike widens the bounds of set membership.",
+    ),
+}
+
+
 def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
-    sample_time, outputs = quality.sample_time, quality.robot.outputs.names
+    outputs = quality.robot.outputs.names
     if channel.missed_rows == channel.rows:
         advice = "Remove it from the file, or log it."
         severity = "warning" if channel.name in outputs else "note"
@@ -204,19 +219,11 @@ def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
         message = f"never leaves {_value(channel, channel.lowest)}."
         advice = "Move it: no model can be identified from a constant."
         yield Finding("warning", "excitation", channel.name, message, advice)
-    if channel.frozen:
-        message = (
-            f"repeats one value for 20 samples or more while its input moves, {_places(channel.frozen)}; "
-            f"longest {max(s.rows for s in channel.frozen) * sample_time:.2f} s."
-        )
-        advice = "Check the sensor and its line, and leave those rows empty."
-        yield Finding("warning", "frozen", channel.name, message, advice, channel.frozen[0].time)
-    if channel.clipped:
-        yield _clipping(channel)
-    if channel.outliers:
-        message = f"has spikes of one or two samples, {_places(channel.outliers)}."
-        advice = "Leave those samples empty; a single spike widens the bounds of set membership."
-        yield Finding("warning", "outliers", channel.name, message, advice, channel.outliers[0].time)
+    for fault, (topic, message, advice) in _FAULTS.items():
+        if found := getattr(channel, fault):
+            longest = max(segment.rows for segment in found) * quality.sample_time
+            message = message.format(places=_places(found), longest=longest)
+            yield Finding("warning", topic, channel.name, message, advice, found[0].time)
     yield from _resolution(channel, outputs)
 
 
@@ -233,13 +240,6 @@ def _dropouts(channel: ChannelQuality, quality: Quality) -> Finding:
         advice = f"Identification leaves these rows out{stop}: check the line."
         return Finding("warning", "dropouts", channel.name, message, advice, longest.time)
     return Finding("note", "dropouts", channel.name, message, "Identification leaves these rows out.", longest.time)
-
-
-def _clipping(channel: ChannelQuality) -> Finding:
-    time = channel.clipped[0].time
-    message = f"has flat tops at the edge of its range, {_places(channel.clipped)}."
-    advice = "Widen the sensor's range or move less; leave those rows empty."
-    return Finding("warning", "clipping", channel.name, message, advice, time)
 
 
 def _resolution(channel: ChannelQuality, outputs: tuple[str, ...]) -> Iterator[Finding]:

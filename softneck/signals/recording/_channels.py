@@ -1,4 +1,4 @@
-"""The channels a recording may have: their SI units in arrays and their units in files."""
+"""The channels a recording may have, their units, and the redefined inputs of the neck (paper, section 2.1)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 import re
 from functools import cache
 
-from softneck.core import DataError, to_si
+import numpy as np
+
+from softneck.core import DataError, Matrix, SettingsError, Vector, to_si
 from softneck.robot import Robot
 
 NECK = Robot.preset("neck")
@@ -105,3 +107,35 @@ def parse_column(title: str, robot: Robot = NECK) -> tuple[str, float]:
     if unit_si != si_unit(name, robot):
         raise DataError(f"column `{name}` cannot be in `{unit}`; expected {table[name]} or its SI unit.")
     return name, factor
+
+
+#: [rad] Tendons of motors 1, 2 and 3 around the neck (Eq. 6 and 8).
+TENDON_ANGLES = np.radians([0.0, 120.0, 240.0])
+
+
+def redefinition_matrix(angles: Vector = TENDON_ANGLES) -> Matrix:
+    """Return T (3, 3) with (theta_i, phi_i, delta_i) = T (P1, P2, P3) of tendons at `angles` [rad] (Eq. 4, 5, 7, 11).
+
+    `Robot.redefinition` does the same for any number of motors and outputs.
+
+    Raises:
+        SettingsError: the angles do not span the plane, so that T has no inverse.
+    """
+    gamma = np.asarray(angles, dtype=np.float64)
+    finite = gamma.shape == (3,) and np.isfinite(gamma).all()
+    T = np.array([np.cos(gamma), np.sin(gamma), np.full(3, 1.0 / 3.0)]) if finite else np.zeros((3, 3))
+    # Near a zero determinant two tendons almost coincide, and the inverse has huge motor angles.
+    if abs(np.linalg.det(T)) < 1e-3:
+        raise SettingsError(f"three tendon angles that span the plane are needed [rad]; got {gamma.tolist()}.")
+    T[np.abs(T) < 1e-15] = 0.0
+    return T
+
+
+def redefine(motors: Matrix, angles: Vector = TENDON_ANGLES) -> Matrix:
+    """Return theta_i, phi_i, delta_i (time, 3) of motor positions (time, 3) [rad] (Eq. 9-11)."""
+    return np.asarray(motors) @ redefinition_matrix(angles).T
+
+
+def motors_from(inputs: Matrix, angles: Vector = TENDON_ANGLES) -> Matrix:
+    """Return the motor positions (time, 3) [rad] of theta_i, phi_i, delta_i (time, 3), the inverse of `redefine`."""
+    return np.asarray(inputs) @ np.linalg.inv(redefinition_matrix(angles)).T

@@ -360,8 +360,6 @@ def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: 
     """Return a column as floats; an empty cell is NaN where `missing` samples are allowed.
 
     Args:
-        column: of a table.
-        name: of the column, for the message.
         missing: whether samples may be missing.
         nan_words: whether a missing sample may be written as `NaN`, as MATLAB and numpy write it.
     """

@@ -85,12 +85,12 @@ class Recording(ReprMixin):
     """Samples of one or more experiments at one sample time.
 
     Attributes:
-        time: (time,) [s], equidistant within each run; may restart at a new run.
         time: (time,) [s], equidistant within each run; may restart with a new run.
-        channels: name -> (time,) in SI; the set-points and the outputs are always there. NaN: sample missed.
+        sample_time: [s].
         channels: name -> (time,) in SI; set-points and outputs are required. NaN is a missed sample.
-        robot: whose channels these are; the paper's neck when not given.
+        run: (time,) integers, constant over each experiment; 0 everywhere if not given.
         robot: the paper's neck if not given.
+
     Example:
         >>> import numpy as np
         >>> import softneck

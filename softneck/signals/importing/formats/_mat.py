@@ -240,7 +240,6 @@ def table_of(source: Path, arrays: Arrays, variable: str | None, wanted: tuple[s
     """Return the table of a file's arrays.
 
     Args:
-        source: the file, for messages.
         arrays: name -> (rows, columns).
         variable: a matrix (time, columns), whose columns get the numbers 0, 1, ...; None takes all vectors by name, and
             matrices (time, n) as `name(:,1)` to `name(:,n)`. Experiments in elements of a cell are concatenated, with
