@@ -37,7 +37,7 @@ from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, StepRe
 from softneck.signals import signal
 from softneck.tuning import tune
 from softneck.tuning._judge import designed, made_ready
-from softneck.tuning._requirements import Task
+from softneck.tuning._task import Task
 from softneck.tuning._tune import BUDGET, task_of
 
 OUT = Path("build/tune")

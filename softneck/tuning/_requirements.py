@@ -1,7 +1,8 @@
-"""What is tuned: requirements, of `verify` and of loops that only tuning looks at, plants, and whose controller."""
+"""Requirements of `tune`, and the check that a controller could meet them."""
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -10,10 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from softneck.core import KINDS, SettingsError, resolve, to_si
-from softneck.identification import Model
+import numpy as np
+
+from softneck.core import SettingsError, to_si
+from softneck.design import ControllerLimits, LoopSettings, UncertainPlant, axis_test, least_rise, uncertain_plant
+from softneck.estimation import AxisPlant
 from softneck.loop import SETTLING_BAND, default_limits
-from softneck.robot import Robot
+from softneck.loop.default_limits import required_rise
+from softneck.robot import TIME_CONSTANT, Robot
 from softneck.verification import (
     VERSION,
     Requirement,
@@ -190,53 +195,183 @@ def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[st
     return found
 
 
-def has_observer(kind: str) -> bool:
-    """Return whether loops of a kind have an observer: designed for it."""
-    return hasattr(resolve(KINDS[kind].settings), "over")
+# What has settled has risen before.
+_RISES = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Task:
-    """All that a worker must know to judge a candidate.
+#: The least rise that is asked where nothing limits it, in time constants: what is quicker, models tell less of.
+USUAL_RISE = 2.0
 
-    Attributes:
-        digest: of all that follows; workers keep what they have made ready by it.
-        linear: by name, models and families.
-        own: by name, simulation models.
+
+def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
+    """Raise SettingsError for a requirement that no controller of the nominal plant can keep.
+
+    Args:
         asked: the requirements.
-        robot: whose controller is tuned.
-        cocontraction: at which the loops are held [SI unit of the motors]; None: by the controller's own rule.
-        seed: of the noise.
-        observer: of the loops of kinds that have one (`mpc`, `nmpc`); None: these have none either.
+        plant: whatever `uncertain_plant` takes.
     """
+    uncertain = uncertain_plant(plant)
+    limits = LoopSettings().limits(uncertain.robot)
+    _refuse_quiet(asked)
+    for name in uncertain.names:
+        nominal = uncertain.axis(name).nominal
+        _refuse_rise(asked, uncertain, limits, name, nominal)
+        _refuse_circle(asked, name, nominal)
+        _refuse_turn(asked, uncertain, limits, name, nominal)
+        _refuse_sensitivity(asked, name)
+        _refuse_load(asked, name, nominal)
+    _refuse_order(asked)
 
-    digest: str
-    linear: Mapping[str, Any]
-    own: Mapping[str, Any]
-    asked: TuneRequirements
-    robot: Robot
-    cocontraction: float | None = None
-    seed: int = 0
-    observer: Any = None
 
-    @property
-    def said_cocontraction(self) -> float | None:
-        """As settings and loop files say it: in the unit of the robot's motors."""
-        factor = to_si(self.robot.motors.unit)[0]
-        return None if self.cocontraction is None else float(f"{self.cocontraction / factor:.4g}")
+def quickest(plant: Any) -> float:
+    """Return the least `rise_s` [s] that designs on a plant take; 0 where the motors do not reach their test step."""
+    uncertain = uncertain_plant(plant)
+    limits = LoopSettings().limits(uncertain.robot)
+    found = [
+        least_rise(axis, axis_test(axis, limits, uncertain.redefinition[1]))
+        for axis in (uncertain.axis(name).nominal for name in uncertain.names)
+    ]
+    return max((least for least in found if math.isfinite(least)), default=0.0)
 
-    @property
-    def tested(self) -> bool:
-        """Whether a family was tested against its recordings."""
-        return any(getattr(thing, "measured", {}) for thing in self.linear.values())
 
-    @property
-    def models(self) -> list[Model]:
-        """Nonlinear models among the simulation models."""
-        return [thing for thing in self.own.values() if isinstance(thing, Model)]
+def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
+    """Return the default rise time [s], of the slowest axis; None where no step is reached."""
+    uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
+    limits, size = LoopSettings().limits(uncertain.robot), asked.certificate.si(asked.certificate.sim["size_deg"])
+    time, found = asked.certificate.scale.time, []
+    for name in uncertain.names:
+        axis = uncertain.axis(name)
+        test = axis_test(axis.nominal, limits, uncertain.redefinition[1])
+        latest = max((plant.delay + 1) * plant.sample_time for plant in (axis.nominal, *axis.samples))
+        least = least_rise(axis.nominal, test, size)
+        found.append(required_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
+    # Who asks for an earlier settling asks for a rise before it.
+    most = digits(time * max(*found, USUAL_RISE * TIME_CONSTANT))
+    return min(most, asked.wanted("sim.settling_s") or math.inf) if most < math.inf else None
 
-    @property
-    def plant(self) -> Any:
-        """What controllers are designed on: the first of several linear sources is the nominal plant."""
-        sources = list(self.linear.values())
-        return sources[0] if len(sources) == 1 else sources
+
+def _refuse_order(asked: TuneRequirements) -> None:
+    """Refuse a step that may rise later than it has to have settled; of defaults of `verify` nobody asked both."""
+    said = {item.metric for item in asked.bounds if item.asked}
+    for group in ("sim", "step"):
+        names = f"{group}.settling_s", f"{group}.rise_s"
+        settling, rise = (asked.wanted(name) for name in names)
+        if settling is not None and rise is not None and settling < rise and said.issuperset(names):
+            raise SettingsError(
+                f"`{names[0]}` <= {settling:g} s and `{names[1]}` <= {rise:g} s contradict each other: what has "
+                f"settled has risen; ask for a rise of at most {settling:g} s as well, or for a later settling."
+            )
+
+
+def _refuse_quiet(asked: TuneRequirements) -> None:
+    """Refuse a steady state that is quieter than the sensor: white noise is in what it tells, whatever is done."""
+    name_of, noise = asked.certificate.scale.name_of, asked.track["noise_deg"]
+    metric = f"sim.{name_of('steady_rms_deg')}"
+    limit = min((b.limit for b in asked.bounds if b.metric == metric and b.bound != "min" and b.asked), default=noise)
+    if limit < noise:
+        raise SettingsError(
+            f"`{metric}` <= {limit:g} cannot be: the noise of the sensor alone is {noise:g} (`[track] "
+            f"{name_of('noise_deg')}`); allow more, or state the noise of yours."
+        )
+
+
+def _refuse_rise(
+    asked: TuneRequirements, uncertain: UncertainPlant, limits: ControllerLimits, name: str, plant: AxisPlant
+) -> None:
+    """Refuse a rise that slew and range cannot give, however the motors are led."""
+    test = axis_test(plant, limits, uncertain.redefinition[1])
+    for metric in _RISES:
+        limit = asked.wanted(metric)
+        if limit is None:
+            continue
+        table = asked.certificate.sim if metric.startswith("sim.") else asked.certificate.step
+        least = least_rise(plant, test, asked.certificate.si(float(table["size_deg"])))
+        if math.isinf(least):
+            raise SettingsError(
+                f"`{metric}` cannot be: the motors' range does not reach {name}'s step of the requirements; ask for a "
+                "smaller step."
+            )
+        if limit < least:
+            raise SettingsError(
+                f"`{metric}` <= {limit:g} s cannot be: within the motors' slew and range {name}'s step of the "
+                f"requirements takes at least {least:.2g} s; allow more, or ask for a smaller step."
+            )
+
+
+def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
+    """Refuse a circle beyond a bandwidth of 1/delay: slower ones a filter leads, but for overshoot."""
+    scale = asked.certificate.scale
+    metric = f"track.{scale.name_of('circle_rms_deg')}"
+    limit = asked.wanted(metric)
+    dead, turn = (plant.delay + 1) * plant.sample_time, asked.track["circle_rad_s"]
+    # Who stands still in the middle is as far behind as the circle is large.
+    if limit is None or not circles(scale.robot) or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
+        return
+    raise SettingsError(
+        f"`{metric}` <= {limit:g} cannot be: a circle at {turn:g} rad/s is beyond the bandwidth that the "
+        f"dead time of {name}, {1e3 * dead:.0f} ms, allows, {1.0 / dead:.3g} rad/s; ask for a slower one, or for "
+        "`track.ahead_rms_deg`, of a reference that is known ahead."
+    )
+
+
+def _refuse_turn(
+    asked: TuneRequirements, uncertain: UncertainPlant, limits: ControllerLimits, name: str, plant: AxisPlant
+) -> None:
+    """Refuse a circle whose first harmonic slew and range of the motors cannot give.
+
+    No input within them has more of it than the square wave of the range, or the triangle of the slew.
+    """
+    scale = asked.certificate.scale
+    if not circles(scale.robot):
+        return
+    size, turn = asked.track["circle_deg"], asked.track["circle_rad_s"]
+    share = float(np.abs(uncertain.redefinition[1][:, uncertain.names.index(name)]).max())
+    most = 4.0 / math.pi * min(limits.position_limit, limits.slew_limit / turn) / share
+    reached = float(scale.shown(most * np.abs(plant.response(np.array([turn])))[0]))
+    # Of one output alone; a sine has its amplitude over the root of two.
+    least = (size - reached) / math.sqrt(2.0)
+    for metric in ("track.circle_rms_deg", "track.ahead_rms_deg"):
+        limit = asked.wanted(metric)
+        if limit is not None and limit < least:
+            raise SettingsError(
+                f"`{metric}` <= {limit:g} cannot be: within the motors' slew and range {name} swings by {reached:.2g} "
+                f"deg at {turn:g} rad/s, of {size:g} deg; ask for a slower circle, or a smaller one."
+            )
+
+
+def _refuse_sensitivity(asked: TuneRequirements, name: str) -> None:
+    """Refuse an Ms of 1: Bode's integral leaves |S| above 1 somewhere (Astrom and Murray 2021, ch. 14)."""
+    for group in ("axes", name):
+        limit = asked.wanted(f"{group}.sensitivity")
+        if limit is not None and limit <= 1.0:
+            raise SettingsError(
+                f"`{group}.sensitivity` <= {limit:g} cannot be: no feedback through a dead time has it."
+            )
+
+
+def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
+    """Refuse a load rejected sooner than the dead time lets anybody act on it."""
+    certificate = asked.certificate
+    metric = f"step.{certificate.scale.name_of('load_rms_deg')}"
+    limit = asked.wanted(metric)
+    if limit is None:
+        return
+    rows = round(float(certificate.step["duration_s"]) / plant.sample_time)
+    load = certificate.step_test(0).load
+    # Felt a dead time late, and answered one more later: until then it acts alone.
+    alone = np.zeros(rows)
+    felt = load * _step_response(plant, plant.delay + 2)
+    alone[plant.delay : plant.delay + felt.size] = felt[: max(rows - plant.delay, 0)]
+    least = math.sqrt(float((alone**2).mean())) / certificate.si(1.0)
+    if limit < least:
+        raise SettingsError(
+            f"`{metric}` <= {limit:g} cannot be: the load of the requirements moves {name} for a dead time before any "
+            f"feedback acts, which alone is {least:.2g}; allow more."
+        )
+
+
+def _step_response(plant: AxisPlant, rows: int) -> np.ndarray:
+    """Return the response (rows,) to a step of the input, without the delay."""
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter(np.append(0.0, plant.numerator), plant.denominator, np.ones(rows)))

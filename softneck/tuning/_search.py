@@ -23,10 +23,9 @@ from softneck.core import Progress, SoftneckError
 from softneck.cosim import Crew
 from softneck.verification import Requirement
 
-from ._judge import LEVELS, Judgement, judge_candidate
-from ._log import Job, Log
-from ._requirements import Task
+from ._judge import LEVELS, judge_candidate
 from ._space import COSTLY, Space
+from ._task import Job, Judgement, Log, Task
 
 # Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
 _GENERATION = 6

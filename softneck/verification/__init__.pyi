@@ -1,5 +1,5 @@
+from ._metrics import METRIC_NAMES as METRIC_NAMES
 from ._page import verification_page as verification_page
-from ._requirements import METRIC_NAMES as METRIC_NAMES
 from ._requirements import Requirements as Requirements
 from ._requirements import make_requirements as make_requirements
 from ._requirements import read_requirements as read_requirements
@@ -17,7 +17,11 @@ from ._linear import ControllerUnderTest as ControllerUnderTest
 from ._linear import judge as judge
 from ._linear import judged as judged
 from ._linear import margins as margins
-from ._metric_titles import metric_title as metric_title
+from ._linear import tested_axes as tested_axes
+from ._metrics import Scale as Scale
+from ._metrics import digits as digits
+from ._metrics import metric_names as metric_names
+from ._metrics import metric_title as metric_title
 from ._neck_loops import ALONE as ALONE
 from ._neck_loops import OwnPlant as OwnPlant
 from ._neck_loops import direction as direction
@@ -39,13 +43,9 @@ from ._requirements import bounds_of as bounds_of
 from ._requirements import check_number as check_number
 from ._requirements import kept_back as kept_back
 from ._requirements import left_to_tune as left_to_tune
-from ._requirements import metric_names as metric_names
 from ._requirements import of_file as of_file
 from ._requirements import with_groups as with_groups
-from ._scale import Scale as Scale
-from ._scale import digits as digits
 from ._steps import run_steps as run_steps
-from ._tested import tested_axes as tested_axes
 from ._verify import Verdict as Verdict
 from ._verify import sources_of as sources_of
 from ._verify import standing_for as standing_for

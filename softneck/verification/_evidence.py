@@ -13,7 +13,7 @@ from softneck.loop import error_unit
 from softneck.runtime import Block
 
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
-from ._linear import ControllerUnderTest, LinearLaw, judged, margins
+from ._linear import AxisMargins, ControllerUnderTest, LinearLaw, judged, margins, tested_axes
 from ._neck_loops import (
     NeckRun,
     OwnPlant,
@@ -30,7 +30,6 @@ from ._plants import Plants, UncertainNeck, all_plants, join
 from ._requirements import Requirements
 from ._steps import UNTOLD, Steps, run_steps
 from ._structured import SearchResult, StructuredResult, search, structured
-from ._tested import TestedAxis, tested_axes
 
 Describe = Callable[[int], dict[str, Any]]
 
@@ -95,7 +94,7 @@ class Evidence(ReprMixin):
     metrics: dict[str, Values] = field(default_factory=dict)
     not_computed: dict[str, str] = field(default_factory=dict)
     foreign: bool = True
-    tested: list[TestedAxis] = field(default_factory=list)
+    tested: list[AxisMargins] = field(default_factory=list)
     crossings: list[Crossing] = field(default_factory=list)
 
 
@@ -193,7 +192,7 @@ def _tell_data(evidence: Evidence) -> None:
         )
 
 
-def _tested_describer(item: TestedAxis, name: str) -> Describe:
+def _tested_describer(item: AxisMargins, name: str) -> Describe:
     facts = {
         "kind": "data", "name": f"{item.source}: the weight over its recordings", "axis": item.axis,
         "frequency_rad_s": item.at[name], "band_rad_s": list(item.band),

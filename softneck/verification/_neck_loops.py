@@ -21,8 +21,8 @@ from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.runtime import Block
 
 from ._experiments import LoopUnderTest
+from ._metrics import Scale
 from ._requirements import Requirements
-from ._scale import Scale
 from ._steps import Steps
 
 # Set by hand [rad]: pretension changes by some 3 % of itself.

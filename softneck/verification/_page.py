@@ -13,10 +13,9 @@ from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
-from ._metric_titles import metric_title
+from ._metrics import Scale, metric_title
 from ._neck_loops import NeckRun, direction
 from ._plants import Plants, mixing
-from ._scale import Scale
 from ._steps import Steps
 from ._verify import Verdict, Verification
 

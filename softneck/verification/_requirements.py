@@ -24,12 +24,9 @@ from softneck.core import (
 from softneck.loop import default_limits
 from softneck.robot import Robot
 
-from ._linear import LARGE, SMALL
-from ._scale import Scale, digits
-from ._steps import METRICS, StepTest
-
-#: Of the loops of [track], which `softneck tune` alone closes.
-_TRACK_METRICS = ("circle_rms_deg", "ahead_rms_deg", "variation_rad_s")
+from ._linear import LARGE
+from ._metrics import Scale, digits, metric_names
+from ._steps import StepTest
 
 
 def for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,28 +79,8 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
 _T = TypeVar("_T")
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
-_AXIS_METRICS = (*LARGE, *SMALL)
-_SIM_METRICS = (
-    "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
-    "slack_s",
-)  # fmt: skip
 # Of requirements files, `tune`'s included.
 _TABLES = ("version", "uncertainty", "sampling", "step", "sim", "require", "track", "reserve")
-
-
-def metric_names(robot: Robot, *, track: bool = False) -> tuple[str, ...]:
-    """Return the names of all metrics that a requirement of a robot can be about; `track`: those of [track] too."""
-    name_of = Scale(robot=robot).name_of
-    return (
-        "stability.radius",
-        "stability.searched_radius",
-        *(f"{axis}.{name}" for axis in ("axes", *robot.outputs.names) for name in _AXIS_METRICS),
-        "mimo.disk_margin",
-        "robust.mu",
-        *(f"step.{name_of(name)}" for name in METRICS),
-        *(f"sim.{name_of(name)}" for name in _SIM_METRICS),
-        *(f"track.{name_of(name)}" for name in _TRACK_METRICS if track),
-    )
 
 
 def with_groups(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track: bool = False) -> dict[str, Any]:
@@ -146,8 +123,6 @@ def with_sim(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
     return found
 
 
-#: Of a neck.
-METRIC_NAMES = metric_names(Robot.preset())
 # What no loop can do: least or largest value of a metric.
 _POSSIBLE = {"sensitivity": (1.0, math.inf), "disk_margin": (0.0, 2.0), "gain_margin": (1.0, math.inf)}
 _BOUNDS = ("min", "max", "below")

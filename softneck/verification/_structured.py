@@ -24,8 +24,8 @@ from softneck.design import mu_upper
 from softneck.identification import response_of
 
 from ._linear import LinearLaw, inverse, loops, radii
+from ._metrics import Scale
 from ._plants import AxisBox, Plants, UncertainNeck, join, make_plants, measured_plant, mixing
-from ._scale import Scale
 
 # Members of a generation per unknown.
 _CROWD = 10

@@ -29,10 +29,10 @@ from softneck.signals import require_same_robot
 from ._evidence import Evidence, gather, worst_row
 from ._experiments import crossing_values
 from ._linear import ControllerUnderTest, judge
+from ._metrics import Scale
 from ._neck_loops import ALONE, check_blocks, is_own_plant, named_plants, not_recorded, own_plant
 from ._plants import UncertainNeck, neck_of_family, neck_of_model
 from ._requirements import Requirement, Requirements, make_requirements, read_requirements, with_groups
-from ._scale import Scale
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
 

@@ -11,7 +11,7 @@ import pytest
 from softneck.design import PiSettings
 from softneck.tuning import tune
 from softneck.verification import make_requirements, verify
-from softneck.verification._scale import Scale
+from softneck.verification._metrics import Scale
 
 from .models import model_of
 from .worlds import PACES, PLANTS, UNITS, View, orders, world

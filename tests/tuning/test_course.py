@@ -12,10 +12,9 @@ import pytest
 from softneck.cosim.studies._run_study import Crew, Here
 from softneck.robot import Robot
 from softneck.tuning import _search
-from softneck.tuning._judge import Judgement
-from softneck.tuning._log import Log
 from softneck.tuning._search import Search
 from softneck.tuning._space import spaces
+from softneck.tuning._task import Judgement, Log
 from softneck.verification._requirements import Requirement
 
 BOUNDS = (

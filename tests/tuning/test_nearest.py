@@ -9,8 +9,8 @@ import pytest
 
 from softneck.loop.default_limits import NECK_RISE_S
 from softneck.tuning._requirements import TuneRequirements, loosened, make_tune_requirements
-from softneck.tuning._result import nearest
 from softneck.tuning._search import Candidate
+from softneck.tuning._tune import nearest
 from softneck.verification._requirements import Requirement
 from softneck.verification._verify import Verdict
 

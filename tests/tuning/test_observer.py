@@ -16,11 +16,9 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.signals import Recording, signal
 from softneck.tuning import tune
-from softneck.tuning._cases import Case, loop_of
-from softneck.tuning._judge import designed, made_ready, watched
-from softneck.tuning._log import digest_of
-from softneck.tuning._requirements import Task
+from softneck.tuning._judge import Case, designed, loop_of, made_ready, watched
 from softneck.tuning._space import spaces
+from softneck.tuning._task import Task, digest_of
 from softneck.tuning._tune import _observer, task_of
 
 from .test_requirements import neck

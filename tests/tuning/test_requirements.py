@@ -17,10 +17,9 @@ from softneck.estimation import LinearNeck
 from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune import _toml_table
 from softneck.robot import Robot
-from softneck.tuning._beforehand import refuse_impossible
-from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements
+from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements, refuse_impossible
 from softneck.verification import make_requirements, read_requirements
-from softneck.verification._scale import Scale
+from softneck.verification._metrics import Scale
 
 TS = 0.02
 GAIN, POLE, DELAY = math.radians(5.23), 5.293, 4

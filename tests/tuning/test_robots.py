@@ -19,15 +19,13 @@ from softneck.loop import SensorFault
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.tuning import tune
-from softneck.tuning._beforehand import refuse_impossible
-from softneck.tuning._cases import loop_of
-from softneck.tuning._judge import made_ready
-from softneck.tuning._requirements import loosened, make_tune_requirements
+from softneck.tuning._judge import loop_of, made_ready
+from softneck.tuning._requirements import loosened, make_tune_requirements, refuse_impossible
 from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
 from softneck.verification import read_requirements
+from softneck.verification._metrics import Scale
 from softneck.verification._neck_loops import direction
-from softneck.verification._scale import Scale
 from softneck.verification._verify import sources_of
 from tests.design.test_robots import BELLOWS, plant
 

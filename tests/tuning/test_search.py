@@ -18,11 +18,10 @@ from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, 
 from softneck.core._kinds import make_settings
 from softneck.robot import Robot
 from softneck.tuning import tune
-from softneck.tuning._log import FILE, Job, Log
-from softneck.tuning._result import binding, front
 from softneck.tuning._search import Candidate, given_out, ratio
 from softneck.tuning._space import KINDS_SEARCHED, spaces
-from softneck.tuning._tune import Tuned
+from softneck.tuning._task import FILE, Job, Log
+from softneck.tuning._tune import Tuned, binding, front
 from softneck.verification._requirements import Requirement
 
 from .test_requirements import neck
@@ -122,7 +121,7 @@ def test_the_folder_of_another_search_is_kept(whole: tuple[Tuned, Path], tmp_pat
 
 
 def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path: Path) -> None:
-    from softneck.tuning._judge import Judgement
+    from softneck.tuning._task import Judgement
 
     log = Log(tmp_path, "d")
     job = Job.of("pi", {"b": 1.25, "a": 1e-17 + 0.1}, "all")
@@ -295,7 +294,7 @@ def test_what_is_not_certified_is_as_bad_in_whatever_way_that_is_told() -> None:
 
 
 def test_what_is_known_twice_counts_by_the_worse() -> None:
-    from softneck.tuning._judge import Judgement
+    from softneck.tuning._task import Judgement
 
     item = candidate(axes__gain_margin=2.5)
     item.take("margins", Judgement({"axes.gain_margin": 1.8, "axes.delay_margin_ms": 90.0}))

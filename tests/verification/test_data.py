@@ -19,10 +19,11 @@ from softneck.identification.linear._srivc_fit import Continuous
 from softneck.identification.uncertainty._measured import AxisMeasured, band_borders, response_of
 from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.verification import Verification, _tested, make_requirements, verify
+from softneck.verification import Verification, make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
 from softneck.verification._experiments import Crossing, LoopUnderTest, _Case
-from softneck.verification._linear import LinearLaw, margins
+from softneck.verification._linear import AxisMargins, LinearLaw, axis_on_data, margins
+from softneck.verification._metrics import Scale
 from softneck.verification._neck_loops import (
     ALONE,
     OwnPlant,
@@ -33,10 +34,8 @@ from softneck.verification._neck_loops import (
     step_at,
 )
 from softneck.verification._plants import all_plants, neck_of_family
-from softneck.verification._scale import Scale
 from softneck.verification._steps import Steps
 from softneck.verification._structured import structured
-from softneck.verification._tested import axis_on_data
 from softneck.verification._verify import unsupported
 
 from .necks import PAPER, QUICK, TS, family, linear_neck, pi
@@ -284,7 +283,7 @@ def test_what_steps_is_told_from_what_is_linear() -> None:
 def test_a_roll_off_that_the_user_states_is_judged_up_to_nyquist() -> None:
     """A controller whose gain rises above the band crosses there unless the plant falls steeply."""
 
-    def judge(rolloff: float, law: LinearLaw = LAW) -> _tested.TestedAxis:
+    def judge(rolloff: float, law: LinearLaw = LAW) -> AxisMargins:
         narrow = measured(weight=0.01, high=20.0)
         return axis_on_data(narrow, law, 0, source="f", name="pitch", extra=0, rolloff=rolloff)
 

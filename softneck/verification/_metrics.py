@@ -1,4 +1,4 @@
-"""How requirements of a robot are said: defaults are numbers of the neck, times its range and its time constant."""
+"""Metrics of a robot: names, titles, and limits scaled from those of the neck by range and time constant."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ from softneck.estimation import NECK_REACH, REACH_OF_STATIC_GAIN, motor_ends
 from softneck.loop import error_unit
 from softneck.robot import MOTOR_RANGE, Robot, Scaling
 
+from ._linear import LARGE, SMALL
 from ._plants import UncertainNeck
+from ._steps import METRICS
 
 # Of the defaults [deg].
 _NOISE_DEG = 0.05
@@ -132,3 +134,70 @@ def _times(factor: float, value: Any) -> Any:
 def digits(value: float) -> float:
     """Return it to 12 digits: without what conversions of units round."""
     return float(f"{value:.12g}")
+
+
+#: Of the loops of [track], which `softneck tune` alone closes.
+_TRACK_METRICS = ("circle_rms_deg", "ahead_rms_deg", "variation_rad_s")
+_AXIS_METRICS = (*LARGE, *SMALL)
+_SIM_METRICS = (
+    "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
+    "slack_s",
+)  # fmt: skip
+
+
+def metric_names(robot: Robot, *, track: bool = False) -> tuple[str, ...]:
+    """Return the names of all metrics that a requirement of a robot can be about; `track`: those of [track] too."""
+    name_of = Scale(robot=robot).name_of
+    return (
+        "stability.radius",
+        "stability.searched_radius",
+        *(f"{axis}.{name}" for axis in ("axes", *robot.outputs.names) for name in _AXIS_METRICS),
+        "mimo.disk_margin",
+        "robust.mu",
+        *(f"step.{name_of(name)}" for name in METRICS),
+        *(f"sim.{name_of(name)}" for name in _SIM_METRICS),
+        *(f"track.{name_of(name)}" for name in _TRACK_METRICS if track),
+    )
+
+
+#: Of a neck.
+METRIC_NAMES = metric_names(Robot.preset())
+
+
+_TITLES = {
+    "radius": "spectral radius",
+    "searched_radius": "spectral radius, searched",
+    "sensitivity": "peak sensitivity",
+    "complementary": "peak complementary sensitivity",
+    "control_sensitivity": "peak control sensitivity",
+    "disk_margin": "disk margin",
+    "gain_margin": "gain margin",
+    "phase_margin": "phase margin",
+    "delay_margin": "delay margin",
+    "mu": "structured singular value",
+    "overshoot": "overshoot",
+    "rise": "rise time",
+    "settling": "settling time",
+    "steady_rms": "steady-state error",
+    "rms_error": "tracking error, rms",
+    "load_rms": "error under the load, rms",
+    "coupling": "coupling",
+    "max": "largest set-point",
+    "limit_violation": "time beyond the limits",
+    "slack": "time with a slack tendon",
+    "circle_rms": "error on a circle, rms",
+    "ahead_rms": "error on a circle known ahead, rms",
+    "variation": "variation of the set-points",
+}
+_GROUPS = {
+    "stability": "every plant", "axes": "worst axis", "mimo": "all axes at once", "robust": "whole uncertainty",
+    "step": "linear plants", "sim": "simulation", "track": "simulation",
+}  # fmt: skip
+
+
+def metric_title(metric: str) -> str:
+    """Return the plain name of a metric with its key: "gain margin, worst axis (axes.gain_margin)"."""
+    group, _, name = metric.partition(".")
+    # What follows the name is the unit of the robot or of the metric: `load_rms_mm`, `rise_s`.
+    known = max((key for key in _TITLES if f"{name}_".startswith(f"{key}_")), key=len, default="")
+    return f"{_TITLES[known]}, {_GROUPS.get(group, group)} ({metric})" if known else metric
