@@ -40,7 +40,7 @@ from softneck.runtime import Block
 from softneck.signals import Excitation, Recording, SetPointLimits, concatenate, multisine_experiments, prepare, signal
 from softneck.verification import make_requirements, verify
 from softneck.verification._experiments import LoopUnderTest, crossing_values, crossings
-from softneck.verification._neck_loops import OwnPlant, run_necks
+from softneck.verification._neck_loops import SimulationModel, run_loops
 from tests.foreign_necks.held_out import HELD_OUT
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import NECKS, ForeignNeck
@@ -244,11 +244,11 @@ def truth(neck: str, controller: Block) -> dict[str, float]:
                       constants={"plant_inputs": {"payload": kg}}) for kg in PAYLOADS
     ]  # fmt: skip
     found = crossing_values(crossings(loops, overall=True))
-    own = OwnPlant(
+    own = SimulationModel(
         name=neck, payload="inputs", make=lambda seed, _: Sensed(block_of(neck, noise=True, seed=seed)),
         quiet=lambda _: Sensed(block_of(neck, noise=False)),
     )  # fmt: skip
-    runs = run_necks(controller, make_requirements(FEW), order="sequential", observer=None, seed=0,
+    runs = run_loops(controller, make_requirements(FEW), order="sequential", observer=None, seed=0,
                      progress=softneck.core.silent, own=[own])  # fmt: skip
     steps = {f"sim.{name}": max(run.metrics[name] for run in runs)
              for name in ("overshoot_pct", "settling_s", "steady_rms_deg")}  # fmt: skip

@@ -36,7 +36,7 @@ from softneck.identification import FamilySettings, GreyBox
 from softneck.loop import BlockPart, Loop, LoopResult, RotationReference, StepReference, metrics, run_loop
 from softneck.signals import signal
 from softneck.tuning import tune
-from softneck.tuning._judge import designed, made_ready
+from softneck.tuning._judge import design_candidate, prepare
 from softneck.tuning._task import Task
 from softneck.tuning._tune import BUDGET, task_of
 
@@ -143,9 +143,9 @@ def searched(neck: str, asked: argparse.Namespace) -> None:
     shown = {found.best.kind: found.best}
     for item in () if asked.best else found.candidates:
         shown.setdefault(item.kind, item)
-    ready = made_ready(found.task)
+    ready = prepare(found.task)
     for item in shown.values():
-        controller = designed(found.task, ready, item.kind, item.settings)
+        controller = design_candidate(found.task, ready, item.kind, item.settings)
         best = item is found.best
         said = ("holds" if found.holds else f"fails: {found.binding}") if best else "-"
         row([neck, f"**{item.kind}**" if best else item.kind, said, f"{spent:.0f}" if best else ""],

@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.tune import GOALS, known, seconds, truth
 from softneck.core import SoftneckError
-from softneck.tuning._judge import designed, loop_metrics, made_ready
+from softneck.tuning._judge import design_candidate, loop_metrics, prepare
 from softneck.tuning._search import STEP
 from softneck.tuning._space import spaces
 from softneck.tuning._tune import task_of
@@ -49,14 +49,14 @@ def pairs(neck: str, count: int) -> Pairs:
     if not kept.exists():
         begin, rows = seconds(), []
         task = replace(task_of(known(neck), {"reserve": dict.fromkeys(METRICS.values(), 0.0)}, 0), digest=neck)
-        ready = made_ready(task)
+        ready = prepare(task)
         for number, space in enumerate(
             spaces(KINDS, rise=GOALS["rise"], cocontraction=task.cocontraction, robot=task.robot)
         ):
             rng = np.random.default_rng(number)
             for x in space.start + STEP * rng.standard_normal((count, space.start.size)):
                 try:
-                    controller = designed(task, ready, space.kind, space.settings(np.clip(x, 0.0, 1.0)))
+                    controller = design_candidate(task, ready, space.kind, space.settings(np.clip(x, 0.0, 1.0)))
                 except SoftneckError:
                     continue
                 seen = loop_metrics(task, ready, controller.block(), "sequential", ready.all)

@@ -19,7 +19,7 @@ from softneck import Recording
 from softneck.core import DataError, SettingsError, SoftneckError
 from softneck.identification import Model
 from softneck.robot import Robot
-from softneck.verification._requirements import with_groups
+from softneck.verification._requirements import expand_metrics
 
 from .data import neck_recording, short_neck
 
@@ -146,14 +146,14 @@ NECK = Robot.preset("neck")
 def test_flat_requirements_are_of_the_plants_that_step_or_else_of_the_linear_ones() -> None:
     flat = {"overshoot_pct": 5, "disk_margin": 0.6}
     for stepping, group in ((True, "sim"), (False, "step")):
-        asked = with_groups(flat, NECK, stepping=stepping)
+        asked = expand_metrics(flat, NECK, stepping=stepping)
         assert asked == {"require": {f"{group}.overshoot_pct": {"max": 5}, "axes.disk_margin": {"min": 0.6}}}
     # A whole table and whole names stay what they are.
     table = {"require": {"step.rise_s": {"max": 0.5}}, "sim": {"necks": 0}}
-    assert with_groups(table, NECK, stepping=False) == table
-    assert with_groups({"step.rise_s": 0.5}, NECK, stepping=True) == {"require": {"step.rise_s": {"max": 0.5}}}
+    assert expand_metrics(table, NECK, stepping=False) == table
+    assert expand_metrics({"step.rise_s": 0.5}, NECK, stepping=True) == {"require": {"step.rise_s": {"max": 0.5}}}
 
 
 def test_an_unknown_flat_requirement_names_the_nearest() -> None:
     with pytest.raises(SettingsError, match=r"unknown requirement `overshoot`; did you mean `overshoot_pct`\?"):
-        with_groups({"overshoot": 5}, NECK, stepping=False)
+        expand_metrics({"overshoot": 5}, NECK, stepping=False)

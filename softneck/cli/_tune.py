@@ -80,7 +80,7 @@ def command(
             files={role: (str(item), file_hash(item)) for role, item in files.items()},
         )  # fmt: skip
     steps = {name: item if item.exists() else str(item) for name, item in zip(things, plants, strict=True)
-             if verification.is_own_plant(things[name])}  # fmt: skip
+             if verification.is_simulation_model(things[name])}  # fmt: skip
     values = write_tuned(found, output, files, steps)
     if as_json:
         print_json(values)

@@ -58,7 +58,7 @@ def command(
     judged = load_for_robot(controller, "controller", robot)
     whose = estimation.robot_of(judged)
     asked = verification.read_requirements(requirements, robot=whose)
-    if left := verification.left_to_tune(asked.own):
+    if left := verification.tune_only_metrics(asked.own):
         note(f"{requirements}: {', '.join(left)} not looked at; `softneck tune` alone closes those loops.")
     things, eyes = (
         verification.named_plants(list(plants), robot),

@@ -124,7 +124,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         table["reference"]["cocontraction"] = task.said_cocontraction
     asked = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
              if b.metric.startswith("sim.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
-    known = ("rise_s", "steady_rms_") + (("overshoot_pct", "settling_s") if task.asked.told() else ())
+    known = ("rise_s", "steady_rms_") + (("overshoot_pct", "settling_s") if task.asked.shows_settling() else ())
     table["limits"] = {f"{first}.{key}": limit for key, limit in asked.items() if key.startswith(known)}
     words = "" if found.observed else (
         "\n# Without observer.npz: with it a requirement on the steps fails, or none was designed."

@@ -2,7 +2,7 @@ from ._tune import tune as tune
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
-from ._requirements import refuse_impossible as refuse_impossible
+from ._requirements import check_feasibility as check_feasibility
 from ._search import Candidate as Candidate
 from ._tune import Loosened as Loosened
 from ._tune import Tuned as Tuned

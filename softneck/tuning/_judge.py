@@ -21,32 +21,32 @@ from softneck.verification import (
     LARGE,
     SMALL,
     ControllerUnderTest,
-    OwnPlant,
     Plants,
+    SimulationModel,
     all_plants,
+    controller_under_test,
     crossing_values,
     crossings,
+    data_margins,
     direction,
+    frequency_grid,
     judge_loop,
-    judged,
     loops_under_test,
+    make_simulation_model,
     margins,
-    own_plant,
     run_steps,
     sources_of,
-    step_at,
     step_loop,
-    tested_axes,
+    step_time,
 )
-from softneck.verification import judge as under_test
 
-from ._requirements import TuneRequirements, circles
+from ._requirements import TuneRequirements, can_follow_circle
 from ._task import Judgement, Task, has_observer
 
 # The circle is led in over so long [s], then goes round so often, of which the last turn is judged.
-_LED, _TURNS = 2.0, 2.0
+_LEAD_IN_S, _TURN_COUNT = 2.0, 2.0
 # A reference is known so much earlier at most [s].
-_AHEAD = 0.8
+_MAX_PREVIEW_S = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Case:
     circle: bool = False
 
 
-def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tuple[Case, ...]:
+def cases(own: Sequence[SimulationModel], asked: TuneRequirements, robot: Robot) -> tuple[Case, ...]:
     """Return all loops."""
     table, small = asked.certificate.sim, asked.track["small_part"]
     payloads = sorted({float(kg) for kg in table["payloads_kg"]})
@@ -84,13 +84,13 @@ def cases(own: Sequence[OwnPlant], asked: TuneRequirements, robot: Robot) -> tup
             found += [Case(number, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)]
             found += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
             found.append(Case(number, kg, angles[0], noise=True, late=True))
-            if circles(robot):
+            if can_follow_circle(robot):
                 found.append(Case(number, kg, circle=True))
     return tuple(dict.fromkeys(found))
 
 
 def run_case(
-    case: Case, plant: OwnPlant, block: Block, order: str, task: Task, observer: Block | None = None
+    case: Case, plant: SimulationModel, block: Block, order: str, task: Task, observer: Block | None = None
 ) -> tuple[dict[str, float], Vector | None]:
     """Return the metrics of a loop by the names of requirements; of a circle its distance for each lead, as shown."""
     loop = loop_of(case, plant, block, order, task, observer)
@@ -98,7 +98,9 @@ def run_case(
         return {}, _distances(loop, task)
     asked = task.asked.certificate
     # What is asked of a robot is seen by its sensor: a quiet output overshoots less.
-    values, result = judge_loop(loop, compiled=True, angle="measured" if task.asked.told(case.part) else "true")
+    values, result = judge_loop(
+        loop, compiled=True, angle="measured" if task.asked.shows_settling(case.part) else "true"
+    )
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
     name_of = asked.scale.name_of
     found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
@@ -110,10 +112,12 @@ def run_case(
     return found, None
 
 
-def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, observer: Block | None = None) -> Loop:
+def loop_of(
+    case: Case, plant: SimulationModel, block: Block, order: str, task: Task, observer: Block | None = None
+) -> Loop:
     """Return the loop of a case."""
     asked, track, robot = task.asked.certificate, task.asked.track, task.robot
-    time, at = asked.scale.time, step_at(block, asked)
+    time, at = asked.scale.time, step_time(block, asked)
     common = task.cocontraction or 0.0
     pulls = any(port.name == "least_cocontraction" for port in block.parameters)
     together = 0.0 if pulls else common
@@ -131,9 +135,9 @@ def loop_of(case: Case, plant: OwnPlant, block: Block, order: str, task: Task, o
     reference = RobotReference(kind="step", values=ends, at=at)
     if case.circle:
         frequency = track["circle_rad_s"] / (2.0 * math.pi)
-        led, inclination = _LED * time, (asked.si(track["circle_deg"]),)
+        led, inclination = _LEAD_IN_S * time, (asked.si(track["circle_deg"]),)
         reference = RobotReference(kind="rotation", values=inclination, frequency=frequency, at=at, rise=led)
-        duration = at + led + _TURNS / frequency
+        duration = at + led + _TURN_COUNT / frequency
     return step_loop(
         block, plant.quiet(Ts), plant, case.payload, _Together(reference, together), asked, duration=duration,
         order=order, observer=observer, faults=faults,
@@ -165,7 +169,7 @@ def variation(result: LoopResult) -> float:
 def _distances(loop: Loop, task: Task) -> Vector:
     """Return the rms distance of the last turn to where the circle was 0, 1, ... samples ago (leads,), as shown."""
     scale = task.asked.certificate.scale
-    leads = round(scale.time * _AHEAD / loop.controller.sample_time)
+    leads = round(scale.time * _MAX_PREVIEW_S / loop.controller.sample_time)
     try:
         result = run_loop(loop, compiled=True)
     except DataError:
@@ -182,9 +186,9 @@ def _distances(loop: Loop, task: Task) -> Vector:
 #: From quick to slow; each includes what those before it found.
 LEVELS = ("linear", "all", "margins")
 # Plants of the boxes on which linear checks are made: nominal, corners, samples; a certificate takes hundreds.
-_PLANTS = 48
+_PLANT_COUNT = 48
 # The worse of two values of a metric is the smaller one of these.
-_BETTER_LARGE = LARGE
+LARGE = LARGE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +209,7 @@ class Ready:
     frequency: Vector
     weights: Any
     uncertain: UncertainPlant
-    own: tuple[OwnPlant, ...]
+    own: tuple[SimulationModel, ...]
     all: tuple[Case, ...]
     kept: dict[str, Any] = field(default_factory=dict)
 
@@ -213,12 +217,12 @@ class Ready:
 def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: str) -> Judgement:
     """Return the metrics of the level alone; an error of ours about the candidate is its result."""
     try:
-        ready = made_ready(task)
-        controller = designed(task, ready, kind, settings)
+        ready = prepare(task)
+        controller = design_candidate(task, ready, kind, settings)
         if level == "linear":
             return Judgement(linear_metrics(task, ready, controller))
         block, order = controller.block(), str(getattr(controller, "order", "sequential"))
-        eyes = watched(task, kind)
+        eyes = make_observer(task, kind)
         if level == "margins":
             return Judgement(margin_metrics(task, ready, block, order, eyes))
         return Judgement(loop_metrics(task, ready, block, order, ready.all, eyes))
@@ -226,16 +230,16 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
         return Judgement({}, " ".join(str(error).split()))
 
 
-def made_ready(task: Task) -> Ready:
+def prepare(task: Task) -> Ready:
     """Return what is made once of a task, in this process."""
-    kept = _kept(task.digest)
+    kept = _cache(task.digest)
     if "ready" not in kept:
         certificate = task.asked.certificate
         sources = sources_of(task.linear, certificate)
-        plants = all_plants(sources, _PLANTS, int(certificate.sampling["seed"]))
-        own = tuple(own_plant(thing, name, task.robot) for name, thing in task.own.items())
+        plants = all_plants(sources, _PLANT_COUNT, int(certificate.sampling["seed"]))
+        own = tuple(make_simulation_model(thing, name, task.robot) for name, thing in task.own.items())
         kept["ready"] = Ready(
-            plants, judged(plants.sample_time, certificate.scale.time), sources[0].weights,
+            plants, frequency_grid(plants.sample_time, certificate.scale.time), sources[0].weights,
             uncertain_plant(task.plant), own,
             cases(own, task.asked, task.robot),
         )  # fmt: skip
@@ -243,12 +247,12 @@ def made_ready(task: Task) -> Ready:
 
 
 @lru_cache(maxsize=4)
-def _kept(digest: str) -> dict[str, Ready]:
+def _cache(digest: str) -> dict[str, Ready]:
     del digest
     return {}
 
 
-def designed(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -> Any:
+def design_candidate(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -> Any:
     """Return the controller, or the one that this process has designed before."""
     key = json.dumps([kind, dict(settings)], sort_keys=True)
     if key not in ready.kept:
@@ -274,7 +278,7 @@ def _plant_for(task: Task, ready: Ready, kind: str, made: Any) -> Any:
     return task.plant  # more of a family is read than its plants
 
 
-def watched(task: Task, kind: str) -> Block | None:
+def make_observer(task: Task, kind: str) -> Block | None:
     """Return the observer that loops of a kind have; None for most kinds."""
     return task.observer.block() if task.observer is not None and has_observer(kind) else None
 
@@ -282,33 +286,33 @@ def watched(task: Task, kind: str) -> Block | None:
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:
     """Return margins over the boxes and over what the recordings show, and steps on the plants of the boxes."""
     asked = task.asked.certificate
-    judged_one: ControllerUnderTest = under_test(controller, order=None, observer=False)
+    judged_one: ControllerUnderTest = controller_under_test(controller, order=None, observer=False)
     plants = ready.plants.later(judged_one.extra)
     found: dict[str, float] = {}
     steep = float(asked.uncertainty["rolloff_db_per_decade"])
     for law in judged_one.laws.values():
         for name, values in margins(plants, law, ready.frequency).items():
             axis, _, last = name.partition(".")
-            value = float(values.min() if last in _BETTER_LARGE else values.max())
-            worse(found, name, value)
+            value = float(values.min() if last in LARGE else values.max())
+            keep_worse(found, name, value)
             if last in (*LARGE, *SMALL) and axis != "mimo":
-                worse(found, f"axes.{last}", value)
-        for item in tested_axes(task.linear, law, plants.axes, judged_one.extra, steep):
+                keep_worse(found, f"axes.{last}", value)
+        for item in data_margins(task.linear, law, plants.axes, judged_one.extra, steep):
             # Nothing is certified of a loop that may cross where nobody recorded.
             values = item.margins or {**dict.fromkeys(LARGE, 0.0), "sensitivity": math.inf}
             for last, value in values.items():
                 for group in (item.axis, "axes", *(("mimo",) if last == "disk_margin" else ())):
-                    worse(found, f"{group}.{last}", float(value))
-            worse(found, "robust.mu", item.mu)
+                    keep_worse(found, f"{group}.{last}", float(value))
+            keep_worse(found, "robust.mu", item.mu)
     steps = run_steps(
         plants, judged_one.block, asked.step_test(task.seed), workers=1, robot=task.robot, weights=ready.weights
     )
     return found | {f"step.{asked.scale.name_of(name)}": float(values.max()) for name, values in steps.metrics.items()}
 
 
-def worse(found: dict[str, float], name: str, value: float) -> None:
+def keep_worse(found: dict[str, float], name: str, value: float) -> None:
     """Note a value of a metric where it is worse than what is there."""
-    pick = min if name.rpartition(".")[2] in _BETTER_LARGE else max
+    pick = min if name.rpartition(".")[2] in LARGE else max
     found[name] = pick(found[name], value) if name in found else value
 
 
@@ -321,7 +325,7 @@ def loop_metrics(
     for case in chosen:
         values, distances = run_case(case, ready.own[case.plant], block, order, task, observer)
         for name, value in values.items():
-            worse(found, name, value)
+            keep_worse(found, name, value)
         if distances is not None:
             shifts.append(distances)
     if shifts:

@@ -24,22 +24,22 @@ from softneck.verification import (
     Requirement,
     Requirements,
     Scale,
+    apply_safety_margin,
     bounds_of,
     check_number,
-    digits,
-    kept_back,
+    expand_metrics,
     make_requirements,
     metric_names,
-    of_file,
-    with_groups,
+    read_file,
+    round_12_digits,
 )
 
-_RISE = "sim.rise_s"
+_RISE_METRIC = "sim.rise_s"
 # Standard deviations of noise: of some hundred samples one may be so far off.
-_SIGMAS = 4.0
+_NOISE_SIGMAS = 4.0
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 # Least, largest and unit of the numbers of [track].
-_TRACK = {
+_TRACK_NUMBERS = {
     "small_part": (0.05, 1.0, ""), "noise_deg": (0.0, 10.0, "deg"), "delay_ms": (0.0, 1e9, "ms"),
     "circle_deg": (0.1, 40.0, "deg"), "circle_rad_s": (0.01, 20.0, "rad/s"),
 }  # fmt: skip
@@ -65,20 +65,20 @@ class TuneRequirements:
     table: Mapping[str, Any]
     stated: frozenset[str] = frozenset()
 
-    def wanted(self, metric: str) -> float | None:
+    def robot_limit(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric of the robot itself: its limit with the reserve."""
         limit = self.limit(metric)
-        return None if limit is None else digits(limit + self.reserve.get(metric, 0.0))
+        return None if limit is None else round_12_digits(limit + self.reserve.get(metric, 0.0))
 
     def limit(self, metric: str) -> float | None:
         """Return the largest value that is allowed of a metric on the plants; None where nothing bounds it."""
         limits = [item.limit for item in self.bounds if item.metric == metric and item.bound != "min"]
         return min(limits, default=None)
 
-    def told(self, part: float = 1.0) -> bool:
+    def shows_settling(self, part: float = 1.0) -> bool:
         """Return whether the sensor shows if a part of the step has settled: its noise alone stays in that band."""
         size = part * float(self.certificate.sim["size_deg"])
-        return _SIGMAS * self.track["noise_deg"] <= SETTLING_BAND * size
+        return _NOISE_SIGMAS * self.track["noise_deg"] <= SETTLING_BAND * size
 
     def lines(self) -> list[str]:
         """Return each requirement as a line for people."""
@@ -108,7 +108,7 @@ def read_tune_requirements(
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
-    return of_file(path, partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise))
+    return read_file(path, partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise))
 
 
 def make_tune_requirements(
@@ -118,16 +118,16 @@ def make_tune_requirements(
     """Return the defaults with what a table like a requirements file says instead."""
     scale = scale or Scale.of(robot or Robot.preset())
     whose = scale.robot
-    table = with_groups(table, whose, stepping=stepping, track=True)
+    table = expand_metrics(table, whose, stepping=stepping, track=True)
     defaults = tomllib.loads(default_text())
     limits = defaults["require"]
-    if not circles(whose):
+    if not can_follow_circle(whose):
         limits = {metric: limit for metric, limit in limits.items() if not metric.startswith("track.")}
     usual = {
         name: scale.table(limits if name == "require" else defaults[name]) for name in defaults if name != "version"
     }
     if rise is not None:
-        usual["require"][_RISE] = {"max": rise}
+        usual["require"][_RISE_METRIC] = {"max": rise}
     if not stepping:
         usual = _for_linear(usual)
     merged = {
@@ -136,7 +136,7 @@ def make_tune_requirements(
         for key in dict.fromkeys((*usual, *table)) if key != "version"
     }  # fmt: skip
     track = _numbers(merged["track"], defaults["track"], scale)
-    require, reserve = kept_back(merged.get("require", {}), merged.get("reserve", {}))
+    require, reserve = apply_safety_margin(merged.get("require", {}), merged.get("reserve", {}))
     tracked = {metric: entry for metric, entry in require.items() if metric.startswith("track.")}
     extra = bounds_of(tracked, metric_names(whose, track=True), tracked)
     if wrong := [item.metric for item in extra if item.bound != "max" or item.limit <= 0.0]:
@@ -152,27 +152,30 @@ def make_tune_requirements(
 
 def default_text() -> str:
     """Return the defaults of tuning as a requirements file, with the rise of the paper's neck."""
-    limits = default_limits.TUNE | {_RISE: default_limits.NECK_RISE_S}
+    limits = default_limits.TUNE | {_RISE_METRIC: default_limits.NECK_RISE_S}
     return DEFAULT_FILE.read_text(encoding="utf-8") + default_limits.as_toml(limits)
 
 
-def circles(robot: Robot) -> bool:
+def can_follow_circle(robot: Robot) -> bool:
     """Return whether a robot can follow a circle: of two angles."""
     return len(robot.outputs.names) == 2 and to_si(robot.outputs.unit)[1] == "rad"
 
 
-def loosened(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:
+def relax_limits(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:
     """Return the requirements with other upper limits of some metrics on the plants; safety margins stay."""
-    require = {metric: {"max": digits(limit + asked.reserve.get(metric, 0.0))} for metric, limit in limits.items()}
+    require = {
+        metric: {"max": round_12_digits(limit + asked.reserve.get(metric, 0.0))} for metric, limit in limits.items()
+    }
     table = {**asked.table, "require": {**asked.table.get("require", {}), **require}}
     if "sim.settling_s" in limits:  # a file states seconds of the robot: so must the duration it is compared with
         table["sim"] = {"duration_s": asked.certificate.sim["duration_s"], **table.get("sim", {})}
     bounds = tuple(replace(b, limit=limits[b.metric]) if b.metric in limits else b for b in asked.bounds)
     own = {key: value for key, value in table.items() if key != "version"}
     certificate = replace(
-        asked.certificate, own=own | {"version": VERSION},
+        asked.certificate,
+        own=own | {"version": VERSION},
         bounds=tuple(b for b in bounds if not b.metric.startswith("track.")),
-    )  # fmt: skip
+    )
     return replace(asked, certificate=certificate, bounds=bounds, table=table)
 
 
@@ -190,20 +193,20 @@ def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[st
     for key, value in given.items():
         if key not in inside:
             raise SettingsError(f"unknown key `{key}` of [track]; it takes {', '.join(map(scale.name_of, defaults))}.")
-        check_number(f"[track] {key}", value, inside[key], _TRACK[inside[key]], scale)
+        check_number(f"[track] {key}", value, inside[key], _TRACK_NUMBERS[inside[key]], scale)
         found[inside[key]] = float(value)
     return found
 
 
 # What has settled has risen before.
-_RISES = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
+_RISE_METRICS = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
 
 
 #: The least rise that is asked where nothing limits it, in time constants: what is quicker, models tell less of.
 USUAL_RISE = 2.0
 
 
-def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
+def check_feasibility(asked: TuneRequirements, plant: Any) -> None:
     """Raise SettingsError for a requirement that no controller of the nominal plant can keep.
 
     Args:
@@ -223,7 +226,7 @@ def refuse_impossible(asked: TuneRequirements, plant: Any) -> None:
     _refuse_order(asked)
 
 
-def quickest(plant: Any) -> float:
+def fastest_rise(plant: Any) -> float:
     """Return the least `rise_s` [s] that designs on a plant take; 0 where the motors do not reach their test step."""
     uncertain = uncertain_plant(plant)
     limits = LoopSettings().limits(uncertain.robot)
@@ -246,8 +249,8 @@ def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
         least = least_rise(axis.nominal, test, size)
         found.append(required_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
     # Who asks for an earlier settling asks for a rise before it.
-    most = digits(time * max(*found, USUAL_RISE * TIME_CONSTANT))
-    return min(most, asked.wanted("sim.settling_s") or math.inf) if most < math.inf else None
+    most = round_12_digits(time * max(*found, USUAL_RISE * TIME_CONSTANT))
+    return min(most, asked.robot_limit("sim.settling_s") or math.inf) if most < math.inf else None
 
 
 def _refuse_order(asked: TuneRequirements) -> None:
@@ -255,7 +258,7 @@ def _refuse_order(asked: TuneRequirements) -> None:
     said = {item.metric for item in asked.bounds if item.asked}
     for group in ("sim", "step"):
         names = f"{group}.settling_s", f"{group}.rise_s"
-        settling, rise = (asked.wanted(name) for name in names)
+        settling, rise = (asked.robot_limit(name) for name in names)
         if settling is not None and rise is not None and settling < rise and said.issuperset(names):
             raise SettingsError(
                 f"`{names[0]}` <= {settling:g} s and `{names[1]}` <= {rise:g} s contradict each other: what has "
@@ -280,8 +283,8 @@ def _refuse_rise(
 ) -> None:
     """Refuse a rise that slew and range cannot give, however the motors are led."""
     test = axis_test(plant, limits, uncertain.redefinition[1])
-    for metric in _RISES:
-        limit = asked.wanted(metric)
+    for metric in _RISE_METRICS:
+        limit = asked.robot_limit(metric)
         if limit is None:
             continue
         table = asked.certificate.sim if metric.startswith("sim.") else asked.certificate.step
@@ -302,10 +305,10 @@ def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None
     """Refuse a circle beyond a bandwidth of 1/delay: slower ones a filter leads, but for overshoot."""
     scale = asked.certificate.scale
     metric = f"track.{scale.name_of('circle_rms_deg')}"
-    limit = asked.wanted(metric)
+    limit = asked.robot_limit(metric)
     dead, turn = (plant.delay + 1) * plant.sample_time, asked.track["circle_rad_s"]
     # Who stands still in the middle is as far behind as the circle is large.
-    if limit is None or not circles(scale.robot) or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
+    if limit is None or not can_follow_circle(scale.robot) or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
         return
     raise SettingsError(
         f"`{metric}` <= {limit:g} cannot be: a circle at {turn:g} rad/s is beyond the bandwidth that the "
@@ -322,7 +325,7 @@ def _refuse_turn(
     No input within them has more of it than the square wave of the range, or the triangle of the slew.
     """
     scale = asked.certificate.scale
-    if not circles(scale.robot):
+    if not can_follow_circle(scale.robot):
         return
     size, turn = asked.track["circle_deg"], asked.track["circle_rad_s"]
     share = float(np.abs(uncertain.redefinition[1][:, uncertain.names.index(name)]).max())
@@ -331,7 +334,7 @@ def _refuse_turn(
     # Of one output alone; a sine has its amplitude over the root of two.
     least = (size - reached) / math.sqrt(2.0)
     for metric in ("track.circle_rms_deg", "track.ahead_rms_deg"):
-        limit = asked.wanted(metric)
+        limit = asked.robot_limit(metric)
         if limit is not None and limit < least:
             raise SettingsError(
                 f"`{metric}` <= {limit:g} cannot be: within the motors' slew and range {name} swings by {reached:.2g} "
@@ -342,7 +345,7 @@ def _refuse_turn(
 def _refuse_sensitivity(asked: TuneRequirements, name: str) -> None:
     """Refuse an Ms of 1: Bode's integral leaves |S| above 1 somewhere (Astrom and Murray 2021, ch. 14)."""
     for group in ("axes", name):
-        limit = asked.wanted(f"{group}.sensitivity")
+        limit = asked.robot_limit(f"{group}.sensitivity")
         if limit is not None and limit <= 1.0:
             raise SettingsError(
                 f"`{group}.sensitivity` <= {limit:g} cannot be: no feedback through a dead time has it."
@@ -353,7 +356,7 @@ def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
     """Refuse a load rejected sooner than the dead time lets anybody act on it."""
     certificate = asked.certificate
     metric = f"step.{certificate.scale.name_of('load_rms_deg')}"
-    limit = asked.wanted(metric)
+    limit = asked.robot_limit(metric)
     if limit is None:
         return
     rows = round(float(certificate.step["duration_s"]) / plant.sample_time)

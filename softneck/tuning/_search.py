@@ -28,25 +28,25 @@ from ._space import COSTLY, Space
 from ._task import Job, Judgement, Log, Task
 
 # Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
-_GENERATION = 6
+_POPULATION_SIZE = 6
 #: The first step of the search, as a part of each range.
 STEP = 0.15
 # By so much the bound on Ms is moved first, as a part of its range, and so often by half as much.
-_LED_BY, _LED = 0.24, 3
+_START_STEP, _START_STEPS = 0.24, 3
 # The last part of the budget is for the neighbours of the best, so far away first and last.
-_REFINED, _AWAY, _NEAREST = 0.3, 0.08, 0.005
+_REFINED_SHARE, _FIRST_DISTANCE, _LAST_DISTANCE = 0.3, 0.08, 0.005
 # Kinds that are never left out, and candidates whose margins are found by experiment at the end.
-_LEAST_KINDS, _FINALS = 2, 3
+_MIN_KINDS, _FINAL_COUNT = 2, 3
 # One kind of so many goes on to the next round.
-_OF = 3
+_HALVING_RATE = 3
 # What breaks ties: all ratios together weigh this part of the largest one.
-_REST = 0.02
+_TIE_WEIGHT = 0.02
 # No requirement adds more, however far it is beyond its limit: what is not certified, not known or never reached is as
 # bad in whatever way that is told, and does not outweigh all the rest.
-_MOST = 4.0
-_MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
+_MAX_PENALTY = 4.0
+_MARGIN_METRICS = ("axes.gain_margin", "axes.delay_margin_ms")
 # Of what only a controller with a linear form has all.
-_LINEAR = ("axes.", "mimo.", "robust.")
+_LINEAR_GROUPS = ("axes.", "mimo.", "robust.")
 
 
 @dataclass(slots=True, eq=False)
@@ -69,7 +69,7 @@ class Candidate:
     metrics: dict[str, float] = field(default_factory=dict)
     error: str = ""
 
-    def take(self, level: str, judgement: Judgement) -> None:
+    def update(self, level: str, judgement: Judgement) -> None:
         """Add what came of a level."""
         self.error = judgement.error or self.error
         if judgement.error:
@@ -77,7 +77,7 @@ class Candidate:
         self.level = level
         # Of margins linear methods and experiments each know a part: the least counts.
         self.metrics |= {
-            name: min(value, self.metrics.get(name, math.inf)) if name in _MARGINS else value
+            name: min(value, self.metrics.get(name, math.inf)) if name in _MARGIN_METRICS else value
             for name, value in judgement.metrics.items()
         }
 
@@ -91,7 +91,7 @@ class Candidate:
         blind = bool(self.metrics) and "axes.sensitivity" not in self.metrics
         for item in bounds:
             value = self.metrics.get(item.metric, math.nan)
-            if blind and item.metric.startswith(_LINEAR):
+            if blind and item.metric.startswith(_LINEAR_GROUPS):
                 known = 1.0 if math.isnan(value) else max(1.0, ratio(item, value))
                 found[item.metric] = math.inf if tested or item.asked else known
             elif not math.isnan(value):
@@ -107,9 +107,9 @@ class Candidate:
         found = list(self.ratios(bounds, tested=tested).values())
         if self.error or not found:
             return math.inf
-        beyond = sum(_saturated(value - 1.0) for value in found if value > 1.0)
-        rest = _REST * float(np.mean([min(value, 1.0) for value in found]))
-        return (1.0 + beyond if beyond > 0.0 else (1.0 - _REST) * max(found)) + rest
+        beyond = sum(_saturate(value - 1.0) for value in found if value > 1.0)
+        rest = _TIE_WEIGHT * float(np.mean([min(value, 1.0) for value in found]))
+        return (1.0 + beyond if beyond > 0.0 else (1.0 - _TIE_WEIGHT) * max(found)) + rest
 
     def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:
         """Whether every requirement that is known is kept."""
@@ -117,8 +117,8 @@ class Candidate:
         return not self.error and bool(found) and max(found.values()) <= 1.0
 
 
-def _saturated(beyond: float) -> float:
-    return _MOST if math.isinf(beyond) else beyond / (1.0 + beyond / _MOST)
+def _saturate(beyond: float) -> float:
+    return _MAX_PENALTY if math.isinf(beyond) else beyond / (1.0 + beyond / _MAX_PENALTY)
 
 
 def ratio(item: Requirement, value: float) -> float:
@@ -150,7 +150,7 @@ class Search:
     log: Log
     budget: int
     report: Progress
-    finals: int = _FINALS
+    finals: int = _FINAL_COUNT
     candidates: dict[tuple[str, str], Candidate] = field(default_factory=dict)
     spent: set[Job] = field(default_factory=set)
     dropped: dict[str, str] = field(default_factory=dict)
@@ -162,121 +162,121 @@ class Search:
         levels = LEVELS[:-1] if self.task.own else LEVELS[:1]
         # A small budget is for the starts first.
         finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
-        alive, before = self._begun(levels, finals, optimisers), -1
-        while self._left(finals + round(_REFINED * self.budget)) > 0 and alive and before < len(self.spent):
+        alive, before = self._judge_starts(levels, finals, optimisers), -1
+        while self._remaining(finals + round(_REFINED_SHARE * self.budget)) > 0 and alive and before < len(self.spent):
             before = len(self.spent)
-            generation = {space.kind: self._asked(space, optimisers[space.kind]) for space in alive}
-            self._through([item for each in generation.values() for item in each], levels, finals)
+            generation = {space.kind: self._sample(space, optimisers[space.kind]) for space in alive}
+            self._judge_levels([item for each in generation.values() for item in each], levels, finals)
             for space in alive:
-                _tell(optimisers[space.kind], generation[space.kind], self._key)
-            alive = self._fewer(alive)
-        self._refined(levels, finals)
+                _tell(optimisers[space.kind], generation[space.kind], self._rank)
+            alive = self._drop_kinds(alive)
+        self._refine(levels, finals)
         if finals:
             # Of those that loops have judged: what was judged further comes first.
-            self._judge([item for item in self.ranked() if item.level == levels[-1]][:finals], "margins", 0)
+            self._judge([item for item in self.sort_candidates() if item.level == levels[-1]][:finals], "margins", 0)
 
-    def ranked(self) -> list[Candidate]:
+    def sort_candidates(self) -> list[Candidate]:
         """Return all candidates that have metrics, the best first."""
-        return sorted((item for item in self.candidates.values() if item.level), key=self._key)
+        return sorted((item for item in self.candidates.values() if item.level), key=self._rank)
 
     def cost(self, item: Candidate) -> float:
         """Return what the search minimises."""
         return item.cost(self.task.asked.bounds, tested=self.task.tested)
 
-    def _of(self, kind: str) -> list[Candidate]:
+    def _candidates_of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]
 
-    def _key(self, item: Candidate) -> tuple[int, float]:
+    def _rank(self, item: Candidate) -> tuple[int, float]:
         """Return the rank: what was judged further first, then the cost: of one level all have the same metrics."""
         return -LEVELS.index(item.level) if item.level else 1, self.cost(item)
 
-    def _left(self, reserved: int) -> int:
+    def _remaining(self, reserved: int) -> int:
         return self.budget - reserved - len(self.spent)
 
-    def _begun(self, levels: Sequence[str], finals: int, optimisers: dict[str, Any]) -> list[Space]:
+    def _judge_starts(self, levels: Sequence[str], finals: int, optimisers: dict[str, Any]) -> list[Space]:
         """Judge each kind where it begins; return those left, with their optimisers there."""
         starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
         self._judge(list(starts.values()), levels[0], finals)
-        starts = self._led(starts, finals + (len(levels) - 1) * len(starts))
+        starts = self._move_starts(starts, finals + (len(levels) - 1) * len(starts))
         for level in levels[1:]:
             self._judge(list(starts.values()), level, finals)
         self.dropped |= {kind: item.error for kind, item in starts.items() if item.error}
         for number, space in enumerate(self.spaces):
             if not np.array_equal(starts[space.kind].x, space.start):
                 optimisers[space.kind] = _optimiser(space, self.task.seed, number, starts[space.kind].x)
-        return self._fewer([space for space in self.spaces if space.kind not in self.dropped])
+        return self._drop_kinds([space for space in self.spaces if space.kind not in self.dropped])
 
-    def _led(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
+    def _move_starts(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
         """Return the starts with their bound on Ms as large as the margins allow, by halves."""
-        at, best, step = dict(starts), dict(starts), _LED_BY
+        at, best, step = dict(starts), dict(starts), _START_STEP
         spaces = {space.kind: space for space in self.spaces}
         # A controller without linear form shows no margin to go by.
         led = {
-            kind: space.led for kind, space in spaces.items()
-            if space.led is not None and (starts[kind].error or "axes.sensitivity" in starts[kind].metrics)
+            kind: space.trade_off for kind, space in spaces.items()
+            if space.trade_off is not None and (starts[kind].error or "axes.sensitivity" in starts[kind].metrics)
         }  # fmt: skip
-        for _ in range(_LED):
+        for _ in range(_START_STEPS):
             for kind, k in led.items():
                 x = at[kind].x.copy()
                 # What could not be designed is given more room.
-                x[k] += step if at[kind].error or self._robust(at[kind]) else -step
+                x[k] += step if at[kind].error or self._is_robust(at[kind]) else -step
                 at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
             self._judge([at[kind] for kind in led], LEVELS[0], reserved)
             for kind, k in led.items():
                 if at[kind].level:
-                    best[kind] = min(best[kind], at[kind], key=lambda item: self._led_key(item, k))
+                    best[kind] = min(best[kind], at[kind], key=lambda item: self._start_rank(item, k))
             step /= 2.0
         return best
 
-    def _robust(self, item: Candidate) -> bool:
+    def _is_robust(self, item: Candidate) -> bool:
         """Return whether the margins that are known hold."""
         found = item.ratios(self.task.asked.bounds, tested=self.task.tested)
-        return all(value <= 1.0 for name, value in found.items() if name.startswith(_LINEAR))
+        return all(value <= 1.0 for name, value in found.items() if name.startswith(_LINEAR_GROUPS))
 
-    def _led_key(self, item: Candidate, k: int) -> tuple[bool, bool, float]:
+    def _start_rank(self, item: Candidate, k: int) -> tuple[bool, bool, float]:
         """Return the rank of a start: designed, robust, and of robust ones the boldest, else the most careful."""
-        robust = self._robust(item)
+        robust = self._is_robust(item)
         return not item.level, not robust, -float(item.x[k]) if robust else float(item.x[k])
 
-    def _through(self, items: Sequence[Candidate], levels: Sequence[str], finals: int) -> None:
+    def _judge_levels(self, items: Sequence[Candidate], levels: Sequence[str], finals: int) -> None:
         """Judge candidates level by level, the better ones further."""
         left = list(items)
         for level in levels:
             self._judge(left, level, finals)
-            left = self._better(left, level)
+            left = self._select(left, level)
 
-    def _refined(self, levels: Sequence[str], finals: int) -> None:
+    def _refine(self, levels: Sequence[str], finals: int) -> None:
         """Judge the neighbours of the best until the budget is spent, or none near it is better.
 
         To both sides along directions that are drawn anew: where two limits meet, one setting alone betters nothing
         (Gratton et al. 2015, SIAM J. Optim. 25:1515).
         """
-        away, rng = _AWAY, np.random.default_rng(self.task.seed)
+        away, rng = _FIRST_DISTANCE, np.random.default_rng(self.task.seed)
         spaces = {space.kind: space for space in self.spaces}
-        while self._left(finals) > 0 and away > _NEAREST:
-            best = next(iter(self.ranked()), None)
+        while self._remaining(finals) > 0 and away > _LAST_DISTANCE:
+            best = next(iter(self.sort_candidates()), None)
             if best is None or best.level != levels[-1]:
                 return
             along = np.linalg.qr(rng.standard_normal((best.x.size, best.x.size)))[0]
             near = [best.x + sign * away * direction for direction in along for sign in (1.0, -1.0)]
-            self._through([self._candidate(spaces[best.kind], np.clip(x, 0.0, 1.0)) for x in near], levels, finals)
-            if self.ranked()[0] is best:
+            self._judge_levels([self._candidate(spaces[best.kind], np.clip(x, 0.0, 1.0)) for x in near], levels, finals)
+            if self.sort_candidates()[0] is best:
                 away /= 2.0
 
-    def _fewer(self, alive: list[Space]) -> list[Space]:
+    def _drop_kinds(self, alive: list[Space]) -> list[Space]:
         """Return the better third of the kinds, in their order: of more than two a costly one only if it is the best.
 
         What a search is given is a number of judgements, whatever each of them costs.
         """
-        keep = max(_LEAST_KINDS, math.ceil(len(alive) / _OF))
-        best = sorted(alive, key=lambda space: min(self._key(item) for item in self._of(space.kind)))
-        if len(alive) > _LEAST_KINDS:
+        keep = max(_MIN_KINDS, math.ceil(len(alive) / _HALVING_RATE))
+        best = sorted(alive, key=lambda space: min(self._rank(item) for item in self._candidates_of(space.kind)))
+        if len(alive) > _MIN_KINDS:
             best = best[:1] + [space for space in best[1:] if space.kind not in COSTLY]
         return [space for space in alive if space in best[:keep]]
 
-    def _asked(self, space: Space, optimiser: Any) -> list[Candidate]:
+    def _sample(self, space: Space, optimiser: Any) -> list[Candidate]:
         """Return a generation."""
-        return [self._candidate(space, optimiser.ask()) for _ in range(_GENERATION)]
+        return [self._candidate(space, optimiser.ask()) for _ in range(_POPULATION_SIZE)]
 
     def _candidate(self, space: Space, x: np.ndarray) -> Candidate:
         """Return the candidate at a point of the cube; the same one for the same settings."""
@@ -284,7 +284,7 @@ class Search:
         job = Job.of(space.kind, settings, "")
         return self.candidates.setdefault((job.kind, job.settings), Candidate(space.kind, settings, np.array(x)))
 
-    def _better(self, items: list[Candidate], level: str) -> list[Candidate]:
+    def _select(self, items: list[Candidate], level: str) -> list[Candidate]:
         """Return those judged at a level that hold so far, as none of them is better there, and at least half."""
         good = sorted((item for item in items if item.level == level and not item.error),
                       key=lambda item: max(1.0, self.cost(item)))  # fmt: skip
@@ -299,31 +299,31 @@ class Search:
             job = Job.of(item.kind, item.settings, level)
             if item.level == level or item.error or job in wanted or job in self.spent:
                 continue
-            if self._left(reserved) - len(wanted) <= 0:
+            if self._remaining(reserved) - len(wanted) <= 0:
                 break
             wanted[job] = item
-        given_out([job for job in wanted if job not in self.log], self._run, self.crew, self._took)
+        run_jobs([job for job in wanted if job not in self.log], self._submit, self.crew, self._store)
         for job, item in wanted.items():
             self.spent.add(job)
-            item.take(level, self.log[job])
-        self._say()
+            item.update(level, self.log[job])
+        self._report_progress()
 
-    def _run(self, job: Job) -> Future:
+    def _submit(self, job: Job) -> Future:
         item = self.candidates[(job.kind, job.settings)]
         return self.crew.pool.submit(judge_candidate, self.task, job.kind, item.settings, job.level)
 
-    def _took(self, job: Job, judgement: Judgement) -> None:
+    def _store(self, job: Job, judgement: Judgement) -> None:
         self.log.add(job, judgement)
         self.log.write()
-        self._say(len(self.spent) + 1)
+        self._report_progress(len(self.spent) + 1)
 
-    def _say(self, done: int | None = None) -> None:
+    def _report_progress(self, done: int | None = None) -> None:
         share = min(1.0, (len(self.spent) if done is None else done) / self.budget)
-        best = next(iter(self.ranked()), None)
+        best = next(iter(self.sort_candidates()), None)
         self.report(share, "nothing yet" if best is None else in_words(best, self.cost(best)))
 
 
-def given_out(
+def run_jobs(
     jobs: Sequence[Job], run: Callable[[Job], Future], crew: Crew, took: Callable[[Job, Judgement], None]
 ) -> None:
     """Have jobs done, two for each worker at a time, and take each as it ends.
@@ -368,7 +368,7 @@ def _optimiser(space: Space, seed: int, number: int, mean: np.ndarray | None = N
     n = len(space.dimensions)
     return CMA(
         mean=space.start if mean is None else mean, sigma=STEP, bounds=np.array([[0.0, 1.0]] * n),
-        population_size=_GENERATION, seed=(1000 * seed + number) % 2**32,
+        population_size=_POPULATION_SIZE, seed=(1000 * seed + number) % 2**32,
     )  # fmt: skip
 
 

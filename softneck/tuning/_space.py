@@ -49,7 +49,7 @@ class Dimension:
 
 _ANGLE = math.radians(1.0)
 # The bound on Ms sets how fast the feedback is, the rise what the reference filter makes of it.
-_OWN: dict[str, tuple[Dimension, ...]] = {
+_DIMENSIONS: dict[str, tuple[Dimension, ...]] = {
     "pi": (Dimension("max_sensitivity", 1.15, 2.5, 1.5), Dimension("phase_margin", 40 * _ANGLE, 80 * _ANGLE, 1.05)),
     "pid": (Dimension("max_sensitivity", 1.2, 3.0, 1.5), Dimension("noise_gain", 2.0, 10.0, 5.0)),
     "fopi": (Dimension("max_sensitivity", 1.2, 3.0, 1.5), Dimension("phase_margin", 60 * _ANGLE, 100 * _ANGLE, 1.4)),
@@ -62,17 +62,17 @@ _OWN: dict[str, tuple[Dimension, ...]] = {
 }  # fmt: skip
 # Starts were chosen on the foreign necks `column` and `chain`, by this search: what is asked of the nominal plant is
 # less than what the slowest payload and the motors make of it.
-_AIM = 0.42
+_RISE_RATIO = 0.42
 # Above the least that the motors can give.
-_ROOM = 1.03
+_RISE_MARGIN = 1.03
 # Of a neck [rad], and not searched: loops over models do not see what it does. On `chain` those over grey boxes are the
 # same from 0.4 to 1.5, and the neck itself overshoots by 2 % at 0.4 and 0.6, by 7 % at 0.8, by 20 % at 1.5; at 0.4 it
 # is slow (0.42 to 0.48 s).
-_LEAD = 0.6
+_LEAD_LIMIT_RAD = 0.6
 # The second number of `reference_time`.
-_LEADING = Dimension("lead", 0.2, 2.5, 1.0)
+_LEAD = Dimension("lead", 0.2, 2.5, 1.0)
 # These plan with it.
-_PLANNED = ("mpc", "nmpc")
+_PREDICTIVE_KINDS = ("mpc", "nmpc")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +95,7 @@ class Space:
         return np.array([item.start_part for item in self.dimensions])
 
     @property
-    def led(self) -> int | None:
+    def trade_off(self) -> int | None:
         """Number of the setting that trades speed for margins, None where there is none."""
         names = [item.name for item in self.dimensions]
         return names.index("max_sensitivity") if "max_sensitivity" in names else None
@@ -105,8 +105,8 @@ class Space:
         searched: dict[str, Any] = {
             item.name: item.value(float(part)) for item, part in zip(self.dimensions, x, strict=True)
         }
-        if _LEADING.name in searched:
-            searched["reference_time"] = [searched["reference_time"], searched.pop(_LEADING.name)]
+        if _LEAD.name in searched:
+            searched["reference_time"] = [searched["reference_time"], searched.pop(_LEAD.name)]
         return {**self.fixed, **searched}
 
 
@@ -134,22 +134,29 @@ def spaces(
     lead = Scaling.of(robot).motor_unit / to_si(robot.motors.unit)[0] if robot.tendon_angles is not None else None
     planned = () if lead is None else (Dimension("lead_limit", 0.4 * lead, 2.0 * lead, 0.8 * lead),)
     for kind in kinds:
-        if kind not in _OWN:
+        if kind not in _DIMENSIONS:
             raise SettingsError(
-                f"`{kind}` cannot be tuned; use some of {', '.join(_OWN)}."
+                f"`{kind}` cannot be tuned; use some of {', '.join(_DIMENSIONS)}."
                 if kind in kinds_of("controller")
-                else f"unknown kind of controller `{kind}`; use some of {', '.join(_OWN)}."
+                else f"unknown kind of controller `{kind}`; use some of {', '.join(_DIMENSIONS)}."
             )
         settings = resolve(KINDS[kind].settings)
-        names = {_LEADING.name, *(item.name for item in dataclasses.fields(settings))}
+        names = {_LEAD.name, *(item.name for item in dataclasses.fields(settings))}
         speed: tuple[Dimension, ...] = (
-            Dimension("rise_s", max(0.3 * rise, _ROOM * least), 1.2 * rise, max(_AIM * rise, _ROOM**2 * least)),
+            Dimension(
+                "rise_s",
+                max(0.3 * rise, _RISE_MARGIN * least),
+                1.2 * rise,
+                max(_RISE_RATIO * rise, _RISE_MARGIN**2 * least),
+            ),
         )
         if issubclass(settings, AxisSettings):
             # A step is led into the motors' limits at once, and a circle is followed the closer.
-            speed = (Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), _LEADING)
-        wanted = (*speed, *_OWN[kind], *(planned if kind in _PLANNED else ()))
-        fixed: dict[str, Any] = {"lead_limit": _LEAD * lead} if lead is not None and kind not in _PLANNED else {}
+            speed = (Dimension("reference_time", 0.05 * rise, 0.6 * rise, 0.25 * rise), _LEAD)
+        wanted = (*speed, *_DIMENSIONS[kind], *(planned if kind in _PREDICTIVE_KINDS else ()))
+        fixed: dict[str, Any] = (
+            {"lead_limit": _LEAD_LIMIT_RAD * lead} if lead is not None and kind not in _PREDICTIVE_KINDS else {}
+        )
         if cocontraction is not None and "least_cocontraction" in names:
             fixed["least_cocontraction"] = cocontraction
         if cocontraction is not None and planned and kind == "nmpc":

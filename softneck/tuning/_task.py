@@ -96,7 +96,7 @@ class Judgement:
 
 
 FILE = "evaluations.json"
-_FORMAT = 1
+_LOG_FORMAT = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ class Log:
              "metrics": {name: value if math.isfinite(value) else None for name, value in item.metrics.items()}}
             for job, item in self._found.items()
         ]  # fmt: skip
-        text = json.dumps({"format": _FORMAT, "digest": self._digest, "evaluations": rows}, indent=1)
+        text = json.dumps({"format": _LOG_FORMAT, "digest": self._digest, "evaluations": rows}, indent=1)
         with atomic_write(self.folder / FILE, force=True) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
 
@@ -186,7 +186,7 @@ class Log:
 def _read(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(settings_text(path, MOST_JSON))
-        if content["format"] != _FORMAT or not isinstance(content["evaluations"], list):
+        if content["format"] != _LOG_FORMAT or not isinstance(content["evaluations"], list):
             raise ValueError("another format")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise FileFormatError(f"{path}: is no log of a search that this softneck reads ({error}).") from error

@@ -30,31 +30,31 @@ from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.signals import require_same_robot
 from softneck.verification import (
     LARGE,
-    OwnPlant,
     Requirement,
     Scale,
+    SimulationModel,
     Verdict,
     Verification,
-    digits,
-    is_own_plant,
+    is_simulation_model,
     judge_loop,
     named_plants,
+    round_12_digits,
     run_steps,
     sources_of,
-    standing_for,
     verify,
+    with_robot,
 )
 
-from ._judge import LEVELS, Case, designed, loop_of, made_ready, watched
+from ._judge import LEVELS, Case, design_candidate, loop_of, make_observer, prepare
 from ._requirements import (
     USUAL_RISE,
     TuneRequirements,
+    check_feasibility,
     default_rise,
-    loosened,
+    fastest_rise,
     make_tune_requirements,
-    quickest,
     read_tune_requirements,
-    refuse_impossible,
+    relax_limits,
 )
 from ._search import Candidate, Search, ratio
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
@@ -65,11 +65,11 @@ BUDGET = 160
 # Fewer do not judge each of the kinds by a loop.
 _LEAST_BUDGET = 1
 # So many of the best are held against `verify`, until one holds.
-_VERIFIED = 2
+_MAX_VERIFICATIONS = 2
 # Why a kind is left out where nobody names it.
-_UNCERTIFIED = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
+_UNCERTIFIED_REASON = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
 # Motors that are held closer to zero than this, of a neck [rad], have no rule for their co-contraction.
-_TAUT = 0.05
+_MIN_COCONTRACTION_RAD = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -111,7 +111,7 @@ class Tuned:
     evaluations: int
     dropped: Mapping[str, str]
     task: Task
-    own: Sequence[OwnPlant] = ()
+    own: Sequence[SimulationModel] = ()
     loosened: Mapping[str, Loosened] = field(default_factory=dict)
 
 
@@ -169,32 +169,32 @@ def tune(
     kinds = tuple(kinds.split(",") if isinstance(kinds, str) else kinds)
     folder = None if folder is None else Path(folder)
     task = task_of(plants, requirements, seed)
-    dropped = {} if kinds or not task.tested else dict.fromkeys(UNCERTIFIED, _UNCERTIFIED)
+    dropped = {} if kinds or not task.tested else dict.fromkeys(UNCERTIFIED, _UNCERTIFIED_REASON)
     chosen = tuple(kind for kind in dict.fromkeys(kinds or KINDS_SEARCHED) if kind not in dropped)
     observer = None if observer is None else load_for_robot(observer, "observer")
     if observer is not None:
         require_same_robot(robot_of(observer), task.robot, "the observer and the plants")
-    refuse_impossible(task.asked, task.plant)
+    check_feasibility(task.asked, task.plant)
     each = spaces(
-        chosen, rise=_aimed(task), cocontraction=task.said_cocontraction, robot=task.robot,
-        least=quickest(task.plant),
+        chosen, rise=_target_rise(task), cocontraction=task.said_cocontraction, robot=task.robot,
+        least=fastest_rise(task.plant),
     )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)
     task = replace(task, digest=digest_of(task, chosen, files))
-    made_ready(task)  # a plant that does not fit is said before anything is searched
+    prepare(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, force=force)
     with shown_progress("tune", progress) as tell:
         with crew(workers, None) as members:
             search = Search(task, each, members, log, budget, lambda done, text: tell(0.9 * done, text))
             search.dropped |= dropped
             search.run()
-        return _finished(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))
+        return _make_result(search, files, lambda done, text: tell(0.9 + 0.1 * done, text))
 
 
 def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int) -> Task:
     """Return what is tuned, for which plants must be one robot's."""
     plants = named_plants(plants)
-    own = {name: thing for name, thing in plants.items() if is_own_plant(thing)}
+    own = {name: thing for name, thing in plants.items() if is_simulation_model(thing)}
     linear = {name: thing for name, thing in plants.items() if name not in own}
     if not linear:
         raise SettingsError(
@@ -205,16 +205,22 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
     for name, thing in plants.items():
         if hasattr(thing, "robot"):
             require_same_robot(robot_of(thing), robot, f"{first} and {name}")
-    own = {name: standing_for(thing, robot) for name, thing in own.items()}
+    own = {name: with_robot(thing, robot) for name, thing in own.items()}
     if own and not loops_start(robot):
         raise SettingsError(
             f"loops over {next(iter(own))} would begin at zero, where {robot.label()} cannot be; give linear plants "
             "alone."
         )
-    asked = _asked(requirements, robot, list(linear.values()), stepping=bool(own))
+    asked = _read_requirements(requirements, robot, list(linear.values()), stepping=bool(own))
     return Task(
-        digest="", linear=linear, own=own, asked=asked, robot=robot, cocontraction=_held(linear, robot), seed=seed
-    )  # fmt: skip
+        digest="",
+        linear=linear,
+        own=own,
+        asked=asked,
+        robot=robot,
+        cocontraction=_recorded_cocontraction(linear, robot),
+        seed=seed,
+    )
 
 
 def loops_start(robot: Robot) -> bool:
@@ -223,7 +229,7 @@ def loops_start(robot: Robot) -> bool:
     return all(low <= 0.0 <= high for low, high in ends)
 
 
-def _asked(
+def _read_requirements(
     requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, robot: Robot, linear: list[Any], *,
     stepping: bool,
 ) -> TuneRequirements:  # fmt: skip
@@ -238,7 +244,7 @@ def _asked(
     return read(rise=default_rise(linear, read()))
 
 
-def _held(linear: Mapping[str, Any], robot: Robot) -> float | None:
+def _recorded_cocontraction(linear: Mapping[str, Any], robot: Robot) -> float | None:
     """Return the co-contraction [SI] around which families were recorded, where there is one: of the heaviest load."""
     made = [part for thing in linear.values()
             for part in getattr(thing, "findings", {}).get("tested", {}).get("conditions", [])]  # fmt: skip
@@ -247,10 +253,10 @@ def _held(linear: Mapping[str, Any], robot: Robot) -> float | None:
     heaviest, unit = max(max(part["payload_kg"]) for part in made), Scaling.of(robot).motor_unit
     middles = [sum(part["cocontraction"]) / 2.0 for part in made if max(part["payload_kg"]) >= heaviest]
     common = round(sorted(middles)[len(middles) // 2] / unit, 3)
-    return common * unit if common > _TAUT else None
+    return common * unit if common > _MIN_COCONTRACTION_RAD else None
 
 
-def _aimed(task: Task) -> float:
+def _target_rise(task: Task) -> float:
     """Return the longest rise that is allowed [s], or what is usual for the plant."""
     limits = [task.asked.limit(metric) for metric in ("sim.rise_s", "step.rise_s")]
     known = [limit for limit in limits if limit is not None]
@@ -260,9 +266,9 @@ def _aimed(task: Task) -> float:
     return USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
-def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
     """Return the result of a search: its best verified, and what it means for the requirements."""
-    task, ranked = search.task, search.ranked()
+    task, ranked = search.task, search.sort_candidates()
     eyes = task.observer
     if not ranked:
         why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
@@ -271,14 +277,14 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
         raise SettingsError(f"no candidate could be judged ({why}).")
     looped_ones = [item for item in ranked if _level(item) >= 1]
     compared = looped_ones or ranked
-    best, verification, controller = _verified(search, compared, files, progress)
+    best, verification, controller = _verify_best(search, compared, files, progress)
     bounds = task.asked.bounds
     names = objectives(compared)
     # Loops of tuning have noise, and plants that are later than they say: `verify` has neither.
     looped = [b for b in bounds if b.metric.startswith(("sim.", "track."))]
     closed = not looped or not task.own or _level(best) >= 1
     holds = verification.holds and closed and (not looped or not task.own or best.holds(looped, tested=False))
-    stuck, nearest = (None, None) if holds else binding(compared, bounds, tested=task.tested)
+    stuck, nearest = (None, None) if holds else active_requirement(compared, bounds, tested=task.tested)
     known = [verdict for verdict in verification.failed if verdict.value is not None]
     if not holds and stuck is None and known:
         # The search saw nothing broken; the certificate of the whole box does.
@@ -287,27 +293,27 @@ def _finished(search: Search, files: Mapping[str, tuple[str, str]] | None, progr
     found = Tuned(
         best=best, controller=controller, observer=eyes,
         assumed=dict(getattr(controller, "design", {}).get("assumed", {})),
-        own=made_ready(task).own,
-        observed=watched(task, best.kind) is not None
-        or (eyes is not None and bool(task.own) and kept_with(task, best, eyes, bounds)),
+        own=prepare(task).own,
+        observed=make_observer(task, best.kind) is not None
+        or (eyes is not None and bool(task.own) and holds_with_observer(task, best, eyes, bounds)),
         verification=verification, holds=holds,
         candidates=compared, front=front(compared, names), objectives=names, binding=stuck, nearest=nearest,
         evaluations=len(search.spent), dropped=search.dropped, task=task,
     )  # fmt: skip
-    return found if holds or not closed else _nearest(found, files, progress)
+    return found if holds or not closed else _relax(found, files, progress)
 
 
-def _nearest(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
+def _relax(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
     """Return the result with the defaults of speed and precision as the best keeps them, if it keeps all the rest.
 
     What somebody asks stands, and so do the margins of stability; the loosened set is verified anew.
     """
-    task, kept = found.task, nearest(found.best, found.verification.failed, found.task.asked)
+    task, kept = found.task, relaxations(found.best, found.verification.failed, found.task.asked)
     if not kept:
         return found
-    asked = loosened(task.asked, {metric: one.limit for metric, one in kept.items()})
+    asked = relax_limits(task.asked, {metric: one.limit for metric, one in kept.items()})
     progress(0.9, "verify what holds")
-    verification = _certified(replace(task, asked=asked), found.controller, found.best.kind, files)
+    verification = _verify_candidate(replace(task, asked=asked), found.controller, found.best.kind, files)
     if not verification.holds:
         return found
     return replace(
@@ -320,25 +326,27 @@ def _level(item: Candidate) -> int:
     return LEVELS.index(item.level)
 
 
-def _verified(
+def _verify_best(
     search: Search, compared: Sequence[Candidate], files: Mapping[str, tuple[str, str]] | None, progress: Progress
 ) -> tuple[Candidate, Verification, Any]:
     """Return the first of the best whose certificate holds, else the best, each with what `verify` says."""
     task, found = search.task, []
-    ready = made_ready(task)
-    promising = [item for item in compared if search.cost(item) <= 1.0][:_VERIFIED] or compared[:1]
+    ready = prepare(task)
+    promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
     for number, item in enumerate(promising):
-        controller = designed(task, ready, item.kind, item.settings)
+        controller = design_candidate(task, ready, item.kind, item.settings)
         progress(number / len(promising), f"verify {item.kind}")
-        verification = _certified(task, controller, item.kind, files)
+        verification = _verify_candidate(task, controller, item.kind, files)
         if verification.holds:
             return item, verification, controller
         found.append((item, verification, controller))
     return found[0]
 
 
-def _certified(task: Task, controller: Any, kind: str, files: Mapping[str, tuple[str, str]] | None) -> Verification:
-    observer = task.observer if watched(task, kind) is not None else None
+def _verify_candidate(
+    task: Task, controller: Any, kind: str, files: Mapping[str, tuple[str, str]] | None
+) -> Verification:
+    observer = task.observer if make_observer(task, kind) is not None else None
     plants = {**task.linear, **task.own}
     return verify(controller, plants, task.asked.certificate, files=files, progress=silent, observer=observer)
 
@@ -355,26 +363,26 @@ def _observer(task: Task) -> Any:
 
 
 # What is traded, the first of each that was found; of the least ones the reciprocal counts.
-_OBJECTIVES = (
+_OBJECTIVE_METRICS = (
     ("sim.rise_s", "step.rise_s"), ("sim.overshoot_pct", "step.overshoot_pct"), ("step.load_rms_",),
     ("sim.steady_rms_", "step.steady_rms_"), ("track.circle_rms_",), ("track.variation_",),
     ("axes.sensitivity",), ("axes.gain_margin",),
 )  # fmt: skip
 # Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
 # loosened, and beyond it is another requirement ("disk_margin 0.0151 costs sensitivity 66.7").
-_NEAR = 2.0
+_MAX_RELAXATION = 2.0
 # Of these a default is a wish about speed and precision: what the best reaches is told instead. Margins of stability,
 # slack tendons and what a load may do are never loosened.
-_LOOSENED = ("sim.rise_s", "sim.settling_s", "sim.overshoot_pct", "sim.steady_rms_", "step.rise_s",
+_RELAXABLE_METRICS = ("sim.rise_s", "sim.settling_s", "sim.overshoot_pct", "sim.steady_rms_", "step.rise_s",
              "step.settling_s", "step.overshoot_pct", "step.steady_rms_", "track.")  # fmt: skip
-_ROOM = 1.05
+_RELAXATION_MARGIN = 1.05
 
 
 def objectives(items: Sequence[Candidate]) -> list[str]:
     """Return the metrics that are traded, of those that all candidates of the last level have."""
     names = set.intersection(*(set(item.metrics) for item in items)) if items else set()
     found = []
-    for group in _OBJECTIVES:
+    for group in _OBJECTIVE_METRICS:
         match = next((name for start in group for name in sorted(names) if name.startswith(start)), None)
         if match is not None:
             found.append(match)
@@ -383,7 +391,7 @@ def objectives(items: Sequence[Candidate]) -> list[str]:
 
 def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
     """Return the candidates that none beats in one objective without losing in another, by the first objective."""
-    table = np.array([[_small(name, item.metrics[name]) for name in names] for item in items])
+    table = np.array([[_signed(name, item.metrics[name]) for name in names] for item in items])
     if not table.size:
         return []
     finite = np.isfinite(table).all(axis=1)
@@ -392,7 +400,7 @@ def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
     return sorted((items[i] for i in kept), key=lambda item: item.metrics[names[0]])
 
 
-def binding(
+def active_requirement(
     items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested: bool
 ) -> tuple[str | None, float | None]:
     """Return the requirement that stands in the way, None where a candidate keeps all that were computed of it.
@@ -402,18 +410,18 @@ def binding(
     It is the one that must be loosened least, alone, for some candidate to keep the rest; where none does, the one
     that the best candidate breaks most. What was not computed is broken all the same, but nothing is known to bind.
     """
-    loosened: dict[str, float] = {}
+    factors: dict[str, float] = {}
     for item in items:
         broken = {name: value for name, value in item.ratios(bounds, tested=tested).items() if value > 1.0}
         if not broken:
             return None, None
         name, value = next(iter(broken.items()))
         if len(broken) == 1 and name in item.metrics:
-            loosened[name] = min(value, loosened.get(name, math.inf))
-    if loosened:
-        name = min(loosened, key=lambda name: loosened[name])
+            factors[name] = min(value, factors.get(name, math.inf))
+    if factors:
+        name = min(factors, key=lambda name: factors[name])
         item = next(bound for bound in bounds if bound.metric == name)
-        return name, item.limit / loosened[name] if item.bound == "min" else item.limit * loosened[name]
+        return name, item.limit / factors[name] if item.bound == "min" else item.limit * factors[name]
     best = min(items, key=lambda item: item.cost(bounds, tested=tested), default=None)
     if best is None:
         return None, None
@@ -440,7 +448,7 @@ class Loosened:
         return f"{metric}: {self.reached:.3g}, by default {self.default:.3g} is required (certified: {self.limit:g})"
 
 
-def nearest(item: Candidate, failed: Sequence[Verdict], asked: TuneRequirements) -> dict[str, Loosened]:
+def relaxations(item: Candidate, failed: Sequence[Verdict], asked: TuneRequirements) -> dict[str, Loosened]:
     """Return metric -> the default that the candidate does not keep, where it keeps all the rest.
 
     Nothing where anything else fails: a margin of stability, what somebody asked for, what was not computed, or what is
@@ -454,23 +462,23 @@ def nearest(item: Candidate, failed: Sequence[Verdict], asked: TuneRequirements)
             broken[bound] = max(seen, broken.get(bound) or 0.0)
     found = {}
     for bound, value in broken.items():
-        free = bound.metric.startswith(_LOOSENED) and bound.metric not in asked.stated and bound.bound == "max"
-        kept = math.inf if value is None else _above(value)
-        if not free or not kept <= _NEAR * bound.limit:
+        free = bound.metric.startswith(_RELAXABLE_METRICS) and bound.metric not in asked.stated and bound.bound == "max"
+        kept = math.inf if value is None else _round_up(value)
+        if not free or not kept <= _MAX_RELAXATION * bound.limit:
             return {}
         found[bound.metric] = Loosened(bound.limit, value or math.nan, kept)
     return found
 
 
-def _above(value: float) -> float:
+def _round_up(value: float) -> float:
     """Return a limit that a value keeps with some room, in two digits: the next loop has other noise."""
     if not 0.0 < value < math.inf:
         return math.inf
-    step = 10.0 ** (math.floor(math.log10(_ROOM * value)) - 1)
-    return digits(math.ceil(_ROOM * value / step - 1e-9) * step)
+    step = 10.0 ** (math.floor(math.log10(_RELAXATION_MARGIN * value)) - 1)
+    return round_12_digits(math.ceil(_RELAXATION_MARGIN * value / step - 1e-9) * step)
 
 
-def _small(name: str, value: float) -> float:
+def _signed(name: str, value: float) -> float:
     return -value if name.rpartition(".")[2] in LARGE else value
 
 
@@ -479,8 +487,8 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
 
     Without a simulation model, on the nominal linear one.
     """
-    ready = made_ready(task)
-    controller = designed(task, ready, item.kind, item.settings)
+    ready = prepare(task)
+    controller = design_candidate(task, ready, item.kind, item.settings)
     block, order = controller.block(), str(getattr(controller, "order", "sequential"))
     name, asked = task.robot.outputs.names[0], task.asked.certificate
     shown = asked.scale.shown
@@ -490,16 +498,18 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
         half = found.time.size // 2
         return found.time[:half], shown(found.angles[0, 0, :half]), np.full(half, shown(test.step))
     case = Case(len(ready.own) - 1, max(map(float, ready.own[-1].payloads(asked.sim["payloads_kg"]))))
-    result = run_loop(loop_of(case, ready.own[case.plant], block, order, task, watched(task, item.kind)), compiled=True)
+    result = run_loop(
+        loop_of(case, ready.own[case.plant], block, order, task, make_observer(task, item.kind)), compiled=True
+    )
     reference = result[f"{name}_reference"]
     first = max(0, int(np.argmax(reference != reference[0])) - round(0.1 / result.sample_time))
     return result.time[first:] - result.time[first], shown(result.angle(name)[first:]), shown(reference[first:])
 
 
-def kept_with(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:
+def holds_with_observer(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:
     """Return whether the plain steps keep their requirements with an observer in the loop."""
-    ready = made_ready(task)
-    controller = designed(task, ready, item.kind, item.settings)
+    ready = prepare(task)
+    controller = design_candidate(task, ready, item.kind, item.settings)
     block, eyes = controller.block(), observer.block()
     order = str(getattr(controller, "order", "sequential"))
     worst: dict[str, float] = {}

@@ -13,23 +13,23 @@ from softneck.loop import error_unit
 from softneck.runtime import Block
 
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
-from ._linear import AxisMargins, ControllerUnderTest, LinearLaw, judged, margins, tested_axes
+from ._linear import AxisMargins, ControllerUnderTest, LinearLaw, data_margins, frequency_grid, margins
 from ._neck_loops import (
-    NeckRun,
-    OwnPlant,
+    LoopRun,
+    SimulationModel,
     direction,
     loops_under_test,
+    missing_payloads,
     neck_changes,
-    no_virtual_plant,
-    payloads_left_out,
     preset_of,
-    run_necks,
-    step_at,
+    run_loops,
+    step_time,
+    why_no_virtual_plant,
 )
-from ._plants import Plants, UncertainNeck, all_plants, join
+from ._plants import Plants, PlantSource, all_plants, join
 from ._requirements import Requirements
-from ._steps import UNTOLD, Steps, run_steps
-from ._structured import SearchResult, StructuredResult, search, structured
+from ._steps import NO_PAYLOAD_IN_STEPS, Steps, run_steps
+from ._structured import SearchResult, StructuredResult, search, structured_singular_value
 
 Describe = Callable[[int], dict[str, Any]]
 
@@ -90,7 +90,7 @@ class Evidence(ReprMixin):
     linear: list[LinearEvidence]
     steps: Steps
     stepped: Plants
-    necks: list[NeckRun]
+    necks: list[LoopRun]
     metrics: dict[str, Values] = field(default_factory=dict)
     not_computed: dict[str, str] = field(default_factory=dict)
     foreign: bool = True
@@ -100,13 +100,13 @@ class Evidence(ReprMixin):
 
 def gather(
     controller: ControllerUnderTest,
-    necks: Sequence[UncertainNeck],
+    necks: Sequence[PlantSource],
     asked: Requirements,
     *,
     observer: Block | None,
     progress: Progress,
     families: Mapping[str, Any] | None = None,
-    own: Sequence[OwnPlant] = (),
+    own: Sequence[SimulationModel] = (),
 ) -> Evidence:
     """Compute all evidence; what the requirements do not need is computed too, where it is cheap.
 
@@ -123,7 +123,7 @@ def gather(
     seed = int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
     plants = base.later(controller.extra)
-    w = judged(base.sample_time, asked.scale.time)
+    w = frequency_grid(base.sample_time, asked.scale.time)
     linear = []
     for number, (name, law) in enumerate(controller.laws.items()):
         progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
@@ -133,8 +133,8 @@ def gather(
     steps = run_steps(
         stepped, controller.block, asked.step_test(seed), robot=controller.robot, weights=sources[0].weights
     )
-    why = no_virtual_plant(controller.robot, asked)
-    runs = run_necks(
+    why = why_no_virtual_plant(controller.robot, asked)
+    runs = run_loops(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
     ) if own or not why else []  # fmt: skip
@@ -146,33 +146,47 @@ def gather(
     found = crossings(loops, overall=overall, progress=late) if loops else []
     steep = float(asked.uncertainty["rolloff_db_per_decade"])
     laws, kept = controller.laws.values(), families or {}
-    tested = [item for law in laws for item in tested_axes(kept, law, plants.axes, controller.extra, steep)]
+    tested = [item for law in laws for item in data_margins(kept, law, plants.axes, controller.extra, steep)]
     evidence = Evidence(
-        plants, w, linear, steps, stepped, runs, foreign=_foreign(asked, own), tested=tested, crossings=found
+        plants,
+        w,
+        linear,
+        steps,
+        stepped,
+        runs,
+        foreign=_uses_built_in_plant(asked, own),
+        tested=tested,
+        crossings=found,
     )
-    evidence.not_computed.update({"sim": why} if why and not own else payloads_left_out(own, asked))
-    _tell(evidence, controller, asked, observer is not None)
+    evidence.not_computed.update({"sim": why} if why and not own else missing_payloads(own, asked))
+    _fill_metrics(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence
 
 
 def _linear(
-    name: str, law: LinearLaw, plants: Plants, necks: list[UncertainNeck], extra: int, w: Vector, asked: Requirements,
-) -> LinearEvidence:  # fmt: skip
+    name: str,
+    law: LinearLaw,
+    plants: Plants,
+    necks: list[PlantSource],
+    extra: int,
+    w: Vector,
+    asked: Requirements,
+) -> LinearEvidence:
     seed, generations = int(asked.sampling["seed"]), int(asked.sampling["search_generations"])
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
     table = margins(tried, law, w)
-    parts = [structured(neck, law, extra=extra, scale=asked.scale) for neck in necks]
+    parts = [structured_singular_value(neck, law, extra=extra, scale=asked.scale) for neck in necks]
     return LinearEvidence(name, law, tried, table, found, parts)
 
 
-def _foreign(asked: Requirements, own: Sequence[OwnPlant]) -> bool:
+def _uses_built_in_plant(asked: Requirements, own: Sequence[SimulationModel]) -> bool:
     """Return whether the loops use a built-in plant that does not count; a file of the user counts."""
     return not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
 
 
-def _tell_data(evidence: Evidence) -> None:
+def _add_data_margins(evidence: Evidence) -> None:
     """Add the margins that the data support, and those by experiment."""
     for item in evidence.tested:
         for name, value in item.margins.items():
@@ -200,11 +214,11 @@ def _tested_describer(item: AxisMargins, name: str) -> Describe:
     return lambda _: dict(facts)
 
 
-def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements, observer: bool) -> None:
+def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements, observer: bool) -> None:
     """Fill metrics and what was not computed."""
     metrics, absent = evidence.metrics, evidence.not_computed
     for part in evidence.linear:
-        _tell_linear(evidence, part)
+        _add_linear_margins(evidence, part)
     if not evidence.linear:
         for name in ("stability", "axes", "mimo", "robust"):
             absent[name] = controller.why
@@ -213,14 +227,14 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
             "margins are of controller and plant alone; the observer is in the simulated loops"
         )
     if any(port.name == "payload" for port in controller.block.inputs):
-        absent["steps of other payloads"] = UNTOLD
+        absent["steps of other payloads"] = NO_PAYLOAD_IN_STEPS
     if not asked.sampling["search_generations"]:
         absent["stability.searched_radius"] = "the search is switched off (search_generations = 0)"
     if any(part.name for part in evidence.linear):
         absent["stability between frozen points"] = (
             "linear checks hold at frozen points; motion between them is simulated"
         )
-    _tell_data(evidence)
+    _add_data_margins(evidence)
     for name, values in evidence.steps.metrics.items():
         metrics[f"step.{asked.scale.name_of(name)}"] = Values(values, _step_describer(evidence, name))
     if not evidence.necks:
@@ -243,7 +257,7 @@ def _tell(evidence: Evidence, controller: ControllerUnderTest, asked: Requiremen
         absent["sim.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
 
 
-def _tell_linear(evidence: Evidence, part: LinearEvidence) -> None:
+def _add_linear_margins(evidence: Evidence, part: LinearEvidence) -> None:
     count = len(evidence.plants)
     describe = _plant_describer(part)
     table = dict(part.margins)
@@ -319,7 +333,7 @@ def _step_describer(evidence: Evidence, name: str) -> Describe:
 
 def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements) -> Describe:
     def describe(row: int) -> dict[str, Any]:
-        run, at = evidence.necks[row], step_at(controller.block, asked)
+        run, at = evidence.necks[row], step_time(controller.block, asked)
         size = float(asked.sim["size_deg"])
         parameters = {} if run.parameters is None else neck_changes(run.parameters, controller.robot)
         return {

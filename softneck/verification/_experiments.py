@@ -27,37 +27,37 @@ from softneck.runtime import Block, Port
 
 from ._steps import middle_motors, middle_of
 
-_RUNTIME = "softneck.verification._louder_runtime"
+_LOOP_GAIN_RUNTIME = "softneck.verification._louder_runtime"
 _NECK = Robot.preset()
-_KEPT = 34
+_BUFFER_SAMPLES = 34
 # The experiment [s]: led there, at rest, kicked; a moment that does not count, and two windows.
-_LED, _REST, _FORGOTTEN, _WINDOW = 1.0, 3.0, 2.0, 4.0
+_LEAD_IN_S, _REST_S, _TRANSIENT_S, _WINDOW_S = 1.0, 3.0, 2.0, 4.0
 # Kicks [rad], small before large, and postures (pitch, roll) [rad]: within what every neck can lean under a payload.
-_SMALL, _LARGE = math.radians(1.0), math.radians(8.0)
-_LEAN = math.radians(5.0)
-_POSTURES = ((0.0, 0.0), (_LEAN, 0.0), (0.0, -_LEAN))
-_TOGETHER = "both"
+_SMALL_RAD, _LARGE_RAD = math.radians(1.0), math.radians(8.0)
+_LEAN_RAD = math.radians(5.0)
+_POSTURES = ((0.0, 0.0), (_LEAN_RAD, 0.0), (0.0, -_LEAN_RAD))
+_ALL_AXES = "both"
 # A neck's sample time [s], of which the delays that are scanned are so many.
-_SAMPLE = 0.02
+_NECK_SAMPLE_TIME_S = 0.02
 # Sustained: the last window has this part of the one before, so what decays by less counts as if it did not, or is
 # above what the kick itself swings without damping: the loop has fed it, though slow parts of a plant may still let it
 # shrink; above this part of the kick, and this many times what the loop does at gain 1.
-_KEEPS, _HEARD, _ABOVE_FLOOR = 0.97, 0.1, 2.0
+_SUSTAINED_RATIO, _AUDIBLE_SHARE, _ABOVE_FLOOR = 0.97, 0.1, 2.0
 # Made quieter, a loop that friction holds comes late, and each axis then moves the other: less than the kick.
-_HEARD_QUIET = 1.0
+_AUDIBLE_SHARE_DOWN = 1.0
 # At gain 1 a loop may hunt by friction; by more than this [rad] peak to peak it oscillates.
-_HUNTS = math.radians(1.0)
+_HUNTING_RAD = math.radians(1.0)
 # Parts of the kick: a loop that moves less does not answer it; hunting by more is told.
-_ANSWERS, _TOLD = 1e-3, 0.01
+_RESPONSE_SHARE, _REPORTED_SHARE = 1e-3, 0.01
 # What is scanned: factors on the gain, up and down, and samples of delay; and to which part a crossing is bisected.
 _GAINS = tuple(2.0 ** (k / 4.0) for k in range(1, 17))
 _COARSE_GAINS = tuple(2.0 ** (k / 2.0) for k in range(1, 9))
-_DELAYS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
-_FINE = 0.005
+_DELAY_SAMPLES = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+_BISECTION_TOLERANCE = 0.005
 # Peak to peak, in parts of the kick: linear loops at their border swing by two, and by a little more if they overshoot.
-_FED = 3.0
+_MAX_SWING = 3.0
 # Of which scans one that has crossed says where all end: a gain margin is up or down, whichever is nearer.
-_LED_BY = {"gain_up": ("gain_up", "gain_down"), "delay": ("delay",)}
+_BOUNDED_SCANS = {"gain_up": ("gain_up", "gain_down"), "delay": ("delay",)}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -93,8 +93,8 @@ class LoopUnderTest:
     @property
     def kicks(self) -> tuple[float, ...]:
         """Small before large; what noise hides, no model has learned."""
-        large = self.size * _LARGE
-        return tuple(dict.fromkeys((min(max(self.size, self.noise) * _SMALL, large), large)))
+        large = self.size * _LARGE_RAD
+        return tuple(dict.fromkeys((min(max(self.size, self.noise) * _SMALL_RAD, large), large)))
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ class LoopUnderTest:
     @property
     def samples(self) -> int:
         """By how many samples a delay that is scanned is longer than a neck's."""
-        return max(1, round(self.time * _SAMPLE / self.controller.sample_time))
+        return max(1, round(self.time * _NECK_SAMPLE_TIME_S / self.controller.sample_time))
 
     def postures(self) -> tuple[tuple[float, ...], ...]:
         """Return where it is kicked, for a neck in rad: nowhere, and leaning to either side."""
@@ -117,7 +117,7 @@ class LoopUnderTest:
         if m == len(_POSTURES[0]):
             return _POSTURES
         rest = (0.0,) * (m - 1)
-        return ((0.0, *rest), (_LEAN, *rest), (*rest, -_LEAN))
+        return ((0.0, *rest), (_LEAN_RAD, *rest), (*rest, -_LEAN_RAD))
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,26 +168,30 @@ def crossings(
     # The first compiles the loop; several threads would do that several times.
     leaders = groups[:1]
     if overall:
-        leaders = [job for job in groups if job[0] is loops[-1] and job[1] == loops[-1].axes[-1] and job[2] in _LED_BY]
+        leaders = [
+            job for job in groups if job[0] is loops[-1] and job[1] == loops[-1].axes[-1] and job[2] in _BOUNDED_SCANS
+        ]
     others = [job for job in groups if job not in leaders]
     least: dict[str, float] = dict.fromkeys(kinds, math.inf)
     done = 0
 
     def group(job: tuple[LoopUnderTest, str, str]) -> list[Crossing]:
         nonlocal done
-        found = _group(*job, coarse, least[job[2]])
+        found = _scan_group(*job, coarse, least[job[2]])
         done += 1
         progress(done / len(groups), f"{job[0].name}: {job[2].replace('_', ' ')} of {job[1]}")
         return found
 
     first = [found for job in leaders for found in group(job)]
     if overall:
-        least |= {kind: min(x.value for x in first if x.what == by) for by, led in _LED_BY.items() for kind in led}
+        least |= {
+            kind: min(x.value for x in first if x.what == by) for by, led in _BOUNDED_SCANS.items() for kind in led
+        }
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         return first + [found for part in pool.map(group, others) for found in part]
 
 
-def _group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float = math.inf) -> list[Crossing]:
+def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float = math.inf) -> list[Crossing]:
     """Return the crossings of one kind; scans end at `least`, or where an earlier one has crossed."""
     found: list[Crossing] = []
     sparse = math.isfinite(least)
@@ -200,9 +204,9 @@ def _group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float
         if least <= none:
             break  # there is no less to look for
         floor, value = case.floor(), none
-        if floor <= loop.size * _HUNTS:
+        if floor <= loop.size * _HUNTING_RAD:
             value = _first_crossing(case, floor, least, coarse, sparse)
-        hunts = floor if _TOLD * amplitude < floor < math.inf else 0.0
+        hunts = floor if _REPORTED_SHARE * amplitude < floor < math.inf else 0.0
         found.append(Crossing(loop.name, axes, what, amplitude, posture, value, hunts, loop.robot))
         least = min(least, value)
     return found
@@ -211,33 +215,33 @@ def _group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float
 def _first_crossing(case: _Case, floor: float, least: float, coarse: bool, sparse: bool = False) -> float:
     """Return the least value scanned at which the loop oscillates, bisected; inf where none below `least` does."""
     calm = 0.0 if case.what == "delay" else 1.0
-    for scanned in _scanned(case, coarse, sparse):
+    for scanned in _scan_values(case, coarse, sparse):
         value = min(scanned, least)
         if case.oscillates(value, floor):
-            return calm if coarse else _bisected(case, calm, value, floor)
+            return calm if coarse else _bisect(case, calm, value, floor)
         if value >= least:
             break
         calm = value
     return math.inf
 
 
-def _scanned(case: _Case, coarse: bool, sparse: bool) -> Iterator[float]:
+def _scan_values(case: _Case, coarse: bool, sparse: bool) -> Iterator[float]:
     if case.what == "delay":
         unit = case.loop.samples * case.sample_time
-        yield from (samples * unit for samples in (_DELAYS[1::2] if sparse else _DELAYS))
+        yield from (samples * unit for samples in (_DELAY_SAMPLES[1::2] if sparse else _DELAY_SAMPLES))
     else:
         # Down to a quarter: what is stable by itself stands that, and what is not fails sooner.
         yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse or sparse else _GAINS
 
 
-def _bisected(case: _Case, calm: float, loud: float, floor: float) -> float:
+def _bisect(case: _Case, calm: float, loud: float, floor: float) -> float:
     """Return the largest value found without oscillation between a calm one and a loud one."""
     if case.what == "delay":
-        while loud - calm > max(_FINE * loud, 0.02 * case.sample_time):
+        while loud - calm > max(_BISECTION_TOLERANCE * loud, 0.02 * case.sample_time):
             middle = 0.5 * (calm + loud)
             calm, loud = (calm, middle) if case.oscillates(middle, floor) else (middle, loud)
         return calm
-    while loud / calm > 1.0 + _FINE:
+    while loud / calm > 1.0 + _BISECTION_TOLERANCE:
         middle = math.sqrt(calm * loud)
         calm, loud = (calm, middle) if case.oscillates(middle, floor) else (middle, loud)
     return calm
@@ -266,8 +270,8 @@ class _Case:
         """Return whether the loop goes on moving at a gain, its reciprocal, or a delay [s]."""
         gain = {"gain_up": value, "gain_down": 1.0 / value, "delay": 1.0}[self.what]
         before, last = self._windows(gain, value / self.sample_time if self.what == "delay" else 0.0)
-        sustained = last >= _KEEPS * before or last >= _FED * self.amplitude
-        heard = (_HEARD_QUIET if self.what == "gain_down" else _HEARD) * self.amplitude
+        sustained = last >= _SUSTAINED_RATIO * before or last >= _MAX_SWING * self.amplitude
+        heard = (_AUDIBLE_SHARE_DOWN if self.what == "gain_down" else _AUDIBLE_SHARE) * self.amplitude
         return sustained and last > max(heard, _ABOVE_FLOOR * floor)
 
     def _windows(self, gain: float, delay: float) -> tuple[float, float]:
@@ -276,21 +280,21 @@ class _Case:
             result = self._run(gain, delay)
         except DataError:  # numbers overflowed
             return 0.0, math.inf
-        rows = round(_WINDOW * self.loop.time / result.sample_time)
+        rows = round(_WINDOW_S * self.loop.time / result.sample_time)
         angles = np.stack([result[name] for name in self.loop.outputs])
-        kicked = angles[:, result.time >= self.loop.time * _REST]
-        if (gain, delay) == (1.0, 0.0) and np.ptp(kicked, axis=1).max() <= _ANSWERS * self.amplitude:
+        kicked = angles[:, result.time >= self.loop.time * _REST_S]
+        if (gain, delay) == (1.0, 0.0) and np.ptp(kicked, axis=1).max() <= _RESPONSE_SHARE * self.amplitude:
             return 0.0, math.inf  # motors that stand at their ends, for one: nothing can be said of this loop
         parts = angles[:, -2 * rows : -rows], angles[:, -rows:]
-        before, last = (max(_swing(angle, _FED * self.amplitude) for angle in part) for part in parts)
+        before, last = (max(_oscillation(angle, _MAX_SWING * self.amplitude) for angle in part) for part in parts)
         return before, last
 
     def _run(self, gain: float, delay: float) -> LoopResult:
         loop = self.loop
-        chosen = [self.axes in (axis, _TOGETHER) for axis in loop.outputs]
+        chosen = [self.axes in (axis, _ALL_AXES) for axis in loop.outputs]
         parameters = {f"gain_{axis}": gain if on else 1.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
         parameters |= {f"delay_{axis}": delay if on else 0.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
-        block, connections = louder(loop.controller, loop.observer, loop.outputs, loop.samples)
+        block, connections = scale_loop_gain(loop.controller, loop.observer, loop.outputs, loop.samples)
         # Towards upright: no neck is led further than its posture.
         kick = np.array([-self.amplitude if p > 0.0 else self.amplitude for p in self.posture]) * chosen
         posture = tuple(float(a + b) for a, b in zip(loop.middle, self.posture, strict=True))
@@ -300,7 +304,7 @@ class _Case:
                 plant=loop.plant(), controller=BlockPart(loop.controller),
                 observer=None if loop.observer is None else BlockPart(loop.observer),
                 reference=_Kicked(posture, tuple(float(v) for v in kick), loop.time, middle), robot=loop.robot,
-                duration=loop.time * (_REST + _FORGOTTEN + 2.0 * _WINDOW), order=loop.order,
+                duration=loop.time * (_REST_S + _TRANSIENT_S + 2.0 * _WINDOW_S), order=loop.order,
                 **loop.constants, other_parameters={"louder": parameters},
                 others={"louder": BlockPart(block)}, connections=connections,
                 # A rate has no reference: it is wanted to be zero.
@@ -310,7 +314,7 @@ class _Case:
         )  # fmt: skip
 
 
-def _swing(angle: Vector, away: float) -> float:
+def _oscillation(angle: Vector, away: float) -> float:
     """Return how far an angle (time,) goes to and fro; peak to peak where that is `away`.
 
     A quiet loop may creep, or stick and come late: what goes one way is no oscillation, unless it runs away.
@@ -331,14 +335,14 @@ class _Kicked:
     together: float = 0.0
 
     def __call__(self, time: float) -> tuple[float, ...]:
-        led = 0.5 - 0.5 * math.cos(math.pi * min(1.0, time / (self.slower * _LED)))
-        on = float(time >= self.slower * _REST)
+        led = 0.5 - 0.5 * math.cos(math.pi * min(1.0, time / (self.slower * _LEAD_IN_S)))
+        on = float(time >= self.slower * _REST_S)
         return *(
             led * there + on * away for there, away in zip(self.posture, self.kick, strict=True)
         ), led * self.together
 
 
-def louder(
+def scale_loop_gain(
     controller: Block, observer: Block | None, outputs: tuple[str, ...] = _NECK.outputs.names, samples: int = 1
 ) -> tuple[Block, dict[str, str]]:
     """Return what makes a loop louder or later, and its connections: it stands behind the sensor.
@@ -350,7 +354,7 @@ def louder(
         samples: by how much longer its delays are than a neck's.
     """
     reader, role = (controller, "controller") if observer is None else (observer, "observer")
-    kept = (_KEPT - 2) * samples + 2
+    kept = (_BUFFER_SAMPLES - 2) * samples + 2
     names = [f"{axis}{what}" for what in ("", "_rate") for axis in outputs]
     seen = {name: name if observer is None else f"{name}_measured" for name in names}
     ports = {port.name: port for port in reader.inputs}
@@ -365,7 +369,7 @@ def louder(
         for name in read
     ]
     block = Block(
-        kind="louder", role="filter", runtime=_RUNTIME, sample_time=controller.sample_time,
+        kind="louder", role="filter", runtime=_LOOP_GAIN_RUNTIME, sample_time=controller.sample_time,
         arrays=(np.array([float(outputs.index(name.removesuffix("_rate"))) for name in read]), np.array([float(kept)])),  # pyright: ignore[reportArgumentType]
         inputs=(*inputs, *references),
         outputs=tuple(replace(port, name=f"{port.name}_seen") for port in inputs),
@@ -400,7 +404,7 @@ def crossing_values(found: Sequence[Crossing]) -> dict[str, tuple[Vector, list[C
     table: dict[str, tuple[Vector, list[Crossing]]] = {}
     for name, kinds, factor in (("gain_margin", ("gain_up", "gain_down"), 1.0), ("delay_margin_ms", ("delay",), 1e3)):
         names = found[0].robot.outputs.names if found else ()
-        for group, axes in (*((axis, (axis,)) for axis in names), ("axes", (*names, _TOGETHER))):
+        for group, axes in (*((axis, (axis,)) for axis in names), ("axes", (*names, _ALL_AXES))):
             chosen = [item for item in found if item.what in kinds and item.axes in axes]
             if chosen:
                 table[f"{group}.{name}"] = (factor * np.array([item.value for item in chosen]), chosen)

@@ -17,7 +17,7 @@ from softneck.loop import ORDERS
 from softneck.robot import Robot
 from softneck.runtime import Block
 
-from ._plants import Plants, mixing
+from ._plants import Plants, mixing_matrix
 
 # Margins that are better large, and better small; of each axis, and of all together.
 LARGE = ("disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
@@ -26,9 +26,9 @@ MIMO = "mimo_disk_margin"
 #: Of a neck [rad/s].
 LOWEST = 0.02
 # Plants whose responses are held in memory at once.
-_CHUNK = 64
+_CHUNK_SIZE = 64
 # The cosine of pi, up to 1e-6 rad.
-_PI = -1.0 + 5e-13
+_COS_PI = -1.0 + 5e-13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +105,7 @@ class LinearLaw:
         return self.C @ inner + D
 
 
-def judged(sample_time: float, time: float = 1.0, points: int = 360) -> Vector:
+def frequency_grid(sample_time: float, time: float = 1.0, points: int = 360) -> Vector:
     """Return the frequencies [rad/s] on which loops are judged, up to the Nyquist frequency.
 
     From 0.02 rad/s of a neck, of a robot that is `time` as slow from less.
@@ -131,7 +131,7 @@ def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     D = int(plants.delay.max(initial=0))
     size = q + D
     A, B, C = np.zeros((n, m * size, m * size)), np.zeros((n, m * size, m)), np.zeros((n, m, m * size))
-    rows, X = np.arange(n), mixing(plants.cross, m)
+    rows, X = np.arange(n), mixing_matrix(plants.cross, m)
     for i in range(m):
         at = i * size
         own = slice(at, at + q)
@@ -155,7 +155,7 @@ def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 def loops(plants: Plants, law: LinearLaw, w: Vector) -> tuple[np.ndarray, np.ndarray]:
     """Return the plants P and the open loops at their outputs -P Ky, both (n, m, axes, axes)."""
     G = plants.response(w)
-    P = mixing(plants.cross, G.shape[1])[:, None] * np.swapaxes(G, 1, 2)[..., None]
+    P = mixing_matrix(plants.cross, G.shape[1])[:, None] * np.swapaxes(G, 1, 2)[..., None]
     return P, -P @ law.feedback(w)
 
 
@@ -176,7 +176,8 @@ def margins(plants: Plants, law: LinearLaw, w: Vector, radius: Vector | None = N
     """
     size = radii(plants, law) if radius is None else radius
     parts = [
-        _margins(plants.take(np.arange(k, min(k + _CHUNK, len(plants)))), law, w) for k in range(0, len(plants), _CHUNK)
+        _margins(plants.take(np.arange(k, min(k + _CHUNK_SIZE, len(plants)))), law, w)
+        for k in range(0, len(plants), _CHUNK_SIZE)
     ]
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     unstable = size >= 1.0
@@ -199,7 +200,7 @@ def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
         found[f"{axis}.control_sensitivity"] = np.abs(CS[..., i, i]).max(axis=1)
         # S - T = 2 S - 1; radius of the balanced disk is 2 / max |S - T|.
         found[f"{axis}.disk_margin"] = 2.0 / np.abs(2.0 * own - 1.0).max(axis=1)
-        for name, values in classical(1.0 / own - 1.0, w).items():
+        for name, values in classical_margins(1.0 / own - 1.0, w).items():
             found[f"{axis}.{name}"] = values
     at_input = inverse(eye - law.feedback(w) @ P)
     sizes = [_scalars(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
@@ -218,7 +219,7 @@ def _scalars(M: np.ndarray) -> np.ndarray:
     return np.abs(np.linalg.eigvals(np.abs(M))).max(axis=-1)
 
 
-def classical(L: np.ndarray, w: Vector) -> dict[str, Vector]:
+def classical_margins(L: np.ndarray, w: Vector) -> dict[str, Vector]:
     """Return gain, phase [deg] and delay margins [ms] of scalar loops (n, m), by straight lines between frequencies.
 
     The gain margin is the factor, up or down, whichever is nearer; so is the phase.
@@ -235,7 +236,7 @@ def classical(L: np.ndarray, w: Vector) -> dict[str, Vector]:
         part = (border - phase[i, k]) / (phase[i, k + 1] - phase[i, k])
         gain[i] = min(gain[i], abs(size[i, k] + part * (size[i, k + 1] - size[i, k])))
     # At the Nyquist frequency a loop is real: where it is negative it has come to such a multiple, and passes none.
-    ends = np.cos(phase[:, -1]) < _PI
+    ends = np.cos(phase[:, -1]) < _COS_PI
     gain[ends] = np.minimum(gain[ends], np.abs(size[ends, -1]))
     least, delay = np.full(n, math.inf), np.full(n, math.inf)
     for i, k in np.argwhere((size[:, 1:] > 0.0) != (size[:, :-1] > 0.0)):
@@ -269,7 +270,7 @@ class ControllerUnderTest:
     why: str
 
 
-def judge(controller: Any, *, order: str | None, observer: bool) -> ControllerUnderTest:
+def controller_under_test(controller: Any, *, order: str | None, observer: bool) -> ControllerUnderTest:
     """Return what of `controller` can be judged.
 
     A linear controller has `ss()` (or `to_lti()`), from references and outputs to the redefined inputs; one that is
@@ -316,7 +317,7 @@ def _laws(controller: Any) -> tuple[dict[str, LinearLaw], str]:
     )
 
 
-_POINTS, _ABOVE = 2000, 400
+_POINT_COUNT, _POINTS_ABOVE = 2000, 400
 # What is certified on the data; the others of an axis are of the box and its samples alone.
 TESTED = ("sensitivity", "complementary", "disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
 
@@ -362,7 +363,7 @@ class AxisMargins:
         )
 
 
-def axis_on_data(
+def axis_margins(
     measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int, rolloff: float = -1.0
 ) -> AxisMargins:
     """Return the margins of one axis that hold for every response within the weight.
@@ -377,7 +378,7 @@ def axis_on_data(
         rolloff: by which the loudest response at the band's end falls above it [dB/decade]; below 0 nobody knows.
     """
     Ts = law.sample_time
-    w = np.geomspace(*measured.band, _POINTS)
+    w = np.geomspace(*measured.band, _POINT_COUNT)
     G0 = response_of(measured.model, w, Ts) * np.exp(-1j * w * Ts * extra)
     L = -law.feedback(w)[:, axis, axis] * G0
     # Half the way to the next frequency on top: no point of the curve lies between two disks.
@@ -386,7 +387,7 @@ def axis_on_data(
     loud = (1.0 + W) * np.abs(L)
     above = np.flatnonzero(loud >= 1.0)
     crossover = float(w[above[-1]]) if above.size else float(w[0])
-    above_band = _above(measured.band[1], (1.0 + W[-1]) * np.abs(G0[-1]), law, axis, rolloff)
+    above_band = _largest_gain_above(measured.band[1], (1.0 + W[-1]) * np.abs(G0[-1]), law, axis, rolloff)
     if max(loud[-1], above_band) >= 1.0:
         crossover = math.inf
     mu = W * np.abs(L / (1.0 + L))
@@ -412,11 +413,11 @@ def axis_on_data(
     )  # fmt: skip
 
 
-def _above(end: float, loudest: float, law: LinearLaw, axis: int, rolloff: float) -> float:
+def _largest_gain_above(end: float, loudest: float, law: LinearLaw, axis: int, rolloff: float) -> float:
     """Return the largest loop gain between the band's end [rad/s] and Nyquist that the stated roll-off leaves, or 0."""
     if rolloff < 0.0 or end >= math.pi / law.sample_time:
         return 0.0
-    w = np.geomspace(end, math.pi / law.sample_time, _ABOVE)
+    w = np.geomspace(end, math.pi / law.sample_time, _POINTS_ABOVE)
     return float((np.abs(law.feedback(w)[:, axis, axis]) * loudest * (end / w) ** (rolloff / 20.0)).max())
 
 
@@ -464,13 +465,13 @@ def _gain_ratio(L: np.ndarray, W: Vector) -> Vector:
     return np.minimum(*ratios)
 
 
-def tested_axes(
+def data_margins(
     families: Mapping[str, Any], law: LinearLaw, axes: tuple[str, ...], extra: int, rolloff: float
 ) -> list[AxisMargins]:
     """Return what the data support about every axis of every family that was tested against them."""
     return [
         replace(
-            axis_on_data(measured, law, axes.index(axis), source=name, name=axis, extra=extra, rolloff=rolloff),
+            axis_margins(measured, law, axes.index(axis), source=name, name=axis, extra=extra, rolloff=rolloff),
             unheard=tuple(family.findings.get("tested", {}).get("unheard", {}).get(axis, ())),
         )
         for name, family in families.items()

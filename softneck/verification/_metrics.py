@@ -16,13 +16,13 @@ from softneck.loop import error_unit
 from softneck.robot import MOTOR_RANGE, Robot, Scaling
 
 from ._linear import LARGE, SMALL
-from ._plants import UncertainNeck
+from ._plants import PlantSource
 from ._steps import METRICS
 
 # Of the defaults [deg].
 _NOISE_DEG = 0.05
 # Angles of every robot, whatever the unit of its outputs is.
-_ANGLES = ("orientations_deg", "phase_margin_deg")
+_ANGLE_KEYS = ("orientations_deg", "phase_margin_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +46,7 @@ class Scale:
     known: bool = True
 
     @classmethod
-    def of(cls, robot: Robot, sources: Sequence[UncertainNeck] = ()) -> Scale:
+    def of(cls, robot: Robot, sources: Sequence[PlantSource] = ()) -> Scale:
         """Return the scale from the robot file, else from its ranges and plants.
 
         Raises:
@@ -65,13 +65,13 @@ class Scale:
                 for source, each in zip(sources, most, strict=True) for box, v in zip(source.axes, each, strict=True)
             )  # fmt: skip
             output = reached if outputs.min is None or outputs.max is None else min(output, reached)
-        size = output * math.radians(1.0) / _shown(robot)
+        size = output * math.radians(1.0) / _unit_factor(robot)
         noise = size * _NOISE_DEG
         if robot.noise_std is not None:
-            noise = robot.noise_std * to_si(outputs.unit)[0] / _shown(robot)
+            noise = robot.noise_std * to_si(outputs.unit)[0] / _unit_factor(robot)
         return cls(
             robot=robot, time=scaling.second, size=size, load=load / to_si(motors.unit)[0],
-            noise=digits(noise / _NOISE_DEG),
+            noise=round_12_digits(noise / _NOISE_DEG),
             known=bool(sources) or None not in (robot.time_constant_s, motors.nominal, outputs.nominal),
         )  # fmt: skip
 
@@ -88,14 +88,14 @@ class Scale:
             return self.noise
         if name == "circle_rad_s":
             return 1.0 / self.time
-        if name.endswith("_deg") and name not in _ANGLES:
+        if name.endswith("_deg") and name not in _ANGLE_KEYS:
             # A steady output is no quieter than its sensor.
             return max(self.size, self.noise) if name == "steady_rms_deg" else self.size
         return self.time if name.endswith(("_s", "_ms")) else 1.0
 
     def name_of(self, name: str) -> str:
         """Return a neck's key or metric as the robot's: `load_rms_mm` for `load_rms_deg`, `max_bar` for `max_rad`."""
-        if name.rpartition(".")[2] in _ANGLES:
+        if name.rpartition(".")[2] in _ANGLE_KEYS:
             return name
         motor = self.robot.motors.unit.replace("/", "_")
         own = re.sub(r"_deg$", f"_{error_unit(self.robot)[0]}", name)
@@ -118,7 +118,7 @@ class Scale:
         return np.degrees(values) if factor is None else values / factor
 
 
-def _shown(robot: Robot) -> float:
+def _unit_factor(robot: Robot) -> float:
     factor = error_unit(robot)[1]
     return math.radians(1.0) if factor is None else factor
 
@@ -128,10 +128,10 @@ def _times(factor: float, value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _times(factor, item) for key, item in value.items()}
     plain = isinstance(value, bool) or not isinstance(value, int | float) or factor == 1.0
-    return value if plain else digits(factor * value)
+    return value if plain else round_12_digits(factor * value)
 
 
-def digits(value: float) -> float:
+def round_12_digits(value: float) -> float:
     """Return it to 12 digits: without what conversions of units round."""
     return float(f"{value:.12g}")
 

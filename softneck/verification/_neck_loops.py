@@ -26,7 +26,7 @@ from ._requirements import Requirements
 from ._steps import Steps
 
 # Set by hand [rad]: pretension changes by some 3 % of itself.
-_SAME = 0.1
+_COCONTRACTION_TOLERANCE_RAD = 0.1
 # Of `adaptive` on foreign necks such margins were up to four times the true ones.
 ALONE = (
     "not supported by the data: found by experiment on models alone; a controller without linear form (`ss()`) is not "
@@ -35,7 +35,7 @@ ALONE = (
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class OwnPlant:
+class SimulationModel:
     """A simulation model of the robot.
 
     Attributes:
@@ -94,12 +94,12 @@ def _opened_plant(item: Any, robot: str | Path | Robot | None) -> Any:
     if path is not None and (path.suffix == ".toml" or (str(item) in PRESETS and not path.exists())):
         return NeckParameters.preset(str(item))
     thing = load_for_robot(item, robot=robot)
-    if not hasattr(thing, "tf") and (path is not None or not is_own_plant(thing)):
+    if not hasattr(thing, "tf") and (path is not None or not is_simulation_model(thing)):
         raise SettingsError(f"{item}: a MODEL, FAMILY, NECK or FMU is needed; this is a {type(thing).__name__}.")
     return thing
 
 
-def is_own_plant(thing: Any) -> bool:
+def is_simulation_model(thing: Any) -> bool:
     """Return whether a thing steps as a plant and has no linear form that a model or a family is judged by."""
     if isinstance(thing, NeckParameters | VirtualNeck | Block):
         return True
@@ -113,7 +113,7 @@ def is_own_plant(thing: Any) -> bool:
     return False
 
 
-def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
+def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> SimulationModel:
     """Return a neck's parameters, a nonlinear model, a block, or a function that returns a part, as a plant.
 
     Raises:
@@ -122,7 +122,7 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
     if isinstance(thing, NeckParameters | VirtualNeck):
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
         still = VirtualNeck(neck.parameters.without_noise(), neck.robot)
-        return OwnPlant(
+        return SimulationModel(
             name=name, payload="inputs", parameters=neck.parameters,
             make=lambda seed, Ts: BlockPart(neck.block(noise_seed=seed, sample_time=Ts)),
             quiet=lambda Ts: BlockPart(still.block(sample_time=Ts)),
@@ -146,13 +146,13 @@ def own_plant(thing: Any, name: str, robot: Robot | None = None) -> OwnPlant:
     settable = part.block.parameters if isinstance(part, BlockPart) and "payload_kg" in known else ()
     taken = {"inputs": part.inputs, "parameters": settable}
     payload = next((how for how, ports in taken.items() if any(port.name == "payload" for port in ports)), "")
-    return OwnPlant(
+    return SimulationModel(
         name=name, make=lambda _seed, _Ts: make(), quiet=lambda _Ts: make(), payload=payload, conditions=known
     )  # fmt: skip
 
 
-def not_recorded(
-    tested: Mapping[str, Any], own: Sequence[OwnPlant], steps: Steps, robot: Robot | None = None
+def unrecorded_conditions(
+    tested: Mapping[str, Any], own: Sequence[SimulationModel], steps: Steps, robot: Robot | None = None
 ) -> dict[str, str]:
     """Return why nothing is known of the "loop" and of simulation models, "sim"; nothing where all was recorded.
 
@@ -165,7 +165,11 @@ def not_recorded(
     robot = robot or Robot.preset()
     if robot.tendon_angles is None:
         return {}
-    factor, unit, same = to_si(robot.motors.unit)[0], robot.motors.unit, _SAME * Scaling.of(robot).motor_unit
+    factor, unit, same = (
+        to_si(robot.motors.unit)[0],
+        robot.motors.unit,
+        _COCONTRACTION_TOLERANCE_RAD * Scaling.of(robot).motor_unit,
+    )
     half = steps.motors.shape[2] // 2
     # Of most plants: where motors reach their limits their mean is another.
     held = float(np.median(steps.motors[:, :, half - 1].mean(axis=-1)))
@@ -173,7 +177,7 @@ def not_recorded(
     for name, item in tested.items():
         made = item.get("conditions", [])
         for kg in sorted({value for part in made for value in part["payload_kg"]}):
-            if not any(_carries(plant, kg, held) for plant in own):
+            if not any(_covers(plant, kg, held) for plant in own):
                 found["sim"] = (
                     f"not supported by the data: {name} was recorded with {kg:g} kg, and no simulation model carries "
                     f"that at a co-contraction of {held / factor:.2g} {unit}; `softneck identify greybox` a recording "
@@ -190,7 +194,7 @@ def not_recorded(
     return found
 
 
-def payloads_left_out(own: Sequence[OwnPlant], asked: Requirements) -> dict[str, str]:
+def missing_payloads(own: Sequence[SimulationModel], asked: Requirements) -> dict[str, str]:
     """Return which of the payloads asked for no loop of a plant carried, as it knows none; nothing where all did."""
     wanted = [kg for kg in asked.sim["payloads_kg"] if kg > 0.0]
     left = {plant.name: [f"{kg:g}" for kg in wanted if kg not in plant.payloads(wanted)] for plant in own}
@@ -205,11 +209,12 @@ def payloads_left_out(own: Sequence[OwnPlant], asked: Requirements) -> dict[str,
     return {"loops with payload": f"{'; '.join(said)}; {way}"}
 
 
-def _carries(plant: OwnPlant, kg: float, held: float) -> bool:
+def _covers(plant: SimulationModel, kg: float, held: float) -> bool:
     """Return whether a plant takes any payload, or was made from recordings with this one and where the loop is."""
     known = plant.conditions
     return plant.payload == "inputs" or (
-        _within(kg, known.get("payload_kg", [0.0])) and _within(held, known.get("cocontraction", [held]), _SAME)
+        _within(kg, known.get("payload_kg", [0.0]))
+        and _within(held, known.get("cocontraction", [held]), _COCONTRACTION_TOLERANCE_RAD)
     )
 
 
@@ -218,15 +223,15 @@ def _within(value: float, ends: Sequence[float], more: float = 0.0) -> bool:
 
 
 # When the step comes [s]: after the controller took over the motors, or has pulled tendons taut.
-_STEP_AT, _TAUT_AT = 0.5, 3.0
-_AXIS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
-_MOTORS = ("max_rad", "limit_violation_s", "slack_s")
+_STEP_AT_S, _STEP_AT_TAUT_S = 0.5, 3.0
+_AXIS_METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
+_MOTOR_METRICS = ("max_rad", "limit_violation_s", "slack_s")
 # An axis that moves less than this part of the step is not judged as stepped.
-_SMALL = 0.05
+_STEPPED_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NeckRun:
+class LoopRun:
     """One loop over an own plant or the virtual neck.
 
     Attributes:
@@ -248,7 +253,7 @@ class NeckRun:
     result: LoopResult | None
 
 
-def no_virtual_plant(robot: Robot, asked: Requirements) -> str:
+def why_no_virtual_plant(robot: Robot, asked: Requirements) -> str:
     """Return why there are no loops over a virtual plant; "" where there are."""
     if not asked.sim["necks"]:
         return "no loops over the virtual neck were asked for (necks = 0)"
@@ -286,13 +291,13 @@ def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
     return (math.cos(orientation), math.sin(orientation), *[0.0] * (outputs - 2))[:outputs]
 
 
-def step_at(controller: Block, asked: Requirements) -> float:
+def step_time(controller: Block, asked: Requirements) -> float:
     """Return when the step comes [s]."""
     pulls = any(port.name == "least_cocontraction" and (port.start or 0.0) > 0.0 for port in controller.parameters)
-    return asked.scale.time * (_TAUT_AT if pulls else _STEP_AT)
+    return asked.scale.time * (_STEP_AT_TAUT_S if pulls else _STEP_AT_S)
 
 
-def run_necks(
+def run_loops(
     controller: Block,
     asked: Requirements,
     *,
@@ -300,8 +305,8 @@ def run_necks(
     observer: Block | None,
     seed: int,
     progress: Progress,
-    own: Sequence[OwnPlant] = (),
-) -> list[NeckRun]:
+    own: Sequence[SimulationModel] = (),
+) -> list[LoopRun]:
     """Return all runs that the table [sim] of the requirements asks for, over the user's own plants if there are any.
 
     Raises:
@@ -315,7 +320,7 @@ def run_necks(
         (plant, payload, angle) for plant in plants
         for payload in plant.payloads(table["payloads_kg"]) for angle in angles
     ]  # fmt: skip
-    runs, size, at = [], asked.si(float(table["size_deg"])), step_at(controller, asked)
+    runs, size, at = [], asked.si(float(table["size_deg"])), step_time(controller, asked)
     for number, (plant, payload, angle) in enumerate(cases):
         name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
         progress(number / len(cases), name)
@@ -326,25 +331,25 @@ def run_necks(
             order=order, observer=observer,
         )  # fmt: skip
         values, result = judge_loop(loop)
-        runs.append(NeckRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
+        runs.append(LoopRun(name, plant.parameters, float(payload), math.radians(angle), seed + number, values, result))
     return runs
 
 
-def _virtual(asked: Requirements, seed: int) -> list[OwnPlant]:
+def _virtual(asked: Requirements, seed: int) -> list[SimulationModel]:
     """Return the virtual plant that the table [sim] asks for and plausible ones around it."""
     table = asked.sim
     base, plant = virtual_plant(asked.robot, asked)
     rng = np.random.default_rng(seed)
     spread = table["spread_pct"] / 100.0
     count = int(table["necks"])
-    necks = [plant.parameters, *(_near(plant, rng, spread) for _ in range(count - 1))][:count]
+    necks = [plant.parameters, *(_sample_neck(plant, rng, spread) for _ in range(count - 1))][:count]
     return [
-        own_plant(VirtualNeck(neck, asked.robot), base if k == 0 else f"{base} varied {k}")
+        make_simulation_model(VirtualNeck(neck, asked.robot), base if k == 0 else f"{base} varied {k}")
         for k, neck in enumerate(necks)
     ]
 
 
-def _near(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckParameters:
+def _sample_neck(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckParameters:
     """Return a plausible neck around a robot's that its tendons do not buckle."""
     for _ in range(100):
         found = plant.parameters.sample(rng, spread=spread)
@@ -356,9 +361,18 @@ def _near(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckPa
 
 
 def step_loop(
-    controller: Block, part: Part, plant: OwnPlant, payload: float, reference: Callable[[float], tuple[float, ...]],
-    asked: Requirements, *, duration: float, order: str, observer: Block | None, faults: Sequence[Any] = (),
-) -> Loop:  # fmt: skip
+    controller: Block,
+    part: Part,
+    plant: SimulationModel,
+    payload: float,
+    reference: Callable[[float], tuple[float, ...]],
+    asked: Requirements,
+    *,
+    duration: float,
+    order: str,
+    observer: Block | None,
+    faults: Sequence[Any] = (),
+) -> Loop:
     """Return a loop over a part that a plant makes."""
     return Loop(
         plant=part, controller=BlockPart(controller), observer=None if observer is None else BlockPart(observer),
@@ -386,25 +400,25 @@ def judge_loop(
         result = run_loop(loop, compiled=compiled)
     except DataError:
         # Numbers overflowed: the loop is not stable, whatever its margins say.
-        return dict.fromkeys((*_AXIS, *_MOTORS), math.inf), None
+        return dict.fromkeys((*_AXIS_METRICS, *_MOTOR_METRICS), math.inf), None
     table, robot = metrics(result, angle=angle), result.robot
     names = Scale(robot=robot).name_of
     sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in robot.outputs.names}
-    stepped = [axis for axis, size in sizes.items() if size > _SMALL * max(sizes.values())]
+    stepped = [axis for axis, size in sizes.items() if size > _STEPPED_SHARE * max(sizes.values())]
     values = {}
-    for name in _AXIS:
+    for name in _AXIS_METRICS:
         found = [table[axis][names(name)] for axis in stepped]
         values[name] = (
             math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
         )
-    told = {name: table["motors"][names(name)] for name in _MOTORS}
+    told = {name: table["motors"][names(name)] for name in _MOTOR_METRICS}
     # A plant that tells no tension says nothing of slack tendons.
     values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
     return values, result
 
 
 def loops_under_test(
-    controller: Block, own: Sequence[OwnPlant], asked: Requirements, *, order: str, observer: Block | None
+    controller: Block, own: Sequence[SimulationModel], asked: Requirements, *, order: str, observer: Block | None
 ) -> list[LoopUnderTest]:
     """Return the loops for margins by experiment: each simulation model, with its lightest and its heaviest payload.
 

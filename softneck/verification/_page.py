@@ -14,8 +14,8 @@ from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
 from ._metrics import Scale, metric_title
-from ._neck_loops import NeckRun, direction
-from ._plants import Plants, mixing
+from ._neck_loops import LoopRun, direction
+from ._plants import Plants, mixing_matrix
 from ._steps import Steps
 from ._verify import Verdict, Verification
 
@@ -23,11 +23,13 @@ RED, PURPLE = "#D55E00", "#CC79A7"
 # Of 1 to 8 motors.
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, "#56B4E9", "#F0E442")
 # Responses that an envelope is taken over; more would not be seen.
-_MOST = 240
-_FREQUENCY = "frequency [rad/s]"
-_CAPTION = f"Band: an even choice of up to {_MOST} plants; black: nominal; red: the plant with the least disk margin."
+_MAX_CURVES = 240
+_FREQUENCY_LABEL = "frequency [rad/s]"
+_CAPTION = (
+    f"Band: an even choice of up to {_MAX_CURVES} plants; black: nominal; red: the plant with the least disk margin."
+)
 # What no robot's numbers in SI reach: pressures have some 1e6 Pa.
-_LARGEST = 1e9
+_LARGEST_DRAWN = 1e9
 
 
 def frequency_charts(part: LinearEvidence, w: Vector, gain: str = "rad/rad") -> list[Chart]:
@@ -36,7 +38,7 @@ def frequency_charts(part: LinearEvidence, w: Vector, gain: str = "rad/rad") -> 
     `gain` is the SI unit of the plants' static gains.
     """
     back = "/".join(reversed(gain.split("/")))
-    rows = _chosen(part)
+    rows = _select_rows(part)
     P, L = loops(part.plants.take(rows), part.law, w)
     S = inverse(np.eye(len(part.plants.axes)) + L)
     PS, CS = S @ P, -part.law.feedback(w) @ S
@@ -44,25 +46,26 @@ def frequency_charts(part: LinearEvidence, w: Vector, gain: str = "rad/rad") -> 
     for i, axis in enumerate(part.plants.axes):
         own = S[..., i, i]
         gang = {
-            "|S|, from load at the output": np.abs(own), "|T|, from reference to output": np.abs(1.0 - own),
+            "|S|, from load at the output": np.abs(own),
+            "|T|, from reference to output": np.abs(1.0 - own),
             f"|PS|, from load at the input [{gain}]": np.abs(PS[..., i, i]),
             f"|CS|, from noise to input [{back}]": np.abs(CS[..., i, i]),
-        }  # fmt: skip
+        }
         worst = _worst_in(part, rows, f"{axis}.disk_margin")
         panels = [_envelope(w, values, name, worst) for name, values in gang.items()]
         charts.append(
             Chart(
-                f"Gang of four: {axis}", panels, _FREQUENCY, columns=2, row_height=2.6,
+                f"Gang of four: {axis}", panels, _FREQUENCY_LABEL, columns=2, row_height=2.6,
                 caption=_CAPTION,
             )
         )  # fmt: skip
     return charts
 
 
-def _chosen(part: LinearEvidence) -> np.ndarray:
+def _select_rows(part: LinearEvidence) -> np.ndarray:
     """Return the rows that are drawn: the first, an even choice, and the worst ones."""
     n = len(part.plants)
-    rows = np.unique(np.linspace(0, n - 1, min(n, _MOST)).astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, _MAX_CURVES)).astype(int))
     worst = [int(np.argmin(part.margins[f"{axis}.disk_margin"])) for axis in part.plants.axes]
     return np.unique(np.concatenate([[0], rows, worst]))
 
@@ -84,7 +87,7 @@ def _bode(part: LinearEvidence, rows: np.ndarray, S: np.ndarray, w: Vector) -> C
             _envelope(w, phase, f"phase of {axis} [deg]", worst, level=-180.0, log=False, y_range=(-540.0, 30.0))
         )
     return Chart(
-        "Bode envelopes of the open loops", panels, _FREQUENCY, columns=2, row_height=2.6,
+        "Bode envelopes of the open loops", panels, _FREQUENCY_LABEL, columns=2, row_height=2.6,
         caption=_CAPTION,
     )  # fmt: skip
 
@@ -118,7 +121,7 @@ def mu_charts(part: LinearEvidence) -> list[Chart]:
             top = max(1.1, 1.1 * float(row.upper.max()))
             panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
     return (
-        [Chart("Structured singular value for stability of the box", panels, _FREQUENCY, row_height=2.4)]
+        [Chart("Structured singular value for stability of the box", panels, _FREQUENCY_LABEL, row_height=2.4)]
         if panels
         else []
     )
@@ -154,7 +157,7 @@ def step_chart(steps: Steps, plants: Plants, scale: Scale) -> Chart:
 
 def _drawable(y: Vector) -> Vector:
     """Return `y` without what is too large to draw."""
-    return np.where(np.isfinite(y) & (np.abs(y) < _LARGEST), y, np.nan)
+    return np.where(np.isfinite(y) & (np.abs(y) < _LARGEST_DRAWN), y, np.nan)
 
 
 def neck_chart(evidence: Evidence, scale: Scale) -> Chart:
@@ -164,7 +167,7 @@ def neck_chart(evidence: Evidence, scale: Scale) -> Chart:
         raise ValueError("no simulated loop came to its end")
     worst = max(runs, key=lambda run: run.metrics["overshoot_pct"])
     slow = max(runs, key=lambda run: run.metrics["settling_s"])
-    along = {id(run): scale.shown(_along(run)) for run in runs}
+    along = {id(run): scale.shown(_output_along_step(run)) for run in runs}
     table = np.array(list(along.values()))
     t = runs[0].result.time if runs[0].result is not None else np.zeros(0)
     curves = [
@@ -177,7 +180,7 @@ def neck_chart(evidence: Evidence, scale: Scale) -> Chart:
     return Chart(title, [Panel(curves, f"true output along the step [{unit}]")], row_height=3.4)
 
 
-def _along(run: NeckRun) -> Vector:
+def _output_along_step(run: LoopRun) -> Vector:
     if run.result is None:
         return np.zeros(0)
     robot = run.result.robot
@@ -194,8 +197,8 @@ def verdict_table(found: Verification) -> Table:
     rows = [
         [
             metric_title(verdict.requirement.metric), number(verdict.value),
-            f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _word(verdict),
-            _plant(verdict, axes),
+            f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _verdict_word(verdict),
+            _worst_plant(verdict, axes),
         ]
         for verdict in found.verdicts
     ]  # fmt: skip
@@ -211,13 +214,13 @@ def number(value: Any) -> str:
     return f"{value:.4g}"
 
 
-def _word(verdict: Verdict) -> str:
+def _verdict_word(verdict: Verdict) -> str:
     if verdict.holds is None and verdict.value is not None:
         return "does not decide"
     return {True: "holds", False: "fails", None: "not computed"}[verdict.holds]
 
 
-def _plant(verdict: Verdict, axes: tuple[str, ...]) -> str:
+def _worst_plant(verdict: Verdict, axes: tuple[str, ...]) -> str:
     if verdict.note:
         return verdict.note.removeprefix("not computed: ")
     worst = verdict.worst
@@ -236,7 +239,7 @@ def verification_page(found: Verification, controller: str, certificate: str = "
     evidence, scale = found.evidence, found.requirements.scale
     first, *others = scale.robot.outputs.names
     stepped = step_chart(evidence.steps, evidence.stepped, scale)
-    sections = [_first(found, certificate, stepped)]
+    sections = [_requirements_section(found, certificate, stepped)]
     for part in evidence.linear:
         sections += _linear_sections(found, part)
     each = f" and, in a run of its own, of {' and '.join(others)}" if others else ""
@@ -247,21 +250,21 @@ def verification_page(found: Verification, controller: str, certificate: str = "
     sections.append(Section("Steps", tables=[_spread(found, "step")], method=text))
     if evidence.necks:
         charts = [neck_chart(evidence, scale)] if any(run.result is not None for run in evidence.necks) else []
-        sections.append(Section("Simulated loops", tables=[_spread(found, "sim"), _runs(found)], charts=charts))
-    sections.append(_plants(found))
+        sections.append(Section("Simulated loops", tables=[_spread(found, "sim"), _runs_table(found)], charts=charts))
+    sections.append(_plants_section(found))
     words = "holds" if found.holds else "does not hold"
     return page(
-        f"{controller} {words}", sections, verdict=_sentence(found), holds=found.holds,
+        f"{controller} {words}", sections, verdict=_verdict_sentence(found), holds=found.holds,
         footer="Written by softneck verify.",
     )  # fmt: skip
 
 
-def _sentence(found: Verification) -> str:
+def _verdict_sentence(found: Verification) -> str:
     """Return the verdict: what holds, and what fails where."""
     axes = found.controller.robot.outputs.names
     failed = [
         f"{metric_title(v.requirement.metric)} is {number(v.value)}, required {_BOUNDS[v.requirement.bound]} "
-        f"{v.requirement.limit:g} ({_plant(v, axes)})"
+        f"{v.requirement.limit:g} ({_worst_plant(v, axes)})"
         for v in found.failed
     ]
     count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"
@@ -285,7 +288,7 @@ def _absent(verdict: Verdict) -> bool:
     return verdict.value is None
 
 
-def _first(found: Verification, certificate: str, stepped: Chart) -> Section:
+def _requirements_section(found: Verification, certificate: str, stepped: Chart) -> Section:
     text = [f"{found.summary()[0].upper()}{found.summary()[1:]}."]
     if certificate:
         text.append(f"Certificate: {certificate}. Each worst plant stands beside it as a loop for softneck simulate.")
@@ -334,7 +337,7 @@ def _spread(found: Verification, group: str) -> Table:
     return Table("Over all of them", ["metric", "nominal", "median", "worst", "worst plant"], rows)
 
 
-def _runs(found: Verification) -> Table:
+def _runs_table(found: Verification) -> Table:
     runs = found.evidence.necks
     names = list(runs[0].metrics)
     rows = [[run.name, *(number(run.metrics[name]) for name in names)] for run in runs]
@@ -342,7 +345,7 @@ def _runs(found: Verification) -> Table:
     return Table("Each loop", ["plant, payload, direction", *shown], rows)
 
 
-def _plants(found: Verification) -> Section:
+def _plants_section(found: Verification) -> Section:
     rows = []
     robot, scale = found.controller.robot, found.requirements.scale
     motor = to_si(robot.motors.unit)[0]
@@ -361,7 +364,7 @@ def _plants(found: Verification) -> Section:
     ]
     cross = [
         f"{neck.name}: {robot.input_names[j]} into {axis} {mixed[i, j]:+.3f} of its own gain."
-        for neck in found.necks for mixed in [mixing(neck.cross, len(neck.names))]
+        for neck in found.necks for mixed in [mixing_matrix(neck.cross, len(neck.names))]
         for i, axis in enumerate(neck.names) for j in range(len(neck.names)) if i != j
     ]  # fmt: skip
     files = [[role, path, digest] for role, (path, digest) in found.files.items()]

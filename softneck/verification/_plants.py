@@ -20,7 +20,7 @@ from softneck.identification import AxisMeasured, response_of
 from softneck.robot import Robot
 
 # Halvings of the way to a plant that is excluded: to a thousandth.
-_HALVINGS = 10
+_BISECTION_STEPS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -71,7 +71,7 @@ def within_weight(numbers: Matrix, box: AxisBox, Ts: float) -> Matrix:
     inside = known[int(np.argmin(excess))]
     share = np.where(_excess(numbers, box, Ts) <= 1.0, 1.0, 0.0)[:, None]
     excluded = 1.0 - share
-    for k in range(1, _HALVINGS + 1):
+    for k in range(1, _BISECTION_STEPS + 1):
         further = share + 0.5**k * excluded
         allowed = _excess(inside + further * (numbers - inside), box, Ts) <= 1.0
         share = np.where(allowed[:, None], further, share)
@@ -82,14 +82,14 @@ def _excess(numbers: Matrix, box: AxisBox, Ts: float) -> Vector:
     """Return how many times the weight over the recordings each plant (n, 3) needs in their band."""
     measured: Any = box.measured
     z = np.exp(1j * measured.frequency * Ts)
-    above, below, delay = sampled(numbers, box.rest, Ts)
+    above, below, delay = discretize_axis(numbers, box.rest, Ts)
     powers = z ** np.arange(above.shape[1] - 1, -1, -1)[:, None]
     G = (above @ powers) / (below @ powers) * z ** -delay[:, None].astype(float)
     error = np.abs(G / response_of(measured.model, measured.frequency, Ts) - 1.0)
     return (error / np.maximum(measured.weight, 1e-12)).max(axis=1)
 
 
-def sampled(numbers: Matrix, rest: tuple[Vector, Vector], Ts: float) -> tuple[Matrix, Matrix, np.ndarray]:
+def discretize_axis(numbers: Matrix, rest: tuple[Vector, Vector], Ts: float) -> tuple[Matrix, Matrix, np.ndarray]:
     """Return numerator and denominator (n, q) and delay (n,) of one axis: y+ = a y + b0 u(k-d) + b1 u(k-d-1)."""
     K, p, L = numbers.T
     # 1e-9: dead times such as 0.08 / 0.02 are whole but for rounding.
@@ -110,12 +110,12 @@ def _products(rows: Matrix, polynomial: Vector) -> Matrix:
 
 
 # A pole that does not count, by the sample rate: so fast that a sample is over before it shows.
-_NO_POLE = 200.0
-_ROUNDING = 1e-6
+_INVISIBLE_POLE = 200.0
+_CROSS_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class UncertainNeck:
+class PlantSource:
     """One source of plants.
 
     Attributes:
@@ -196,7 +196,7 @@ class Plants:
         return (self.numerator @ powers) / (self.denominator @ powers) * z ** -self.delay[:, :, None].astype(float)
 
 
-def neck_of_family(family: Any, name: str) -> UncertainNeck:
+def source_of_family(family: Any, name: str) -> PlantSource:
     """Return a `Family` as a source of plants, the samples that it uses with their standard deviations.
 
     Raises:
@@ -217,19 +217,19 @@ def neck_of_family(family: Any, name: str) -> UncertainNeck:
             )
         )  # fmt: skip
     own = np.array([family.axes[axis].nominal[0] for axis in names])
-    cross = np.nan_to_num(between(family.cross[:, : len(names)] / own[:, None]))
-    return UncertainNeck(
+    cross = np.nan_to_num(off_diagonal(family.cross[:, : len(names)] / own[:, None]))
+    return PlantSource(
         name=name, sample_time=family.sample_time, axes=tuple(boxes), cross=cross, kind="family",
         robot=robot_of(family), weights=directions_of(family),
     )  # fmt: skip
 
 
-def between(matrix: Matrix) -> Vector:
+def off_diagonal(matrix: Matrix) -> Vector:
     """Return the entries of a matrix (m, m) beside its diagonal (m (m - 1),), row by row."""
     return np.asarray(matrix)[~np.eye(len(matrix), dtype=bool)]
 
 
-def mixing(cross: np.ndarray, axes: int) -> np.ndarray:
+def mixing_matrix(cross: np.ndarray, axes: int) -> np.ndarray:
     """Return X (..., m, m) with which the inputs v of all axes act as X v: ones, and `cross` (..., m (m - 1))."""
     X = np.zeros((*cross.shape[:-1], axes, axes))
     X[..., np.eye(axes, dtype=bool)] = 1.0
@@ -237,7 +237,7 @@ def mixing(cross: np.ndarray, axes: int) -> np.ndarray:
     return X
 
 
-def neck_of_model(model: Any, name: str, spread: Mapping[str, float]) -> UncertainNeck:
+def source_of_model(model: Any, name: str, spread: Mapping[str, float]) -> PlantSource:
     """Return a linear model as a source of plants within +-`gain` and +-`pole` (relative) and +-`delay` [s] of it.
 
     Raises:
@@ -252,7 +252,7 @@ def neck_of_model(model: Any, name: str, spread: Mapping[str, float]) -> Uncerta
             raise SettingsError(f"{name}: {error}") from error
     if not all(math.isclose(plants[0].sample_time, plant.sample_time, rel_tol=1e-9) for plant in plants):
         raise SettingsError(f"{name}: {' and '.join(names)} have different sample times.")
-    return UncertainNeck(
+    return PlantSource(
         name=name, sample_time=plants[0].sample_time, axes=tuple(_axis_of(plant, spread) for plant in plants),
         cross=_cross_gains(model, plants, robot), kind="model", robot=robot, weights=directions_of(model),
     )  # fmt: skip
@@ -265,7 +265,7 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
     dead = plant.delay * Ts
     if abs(slowest.imag) > 1e-9 or slowest.real <= 1e-6:
         # No slowest real pole to be uncertain about: one that does not show, and all else is certain.
-        nominal = np.array([gain, _NO_POLE / Ts, dead])
+        nominal = np.array([gain, _INVISIBLE_POLE / Ts, dead])
         rest = (np.append(plant.numerator, 0.0) / gain, plant.denominator)
         pole_spread = 0.0
     else:
@@ -292,16 +292,16 @@ def _cross_gains(model: Any, plants: list[AxisPlant], robot: Robot) -> Vector:
 
     gains = [[gain(axis, name) / plant.static_gain for name in robot.input_names]
              for axis, plant in zip(robot.outputs.names, plants, strict=True)]  # fmt: skip
-    cross = np.nan_to_num(between(np.array(gains)), posinf=0.0, neginf=0.0)
+    cross = np.nan_to_num(off_diagonal(np.array(gains)), posinf=0.0, neginf=0.0)
     # What rounding leaves of axes that do not meet.
-    return np.where(np.abs(cross) < _ROUNDING, 0.0, cross)
+    return np.where(np.abs(cross) < _CROSS_TOLERANCE, 0.0, cross)
 
 
-def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:
+def make_plants(neck: PlantSource, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:
     """Return plants of `neck` with `numbers` (n, axes, 3), sampled exactly; of a tested family within its weight."""
     Ts = neck.sample_time
     numbers = np.stack([within_weight(numbers[:, i], box, Ts) for i, box in enumerate(neck.axes)], axis=1)
-    parts = [sampled(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
+    parts = [discretize_axis(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
     q = max(part[0].shape[1] for part in parts)
     padded = [[np.pad(p, ((0, 0), (0, q - p.shape[1]))) for p in part[:2]] for part in parts]
     # Zeros behind both polynomials of an axis are poles and zeros at 0 that cancel.
@@ -314,7 +314,7 @@ def make_plants(neck: UncertainNeck, numbers: np.ndarray, names: list[str], *, s
     )  # fmt: skip
 
 
-def measured_plant(neck: UncertainNeck, source: int) -> Plants | None:
+def measured_plant(neck: PlantSource, source: int) -> Plants | None:
     """Return the plant in the middle of what the recordings show, of one to three poles; None where none was tested."""
     models = [box.measured.model for box in neck.axes if box.measured is not None]
     if len(models) < len(neck.axes):
@@ -333,7 +333,7 @@ def measured_plant(neck: UncertainNeck, source: int) -> Plants | None:
     )  # fmt: skip
 
 
-def nominal_plants(necks: list[UncertainNeck]) -> list[Plants]:
+def nominal_plants(necks: list[PlantSource]) -> list[Plants]:
     """Return the nominal plant of each neck."""
     return [
         make_plants(neck, np.stack([box.nominal for box in neck.axes])[None], [f"{neck.name}: nominal"], source=i)
@@ -341,17 +341,17 @@ def nominal_plants(necks: list[UncertainNeck]) -> list[Plants]:
     ]
 
 
-def all_plants(necks: list[UncertainNeck], count: int, seed: int) -> Plants:
+def all_plants(necks: list[PlantSource], count: int, seed: int) -> Plants:
     """Return nominals, corners, identified samples and, up to `count` in all, plants from inside the boxes.
 
     Corners of pitch stand beside the same of roll, and beside the opposite ones; of more axes every other one is
     opposite. Inside, a Latin hypercube.
     """
     share = max(1, count // len(necks))
-    return join([_of_neck(neck, share, seed + i, i) for i, neck in enumerate(necks)])
+    return join([_plants_of(neck, share, seed + i, i) for i, neck in enumerate(necks)])
 
 
-def _of_neck(neck: UncertainNeck, count: int, seed: int, source: int) -> Plants:
+def _plants_of(neck: PlantSource, count: int, seed: int, source: int) -> Plants:
     from scipy.stats import qmc
 
     m = len(neck.axes)

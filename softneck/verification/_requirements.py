@@ -25,26 +25,26 @@ from softneck.loop import default_limits
 from softneck.robot import Robot
 
 from ._linear import LARGE
-from ._metrics import Scale, digits, metric_names
+from ._metrics import Scale, metric_names, round_12_digits
 from ._steps import StepTest
 
 
-def for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
+def select_for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a file asks of `verify`: its limits less their reserve, and nothing of the loops of [track]."""
     found = {name: table for name, table in own.items() if name not in ("track", "reserve")}
     require = found.get("require", {})
     if isinstance(require, Mapping):
-        kept, _ = kept_back(require, own.get("reserve", {}))
+        kept, _ = apply_safety_margin(require, own.get("reserve", {}))
         found["require"] = {metric: entry for metric, entry in kept.items() if not metric.startswith("track.")}
     return found
 
 
-def left_to_tune(own: Mapping[str, Any]) -> list[str]:
+def tune_only_metrics(own: Mapping[str, Any]) -> list[str]:
     """Return what of a file's requirements `verify` does not look at."""
     return [metric for metric, entry in own.get("require", {}).items() if metric.startswith("track.") and entry]
 
 
-def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
+def apply_safety_margin(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
     """Return the requirements less their reserve, and the reserve of those that are asked."""
     if not isinstance(reserve, Mapping):
         raise SettingsError("`reserve` must be a table: [reserve].")
@@ -71,7 +71,7 @@ def kept_back(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any],
                 f"`{metric}` <= {limit:g} leaves nothing beside its reserve of {value:g}; ask for more, or state "
                 f"another one ([reserve])."
             )
-        less[metric] = {**entry, "max": digits(limit - value)}
+        less[metric] = {**entry, "max": round_12_digits(limit - value)}
         kept[metric] = float(value)
     return less, kept
 
@@ -80,24 +80,24 @@ _T = TypeVar("_T")
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
 # Of requirements files, `tune`'s included.
-_TABLES = ("version", "uncertainty", "sampling", "step", "sim", "require", "track", "reserve")
+_TABLE_NAMES = ("version", "uncertainty", "sampling", "step", "sim", "require", "track", "reserve")
 
 
-def with_groups(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track: bool = False) -> dict[str, Any]:
+def expand_metrics(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track: bool = False) -> dict[str, Any]:
     """Return a table like a requirements file of one that may be flat: `{"overshoot_pct": 5}`.
 
     A metric without its group is one of the simulation models if there are any, else of the linear ones, or of the only
     group that has it; a number is the least that margins may be, and the most that all else may.
     """
-    table = with_sim(table, robot)
+    table = rename_neck_table(table, robot)
     order = ("sim", "step", "track") if stepping else ("step", "track")
     known = metric_names(robot, track=track)
-    nested: dict[str, Any] = {key: value for key, value in table.items() if key in _TABLES}
+    nested: dict[str, Any] = {key: value for key, value in table.items() if key in _TABLE_NAMES}
     for key, value in table.items():
         full = [key, *(f"{group}.{key}" for group in (*order, "axes", "robust", "mimo", "stability"))]
         metric = next((name for name in full if name in known), None)
         if metric is None:
-            if isinstance(value, Mapping) or key in _TABLES:
+            if isinstance(value, Mapping) or key in _TABLE_NAMES:
                 nested[key] = value  # a table, which is refused below where nobody knows it
                 continue
             ends = sorted({name.partition(".")[2] for name in known})
@@ -112,7 +112,7 @@ def with_groups(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track
     return nested
 
 
-def with_sim(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
+def rename_neck_table(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
     """Return a requirements table with today's names: files up to softneck 0.2 use `neck` for `sim`."""
     if "neck" in robot.outputs.names:
         return dict(table)
@@ -125,7 +125,7 @@ def with_sim(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
 
 # What no loop can do: least or largest value of a metric.
 _POSSIBLE = {"sensitivity": (1.0, math.inf), "disk_margin": (0.0, 2.0), "gain_margin": (1.0, math.inf)}
-_BOUNDS = ("min", "max", "below")
+_BOUND_NAMES = ("min", "max", "below")
 # Number -> least, largest, unit.
 _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
     "uncertainty": {
@@ -142,7 +142,7 @@ _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
         "duration_s": (1e-3, 1e6, "s"), "taut_up_to_kg": (0.0, 5.0, "kg"),
     },
 }  # fmt: skip
-_WHOLE = ("plants", "search_generations", "seed", "necks")
+_INTEGER_KEYS = ("plants", "search_generations", "seed", "necks")
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,10 +232,10 @@ def read_requirements(
         FileFormatError: no such file, no TOML, another version.
         SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
-    return of_file(path, partial(make_requirements, robot=robot, scale=scale))
+    return read_file(path, partial(make_requirements, robot=robot, scale=scale))
 
 
-def of_file(path: str | Path | None, make: Callable[[Mapping[str, Any]], _T]) -> _T:
+def read_file(path: str | Path | None, make: Callable[[Mapping[str, Any]], _T]) -> _T:
     """Return what `make` makes of the tables of a file, of none where there is no file; its errors name the file."""
     if path is None:
         return make({})
@@ -253,8 +253,8 @@ def make_requirements(
 ) -> Requirements:
     """Return the defaults with what a table like a requirements file says instead."""
     scale = scale or Scale.of(robot or Robot.preset())
-    said = {"version": VERSION, **with_sim(table, scale.robot)}
-    own, defaults = for_verify(said), tomllib.loads(default_text())
+    said = {"version": VERSION, **rename_neck_table(table, scale.robot)}
+    own, defaults = select_for_verify(said), tomllib.loads(default_text())
     for key in own:
         if key not in ("version", *_NUMBERS, "require"):
             raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(_NUMBERS)}, require.")
@@ -318,7 +318,7 @@ def check_number(name: str, value: Any, key: str, ends: tuple[float, float, str]
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SettingsError(f"`{name}` must be a number; got {value!r}.")
     low, high, unit = ends
-    if key in _WHOLE:
+    if key in _INTEGER_KEYS:
         require_whole(name, value, int(low), int(high))
     own = scale.name_of(key)
     if own != key or scale.factor(key) != 1.0:
@@ -344,7 +344,7 @@ def bounds_of(require: Mapping[str, Any], names: tuple[str, ...], own: Any) -> t
             raise SettingsError(f"unknown metric `{metric}`; [require] takes {', '.join(names)}.")
         if entry is False:
             continue
-        if not isinstance(entry, Mapping) or not entry or any(key not in _BOUNDS for key in entry):
+        if not isinstance(entry, Mapping) or not entry or any(key not in _BOUND_NAMES for key in entry):
             raise SettingsError(
                 f"`{metric}` must say {{ min = NUMBER }}, {{ max = NUMBER }}, both, or false; got {entry!r}."
             )
@@ -387,7 +387,7 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
 _ALWAYS_AT_LEAST = {"gain_margin": 1.0, "sensitivity": 1.0}
 _ALWAYS_AT_MOST = {"disk_margin": 2.0, "phase_margin_deg": 180.0}
 # By the small gain theorem and by definition: what is not below 1 is not stable.
-_STABILITY = ("stability.radius", "stability.searched_radius", "robust.mu")
+_STABILITY_METRICS = ("stability.radius", "stability.searched_radius", "robust.mu")
 
 
 def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[str, Any]], scale: Scale) -> None:
@@ -404,7 +404,7 @@ def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[s
             if item.bound == "min"
             else item.limit >= _ALWAYS_AT_MOST.get(name, math.inf)
         )
-        if always or (item.metric in _STABILITY and item.limit > 1.0):
+        if always or (item.metric in _STABILITY_METRICS and item.limit > 1.0):
             raise SettingsError(
                 f"`{item.metric}` {item.bound} {item.limit:g} "
                 + ("allows unstable loops; 1 is the limit." if not always else "always holds, so it says nothing.")

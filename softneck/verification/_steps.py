@@ -17,17 +17,17 @@ from softneck.loop import SETTLING_BAND, error_unit
 from softneck.robot import Robot
 from softneck.runtime import Block, load_functions
 
-from ._plants import Plants, mixing
+from ._plants import Plants, mixing_matrix
 
-_RUNTIME = "softneck.verification._sweep_runtime"
+_SWEEP_RUNTIME = "softneck.verification._sweep_runtime"
 # Of a controller that is told the payload.
-UNTOLD = (
+NO_PAYLOAD_IN_STEPS = (
     "linear plants are stepped with the payload at its start value (0 kg); the estimate is in the loops over plants "
     "that step"
 )
 METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "load_rms_deg", "coupling_deg")
 # As the lab and `softneck.loop` measure a rise, and the part of the time in which all is settled.
-_RISE, _STEADY_PART = (0.1, 0.9), 0.25
+_RISE_LEVELS, _STEADY_SHARE = (0.1, 0.9), 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,7 +155,7 @@ def middle_motors(robot: Robot, block: Block) -> Vector:
 def _run(
     plants: Plants, block: Block, signals: Matrix, T: Matrix, robot: Robot, workers: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    functions: Any = load_functions(f"{_RUNTIME}({block.runtime}:{len(block.arrays)})")
+    functions: Any = load_functions(f"{_SWEEP_RUNTIME}({block.runtime}:{len(block.arrays)})")
     axes, set_points = robot.outputs.names, robot.set_points
     arrays = (T, *block.arrays)
     parameters = block.initial_state().parameters
@@ -173,7 +173,7 @@ def _run(
             start[names.index(f"{name}_reference_ahead")] = signals[0, axis]
     n, rows = len(plants), signals.shape[0]
     angles, motors = np.empty((n, rows, len(axes))), np.empty((n, rows, len(set_points)))
-    mixed = mixing(plants.cross, len(axes))
+    mixed = mixing_matrix(plants.cross, len(axes))
 
     def part(chosen: slice) -> None:
         with np.errstate(all="ignore"):  # an own controller runs in plain Python, and loops may diverge
@@ -205,12 +205,12 @@ def _metrics(
         return np.degrees(values) if factor is None else values / factor
 
     first = np.where(finite[:, None], first, 0.0)
-    rise = [np.where((first >= level).any(axis=1), (first >= level).argmax(axis=1), np.inf) for level in _RISE]
+    rise = [np.where((first >= level).any(axis=1), (first >= level).argmax(axis=1), np.inf) for level in _RISE_LEVELS]
     outside = np.abs(first - 1.0) >= SETTLING_BAND
     settled = half - outside[:, ::-1].argmax(axis=1)
     settled = np.where(outside.any(axis=1), settled, 0)
     tail = np.where(finite[:, None], y, np.inf)
-    steady = tail[:, half - int(half * _STEADY_PART) : half] - test.step
+    steady = tail[:, half - int(half * _STEADY_SHARE) : half] - test.step
     with np.errstate(invalid="ignore", over="ignore"):
         found = {
             "overshoot_pct": np.maximum(0.0, 100.0 * (first.max(axis=1) - 1.0)),

@@ -25,12 +25,12 @@ from softneck.identification import response_of
 
 from ._linear import LinearLaw, inverse, loops, radii
 from ._metrics import Scale
-from ._plants import AxisBox, Plants, UncertainNeck, join, make_plants, measured_plant, mixing
+from ._plants import AxisBox, Plants, PlantSource, join, make_plants, measured_plant, mixing_matrix
 
 # Members of a generation per unknown.
-_CROWD = 10
+_POPULATION_PER_UNKNOWN = 10
 # An unstable loop is worse than any peak; a peak is at most this.
-_UNSTABLE = 1e3
+_UNSTABLE_BADNESS = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +49,7 @@ class SearchResult:
 
 
 def search(
-    necks: list[UncertainNeck], law: LinearLaw, w: Vector, *, extra: int, generations: int, seed: int
+    necks: list[PlantSource], law: LinearLaw, w: Vector, *, extra: int, generations: int, seed: int
 ) -> SearchResult:
     """Return the plants inside the boxes with the smallest disk margin, unstable ones first.
 
@@ -67,35 +67,35 @@ def search(
     worst: list[Plants] = []
     largest, count = 0.0, 0
     for source, neck in enumerate(necks):
-        for axes in axes_together(neck, law):
+        for axes in coupled_axes(neck, law):
             task = _Task(neck, source, axes, law, w, extra)
             found = _evolve(task.badness, 3 * len(axes), generations, seed)
-            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({_axes(neck, axes)})"))
+            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({_axes_label(neck, axes)})"))
             largest, count = max(largest, task.radius), count + task.count
     return SearchResult(join(worst), largest, count)
 
 
-def axes_together(neck: UncertainNeck, law: LinearLaw) -> list[tuple[int, ...]]:
+def coupled_axes(neck: PlantSource, law: LinearLaw) -> list[tuple[int, ...]]:
     """Return which axes are judged together: all where plant or controller couple them, else each alone."""
     every = tuple(range(len(neck.axes)))
     whole = law.coupled or bool(np.any(neck.cross != 0.0))
     return [every] if whole else [(i,) for i in every]
 
 
-def together(neck: UncertainNeck, axes: Sequence[int]) -> str:
+def axes_name(neck: PlantSource, axes: Sequence[int]) -> str:
     """Return what axes that are judged together are called."""
     return neck.names[axes[0]] if len(axes) == 1 else "both" if len(axes) == 2 else "all"
 
 
-def _axes(neck: UncertainNeck, axes: tuple[int, ...]) -> str:
-    return neck.names[axes[0]] if len(axes) == 1 else f"{together(neck, axes)} axes"
+def _axes_label(neck: PlantSource, axes: tuple[int, ...]) -> str:
+    return neck.names[axes[0]] if len(axes) == 1 else f"{axes_name(neck, axes)} axes"
 
 
 class _Task:
     """The badness of plants of one neck, and the largest radius that was met."""
 
     def __init__(
-        self, neck: UncertainNeck, source: int, axes: tuple[int, ...], law: LinearLaw, w: Vector, extra: int
+        self, neck: PlantSource, source: int, axes: tuple[int, ...], law: LinearLaw, w: Vector, extra: int
     ) -> None:
         self.neck, self.source, self.axes, self.law, self.w, self.extra = neck, source, axes, law, w, extra
         self.radius, self.count = 0.0, 0
@@ -116,28 +116,36 @@ class _Task:
         S = inverse(np.eye(len(self.neck.axes)) + loops(plants, self.law, self.w)[1])
         peaks = np.stack([np.abs(2.0 * S[..., i, i] - 1.0).max(axis=1) for i in self.axes]).max(axis=0)
         # Beyond stability the radius leads on; before it the peak does, which is infinite on the border.
-        return -np.where(size >= 1.0, _UNSTABLE * size, np.minimum(peaks, _UNSTABLE))
+        return -np.where(size >= 1.0, _UNSTABLE_BADNESS * size, np.minimum(peaks, _UNSTABLE_BADNESS))
 
 
 def _evolve(function: Callable[[Matrix], Vector], unknowns: int, generations: int, seed: int) -> Vector:
     from scipy.optimize import differential_evolution
 
     result = differential_evolution(
-        function, [(0.0, 1.0)] * unknowns, vectorized=True, updating="deferred", popsize=_CROWD, maxiter=generations,
-        init="sobol", rng=np.random.default_rng(seed), polish=False, tol=1e-6,
-    )  # fmt: skip
+        function,
+        [(0.0, 1.0)] * unknowns,
+        vectorized=True,
+        updating="deferred",
+        popsize=_POPULATION_PER_UNKNOWN,
+        maxiter=generations,
+        init="sobol",
+        rng=np.random.default_rng(seed),
+        polish=False,
+        tol=1e-6,
+    )
     return np.asarray(result.x)
 
 
 # Dead times and poles of a box that its weight is taken over.
-_DELAYS, _POLES = 15, 5
+_DELAY_COUNT, _POLE_COUNT = 15, 5
 # What lies between those is covered by this part more; and a complex change of this size is always allowed for, which
 # makes peaks of purely real uncertainty wider than a point.
-_ROOM, _LEAST = 1.01, 0.01
-_FREQUENCIES = 90
+_WEIGHT_MARGIN, _MIN_WEIGHT = 1.01, 0.01
+_FREQUENCY_COUNT = 90
 # Between which the peaks of a real scalar alone are looked for: 0.2 % apart, so that a dead time of 0.1 s turns by
 # 0.03 rad at the most from one to the next.
-_FINE = 4000
+_FINE_FREQUENCY_COUNT = 4000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,8 +168,8 @@ class StructuredResult:
         return float(self.upper.max())
 
 
-def structured(
-    neck: UncertainNeck, law: LinearLaw, *, extra: int, scale: Scale | None = None
+def structured_singular_value(
+    neck: PlantSource, law: LinearLaw, *, extra: int, scale: Scale | None = None
 ) -> list[StructuredResult]:
     """Return the bounds of each axis, or of both together where plant or controller couple them.
 
@@ -174,13 +182,13 @@ def structured(
     time, gain = (1.0, 1.0) if scale is None else (scale.time, scale.gain)
     Ts = neck.sample_time
     results = []
-    for axes in axes_together(neck, law):
+    for axes in coupled_axes(neck, law):
         bands = [box.measured.band for box in (neck.axes[i] for i in axes) if box.measured is not None]
         low, high = [max(ends) for ends in zip(*((a, -b) for a, b in bands), (0.05 / time, -math.pi / Ts), strict=True)]
-        peaks = _real_peaks(neck, law, np.geomspace(low, -high, _FINE), axes, extra, gain)
-        w = np.union1d(np.geomspace(low, -high, _FREQUENCIES), peaks)
+        peaks = _real_peaks(neck, law, np.geomspace(low, -high, _FINE_FREQUENCY_COUNT), axes, extra, gain)
+        w = np.union1d(np.geomspace(low, -high, _FREQUENCY_COUNT), peaks)
         M, blocks = interconnection(neck, law, w, axes, extra, gain)
-        name = together(neck, axes)
+        name = axes_name(neck, axes)
         if not _middle_is_stable(neck, law, axes, extra):
             # The bound grows the box from a stable middle; without one there is nothing to grow.
             never = np.full(w.size, math.inf)
@@ -190,7 +198,7 @@ def structured(
     return results
 
 
-def _real_peaks(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float) -> Vector:
+def _real_peaks(neck: PlantSource, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float) -> Vector:
     """Return where a real scalar alone could make the loop unstable: peaks that no grid meets.
 
     Packard and Pandey, 1993: mu of real scalars is not continuous in frequency.
@@ -201,7 +209,7 @@ def _real_peaks(neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[i
     return w[i] + own[i, k] / (own[i, k] - own[i + 1, k]) * (w[i + 1] - w[i])
 
 
-def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], extra: int) -> bool:
+def _middle_is_stable(neck: PlantSource, law: LinearLaw, axes: Sequence[int], extra: int) -> bool:
     """Return whether the loop around which the box is modelled is stable; an axis that is not judged is nominal."""
     measured = measured_plant(neck, 0)
     if measured is not None:
@@ -214,12 +222,12 @@ def _middle_is_stable(neck: UncertainNeck, law: LinearLaw, axes: Sequence[int], 
 
 
 def interconnection(
-    neck: UncertainNeck, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float = 1.0
+    neck: PlantSource, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float = 1.0
 ) -> tuple[np.ndarray, list[tuple[int, int]]]:
     """Return M (m, rows, columns) over `w` [rad/s] and its blocks; `gain` is one of scaled quantities, in SI."""
     n = len(axes)
-    parts = [_axis(neck.axes[i], w, neck.sample_time, extra, gain) for i in axes]
-    X = np.eye(n) if n == 1 else mixing(neck.cross, n)
+    parts = [_axis_model(neck.axes[i], w, neck.sample_time, extra, gain) for i in axes]
+    X = np.eye(n) if n == 1 else mixing_matrix(neck.cross, n)
     Ky = gain * law.feedback(w)[:, list(axes)][:, :, list(axes)]
     V = X @ Ky
     m = w.size
@@ -238,13 +246,13 @@ def interconnection(
     return M, blocks
 
 
-def _uncertain(neck: UncertainNeck, axis: int, start: int) -> list[int]:
+def _uncertain(neck: PlantSource, axis: int, start: int) -> list[int]:
     """Return which of gain and pole of an axis are uncertain, and its dead time, which always is a little."""
     widths = neck.axes[axis].widths if neck.axes[axis].measured is None else np.zeros(3)
     return [start + k for k in range(3) if widths[k] > 0.0 or k == 2]
 
 
-def _axis(box: Any, w: Vector, Ts: float, extra: int, gain: float = 1.0) -> tuple[np.ndarray, ...]:
+def _axis_model(box: Any, w: Vector, Ts: float, extra: int, gain: float = 1.0) -> tuple[np.ndarray, ...]:
     """Return P (m,), H (m, 3), F (m, 3), E (m, 3, 3) of one axis around the middle of its box."""
     z = np.exp(1j * w * Ts)
     if box.measured is not None:
@@ -287,7 +295,7 @@ def _delay_factor(p: float, L: float, z: np.ndarray, Ts: float) -> np.ndarray:
 
 def _delay_weight(box: Any, middle: float, z: np.ndarray, Ts: float) -> Vector:
     base = _delay_factor(middle, box.middle[2], z, Ts)
-    delays = np.linspace(box.low[2], box.high[2], _DELAYS)
-    poles = np.unique(np.linspace(box.low[1], box.high[1], _POLES))
+    delays = np.linspace(box.low[2], box.high[2], _DELAY_COUNT)
+    poles = np.unique(np.linspace(box.low[1], box.high[1], _POLE_COUNT))
     changes = [np.abs(_delay_factor(p, L, z, Ts) / base - 1.0) for p, L in itertools.product(poles, delays)]
-    return np.maximum(_ROOM * np.max(changes, axis=0), _LEAST)
+    return np.maximum(_WEIGHT_MARGIN * np.max(changes, axis=0), _MIN_WEIGHT)

@@ -28,11 +28,18 @@ from softneck.signals import require_same_robot
 
 from ._evidence import Evidence, gather, worst_row
 from ._experiments import crossing_values
-from ._linear import ControllerUnderTest, judge
+from ._linear import ControllerUnderTest, controller_under_test
 from ._metrics import Scale
-from ._neck_loops import ALONE, check_blocks, is_own_plant, named_plants, not_recorded, own_plant
-from ._plants import UncertainNeck, neck_of_family, neck_of_model
-from ._requirements import Requirement, Requirements, make_requirements, read_requirements, with_groups
+from ._neck_loops import (
+    ALONE,
+    check_blocks,
+    is_simulation_model,
+    make_simulation_model,
+    named_plants,
+    unrecorded_conditions,
+)
+from ._plants import PlantSource, source_of_family, source_of_model
+from ._requirements import Requirement, Requirements, expand_metrics, make_requirements, read_requirements
 from ._steps import check_ports
 from ._worst import write_linear, write_neck
 
@@ -75,7 +82,7 @@ class Verification(ReprMixin):
     verdicts: list[Verdict]
     evidence: Evidence
     controller: ControllerUnderTest
-    necks: list[UncertainNeck]
+    necks: list[PlantSource]
     requirements: Requirements
     files: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     observer: bool = False
@@ -134,18 +141,17 @@ class Verification(ReprMixin):
             "plants": {
                 "count": len(evidence.plants),
                 "sources": [
-                    {"name": neck.name, "kind": neck.kind, "cross": neck.cross, **_box(neck)} for neck in self.necks
+                    {"name": neck.name, "kind": neck.kind, "cross": neck.cross, **_box_facts(neck)}
+                    for neck in self.necks
                 ],
             },
             "virtual_neck_loops": len(evidence.necks),
             "foreign_plants": evidence.foreign,
             **validity(evidence, self.tested),
-            "settings": {
-                name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")
-            },
+            "settings": {name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")},
             **self._robot(),
-        }  # fmt: skip
-        return certificate_contents("verify", holds=self.holds, files=self.files, more=plain(more))
+        }
+        return certificate_contents("verify", holds=self.holds, files=self.files, more=to_json(more))
 
     def _robot(self) -> dict[str, Any]:
         """Return of another robot than the preset `neck` who it is, and by what the defaults are its own."""
@@ -186,12 +192,12 @@ class Verification(ReprMixin):
         return files
 
 
-def standing_for(thing: Any, robot: Robot) -> Any:
+def with_robot(thing: Any, robot: Robot) -> Any:
     """Return a plant of one's own, a neck's physics as those of the robot that it stands for."""
     return VirtualNeck.of(robot, thing) if isinstance(thing, NeckParameters) else thing
 
 
-def sources_of(things: Mapping[str, Any], requirements: Requirements | None = None) -> list[UncertainNeck]:
+def sources_of(things: Mapping[str, Any], requirements: Requirements | None = None) -> list[PlantSource]:
     """Return models and families as sources of plants: name -> model (anything with `tf`) or family.
 
     Models are as uncertain as the requirements say; without requirements they are certain.
@@ -208,9 +214,9 @@ def sources_of(things: Mapping[str, Any], requirements: Requirements | None = No
     necks = []
     for name, thing in things.items():
         if hasattr(thing, "axes") and hasattr(thing, "cross"):
-            necks.append(neck_of_family(thing, name))
+            necks.append(source_of_family(thing, name))
         elif hasattr(thing, "tf"):
-            necks.append(neck_of_model(thing, name, spread))
+            necks.append(source_of_model(thing, name, spread))
         else:
             raise SettingsError(f"{name}: a linear model or a family is needed; this is a {type(thing).__name__}.")
     return necks
@@ -258,20 +264,20 @@ def verify(
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
         # Physics and functions of one's own say nothing of a robot: their ports have to be its own.
-        if hasattr(thing, "robot") or not is_own_plant(thing):
+        if hasattr(thing, "robot") or not is_simulation_model(thing):
             require_same_robot(robot_of(thing), robot, f"the controller and {what}")
-    own = {name: standing_for(thing, robot) for name, thing in named.items() if is_own_plant(thing)}
+    own = {name: with_robot(thing, robot) for name, thing in named.items() if is_simulation_model(thing)}
     linear = {name: thing for name, thing in named.items() if name not in own}
     scale = Scale.of(robot, sources_of(linear))
     if isinstance(requirements, Requirements):
         asked = requirements.at(scale)
     elif isinstance(requirements, Mapping):
-        asked = make_requirements(with_groups(requirements, robot, stepping=bool(own)), scale=scale)
+        asked = make_requirements(expand_metrics(requirements, robot, stepping=bool(own)), scale=scale)
     else:
         asked = read_requirements(requirements, scale=scale)
     necks = sources_of(linear, asked)
     eyes = None if observer is None else observer.block()
-    judged = judge(controller, order=order, observer=observer is not None)
+    judged = controller_under_test(controller, order=order, observer=observer is not None)
     check_ports(judged.block, robot)
     check_blocks(judged.block, eyes)
     for neck in necks:
@@ -280,11 +286,11 @@ def verify(
                 f"the controller has a sample time of {judged.block.sample_time:g} s, {neck.name} one of "
                 f"{neck.sample_time:g} s; design it on a model of its own sample time."
             )
-    step = [own_plant(thing, name, robot) for name, thing in own.items()]
+    step = [make_simulation_model(thing, name, robot) for name, thing in own.items()]
     with shown_progress("verify", progress) as tell:
         evidence = gather(judged, necks, asked, observer=eyes, progress=tell, families=linear, own=step)
     tested = {name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})}
-    elsewhere = not_recorded(tested, step, evidence.steps, robot)
+    elsewhere = unrecorded_conditions(tested, step, evidence.steps, robot)
     if tested and not judged.laws:
         elsewhere["margins"] = ALONE
     return Verification(
@@ -309,21 +315,21 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
         return Verdict(item, None, False if item.asked else None, {}, f"not computed: {why}")
     row = worst_row(evidence.metrics, item.metric, item.bound)
     value = float(values.values[row])
-    worst = plain(values.describe(row))
-    why = unsupported(item, evidence, elsewhere)
+    worst = to_json(values.describe(row))
+    why = unsupported_reason(item, evidence, elsewhere)
     if why:
         return Verdict(item, value, False, worst, why)
     if item.metric.startswith("sim.") and evidence.foreign and not item.asked:
-        return Verdict(item, value, None, worst, _FOREIGN)
+        return Verdict(item, value, None, worst, _BUILT_IN_NOTE)
     return Verdict(item, value, item.holds(value), worst)
 
 
-_FOREIGN = "shown only: this is a built-in plant; add a model of your robot to count it, or set `[sim] decides`"
+_BUILT_IN_NOTE = "shown only: this is a built-in plant; add a model of your robot to count it, or set `[sim] decides`"
 # What is about the loop's response, which the data may not reach.
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 
 
-def unsupported(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]) -> str:
+def unsupported_reason(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]) -> str:
     """Return why the data do not support a requirement; else ""."""
     group, _, name = item.metric.partition(".")
     axes = evidence.plants.axes
@@ -368,7 +374,7 @@ def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _box(neck: UncertainNeck) -> dict[str, Any]:
+def _box_facts(neck: PlantSource) -> dict[str, Any]:
     return {
         axis: {
             "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
@@ -378,14 +384,14 @@ def _box(neck: UncertainNeck) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def plain(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """Return JSON values of numbers, arrays, tables: what is not finite becomes None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
+        return to_json(value.tolist())
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, str | bool | int):

@@ -17,13 +17,13 @@ from softneck.robot import Robot
 from softneck.runtime import Block, Port
 from softneck.signals import Recording, write_recording
 
-from ._plants import mixing
+from ._plants import mixing_matrix
 from ._requirements import Requirements
 from ._steps import middle_motors, middle_of
 
-_RUNTIME = "softneck.verification._linear_plant_runtime"
+_PLANT_RUNTIME = "softneck.verification._linear_plant_runtime"
 
-_PLANT = '''"""The plant `{name}`, written by `softneck verify`: its own delay and that of the loop's order."""
+_PLANT_TEMPLATE = '''"""The plant `{name}`, written by `softneck verify`: its own delay and that of the loop's order."""
 
 from softneck.verification import linear_plant
 
@@ -38,7 +38,7 @@ def plant():
         sample_time={sample_time!r},{more}
     )
 '''
-_LOOP = """# Written by `softneck verify`: {title}.
+_LOOP_TEMPLATE = """# Written by `softneck verify`: {title}.
 # Run it with `softneck simulate {name}`.
 duration_s = {duration:g}
 sample_time_s = {sample_time!r}
@@ -111,18 +111,31 @@ def linear_plant(
     angles = [Port(name=name, unit=unit) for name in (*names, *(f"{axis}_measured" for axis in names))]
     positions = [Port(name=name, unit=motor) for name in whose.motor_positions]
     return Block(
-        kind="linear_plant", role="plant", runtime=_RUNTIME, sample_time=sample_time,
+        kind="linear_plant",
+        role="plant",
+        runtime=_PLANT_RUNTIME,
+        sample_time=sample_time,
         arrays=(
-            above, below, np.asarray(delay, dtype=np.float64), mixing(np.asarray(cross[: m * (m - 1)], float), m), T,
+            above,
+            below,
+            np.asarray(delay, dtype=np.float64),
+            mixing_matrix(np.asarray(cross[: m * (m - 1)], float), m),
+            T,
             around,
         ),
-        inputs=(*motors, *loads), outputs=(*angles, *positions),
+        inputs=(*motors, *loads),
+        outputs=(*angles, *positions),
         parameters=(
-            Port(name="noise_std", unit=unit, description="noise of the measured angles", minimum=0.0,
-                 maximum=0.2 if unit == "rad" else None),
+            Port(
+                name="noise_std",
+                unit=unit,
+                description="noise of the measured angles",
+                minimum=0.0,
+                maximum=0.2 if unit == "rad" else None,
+            ),
             Port(name="noise_seed", description="seed of that noise", minimum=0.0),
         ),
-    )  # fmt: skip
+    )
 
 
 def write_linear(
@@ -157,7 +170,7 @@ def write_linear(
     if before.any() or around.any():
         more += f"\n        inputs={before[:-1].tolist()!r},\n        outputs={around.tolist()!r},"
     named = {**worst, "name": str(worst["name"]).replace("\\", "/").replace('"', "'")}
-    text = _PLANT.format(**named, axes=inputs, more=more)
+    text = _PLANT_TEMPLATE.format(**named, axes=inputs, more=more)
     # Modules of one name are imported once: another plant needs another name.
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     _write(folder / f"{module}.py", text, force=True)
@@ -172,7 +185,7 @@ def write_linear(
     else:
         wanted = _step(robot, asked.scale.shown(stepped), 0.0)
     noise = f"noise_std = {asked.si(step['noise_deg'])!r}"
-    text = _loop(
+    text = _loop_text(
         folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',
         parameters=noise, controller=controller, observer=None, wanted=wanted,
         duration=duration, sample_time=Ts, order="sequential",
@@ -190,7 +203,7 @@ def write_neck(
     unit = error_unit(whose)[0]
     ends = [worst[f"{axis}_{unit}"] for axis in whose.outputs.names]
     values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
-    text = _loop(
+    text = _loop_text(
         folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
         parameters=", ".join(f"{key} = {float(value)!r}" for key, value in values.items()), controller=controller,
         observer=observer, wanted=_step(whose, ends, worst["at_s"]),
@@ -217,16 +230,16 @@ def _write_reference(path: Path, robot: Robot, levels: Matrix, sample_time: floa
     write_recording(path, Recording(time, sample_time, channels, robot=robot), force=force)
 
 
-def _loop(
+def _loop_text(
     folder: Path, name: str, *, title: str, controller: Path, observer: Path | None, **values: Any
 ) -> str:  # fmt: skip
-    seen = "" if observer is None else f"\n[observer]\nfile = {_quoted(observer, folder)}\n"
-    return _LOOP.format(
-        name=name, title=title.replace("\n", " "), controller=_quoted(controller, folder), observer=seen, **values
+    seen = "" if observer is None else f"\n[observer]\nfile = {_toml_path(observer, folder)}\n"
+    return _LOOP_TEMPLATE.format(
+        name=name, title=title.replace("\n", " "), controller=_toml_path(controller, folder), observer=seen, **values
     )  # fmt: skip
 
 
-def _quoted(path: Path, folder: Path) -> str:
+def _toml_path(path: Path, folder: Path) -> str:
     """Return the path from `folder` as a TOML text."""
     relative = Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
     return '"' + relative.replace("\\", "\\\\").replace('"', '\\"') + '"'

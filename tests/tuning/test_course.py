@@ -54,19 +54,19 @@ def test_kinds_begin_at_the_largest_bound_on_Ms_that_their_margins_allow(monkeyp
         (led,) = [
             item for item in found.candidates.values() if item.kind == space.kind and item.level not in ("", "linear")
         ]
-        dimension = space.dimensions[space.led or 0]
+        dimension = space.dimensions[space.trade_off or 0]
         # A gain margin of 2 is a certified Ms of 2.
         most = math.log(2.0 / CERTIFIED[space.kind] / dimension.low) / math.log(dimension.high / dimension.low)
         # 0.24 of the range, 0.12 and 0.06: within the last of them, if it is within all of them of the start.
-        if abs(most - space.start[space.led or 0]) < 0.42:
-            assert most - 0.12 <= led.x[space.led or 0] <= most
-        assert found._robust(led)
+        if abs(most - space.start[space.trade_off or 0]) < 0.42:
+            assert most - 0.12 <= led.x[space.trade_off or 0] <= most
+        assert found._is_robust(led)
 
 
 @pytest.mark.parametrize("tested", [True, False])
 def test_nothing_that_was_judged_as_far_is_better_than_the_best(monkeypatch: pytest.MonkeyPatch, tested: bool) -> None:
     found = searched(monkeypatch, 90, tested)
-    ranked = found.ranked()
+    ranked = found.sort_candidates()
     best = ranked[0]
     assert len(found.spent) <= 90
     assert best.level == "margins"

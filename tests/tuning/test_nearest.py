@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from softneck.loop.default_limits import NECK_RISE_S
-from softneck.tuning._requirements import TuneRequirements, loosened, make_tune_requirements
+from softneck.tuning._requirements import TuneRequirements, make_tune_requirements, relax_limits
 from softneck.tuning._search import Candidate
-from softneck.tuning._tune import nearest
+from softneck.tuning._tune import relaxations
 from softneck.verification._requirements import Requirement
 from softneck.verification._verify import Verdict
 
@@ -31,11 +31,11 @@ def candidate(**metrics: float) -> Candidate:
 
 
 def test_a_slower_rise_than_the_default_is_told_and_certified_with_some_room() -> None:
-    found = nearest(candidate(), [failed("sim.rise_s", 0.6)], ASKED)
+    found = relaxations(candidate(), [failed("sim.rise_s", 0.6)], ASKED)
     assert list(found) == ["sim.rise_s"]
     assert (found["sim.rise_s"].default, found["sim.rise_s"].reached) == (NECK_RISE_S, 0.6)
     assert 0.6 < found["sim.rise_s"].limit <= 0.6 * 1.05 + 0.01  # the room, up to the next hundredth
-    asked = loosened(ASKED, {"sim.rise_s": found["sim.rise_s"].limit})
+    asked = relax_limits(ASKED, {"sim.rise_s": found["sim.rise_s"].limit})
     assert asked.limit("sim.rise_s") == found["sim.rise_s"].limit
     assert [b for b in asked.bounds if b.metric != "sim.rise_s"] == [
         b for b in ASKED.bounds if b.metric != "sim.rise_s"
@@ -46,9 +46,9 @@ def test_a_slower_rise_than_the_default_is_told_and_certified_with_some_room() -
 
 
 def test_the_worse_of_the_loops_with_noise_and_of_verify_counts() -> None:
-    found = nearest(candidate(sim__rise_s=0.7), [failed("sim.rise_s", 0.6)], ASKED)
+    found = relaxations(candidate(sim__rise_s=0.7), [failed("sim.rise_s", 0.6)], ASKED)
     assert found["sim.rise_s"].reached == 0.7
-    assert list(nearest(candidate(track__circle_rms_deg=3.5), [], ASKED)) == ["track.circle_rms_deg"]
+    assert list(relaxations(candidate(track__circle_rms_deg=3.5), [], ASKED)) == ["track.circle_rms_deg"]
 
 
 @pytest.mark.parametrize(
@@ -57,12 +57,12 @@ def test_the_worse_of_the_loops_with_noise_and_of_verify_counts() -> None:
      ("sim.rise_s", float("inf")), ("sim.rise_s", None), ("step.load_rms_deg", 2.1)],
 )  # fmt: skip
 def test_margins_loads_and_what_is_far_off_are_never_loosened(metric: str, value: float | None) -> None:
-    assert nearest(candidate(), [failed(metric, value)], ASKED) == {}
+    assert relaxations(candidate(), [failed(metric, value)], ASKED) == {}
     # Nor is anything beside them.
-    assert nearest(candidate(), [failed("sim.settling_s", 2.6), failed(metric, value)], ASKED) == {}
+    assert relaxations(candidate(), [failed("sim.settling_s", 2.6), failed(metric, value)], ASKED) == {}
 
 
 def test_what_somebody_asks_for_stands() -> None:
     asked = make_tune_requirements({"require": {"sim.rise_s": {"max": 0.4}}})
-    assert nearest(candidate(), [failed("sim.rise_s", 0.44, asked)], asked) == {}
-    assert nearest(candidate(), [failed("sim.rise_s", 0.6)], replace(ASKED, stated=frozenset())) != {}
+    assert relaxations(candidate(), [failed("sim.rise_s", 0.44, asked)], asked) == {}
+    assert relaxations(candidate(), [failed("sim.rise_s", 0.6)], replace(ASKED, stated=frozenset())) != {}

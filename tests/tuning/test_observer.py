@@ -16,7 +16,7 @@ from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.signals import Recording, signal
 from softneck.tuning import tune
-from softneck.tuning._judge import Case, designed, loop_of, made_ready, watched
+from softneck.tuning._judge import Case, design_candidate, loop_of, make_observer, prepare
 from softneck.tuning._space import spaces
 from softneck.tuning._task import Task, digest_of
 from softneck.tuning._tune import _observer, task_of
@@ -44,7 +44,7 @@ def task(several: Model) -> Task:
 
 def controller(task: Task, kind: str) -> Any:
     (space,) = spaces((kind,), rise=0.4, cocontraction=None, robot=Robot.preset())
-    return designed(task, made_ready(task), kind, space.settings(space.start))
+    return design_candidate(task, prepare(task), kind, space.settings(space.start))
 
 
 def test_the_observer_is_over_the_model_that_knows_payloads(task: Task) -> None:
@@ -62,7 +62,7 @@ def test_a_planner_takes_the_observers_lead_and_payload_into_its_design(task: Ta
 @pytest.mark.parametrize("kind", ["pi", "mpc"])
 def test_loops_have_the_observer_that_their_kind_is_designed_for(task: Task, kind: str) -> None:
     case, block = Case(0, 1.0), controller(task, kind).block()
-    loop = loop_of(case, made_ready(task).own[0], block, "sequential", task, watched(task, kind))
+    loop = loop_of(case, prepare(task).own[0], block, "sequential", task, make_observer(task, kind))
     if kind == "pi":
         assert loop.observer is None
     else:

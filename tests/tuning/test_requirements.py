@@ -17,7 +17,7 @@ from softneck.estimation import LinearNeck
 from softneck.loop.default_limits import NECK_RISE_S
 from softneck.report._tune import _toml_table
 from softneck.robot import Robot
-from softneck.tuning._requirements import make_tune_requirements, read_tune_requirements, refuse_impossible
+from softneck.tuning._requirements import check_feasibility, make_tune_requirements, read_tune_requirements
 from softneck.verification import make_requirements, read_requirements
 from softneck.verification._metrics import Scale
 
@@ -38,14 +38,14 @@ def test_the_defaults_are_those_of_verify_with_what_tuning_adds() -> None:
     assert set(theirs) <= set(mine)
     changed = {key for key in theirs if theirs[key] != mine[key]}
     assert changed == {("sim.overshoot_pct", "max"), ("sim.steady_rms_deg", "max")}
-    assert (asked.wanted("sim.rise_s"), asked.wanted("track.circle_rms_deg")) == (NECK_RISE_S, 3.0)
+    assert (asked.robot_limit("sim.rise_s"), asked.robot_limit("track.circle_rms_deg")) == (NECK_RISE_S, 3.0)
 
 
 def test_a_reserve_is_taken_off_what_plants_must_keep_and_said() -> None:
     table = {"require": {"sim.rise_s": {"max": 0.5}}, "reserve": {"sim.rise_s": 0.1, "track.circle_rms_deg": 0.0}}
     asked = make_tune_requirements(table)
-    assert (asked.limit("sim.rise_s"), asked.wanted("sim.rise_s")) == (0.4, 0.5)
-    assert asked.limit("track.circle_rms_deg") == asked.wanted("track.circle_rms_deg") == 3.0
+    assert (asked.limit("sim.rise_s"), asked.robot_limit("sim.rise_s")) == (0.4, 0.5)
+    assert asked.limit("track.circle_rms_deg") == asked.robot_limit("track.circle_rms_deg") == 3.0
     assert {"sim.rise_s <= 0.4 (0.5 less a reserve of 0.1)", "track.circle_rms_deg <= 3"} <= set(asked.lines())
     # What verify is asked is what the plants must keep.
     assert asked.certificate.bounds == tuple(b for b in asked.bounds if not b.metric.startswith("track."))
@@ -118,7 +118,7 @@ def test_a_file_says_what_differs(tmp_path: Path) -> None:
     path = tmp_path / "wanted.toml"
     path.write_text('version = 1\n[track]\ncircle_deg = 10.0\n[require]\n"sim.rise_s" = { max = 0.6 }\n')
     asked = read_tune_requirements(path)
-    assert (asked.wanted("sim.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
+    assert (asked.robot_limit("sim.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
     path.write_text("version = 2\n")
     with pytest.raises(FileFormatError, match="version = 1"):
         read_tune_requirements(path)
@@ -127,7 +127,7 @@ def test_a_file_says_what_differs(tmp_path: Path) -> None:
 
 
 def test_the_defaults_can_be_had() -> None:
-    refuse_impossible(make_tune_requirements({}), neck())
+    check_feasibility(make_tune_requirements({}), neck())
 
 
 def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
@@ -144,12 +144,12 @@ def test_a_rise_is_refused_exactly_where_the_motors_cannot_give_it() -> None:
         table = {"require": {"sim.rise_s": {"max": least * factor}, "track.circle_rms_deg": False}}
         asked = make_tune_requirements(table)
         if factor > 1.0:
-            refuse_impossible(asked, neck())
+            check_feasibility(asked, neck())
         else:
             with pytest.raises(SettingsError, match="within the motors' slew and range pitch's step"):
-                refuse_impossible(asked, neck())
+                check_feasibility(asked, neck())
     with pytest.raises(SettingsError, match="range does not reach"):
-        refuse_impossible(
+        check_feasibility(
             make_tune_requirements({"sim": {"size_deg": 45.0}}), LinearNeck(neck().pitch / 2, neck().roll)
         )
 
@@ -162,9 +162,9 @@ def test_a_circle_beyond_a_bandwidth_of_one_over_the_dead_time_is_refused() -> N
         asked = make_tune_requirements(table)
         if refused:
             with pytest.raises(SettingsError, match="dead time of pitch, 100 ms, allows, 10 rad/s"):
-                refuse_impossible(asked, neck())
+                check_feasibility(asked, neck())
         else:
-            refuse_impossible(asked, neck())
+            check_feasibility(asked, neck())
 
 
 @pytest.mark.parametrize("turn", [2.0, 6.0])
@@ -187,9 +187,9 @@ def test_a_circle_is_refused_exactly_where_slew_and_range_leave_too_little_of_it
         plant, asked = LinearNeck(pitch=neck().pitch, roll=0.5 * neck().roll), make_tune_requirements(table)
         if refused:
             with pytest.raises(SettingsError, match="within the motors' slew and range roll swings by"):
-                refuse_impossible(asked, plant)
+                check_feasibility(asked, plant)
         else:
-            refuse_impossible(asked, plant)
+            check_feasibility(asked, plant)
 
 
 @pytest.mark.parametrize("group", ["sim", "step"])
@@ -200,13 +200,13 @@ def test_what_may_rise_later_than_it_settles_is_refused(
     table = {"require": {f"{group}.rise_s": {"max": rise}, f"{group}.settling_s": {"max": settling}}}
     if refused:
         with pytest.raises(SettingsError, match=r"what has settled has risen; ask for a rise of at most 0\.3 s"):
-            refuse_impossible(make_tune_requirements(table), neck())
+            check_feasibility(make_tune_requirements(table), neck())
     else:
-        refuse_impossible(make_tune_requirements(table), neck())
+        check_feasibility(make_tune_requirements(table), neck())
 
 
 def test_a_slow_rise_beside_a_settling_that_nobody_asked_is_no_contradiction() -> None:
-    refuse_impossible(make_tune_requirements({"require": {"sim.rise_s": {"max": 3.0}}}), neck())
+    check_feasibility(make_tune_requirements({"require": {"sim.rise_s": {"max": 3.0}}}), neck())
 
 
 @pytest.mark.parametrize(("limit", "noise", "refused"), [(0.05, 0.06, True), (0.05, 0.04, False), (0.0, 0.05, True)])
@@ -214,19 +214,19 @@ def test_a_steady_state_quieter_than_the_sensor_is_refused(limit: float, noise: 
     table = {"require": {"sim.steady_rms_deg": {"max": limit}}, "track": {"noise_deg": noise}}
     if refused:
         with pytest.raises(SettingsError, match="noise of the sensor alone"):
-            refuse_impossible(make_tune_requirements(table), neck())
+            check_feasibility(make_tune_requirements(table), neck())
     else:
-        refuse_impossible(make_tune_requirements(table), neck())
+        check_feasibility(make_tune_requirements(table), neck())
 
 
 def test_what_settles_before_it_can_rise_and_an_Ms_of_one_are_refused() -> None:
     for metric, limit, match in (("sim.settling_s", 0.05, "slew and range"), ("axes.sensitivity", 1.0, "no feedback")):
         asked = make_tune_requirements({"require": {metric: {"max": limit}}})
         with pytest.raises(SettingsError, match=match):
-            refuse_impossible(asked, neck())
+            check_feasibility(asked, neck())
 
 
 def test_a_load_rejected_within_the_dead_time_is_refused() -> None:
     asked = make_tune_requirements({"require": {"step.load_rms_deg": {"max": 0.02}}})
     with pytest.raises(SettingsError, match="dead time before any feedback acts"):
-        refuse_impossible(asked, neck())
+        check_feasibility(asked, neck())

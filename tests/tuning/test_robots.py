@@ -19,8 +19,8 @@ from softneck.loop import SensorFault
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.robot import Robot
 from softneck.tuning import tune
-from softneck.tuning._judge import loop_of, made_ready
-from softneck.tuning._requirements import loosened, make_tune_requirements, refuse_impossible
+from softneck.tuning._judge import loop_of, prepare
+from softneck.tuning._requirements import check_feasibility, make_tune_requirements, relax_limits
 from softneck.tuning._space import spaces
 from softneck.tuning._tune import Tuned, task_of
 from softneck.verification import read_requirements
@@ -55,7 +55,7 @@ def test_a_default_that_is_quieter_than_the_noise_of_a_neck_refuses_no_other_rob
     model = plant(Robot.preset("antagonist"))
     asked = task_of({"model": model}, {"track": {"noise_deg": 5.0}}, 0).asked
     assert 0.0 < (asked.limit("sim.steady_rms_deg") or 0.0) < 5.0
-    refuse_impossible(asked, model)
+    check_feasibility(asked, model)
 
 
 def test_noise_and_delay_of_the_noisy_loops_are_the_robots_own() -> None:
@@ -75,7 +75,7 @@ def test_a_loosened_settling_time_of_a_slow_robot_is_a_file_that_is_read_again()
     asked = task_of({"model": slow}, {}, 0).asked
     limit = 1.5 * (asked.limit("sim.settling_s") or 0.0)
     assert limit > 5.0  # the neck's duration of a step
-    wider = loosened(asked, {"sim.settling_s": limit})
+    wider = relax_limits(asked, {"sim.settling_s": limit})
     table = {key: value for key, value in wider.table.items() if key != "version"}
     again = make_tune_requirements(table, robot=slow.robot)
     assert again.limit("sim.settling_s") == pytest.approx(limit, rel=1e-6)  # a file has 9 digits
@@ -162,7 +162,7 @@ def test_a_plant_of_another_robot_is_refused_before_anything_is_searched(tmp_pat
 def test_every_step_is_judged_as_verify_does_and_with_a_noisy_sensor_each_direction_its_own() -> None:
     robot = Robot.preset("trunk4")
     task = task_of({"model": plant(robot), "own": plant(robot).block()}, QUICK | {"track": {}}, 3)
-    ready, controller = made_ready(task), PiSettings().design(plant(robot))
+    ready, controller = prepare(task), PiSettings().design(plant(robot))
     quiet = {
         case.orientation for case in ready.all if case == replace(case, noise=False, late=False, circle=False, part=1.0)
     }

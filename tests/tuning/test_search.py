@@ -18,10 +18,10 @@ from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, 
 from softneck.core._kinds import make_settings
 from softneck.robot import Robot
 from softneck.tuning import tune
-from softneck.tuning._search import Candidate, given_out, ratio
+from softneck.tuning._search import Candidate, ratio, run_jobs
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._task import FILE, Job, Log
-from softneck.tuning._tune import Tuned, binding, front
+from softneck.tuning._tune import Tuned, active_requirement, front
 from softneck.verification._requirements import Requirement
 
 from .test_requirements import neck
@@ -154,7 +154,7 @@ def test_work_is_given_out_two_to_a_worker_and_all_of_it_comes_back() -> None:
         out.remove(job)
         back.append((job, result))
 
-    given_out(jobs, run, Lazy(), took)  # pyright: ignore[reportArgumentType]
+    run_jobs(jobs, run, Lazy(), took)  # pyright: ignore[reportArgumentType]
     assert sorted(back, key=lambda pair: pair[1]) == [(job, job.settings) for job in jobs]
 
 
@@ -219,14 +219,14 @@ def test_what_binds_is_what_alone_must_give_way_least() -> None:
     fast = candidate(sim__rise_s=0.3, sim__overshoot_pct=7.0, axes__gain_margin=2.5)
     slow = candidate(sim__rise_s=0.52, sim__overshoot_pct=5.0, axes__gain_margin=2.5)
     loud = candidate(sim__rise_s=0.3, sim__overshoot_pct=6.0, axes__gain_margin=1.0)
-    assert binding([fast, slow, loud], BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
+    assert active_requirement([fast, slow, loud], BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
     slower = candidate(sim__rise_s=0.55, sim__overshoot_pct=5.0, axes__gain_margin=2.5)
     for listed in ([slow, slower, loud], [slower, slow, loud]):
-        assert binding(listed, BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
-    assert binding([fast, loud], BOUNDS, tested=False) == ("sim.overshoot_pct", pytest.approx(7.0))
-    assert binding([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
+        assert active_requirement(listed, BOUNDS, tested=False) == ("sim.rise_s", pytest.approx(0.52))
+    assert active_requirement([fast, loud], BOUNDS, tested=False) == ("sim.overshoot_pct", pytest.approx(7.0))
+    assert active_requirement([loud], BOUNDS, tested=False) == ("axes.gain_margin", None)
     good = candidate(sim__rise_s=0.3, sim__overshoot_pct=5.0, axes__gain_margin=2.0)
-    assert binding([good, slow], BOUNDS, tested=False) == (None, None)
+    assert active_requirement([good, slow], BOUNDS, tested=False) == (None, None)
 
 
 @pytest.mark.parametrize("tested", [True, False])
@@ -236,10 +236,10 @@ def test_what_was_not_computed_does_not_bind(tested: bool) -> None:
     blind = candidate(sim__rise_s=0.5, sim__overshoot_pct=3.0)
     del blind.metrics["axes.sensitivity"]
     assert blind.cost(bounds, tested=tested) > 1.0
-    assert binding([blind], bounds, tested=tested) == ("sim.rise_s", None)
+    assert active_requirement([blind], bounds, tested=tested) == ("sim.rise_s", None)
     blind.metrics["sim.rise_s"] = 0.3
     assert blind.cost(bounds, tested=tested) > 1.0
-    assert binding([blind], bounds, tested=tested) == (None, None)
+    assert active_requirement([blind], bounds, tested=tested) == (None, None)
 
 
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:
@@ -297,7 +297,7 @@ def test_what_is_known_twice_counts_by_the_worse() -> None:
     from softneck.tuning._task import Judgement
 
     item = candidate(axes__gain_margin=2.5)
-    item.take("margins", Judgement({"axes.gain_margin": 1.8, "axes.delay_margin_ms": 90.0}))
+    item.update("margins", Judgement({"axes.gain_margin": 1.8, "axes.delay_margin_ms": 90.0}))
     assert item.metrics["axes.gain_margin"] == 1.8
-    item.take("margins", Judgement({"axes.gain_margin": 4.0}))
+    item.update("margins", Judgement({"axes.gain_margin": 4.0}))
     assert item.metrics["axes.gain_margin"] == 1.8

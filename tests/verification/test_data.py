@@ -22,21 +22,21 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.verification import Verification, make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
 from softneck.verification._experiments import Crossing, LoopUnderTest, _Case
-from softneck.verification._linear import AxisMargins, LinearLaw, axis_on_data, margins
+from softneck.verification._linear import AxisMargins, LinearLaw, axis_margins, margins
 from softneck.verification._metrics import Scale
 from softneck.verification._neck_loops import (
     ALONE,
-    OwnPlant,
-    is_own_plant,
+    SimulationModel,
+    is_simulation_model,
+    make_simulation_model,
     named_plants,
-    not_recorded,
-    own_plant,
-    step_at,
+    step_time,
+    unrecorded_conditions,
 )
-from softneck.verification._plants import all_plants, neck_of_family
+from softneck.verification._plants import all_plants, source_of_family
 from softneck.verification._steps import Steps
-from softneck.verification._structured import structured
-from softneck.verification._verify import unsupported
+from softneck.verification._structured import structured_singular_value
+from softneck.verification._verify import unsupported_reason
 
 from .necks import PAPER, QUICK, TS, family, linear_neck, pi
 
@@ -62,7 +62,7 @@ def on_data(**values: float) -> Family:
 
 def test_margins_of_a_disk_are_those_of_its_worst_points() -> None:
     """Closed forms against a thousand points of each disk."""
-    item = axis_on_data(measured(), LAW, 0, source="f", name="pitch", extra=0)
+    item = axis_margins(measured(), LAW, 0, source="f", name="pitch", extra=0)
     w = np.geomspace(0.3, 25.0, 400)
     L0 = -LAW.feedback(w)[:, 0, 0] * response_of(MODEL, w, TS)
     D = 0.3 * np.exp(1j * np.linspace(0.0, 2.0 * math.pi, 1000))[:, None]
@@ -84,31 +84,31 @@ def test_margins_of_a_disk_are_those_of_its_worst_points() -> None:
 
 
 def test_without_uncertainty_the_margins_are_those_of_the_plant() -> None:
-    from softneck.verification._linear import judged
-    from softneck.verification._plants import neck_of_model, nominal_plants
+    from softneck.verification._linear import frequency_grid
+    from softneck.verification._plants import nominal_plants, source_of_model
 
-    plant = nominal_plants([neck_of_model(linear_neck(), "m", {"gain": 0.0, "pole": 0.0, "delay": 0.0})])[0]
-    exact = margins(plant, LAW, judged(TS, 4000))
-    item = axis_on_data(measured(weight=1e-9, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    plant = nominal_plants([source_of_model(linear_neck(), "m", {"gain": 0.0, "pole": 0.0, "delay": 0.0})])[0]
+    exact = margins(plant, LAW, frequency_grid(TS, 4000))
+    item = axis_margins(measured(weight=1e-9, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
     for name in ("sensitivity", "disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms"):
         # 400 frequencies over two decades and a half: 1.5 % apart, at crossings half of that.
         assert item.margins[name] == pytest.approx(exact[f"pitch.{name}"][0], rel=0.02), name
 
 
 def test_a_weight_that_may_hold_an_unstable_loop_leaves_no_margin() -> None:
-    item = axis_on_data(measured(weight=1.5, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    item = axis_margins(measured(weight=1.5, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
     assert item.mu >= 1.0
     assert item.margins["gain_margin"] == 1.0
     assert item.margins["sensitivity"] == math.inf
 
 
 def test_a_gain_margin_ends_where_the_band_does() -> None:
-    wide = axis_on_data(measured(weight=0.01, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
-    narrow = axis_on_data(measured(weight=0.01, high=1.3 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
+    wide = axis_margins(measured(weight=0.01, high=100.0), LAW, 0, source="f", name="pitch", extra=0)
+    narrow = axis_margins(measured(weight=0.01, high=1.3 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
     # The loop falls about as 1/w at its crossover: 1.3 times the gain moves it to the band's end.
     assert narrow.margins["gain_margin"] == pytest.approx(1.3, rel=0.1)
     assert wide.margins["gain_margin"] > 2.0
-    beyond = axis_on_data(measured(weight=0.01, high=0.7 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
+    beyond = axis_margins(measured(weight=0.01, high=0.7 * wide.crossover), LAW, 0, source="f", name="pitch", extra=0)
     assert beyond.margins == {}
     assert "not supported by the data: f excites pitch from 0.3 to" in beyond.why()
     assert "record `multisine --band" in beyond.why()
@@ -206,8 +206,10 @@ def test_what_nobody_recorded_is_not_supported(
     tested = {"f.npz": {"conditions": [{"payload_kg": [1.0, 1.0], "cocontraction": [-0.5, 0.5]}]}}
     known = {} if payload is None else {"payload_kg": payload, "cocontraction": at}
     part: Any = None
-    plant = OwnPlant(name="p", make=part, quiet=part, payload="inputs" if payload is None else "", conditions=known)
-    found = not_recorded(tested, [plant], held_at(loop))
+    plant = SimulationModel(
+        name="p", make=part, quiet=part, payload="inputs" if payload is None else "", conditions=known
+    )
+    found = unrecorded_conditions(tested, [plant], held_at(loop))
     assert found.keys() == said.keys()
     for group, words in said.items():
         assert words in found[group]
@@ -218,16 +220,16 @@ def test_of_what_was_not_recorded_no_requirement_holds(supported: Verification) 
     evidence, why = supported.evidence, {"sim": "no such payload", "loop": "slack there"}
     for item in make_requirements(QUIET).bounds:
         group = "sim" if item.metric.startswith("sim.") else "loop"
-        assert unsupported(item, replace(evidence, foreign=False), why) == why[group], item.metric
+        assert unsupported_reason(item, replace(evidence, foreign=False), why) == why[group], item.metric
         # A preset is nobody's recorded plant, and decides nothing.
-        assert unsupported(item, evidence, {"sim": why["sim"]}) == "", item.metric
+        assert unsupported_reason(item, evidence, {"sim": why["sim"]}) == "", item.metric
 
 
 @pytest.mark.slow
 def test_margins_of_a_controller_without_linear_form_are_no_promise(supported: Verification) -> None:
     """Nothing of it is held against the weight over the recordings: models alone told four times the true margin."""
     evidence, why = replace(supported.evidence, tested=[]), {"margins": ALONE}
-    told = {item.metric: unsupported(item, evidence, why) for item in supported.requirements.bounds}
+    told = {item.metric: unsupported_reason(item, evidence, why) for item in supported.requirements.bounds}
     assert {metric for metric, reason in told.items() if reason == ALONE} == {
         metric for metric in told if metric.endswith(("gain_margin", "delay_margin_ms"))
     }
@@ -273,11 +275,11 @@ def test_a_preset_is_a_foreign_plant_that_decides_only_where_it_is_asked() -> No
 
 
 def test_what_steps_is_told_from_what_is_linear() -> None:
-    assert is_own_plant(NeckParameters.paper())
-    assert not is_own_plant(linear_neck())
-    assert not is_own_plant(family())
+    assert is_simulation_model(NeckParameters.paper())
+    assert not is_simulation_model(linear_neck())
+    assert not is_simulation_model(family())
     with pytest.raises(SettingsError, match="c: is no plant with the outputs pitch and roll"):
-        own_plant(pi().block(), "c")
+        make_simulation_model(pi().block(), "c")
 
 
 def test_a_roll_off_that_the_user_states_is_judged_up_to_nyquist() -> None:
@@ -285,7 +287,7 @@ def test_a_roll_off_that_the_user_states_is_judged_up_to_nyquist() -> None:
 
     def judge(rolloff: float, law: LinearLaw = LAW) -> AxisMargins:
         narrow = measured(weight=0.01, high=20.0)
-        return axis_on_data(narrow, law, 0, source="f", name="pitch", extra=0, rolloff=rolloff)
+        return axis_margins(narrow, law, 0, source="f", name="pitch", extra=0, rolloff=rolloff)
 
     silent, falling = judge(-1.0), judge(20.0)
     # The law and the plant both fall above 20 rad/s: nothing is lost by asking.
@@ -312,14 +314,14 @@ def _labelled(system: Any) -> Any:
 def test_a_step_waits_for_the_motors_that_pull_tendons_taut() -> None:
     taut = PiSettings(least_cocontraction=0.6).design(linear_neck())
     asked = make_requirements({})
-    assert step_at(pi().block(), asked) == 0.5
-    assert step_at(taut.block(), asked) == 3.0
-    assert step_at(taut.block(), replace(asked, scale=Scale(time=10.0))) == 30.0
+    assert step_time(pi().block(), asked) == 0.5
+    assert step_time(taut.block(), asked) == 3.0
+    assert step_time(taut.block(), replace(asked, scale=Scale(time=10.0))) == 30.0
 
 
 def test_a_tested_family_holds_no_plant_that_its_recordings_exclude_and_reaches_to_the_weight() -> None:
     """Corners put together what no recording has: a slow pole and a long dead time, of which designs were refused."""
-    neck = neck_of_family(on_data(weight=0.15, high=25.0), "f")
+    neck = source_of_family(on_data(weight=0.15, high=25.0), "f")
     wide = tuple(replace(box, low=0.5 * box.nominal, high=2.0 * box.nominal) for box in neck.axes)
     plants = all_plants([replace(neck, axes=wide)], 60, 0)
     w = np.geomspace(0.3, 25.0, 20)
@@ -336,9 +338,9 @@ def test_a_tested_family_holds_no_plant_that_its_recordings_exclude_and_reaches_
 
 @pytest.mark.parametrize("weight", [0.1, 0.3])
 def test_mu_over_the_weight_of_axes_apart_is_the_largest_of_each(weight: float) -> None:
-    neck = replace(neck_of_family(on_data(weight=weight), "f"), cross=np.zeros(2))
-    found = structured(neck, LAW, extra=0)
-    alone = axis_on_data(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0)
+    neck = replace(source_of_family(on_data(weight=weight), "f"), cross=np.zeros(2))
+    found = structured_singular_value(neck, LAW, extra=0)
+    alone = axis_margins(measured(weight=weight), LAW, 0, source="f", name="pitch", extra=0)
     # 90 frequencies in two decades: 5 % apart, and the peak is flat; the other grid adds half its step.
     assert found[0].mu == pytest.approx(alone.mu, rel=0.03)
 
@@ -348,7 +350,7 @@ def test_an_fmu_stands_as_much_as_the_plant_that_it_is_made_of(tmp_path: Path, m
     block = VirtualNeck(NeckParameters.paper().without_noise()).block()
     build_fmu(block, tmp_path / "neck.fmu")
     monkeypatch.chdir(tmp_path)
-    own = own_plant(named_plants("neck.fmu")["neck.fmu"], "neck.fmu")
+    own = make_simulation_model(named_plants("neck.fmu")["neck.fmu"], "neck.fmu")
     # Loading an FMU changes the folder for a moment: another thread's relative path was "no such file".
     monkeypatch.chdir(Path("/"))
     swings = [

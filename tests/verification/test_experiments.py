@@ -15,22 +15,22 @@ from softneck.runtime import Block
 from softneck.verification import linear_plant
 from softneck.verification._experiments import (
     _POSTURES,
-    _SMALL,
+    _SMALL_RAD,
     Crossing,
     LoopUnderTest,
     _Case,
     _first_crossing,
-    _group,
-    _swing,
+    _oscillation,
+    _scan_group,
     crossing_values,
     crossings,
 )
-from softneck.verification._linear import LinearLaw, judged, margins
-from softneck.verification._plants import Plants, all_plants, neck_of_family
+from softneck.verification._linear import LinearLaw, frequency_grid, margins
+from softneck.verification._plants import Plants, all_plants, source_of_family
 
 from .necks import TS, family, pi
 
-W = judged(TS, 20_000)
+W = frequency_grid(TS, 20_000)
 
 
 def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
@@ -50,14 +50,14 @@ def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
 
 def first(loop: LoopUnderTest, axes: str, what: str) -> float:
     """The first crossing of a small kick from upright."""
-    case = _Case(loop, axes, what, _SMALL, _POSTURES[0])
+    case = _Case(loop, axes, what, _SMALL_RAD, _POSTURES[0])
     return _first_crossing(case, case.floor(), math.inf, False)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", [0, 3])
 def test_on_linear_plants_the_margins_are_the_closed_forms_to_one_percent(row: int) -> None:
-    plants = all_plants([neck_of_family(family(), "f")], 12, 0)
+    plants = all_plants([source_of_family(family(), "f")], 12, 0)
     expected = margins(plants.take([row]), LinearLaw.of(pi().ss()), W)
     loop = over(plants, row)
     up = first(loop, "pitch", "gain_up")
@@ -71,7 +71,7 @@ def test_on_linear_plants_the_margins_are_the_closed_forms_to_one_percent(row: i
 
 @pytest.mark.slow
 def test_only_the_axis_that_is_raised_counts_and_both_at_once_are_found_through_the_cross_gain() -> None:
-    plants = all_plants([neck_of_family(family(), "f")], 12, 0)
+    plants = all_plants([source_of_family(family(), "f")], 12, 0)
     alone = over(plants, 0)
     pitch, both = (first(alone, axes, "gain_up") for axes in ("pitch", "both"))
     # Two equal axes without coupling: jointly they stand what each stands.
@@ -83,9 +83,9 @@ def test_only_the_axis_that_is_raised_counts_and_both_at_once_are_found_through_
 
 
 def test_an_unstable_loop_has_no_margin_and_an_overflow_is_an_oscillation() -> None:
-    plants = all_plants([neck_of_family(family(), "f")], 12, 0)
+    plants = all_plants([source_of_family(family(), "f")], 12, 0)
     slow = plants.take([0]).later(20)
-    found = _group(over(slow, 0), "pitch", "gain_up", False)
+    found = _scan_group(over(slow, 0), "pitch", "gain_up", False)
     assert min(item.value for item in found) == 1.0
 
 
@@ -98,7 +98,7 @@ def test_the_first_crossing_is_found_where_stability_is_not_monotone(monkeypatch
         return (1.0, 1.0) if loud else (1.0, 0.0)
 
     monkeypatch.setattr(_Case, "_windows", windows)
-    found = _group(over(all_plants([neck_of_family(family(), "f")], 2, 0), 0), "pitch", "gain_up", False)
+    found = _scan_group(over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "pitch", "gain_up", False)
     assert found[0].value == pytest.approx(1.5, rel=0.005)
     # Later cases look no further than the least so far.
     assert all(item.value == pytest.approx(1.5, rel=0.005) or math.isinf(item.value) for item in found)
@@ -106,7 +106,7 @@ def test_the_first_crossing_is_found_where_stability_is_not_monotone(monkeypatch
 
 def test_the_least_over_plants_axes_and_kinds_is_each_metric_s() -> None:
     def crossing(axes: str, what: str, value: float) -> Crossing:
-        return Crossing("p", axes, what, _SMALL, _POSTURES[0], value, 0.0)
+        return Crossing("p", axes, what, _SMALL_RAD, _POSTURES[0], value, 0.0)
 
     found = [
         crossing("pitch", "gain_up", 3.0), crossing("pitch", "gain_down", 2.5), crossing("roll", "gain_up", 4.0),
@@ -152,7 +152,7 @@ def test_the_virtual_neck_stands_less_than_its_linear_model_and_coarse_is_quick(
 
 def test_the_least_of_all_is_the_same_where_only_that_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every case has a border of its own; the heaviest of both axes is not the worst everywhere."""
-    plants = all_plants([neck_of_family(family(), "f")], 2, 0)
+    plants = all_plants([source_of_family(family(), "f")], 2, 0)
     loops = [replace(over(plants, row), name=f"p{row}") for row in (0, 1)]
     runs = 0
 
@@ -183,10 +183,12 @@ def test_a_loop_that_feeds_a_kick_oscillates_though_slow_parts_of_its_plant_let_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Seen on a foreign neck: 3.5 deg from a kick of 1, then 3.1; it was called calm."""
-    case = _Case(over(all_plants([neck_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", _SMALL, _POSTURES[0])
-    monkeypatch.setattr(_Case, "_windows", lambda *_: (3.5 * _SMALL, 3.1 * _SMALL))
+    case = _Case(
+        over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", _SMALL_RAD, _POSTURES[0]
+    )
+    monkeypatch.setattr(_Case, "_windows", lambda *_: (3.5 * _SMALL_RAD, 3.1 * _SMALL_RAD))
     assert case.oscillates(1.6, 0.0)
-    monkeypatch.setattr(_Case, "_windows", lambda *_: (2.5 * _SMALL, 2.1 * _SMALL))
+    monkeypatch.setattr(_Case, "_windows", lambda *_: (2.5 * _SMALL_RAD, 2.1 * _SMALL_RAD))
     assert not case.oscillates(1.6, 0.0)
 
 
@@ -194,17 +196,17 @@ def test_what_sticks_and_comes_late_is_no_oscillation_and_what_runs_away_is_one(
     """Seen on a foreign neck: at gain 1/1.4 friction holds it for 4 s, then it steps once; that was its gain margin."""
     t = np.arange(200) * TS
     late = 1.0 / (1.0 + np.exp(-4.0 * (t - 2.0)))
-    assert _swing(late, 3.0) < 1e-9
-    assert _swing(5.0 * late, 3.0) == pytest.approx(5.0, rel=0.01)
+    assert _oscillation(late, 3.0) < 1e-9
+    assert _oscillation(5.0 * late, 3.0) == pytest.approx(5.0, rel=0.01)
     # 12 rad/s for 4 s: to and fro, with or without a drift that is slower.
-    assert _swing(np.sin(12.0 * t), 3.0) == pytest.approx(2.0, rel=0.01)
-    assert _swing(np.sin(12.0 * t) + 0.2 * t, 3.0) == pytest.approx(2.0, rel=0.05)
+    assert _oscillation(np.sin(12.0 * t), 3.0) == pytest.approx(2.0, rel=0.01)
+    assert _oscillation(np.sin(12.0 * t) + 0.2 * t, 3.0) == pytest.approx(2.0, rel=0.05)
 
 
 def test_where_a_loop_hunts_at_gain_1_there_is_no_less_to_look_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """It hunts after the small kick and not after the large one: the second divided by a delay of zero."""
-    monkeypatch.setattr(_Case, "_windows", lambda case, *_: (1.0, 1.0 if case.amplitude == _SMALL else 0.0))
-    loop = over(all_plants([neck_of_family(family(), "f")], 2, 0), 0)
+    monkeypatch.setattr(_Case, "_windows", lambda case, *_: (1.0, 1.0 if case.amplitude == _SMALL_RAD else 0.0))
+    loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for overall in (False, True):
         found = crossings([loop], overall=overall)
         assert {x.what: x.value for x in found} == {"gain_up": 1.0, "gain_down": 1.0, "delay": 0.0} or overall
@@ -216,8 +218,8 @@ def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Seen on a foreign neck: a dip of 0.2 deg as the other axis came late was a gain margin of 1.4."""
-    loop = over(all_plants([neck_of_family(family(), "f")], 2, 0), 0)
+    loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for size, loud in ((0.2, False), (1.5, True)):
-        monkeypatch.setattr(_Case, "_windows", lambda *_, size=size: (size * _SMALL, size * _SMALL))
-        assert _Case(loop, "both", "gain_down", _SMALL, _POSTURES[0]).oscillates(1.4, 0.0) is loud
-        assert _Case(loop, "both", "gain_up", _SMALL, _POSTURES[0]).oscillates(1.4, 0.0)
+        monkeypatch.setattr(_Case, "_windows", lambda *_, size=size: (size * _SMALL_RAD, size * _SMALL_RAD))
+        assert _Case(loop, "both", "gain_down", _SMALL_RAD, _POSTURES[0]).oscillates(1.4, 0.0) is loud
+        assert _Case(loop, "both", "gain_up", _SMALL_RAD, _POSTURES[0]).oscillates(1.4, 0.0)

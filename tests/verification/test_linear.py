@@ -13,23 +13,23 @@ from softneck.design import FopiSettings, PiSettings, mu_upper
 from softneck.design.robust._mu import two_scalars
 from softneck.estimation import LinearNeck
 from softneck.identification.models._linear_systems import remove_unreachable_states
-from softneck.verification._linear import LinearLaw, judged, margins, radii
+from softneck.verification._linear import LinearLaw, frequency_grid, margins, radii
 from softneck.verification._plants import (
     AxisBox,
     Plants,
-    UncertainNeck,
+    PlantSource,
     all_plants,
     make_plants,
-    neck_of_family,
-    neck_of_model,
     nominal_plants,
+    source_of_family,
+    source_of_model,
 )
-from softneck.verification._structured import _axis, search, structured
+from softneck.verification._structured import _axis_model, search, structured_singular_value
 
 from .necks import PAPER, TS, controller_of, family, linear_neck, pi
 
 SPREAD = {"gain": 0.2, "pole": 0.2, "delay": 0.02}
-W = judged(TS)
+W = frequency_grid(TS)
 
 
 def _disk(L: Any) -> float:
@@ -47,7 +47,7 @@ def _transfer(plants: Plants, row: int, axis: int) -> control.TransferFunction:
 
 def test_plants_of_a_family_are_sampled_as_the_family_samples_them() -> None:
     found = family()
-    plants = all_plants([neck_of_family(found, "f")], 1, 0)
+    plants = all_plants([source_of_family(found, "f")], 1, 0)
     rows = [k for k, name in enumerate(plants.names) if "sample" in name]
     G = plants.take(rows).response(W)
     for i, axis in enumerate(("pitch", "roll")):
@@ -62,7 +62,7 @@ def test_the_nominal_plant_of_a_model_is_the_model() -> None:
     second = control.TransferFunction([0.002, 0.001], np.concatenate([np.convolve([1, -a], [1, -b]), [0, 0, 0]]), TS)
     ringing = control.TransferFunction([0.002, 0.001], [1.0, -1.6, 0.73, 0.0, 0.0], TS)
     for tf in (model.pitch, second, ringing):
-        neck = neck_of_model(type(model)(pitch=tf, roll=tf), "m", SPREAD)
+        neck = source_of_model(type(model)(pitch=tf, roll=tf), "m", SPREAD)
         G = nominal_plants([neck])[0].response(W)[0, 0]
         # 1e-6: of a ringing model the pole that does not show is at exp(-200).
         np.testing.assert_allclose(G, np.asarray(tf(np.exp(1j * W * TS))), rtol=1e-6)
@@ -70,7 +70,7 @@ def test_the_nominal_plant_of_a_model_is_the_model() -> None:
 
 @pytest.mark.parametrize("cross", [0.0, 0.3])
 def test_radii_are_those_of_the_closed_loops_poles(cross: float) -> None:
-    plants = all_plants([neck_of_family(family(cross=cross, spread=0.5), "f")], 40, 1).later(2)
+    plants = all_plants([source_of_family(family(cross=cross, spread=0.5), "f")], 40, 1).later(2)
     controller = pi()
     found = radii(plants, LinearLaw.of(controller.ss()))
     K: Any = controller.ss()
@@ -87,7 +87,7 @@ def test_radii_are_those_of_the_closed_loops_poles(cross: float) -> None:
 @pytest.mark.slow
 def test_margins_are_those_of_python_control() -> None:
     pytest.importorskip("slycot")
-    plants = all_plants([neck_of_model(linear_neck(), "m", SPREAD)], 30, 0)
+    plants = all_plants([source_of_model(linear_neck(), "m", SPREAD)], 30, 0)
     law = LinearLaw.of(pi().ss())
     found = margins(plants, law, np.geomspace(0.02, math.pi / TS, 1500))
     z = np.exp(1j * W * TS)
@@ -111,13 +111,13 @@ def test_margins_are_those_of_python_control() -> None:
 
 @pytest.mark.parametrize("kind", [PiSettings, FopiSettings], ids=["pi", "fopi"])
 def test_python_control_says_the_same_margins(kind: Any) -> None:
-    plants = nominal_plants([neck_of_model(linear_neck(), "m", SPREAD)])[0]
+    plants = nominal_plants([source_of_model(linear_neck(), "m", SPREAD)])[0]
     law = LinearLaw.of(kind().design(linear_neck()).ss())
     own = margins(plants, law, W)
     A, B, C = remove_unreachable_states(law.A, law.By[:, [0]], law.C[[0]])
     K = control.StateSpace(A, B, -C, -law.Dy[[0]][:, [0]], TS)
     # Of the state-space form's response: polynomials of this order are inaccurate.
-    response = control.frequency_response(control.ss(_transfer(plants, 0, 0)) * K, judged(TS, 1500)[:-1])
+    response = control.frequency_response(control.ss(_transfer(plants, 0, 0)) * K, frequency_grid(TS, 1500)[:-1])
     gains, phases = (np.asarray(item) for item in control.stability_margins(response, returnall=True)[:2])
     gain = np.exp(np.abs(np.log(gains[gains > 0.0])).min())
     phase = np.abs((phases + 180.0) % 360.0 - 180.0).min()
@@ -134,7 +134,7 @@ def test_two_complex_scalars_have_a_closed_form() -> None:
 
 @pytest.mark.slow
 def test_the_margin_of_both_channels_is_that_of_the_system_of_two() -> None:
-    plants = nominal_plants([neck_of_family(family(cross=0.3), "f")])[0]
+    plants = nominal_plants([source_of_family(family(cross=0.3), "f")])[0]
     controller: Any = pi().ss()
     law = LinearLaw.of(controller)
     mixed = np.array([[1.0, plants.cross[0, 0]], [plants.cross[0, 1], 1.0]])
@@ -146,7 +146,7 @@ def test_the_margin_of_both_channels_is_that_of_the_system_of_two() -> None:
     assert margins(plants, law, W)["mimo.disk_margin"][0] == pytest.approx(least, rel=5e-3)
 
 
-def _hidden() -> tuple[UncertainNeck, LinearLaw]:
+def _hidden() -> tuple[PlantSource, LinearLaw]:
     """A resonance of gain 2 and a dead time that turns it once around: unstable only in the middle.
 
     At both ends of the box the resonance is in phase with -180 deg + 180 deg; half a period later it is at -180.
@@ -167,7 +167,7 @@ def _hidden() -> tuple[UncertainNeck, LinearLaw]:
     box = AxisBox(
         nominal=low, low=low, high=low + np.array([0.0, 0.0, 0.08]), samples=np.zeros((0, 3)),
     )  # fmt: skip
-    neck = UncertainNeck(name="hidden", sample_time=TS, axes=(box, box), cross=np.zeros(2), kind="model",
+    neck = PlantSource(name="hidden", sample_time=TS, axes=(box, box), cross=np.zeros(2), kind="model",
                         weights=np.eye(2))  # fmt: skip
     law = LinearLaw.of(controller_of(sign * np.array([1.0, -1.0]), below))
     return neck, law
@@ -185,18 +185,18 @@ def test_a_loop_that_is_stable_at_all_corners_but_not_inside_is_caught_by_the_se
 
 def test_where_the_search_finds_an_unstable_plant_the_bound_proves_nothing() -> None:
     neck, law = _hidden()
-    for row in structured(neck, law, extra=0):
+    for row in structured_singular_value(neck, law, extra=0):
         assert row.mu > 1.0
 
 
 @pytest.mark.slow
 def test_bounds_enclose_what_was_sampled() -> None:
     """The box of a neck with a PI: no drawn plant of a box that is grown by less than 1/mu is unstable."""
-    neck = neck_of_model(linear_neck(), "m", {"gain": 0.4, "pole": 0.4, "delay": 0.02})
+    neck = source_of_model(linear_neck(), "m", {"gain": 0.4, "pole": 0.4, "delay": 0.02})
     law = LinearLaw.of(pi().ss())
     drawn = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 2, 3))
     drawn[:50] = np.sign(drawn[:50])
-    row = structured(neck, law, extra=0)[0]
+    row = structured_singular_value(neck, law, extra=0)[0]
     middle, widths = (np.stack([getattr(box, name) for box in neck.axes]) for name in ("middle", "widths"))
 
     def unstable(scale: float) -> bool:
@@ -221,10 +221,10 @@ def one_pole(gain: float, pole: float, late: int) -> LinearNeck:
 def test_mu_of_gain_alone_is_that_of_the_gain_margin(model: LinearNeck) -> None:
     """With gain +-r alone the loop is unstable from 1 + k r = gain margin on: mu = r/(margin - 1)."""
     r = 0.3
-    neck = neck_of_model(model, "m", {"gain": r, "pole": 0.0, "delay": 0.0})
+    neck = source_of_model(model, "m", {"gain": r, "pole": 0.0, "delay": 0.0})
     law = LinearLaw.of(pi().ss())
     margin = float(margins(nominal_plants([neck])[0], law, W)["pitch.gain_margin"][0])
-    row = structured(neck, law, extra=0)[0]
+    row = structured_singular_value(neck, law, extra=0)[0]
     # The 1 % of complex dead time that is always there widens the peak, and costs as much here.
     assert r / (margin - 1.0) <= row.mu <= 1.2 * r / (margin - 1.0)
 
@@ -235,7 +235,7 @@ def test_a_gain_margin_is_where_poles_leave_the_circle(late: int) -> None:
     law, box = LinearLaw.of(pi().ss()), {"gain": 0.3, "pole": 0.0, "delay": 0.0}
 
     def plant(k: float) -> Plants:
-        return nominal_plants([neck_of_model(one_pole(0.3 * k, -0.43, late), "m", box)])[0]
+        return nominal_plants([source_of_model(one_pole(0.3 * k, -0.43, late), "m", box)])[0]
 
     margin = float(margins(plant(1.0), law, W)["pitch.gain_margin"][0])
     # 0.1 %: straight lines between frequencies.
@@ -246,20 +246,20 @@ def test_a_gain_margin_is_where_poles_leave_the_circle(late: int) -> None:
 def test_the_middle_of_a_model_s_box_is_the_model(poles: list[float]) -> None:
     """Also where no pole is a lag's, as of a log in which motor positions are the input."""
     tf = control.TransferFunction([0.01], [*poles, 0.0, 0.0, 0.0], TS)
-    neck = neck_of_model(LinearNeck(pitch=tf, roll=tf), "m", {"gain": 0.2, "pole": 0.0, "delay": 0.0})
+    neck = source_of_model(LinearNeck(pitch=tf, roll=tf), "m", {"gain": 0.2, "pole": 0.0, "delay": 0.0})
     # 1e-6: as of the nominal plant.
-    np.testing.assert_allclose(_axis(neck.axes[0], W, TS, 0)[0], np.asarray(tf(np.exp(1j * W * TS))), rtol=1e-6)
+    np.testing.assert_allclose(_axis_model(neck.axes[0], W, TS, 0)[0], np.asarray(tf(np.exp(1j * W * TS))), rtol=1e-6)
 
 
 def test_wrong_delay_is_seen() -> None:
     """Designed without dead time, judged on the paper's 80 ms: not stable."""
-    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    neck = source_of_model(linear_neck(), "m", SPREAD)
     assert radii(nominal_plants([neck])[0], LinearLaw.of(pi(delay=0).ss())).max() > 1.0
 
 
 def test_more_delay_by_the_order_is_more_delay_of_the_plant() -> None:
-    neck = neck_of_model(linear_neck(delay=4), "m", SPREAD)
-    other = neck_of_model(linear_neck(delay=6), "m", SPREAD)
+    neck = source_of_model(linear_neck(delay=4), "m", SPREAD)
+    other = source_of_model(linear_neck(delay=6), "m", SPREAD)
     law = LinearLaw.of(pi().ss())
     one, two = margins(nominal_plants([neck])[0].later(2), law, W), margins(nominal_plants([other])[0], law, W)
     for name in one:
@@ -268,7 +268,7 @@ def test_more_delay_by_the_order_is_more_delay_of_the_plant() -> None:
 
 def test_numbers_make_plants_between_samples() -> None:
     """A dead time of 3.5 samples lies between those of 3 and 4 in phase."""
-    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    neck = source_of_model(linear_neck(), "m", SPREAD)
     numbers = np.tile(PAPER, (3, 2, 1))
     numbers[:, :, 2] = np.array([0.06, 0.07, 0.08])[:, None]
     G = make_plants(neck, numbers, [""] * 3).response(np.array([1.0]))[:, 0, 0]

@@ -11,7 +11,7 @@ import pytest
 from softneck.core import load, silent
 from softneck.plant import NeckParameters
 from softneck.verification import make_requirements
-from softneck.verification._neck_loops import OwnPlant, own_plant, payloads_left_out, run_necks
+from softneck.verification._neck_loops import SimulationModel, make_simulation_model, missing_payloads, run_loops
 
 from ..data import ROOT
 from ..identification.structured.test_payload import at
@@ -20,8 +20,10 @@ from .necks import QUICK, pi
 GREYBOX = ROOT / "tests" / "golden" / "greybox.npz"
 
 
-def plant_with(payload: str, seen: list[float]) -> OwnPlant:
-    return replace(own_plant(NeckParameters.paper(), "own"), payload=payload, conditions={"payload_kg": seen})
+def plant_with(payload: str, seen: list[float]) -> SimulationModel:
+    return replace(
+        make_simulation_model(NeckParameters.paper(), "own"), payload=payload, conditions={"payload_kg": seen}
+    )
 
 
 @pytest.mark.parametrize(
@@ -39,9 +41,9 @@ def test_a_plant_carries_the_payloads_that_it_knows_and_the_others_are_said(
 ) -> None:
     plant = plant_with(payload, seen)
     assert plant.payloads([0.0, 0.5, 1.0]) == carried
-    told = payloads_left_out([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0, 0.5, 1.0]}}))
+    told = missing_payloads([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0, 0.5, 1.0]}}))
     assert [f"no loop of own carries {left} kg" in why for why in told.values()] == [True] * bool(left)
-    assert not payloads_left_out([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0]}}))
+    assert not missing_payloads([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0]}}))
 
 
 def test_loops_over_a_model_of_several_payloads_carry_each() -> None:
@@ -54,8 +56,8 @@ def test_loops_over_a_model_of_several_payloads_carry_each() -> None:
     few = make_requirements({**QUICK, "sim": {"payloads_kg": [0.0, 1.0], "orientations_deg": [0.0], "duration_s": 2.5}})
 
     def angles(model: Any) -> list[np.ndarray]:
-        own = [own_plant(model, "m")]
-        runs = run_necks(pi().block(), few, order="sequential", observer=None, seed=0, progress=silent, own=own)
+        own = [make_simulation_model(model, "m")]
+        runs = run_loops(pi().block(), few, order="sequential", observer=None, seed=0, progress=silent, own=own)
         return [run.result.angle("pitch") for run in runs if run.result is not None]
 
     light, heavy = angles(several)

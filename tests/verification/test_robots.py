@@ -17,10 +17,10 @@ from softneck.loop import BlockPart
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
 from softneck.verification import make_requirements, verify
-from softneck.verification._experiments import _SMALL, LoopUnderTest, _Case, _first_crossing, crossings
-from softneck.verification._linear import LinearLaw, judged, margins, radii
-from softneck.verification._neck_loops import own_plant
-from softneck.verification._plants import all_plants, between, mixing, neck_of_model
+from softneck.verification._experiments import _SMALL_RAD, LoopUnderTest, _Case, _first_crossing, crossings
+from softneck.verification._linear import LinearLaw, frequency_grid, margins, radii
+from softneck.verification._neck_loops import make_simulation_model
+from softneck.verification._plants import all_plants, mixing_matrix, off_diagonal, source_of_model
 from softneck.verification._requirements import read_requirements
 from softneck.verification._steps import StepTest, run_steps
 from softneck.verification._verify import sources_of
@@ -36,7 +36,7 @@ def test_margins_of_axes_apart_are_those_of_each_alone(outputs: int) -> None:
     """One plant on each axis: the margins of an antagonist are those of a trunk's pitch and of a length of four."""
     robot = (Robot.preset("antagonist"), Robot.preset("trunk4"), BELLOWS)[outputs - 1]
     model = plant(robot, gain=0.08 if outputs < 3 else 1e-7)
-    source = neck_of_model(model, "m", NONE)
+    source = source_of_model(model, "m", NONE)
     assert not source.cross.any()
     plants = all_plants([source], 1, 0)
     # v = K (r - y), K of half a rad of input for one of output at a static gain of one.
@@ -51,7 +51,7 @@ def test_margins_of_axes_apart_are_those_of_each_alone(outputs: int) -> None:
         -K * one,
         0.02,
     )
-    w = judged(0.02)
+    w = frequency_grid(0.02)
     table = margins(plants, law, w)
     # L = 0.5 * 0.1 z^-4 / (1 - 0.9 z^-1), whatever the units.
     z = np.exp(1j * w * 0.02)
@@ -65,12 +65,12 @@ def test_margins_of_axes_apart_are_those_of_each_alone(outputs: int) -> None:
 def test_the_radius_of_coupled_axes_is_that_of_the_whole_system() -> None:
     robot = BELLOWS
     model = plant(robot, gain=1e-7)
-    source = neck_of_model(model, "m", NONE)
+    source = source_of_model(model, "m", NONE)
     from dataclasses import replace
 
     X = np.array([[1.0, 0.2, 0.0], [-0.1, 1.0, 0.3], [0.05, 0.0, 1.0]])
-    np.testing.assert_array_equal(mixing(between(X), 3), X)
-    plants = all_plants([replace(source, cross=between(X))], 1, 0)
+    np.testing.assert_array_equal(mixing_matrix(off_diagonal(X), 3), X)
+    plants = all_plants([replace(source, cross=off_diagonal(X))], 1, 0)
     K = -2e6 * np.eye(3)
     law = LinearLaw(
         np.zeros((0, 0)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((3, 0)), -K, K, 0.02
@@ -194,7 +194,7 @@ def test_margins_by_experiment_of_a_linear_plant_are_those_of_its_loop(name: str
     )  # fmt: skip
     rest = (0.0,) * len(robot.outputs.names)
     for what, key in (("gain_up", "gain"), ("delay", "delay")):
-        case = _Case(loop, axis, what, size * _SMALL, rest)
+        case = _Case(loop, axis, what, size * _SMALL_RAD, rest)
         expected = controller.design[axis]["margins"][key]
         found = _first_crossing(case, case.floor(), math.inf, False)
         # A straight line between two samples is no later, but up to 1.6 % short. The way from 0 bar to the middle
@@ -220,8 +220,8 @@ def test_of_a_loop_that_does_not_answer_nothing_is_certified() -> None:
 def test_a_plant_of_ones_own_has_to_be_of_the_robot() -> None:
     antagonist, trunk = (plant(Robot.preset(name)) for name in ("antagonist", "trunk4"))
     with pytest.raises(SettingsError, match="x: is no plant with the outputs pitch and roll"):
-        own_plant(antagonist.block(), "x", Robot.preset("trunk4"))
-    assert own_plant(trunk.block(), "x", Robot.preset("trunk4")).name == "x"
+        make_simulation_model(antagonist.block(), "x", Robot.preset("trunk4"))
+    assert make_simulation_model(trunk.block(), "x", Robot.preset("trunk4")).name == "x"
 
 
 @pytest.mark.slow

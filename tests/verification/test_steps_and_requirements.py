@@ -15,11 +15,18 @@ from softneck.core._certificate import required_rows
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
 from softneck.verification import make_requirements, metric_names, metric_title
-from softneck.verification._linear import LinearLaw, classical, judged
-from softneck.verification._plants import all_plants, join, make_plants, neck_of_family, neck_of_model, nominal_plants
+from softneck.verification._linear import LinearLaw, classical_margins, frequency_grid
+from softneck.verification._plants import (
+    all_plants,
+    join,
+    make_plants,
+    nominal_plants,
+    source_of_family,
+    source_of_model,
+)
 from softneck.verification._requirements import Requirement
 from softneck.verification._steps import StepTest, _metrics, run_steps
-from softneck.verification._verify import plain
+from softneck.verification._verify import to_json
 
 from .necks import TS, controller_of, family, linear_neck, pi
 
@@ -73,7 +80,7 @@ def test_what_never_arrives_or_overflows_is_infinite() -> None:
 
 
 def test_a_load_comes_in_the_second_half_on_the_stepped_axis_alone_and_noise_scales() -> None:
-    plants = nominal_plants([neck_of_family(family(), "f")])[0]
+    plants = nominal_plants([source_of_family(family(), "f")])[0]
     block = pi().block()
 
     def run(**changes: float) -> Any:
@@ -168,18 +175,18 @@ def test_what_no_loop_can_do_is_refused_at_the_border(require: dict[str, Any], p
 
 def test_json_values_of_everything_and_nothing_else() -> None:
     values = {"a": np.array([1.0, math.inf]), 2: (True, np.bool_(False)), "n": np.int64(3), "x": math.nan, "t": "s"}
-    assert plain(values) == {"a": [1.0, None], "2": [True, False], "n": 3, "x": None, "t": "s"}
-    assert plain(True) is True
-    assert plain(None) is None
+    assert to_json(values) == {"a": [1.0, None], "2": [True, False], "n": 3, "x": None, "t": "s"}
+    assert to_json(True) is True
+    assert to_json(None) is None
     with pytest.raises(DataError):
-        plain(object())
+        to_json(object())
 
 
 # -- boxes and plants -------------------------------------------------------------------------------------------------
 
 
 def test_the_box_of_a_model_is_its_spread_around_it() -> None:
-    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    neck = source_of_model(linear_neck(), "m", SPREAD)
     for box in neck.axes:
         K, p, L = box.nominal
         np.testing.assert_allclose(box.low, [0.8 * K, 0.7 * p, L - 0.02], rtol=1e-12)
@@ -187,12 +194,12 @@ def test_the_box_of_a_model_is_its_spread_around_it() -> None:
         np.testing.assert_allclose(box.middle, box.nominal, rtol=1e-12)
         np.testing.assert_allclose(box.widths, [0.2 * K, 0.3 * p, 0.02], rtol=1e-9)
     # A dead time is never negative.
-    assert neck_of_model(linear_neck(delay=0), "m", SPREAD).axes[0].low[2] == 0.0
+    assert source_of_model(linear_neck(delay=0), "m", SPREAD).axes[0].low[2] == 0.0
 
 
 def test_all_plants_are_the_nominal_both_sets_of_corners_the_samples_and_what_lies_inside() -> None:
     found = family(count=6)
-    neck = neck_of_family(found, "f")
+    neck = source_of_family(found, "f")
     plants = all_plants([neck], 40, 0)
     # 1 nominal, 8 corners twice, 6 samples, and 17 from inside the box.
     assert [sum(word in name for name in plants.names) for word in ("nominal", "corner", "sample", "inside")] == [
@@ -215,9 +222,9 @@ def test_all_plants_are_the_nominal_both_sets_of_corners_the_samples_and_what_li
 
 
 def test_joined_plants_respond_as_each_alone() -> None:
-    w = judged(TS, 20)
-    one = nominal_plants([neck_of_model(linear_neck(), "m", SPREAD)])[0]
-    two = all_plants([neck_of_family(family(cross=0.1), "f")], 1, 0)
+    w = frequency_grid(TS, 20)
+    one = nominal_plants([source_of_model(linear_neck(), "m", SPREAD)])[0]
+    two = all_plants([source_of_family(family(cross=0.1), "f")], 1, 0)
     both = join([one, two])
     np.testing.assert_allclose(both.response(w), np.concatenate([one.response(w), two.response(w)]), rtol=1e-12)
     np.testing.assert_array_equal(both.cross, np.concatenate([one.cross, two.cross]))
@@ -226,13 +233,13 @@ def test_joined_plants_respond_as_each_alone() -> None:
 
 
 def test_frequencies_go_up_to_nyquist() -> None:
-    w = judged(TS)
+    w = frequency_grid(TS)
     assert (w[0], w[-1]) == pytest.approx((0.02, math.pi / TS))
     assert w.size == 360
 
 
 def test_the_static_gain_of_a_plant_is_its_number() -> None:
-    neck = neck_of_model(linear_neck(), "m", SPREAD)
+    neck = source_of_model(linear_neck(), "m", SPREAD)
     numbers = np.array([[[0.1, 5.0, 0.05], [-0.2, 3.0, 0.071]]])
     plants = make_plants(neck, numbers, [""])
     low = plants.response(np.array([1e-6]))[0, :, 0]
@@ -251,16 +258,16 @@ def test_margins_of_an_integrator_with_delay_are_the_textbooks() -> None:
     w = np.geomspace(1e-2, 20.0, 4000)
     k, T = np.array([0.5, 1.0, 2.5]), 0.5
     L = k[:, None] * np.exp(-1j * w * T) / (1j * w)
-    found = classical(L, w)
+    found = classical_margins(L, w)
     crossing = math.pi / 2 - k * T
     np.testing.assert_allclose(found["phase_margin_deg"], np.degrees(crossing), rtol=1e-4)  # straight lines between
     np.testing.assert_allclose(found["gain_margin"], np.pi / (2 * k * T), rtol=1e-4)
     np.testing.assert_allclose(found["delay_margin_ms"], 1e3 * crossing / k, rtol=1e-4)
     # Upside down: where the gain may fall by so much, an unstable plant's loop for example.
-    upside = classical(1.0 / np.conj(L), w)
+    upside = classical_margins(1.0 / np.conj(L), w)
     np.testing.assert_allclose(upside["gain_margin"], found["gain_margin"], rtol=1e-4)
     # A loop that crosses neither has no margin to lose.
-    assert all(np.isinf(values).all() for values in classical(np.full((1, 4000), 0.5 + 0j), w).values())
+    assert all(np.isinf(values).all() for values in classical_margins(np.full((1, 4000), 0.5 + 0j), w).values())
 
 
 def test_a_controller_is_coupled_where_one_angle_moves_the_others_input() -> None:
@@ -268,7 +275,7 @@ def test_a_controller_is_coupled_where_one_angle_moves_the_others_input() -> Non
     assert not law.coupled
     coupled = LinearLaw(law.A, law.Br, law.By, law.C, law.Dr, law.Dy + np.array([[0.0, 1e-6], [0.0, 0.0]]), TS)
     assert coupled.coupled
-    w = judged(TS, 15)
+    w = frequency_grid(TS, 15)
     z = np.exp(1j * w * TS)
     np.testing.assert_allclose(law.feedback(w)[:, 0, 0], -(z - 0.9) / (z - 0.5), rtol=1e-12)
     assert np.abs(law.forward(w)).max() == 0.0

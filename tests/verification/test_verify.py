@@ -26,7 +26,7 @@ from softneck.verification import (
     verification_page,
     verify,
 )
-from softneck.verification._plants import all_plants, neck_of_family
+from softneck.verification._plants import all_plants, source_of_family
 from softneck.verification._steps import StepTest, run_steps
 
 from ..browser import shown
@@ -124,7 +124,7 @@ def test_the_order_adds_its_samples_and_says_so() -> None:
 
 def test_the_sweep_is_the_loop_to_the_last_bits() -> None:
     """The compiled sweep and `run_loop` over `linear_plant` are the same system."""
-    plants = all_plants([neck_of_family(family(cross=0.1), "f")], 24, 0)
+    plants = all_plants([source_of_family(family(cross=0.1), "f")], 24, 0)
     controller = pi()
     test = StepTest(step=0.2, duration=1.0, noise=0.0, load=0.0, seed=0)
     steps = run_steps(plants, controller.block(), test)

@@ -12,12 +12,12 @@ import pytest
 from softneck.cosim import load_loop
 from softneck.verification import make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
-from softneck.verification._linear import LinearLaw, judged, margins
+from softneck.verification._linear import LinearLaw, frequency_grid, margins
 from softneck.verification._worst import write_neck
 
 from .necks import QUICK, TS, family, pi
 
-W = judged(TS)
+W = frequency_grid(TS)
 
 
 def _values(*numbers: float) -> dict[str, Values]:

@@ -93,7 +93,7 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
     while True:
         task = tuning.task_of(things, {"require": dict.fromkeys(refused, False)}, 0)
         try:
-            tuning.refuse_impossible(task.asked, task.plant)
+            tuning.check_feasibility(task.asked, task.plant)
         except SettingsError as error:
             metric = _METRIC.match(str(error))
             if metric is None or metric[1] in refused:

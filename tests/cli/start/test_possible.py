@@ -31,7 +31,7 @@ WHY = {
 
 def refuse(asked: Any, _: Any) -> None:
     for metric, why in WHY.items():
-        if asked.wanted(metric) is not None:
+        if asked.robot_limit(metric) is not None:
             raise SettingsError(why)
 
 
@@ -54,14 +54,14 @@ def test_each_default_that_cannot_be_is_left_out_with_its_reason(
     tmp_path: Path, rls_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(softneck.tuning, "refuse_impossible", refuse)
+    monkeypatch.setattr(softneck.tuning, "check_feasibility", refuse)
     assert _possible.possible((str(rls_file),)) == " ".join(WHY.values())
     text = Path(_possible.FILE).read_text(encoding="utf-8")
     assert tomllib.loads(text)["require"] == dict.fromkeys(WHY, False)
     assert all(f"# {why}" in text for why in WHY.values())
     # Nothing is left out, and no file made, where all can be.
     Path(_possible.FILE).unlink()
-    monkeypatch.setattr(softneck.tuning, "refuse_impossible", lambda *_: None)
+    monkeypatch.setattr(softneck.tuning, "check_feasibility", lambda *_: None)
     assert _possible.possible((str(rls_file),)) == ""
     assert not Path(_possible.FILE).exists()
 
@@ -70,7 +70,7 @@ def test_what_is_no_requirement_s_fault_is_refused(rls_file: Path, monkeypatch: 
     def never(*_: Any) -> None:
         raise SettingsError("the plant cannot be: it is no plant.")
 
-    monkeypatch.setattr(softneck.tuning, "refuse_impossible", never)
+    monkeypatch.setattr(softneck.tuning, "check_feasibility", never)
     with pytest.raises(SettingsError, match="it is no plant"):
         _possible.impossible((str(rls_file),))
 
