@@ -39,10 +39,10 @@ def import_page(
         lines: of the guess, and notes of the import.
         problems: missing entries, or the reason for no recording.
     """
-    first, *charts = [*_charts(frame, layout, recording), None]
-    sections = [_doubts_section(doubts, problems, lines, first), _mapping(frame, layout, recording)]
-    if charts[:-1]:
-        sections.append(Section("Raw and made", charts=[chart for chart in charts if chart is not None]))
+    charts = _charts(frame, layout, recording)
+    sections = [_doubts_section(doubts, problems, lines, charts[:1]), _mapping(frame, layout, recording)]
+    if charts[1:]:
+        sections.append(Section("Raw columns and channels", charts=charts[1:]))
     if left_out := [line.removeprefix("ignored: ") for line in lines if line.startswith("ignored: ")]:
         sections.append(Section("Left out", text=left_out))
     return page(
@@ -60,7 +60,7 @@ def _import_verdict(doubts: Sequence[Doubt], problems: Sequence[str], recording:
 
 
 def _doubts_section(
-    doubts: Sequence[Doubt], problems: Sequence[str], lines: Sequence[str], chart: Chart | None
+    doubts: Sequence[Doubt], problems: Sequence[str], lines: Sequence[str], charts: Sequence[Chart]
 ) -> Section:
     """Return the doubts and problems for the reader to decide, with the first chart."""
     findings = [("warning", f"missing: {problem}") for problem in problems]
@@ -75,7 +75,6 @@ def _doubts_section(
     method = (
         "Left: the columns as logged, over their rows. Right: the recording's channels over time, in the same colours."
     )
-    charts = [] if chart is None else [chart]
     return Section("Doubts", findings=findings, charts=charts, method=[method] if charts else [])
 
 
@@ -182,7 +181,8 @@ def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
     t = np.arange(len(recording)) * recording.sample_time
     border = np.flatnonzero(np.diff(recording.run)) + 1
     panels = []
-    for name in [name for name in _drawn_channels(recording) if name not in recording.robot.set_points]:
+    measured = (*recording.robot.motor_positions, *recording.robot.outputs.names)
+    for name in [name for name in measured if name in recording.channels]:
         y = _values(recording, name)
         y[border] = np.nan
         curves = [Curve(t, y, colour=GREY, width=0.7)]
@@ -204,12 +204,6 @@ def _fault_curve(t: Vector, y: Vector, rows: Sequence[np.ndarray], sort: str, co
     x = np.concatenate([[t[one[0]], t[one[-1]] + step, t[one[-1]] + step] for one in rows])
     gaps = np.tile([0.0, 0.0, np.nan], len(rows))
     return Curve(x, low + gaps, sort, colour, "band", upper=high + gaps)
-
-
-def _drawn_channels(recording: Recording) -> list[str]:
-    robot = recording.robot
-    names = (*robot.set_points, *robot.motor_positions, *robot.outputs.names)
-    return [name for name in names if name in recording.channels]
 
 
 def _values(recording: Recording, name: str) -> Vector:
@@ -251,15 +245,11 @@ def _quality_verdict(recording: Recording, quality: Quality) -> str:
 
 
 def _findings(quality: Quality) -> list[tuple[str, str]]:
-    """Return each finding with the time of its first place."""
-    return [
-        (
-            one.severity,
-            str(one).removeprefix(f"{one.severity}: ")
-            + (f" First at {one.time:.2f} s of its run." if one.time is not None and "at " not in one.message else ""),
-        )
-        for one in quality.findings
-    ]
+    findings = []
+    for one in quality.findings:
+        first = f" First at {one.time:.2f} s of its run." if one.time is not None and "at " not in one.message else ""
+        findings.append((one.severity, str(one).removeprefix(f"{one.severity}: ") + first))
+    return findings
 
 
 def _channel_table(quality: Quality) -> Table:

@@ -118,9 +118,7 @@ class Demo:
 def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     """Run the demo, from experiment to closed loop, and write everything to `settings.out`.
 
-    Args:
-        settings: what to do.
-        tell: announces a stage and returns its progress callback.
+    `tell` announces a stage and returns its progress callback.
 
     Raises:
         OutputFileError: the folder cannot be written.
@@ -131,7 +129,8 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
         raise OutputFileError(f"{out}: is a file; name a folder.")
     neck = NeckParameters.paper()
     experiments = record_experiments(neck, duration=settings.duration, tell=tell)
-    _write_recordings(out / "recordings", experiments)
+    for name, recording in {"identification": experiments.identification, **experiments.judged}.items():
+        write_recording(out / "recordings" / f"{name}.csv", recording, force=True)
     models = identify(experiments.identification, iterations=settings.iterations, seed=settings.seed, tell=tell)
     for name, model in models.items():
         model.save(out / "models" / f"{name}.npz", force=True)
@@ -148,23 +147,14 @@ def run_demo(settings: DemoSettings, *, tell: Tell) -> Demo:
     for name, result in loops.items():
         recording = result.recording()
         write_recording(out / "results" / f"{name}.csv", recording, force=True)
-        write_page(
-            out / "results" / f"{name}_3d.html",
-            neck_view(recording, title=f"The neck in the loop {to_words(name)}"),
-            force=True,
-        )
+        view = neck_view(recording, title=f"The neck in the loop {to_words(name)}")
+        write_page(out / "results" / f"{name}_3d.html", view, force=True)
     demo = Demo(
         settings=settings, experiments=experiments, models=models, judged=judged, rough=rough, packaged=packaged,
         designed=designed, loops=loops, seconds=0.0,
     )  # fmt: skip
     _write_results(demo, tell)
     return replace(demo, seconds=time.monotonic() - begin)
-
-
-def _write_recordings(folder: Path, experiments: Experiments) -> None:
-    everything = {"identification": experiments.identification, **experiments.judged}
-    for name, recording in everything.items():
-        write_recording(folder / f"{name}.csv", recording, force=True)
 
 
 def _write_results(demo: Demo, tell: Tell) -> None:

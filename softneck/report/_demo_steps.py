@@ -213,7 +213,11 @@ def close_loops(folder: Path, *, sample_time: float, tell: Tell) -> dict[str, Re
         )
         with atomic_write(path, force=True) as temporary:
             temporary.write_text(text, encoding="utf-8")
-        results[name] = simulate(load_loop(path), report=_loop_progress(report, number, name))
+
+        def progress(done: float, number: int = number, name: str = name) -> None:
+            report((number + done) / len(_STEPS), name)
+
+        results[name] = simulate(load_loop(path), report=progress)
     return results
 
 
@@ -223,10 +227,6 @@ def _limits(pitch: float, roll: float) -> str:
     # An axis without a step must stay in place.
     lines += [f'"{axis}.rms_error_deg" = 1.0' for axis, size in (("pitch", pitch), ("roll", roll)) if not size]
     return "\n".join(lines)
-
-
-def _loop_progress(report: Progress, number: int, name: str) -> Callable[[float], None]:
-    return lambda done: report((number + done) / len(_STEPS), name)
 
 
 def limits_of(results: Mapping[str, Result]) -> list[tuple[str, dict]]:

@@ -38,7 +38,7 @@ from softneck.cosim import (
     simulate,
 )
 from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged_parts
-from softneck.plots import Chart, Section, Table, cell, loop_chart, page, recording_chart, validation_chart
+from softneck.plots import Section, Table, cell, loop_chart, page, recording_chart, validation_chart
 from softneck.robot import FILE
 from softneck.signals import Recording, assess_quality, doubts_in, import_log, read_layout, read_recording
 
@@ -249,23 +249,26 @@ _RULES = Rules(horizons=_HORIZONS)
 
 def project_page(project: Project, *, progress: Progress = silent) -> str:
     """Return the HTML page of a project: results of loops and certificates, data, models, and problems."""
-    title = f"Project {project.folder.resolve().name}"
-    sections = [_loops(project), _certificates(project), _data(project), _models(project, progress)]
-    designs = _summaries("Observers and controllers", {**project.observers, **project.controllers})
-    sections += [
-        _summaries("Uncertain plant", project.families),
-        designs,
-        _fmus(project),
-        *_studies(project),
-        _problems(project),
-    ]
+    designs = {**project.observers, **project.controllers}
+    parts = (
+        (project.loops, lambda: _loops(project)),
+        (project.certificates, lambda: _certificates(project)),
+        (project.recordings, lambda: _data(project)),
+        (project.models, lambda: _models(project, progress)),
+        (project.families, lambda: _summaries("Uncertain plant", project.families)),
+        (designs, lambda: _summaries("Observers and controllers", designs)),
+        (project.fmus, lambda: _fmus(project)),
+    )
+    sections = [*(make() for content, make in parts if content), *_studies(project)]
+    if project.problems:
+        rows = [[name, " ".join(text.split())[:300]] for name, text in project.problems.items()]
+        table = Table("Files that could not be read or run", ["file", "why"], rows, text=2)
+        sections.append(Section("Problems", tables=[table]))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    kept = [section for section in sections if section is not None]
     sentence, holds = project_verdict(project)
-    return page(
-        title, kept, verdict=sentence, holds=holds,
-        footer=f"softneck report, {now}. All plots and tables are in this file.",
-    )  # fmt: skip
+    footer = f"softneck report, {now}. All plots and tables are in this file."
+    title = f"Project {project.folder.resolve().name}"
+    return page(title, sections, verdict=sentence, holds=holds, footer=footer)
 
 
 def project_verdict(project: Project) -> tuple[str, bool | None]:
@@ -299,9 +302,7 @@ def _shorten(doubts: Sequence[str]) -> str:
     return f"{doubts[0].partition(' sure): ')[0]} sure){more}"
 
 
-def _data(project: Project) -> Section | None:
-    if not project.recordings:
-        return None
+def _data(project: Project) -> Section:
     rows, findings, charts = [], [], []
     for name, (recording, found) in project.recordings.items():
         seconds = len(recording) * recording.sample_time
@@ -322,9 +323,7 @@ def _data(project: Project) -> Section | None:
     return Section("Data", tables=tables, charts=charts)
 
 
-def _models(project: Project, progress: Progress) -> Section | None:
-    if not project.models:
-        return None
+def _models(project: Project, progress: Progress) -> Section:
     rows, charts, texts = [], [], []
     judged_on = list(project.recordings.items())[:_MAX_RECORDINGS]
     # Baselines depend only on the judged rows and take longer than a model, so models with the same rows share them.
@@ -342,7 +341,11 @@ def _models(project: Project, progress: Progress) -> Section | None:
                 continue
             rows.append([f"{name} on {data}", str(result.rows_scored), *_fits(result)])
             if len(charts) < _MAX_CHARTS:
-                charts.append(_simulation_chart(result, f"{name} on {data}: simulation"))
+                free_run = {"simulation": drawable(result, result.free_run)}
+                charts.append(validation_chart(
+                    result.time, result.measured, free_run, f"{name} on {data}: simulation", run=result.run,
+                    robot=result.robot,
+                ))  # fmt: skip
     tables = [Table("Models", ["model", "kind", "summary"], texts, text=3)]
     if rows:
         outputs = judged_on[0][1][0].robot.outputs  # a project has one robot
@@ -361,16 +364,7 @@ def _fits(result: Any) -> list[str]:
     return [*cells, cell(result.rmse_deg[INFINITE], ".2f"), cell(result.persistence["1"], ".1f")]
 
 
-def _simulation_chart(result: Any, title: str) -> Chart:
-    return validation_chart(
-        result.time, result.measured, {"simulation": drawable(result, result.free_run)}, title, run=result.run,
-        robot=result.robot,
-    )  # fmt: skip
-
-
-def _summaries(title: str, things: Mapping[str, Any]) -> Section | None:
-    if not things:
-        return None
+def _summaries(title: str, things: Mapping[str, Any]) -> Section:
     rows = [[name if not i else "", line] for name, thing in things.items() for i, line in enumerate(_lines(thing))]
     return Section(title, tables=[Table(title, ["file", "summary"], rows, text=2)])
 
@@ -379,9 +373,7 @@ def _lines(thing: Any) -> list[str]:
     return [line for line in str(thing.summary()).splitlines() if line.strip()] or ["-"]
 
 
-def _certificates(project: Project) -> Section | None:
-    if not project.certificates:
-        return None
+def _certificates(project: Project) -> Section:
     rows, details = [], []
     for name, content in project.certificates.items():
         stale = _changed_files(project.folder, name, content)
@@ -419,9 +411,7 @@ def _changed_files(folder: Path, name: str, content: Mapping[str, Any]) -> list[
     return changed
 
 
-def _fmus(project: Project) -> Section | None:
-    if not project.fmus:
-        return None
+def _fmus(project: Project) -> Section:
     rows = []
     for name, model in project.fmus.items():
         counts = [str(sum(v.causality == c for v in model.modelVariables)) for c in ("input", "output", "parameter")]
@@ -430,9 +420,7 @@ def _fmus(project: Project) -> Section | None:
     return Section("FMUs", tables=[Table("FMUs", head, rows, text=3)])
 
 
-def _loops(project: Project) -> Section | None:
-    if not project.loops:
-        return None
+def _loops(project: Project) -> Section:
     metrics, limits, charts = [], [], []
     for name, result in project.loops.items():
         metrics.append([name, *_metrics(result)])
@@ -467,11 +455,3 @@ def _studies(project: Project) -> list[Section]:
         for part in study_sections(description, runs) if len(runs) else []:
             sections.append(replace(part, title=f"Study {name}: {part.title}"))
     return sections
-
-
-def _problems(project: Project) -> Section | None:
-    if not project.problems:
-        return None
-    rows = [[name, " ".join(text.split())[:300]] for name, text in project.problems.items()]
-    table = Table("Files that could not be read or run", ["file", "why"], rows, text=2)
-    return Section("Problems", tables=[table])

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import require_whole
+from softneck.core import Progress, require_whole
 from softneck.identification import INFINITE, Model, Network, Rls, SetMembership, continuous_parameters
 from softneck.plant import NeckParameters
 from softneck.plots import (
@@ -92,20 +92,16 @@ def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
     models = _models(experiments, settings, tell)
     others: dict[str, Verdicts] = {}
     for name, neck in _other_necks(settings.other_necks).items():
-        recorded = record_experiments(neck, duration=settings.duration, tell=lambda text, n=name: tell(f"{n}: {text}"))
-        others[name] = judge(
-            _models(recorded, settings, lambda text, n=name: tell(f"{n}: {text}")),
-            recorded,
-            tell=lambda text, n=name: tell(f"{n}: {text}"),
-        )
+
+        def tell_neck(text: str, name: str = name) -> Progress:
+            return tell(f"{name}: {text}")
+
+        recorded = record_experiments(neck, duration=settings.duration, tell=tell_neck)
+        others[name] = judge(_models(recorded, settings, tell_neck), recorded, tell=tell_neck)
     return Reproduction(
-        settings=settings,
-        experiments=experiments,
-        models=models,
-        judged=judge(models, experiments, tell=tell),
-        others=others,
-        seconds=time.monotonic() - begin,
-    )
+        settings=settings, experiments=experiments, models=models, judged=judge(models, experiments, tell=tell),
+        others=others, seconds=time.monotonic() - begin,
+    )  # fmt: skip
 
 
 def _models(experiments: Experiments, settings: ReproduceSettings, tell: Tell) -> dict[str, Model]:

@@ -107,10 +107,7 @@ def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: li
 def _ranking(runs: pd.DataFrame, keys: list[str], objectives: list[str]) -> Section:
     worst = [_row(row, keys, objectives) for row in worst_runs(runs, objectives, 5).to_dict("records")]
     head = study_head(keys, objectives)
-    tables = [
-        Table("Best runs", head, study_rows(runs, keys, objectives)),
-        Table("Worst runs", head, worst),
-    ]
+    tables = [Table("Best runs", head, study_rows(runs, keys, objectives)), Table("Worst runs", head, worst)]
     words = f"Ranked by limits kept, then {objectives[0]}. Loop files of the worst runs are in the folder `worst`."
     return Section("Ranking", text=[words], tables=tables)
 

@@ -111,9 +111,10 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
     at = _LOOP_TAUT if taut else _LOOP_AT
     neck = task.asked.certificate.sim
     first, unit = robot.outputs.names[0], error_unit(robot)[0]
+    kind = {".fmu": "fmu", ".npz": "model"}.get(Path(path).suffix, "neck")
     table: dict[str, Any] = {
         "duration_s": at + float(neck["duration_s"]),
-        "plant": {_plant_key(path): _relative(path, folder)},
+        "plant": {kind: path if isinstance(path, str) else Path(os.path.relpath(path, folder)).as_posix()},
         **({"observer": {"file": OBSERVER}} if found.observed else {}),
         "controller": {"file": BEST},
         "reference": {"kind": "step", f"{first}_{unit}": float(neck["size_deg"]), "at_s": at},
@@ -130,15 +131,6 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         "\n# Without observer.npz: with it a requirement on the steps fails, or none was designed."
     )  # fmt: skip
     _write(folder / LOOP, f"# The best of `softneck tune` over {name}.{words}\n{tomli_w.dumps(table)}")
-
-
-def _plant_key(path: Path | str) -> str:
-    text = str(path)
-    return "fmu" if text.endswith(".fmu") else "model" if text.endswith(".npz") else "neck"
-
-
-def _relative(path: Path | str, folder: Path) -> str:
-    return path if isinstance(path, str) else Path(os.path.relpath(path, folder)).as_posix()
 
 
 def _toml_table(table: Mapping[str, Any]) -> dict[str, Any]:

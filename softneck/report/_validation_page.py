@@ -39,7 +39,9 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
         results: of `validate`, one for each model and recording.
     """
     together = _comparisons(results)
-    sections = [_overview(results, together or [curves(results[0])])]
+    note = VALIDATION_NOTE.format(outputs="/".join(results[0].robot.outputs.names))
+    charts = together or [curves(results[0])]
+    sections = [Section("Fits", charts=charts, tables=[fit_table(results)], method=[note])]
     sections += [_section(r, drawn=not together and r is results[0]) for r in results]
     return page(title, sections, verdict=_verdict(results), footer="Written by softneck validate.")
 
@@ -78,11 +80,6 @@ def fit_table(results: Sequence[Validation]) -> Table:
     return Table(f"Fit in %, errors in {outputs.display_unit}, {'/'.join(outputs.names)}", _FIT_COLUMNS, rows)
 
 
-def _overview(results: Sequence[Validation], charts: Sequence[Chart]) -> Section:
-    names = "/".join(results[0].robot.outputs.names)
-    return Section("Fits", charts=charts, tables=[fit_table(results)], method=[VALIDATION_NOTE.format(outputs=names)])
-
-
 def _comparisons(results: Sequence[Validation]) -> list[Chart]:
     """Return a chart of the simulations of all models judged on the same rows, for each such group."""
     groups: dict[tuple[str, bytes, bytes], list[Validation]] = {}
@@ -105,39 +102,30 @@ def _comparisons(results: Sequence[Validation]) -> list[Chart]:
     return charts
 
 
-def _predictions(r: Validation) -> dict[str, Matrix]:
+def curves(r: Validation) -> Chart:
+    """Return a chart of measured and predicted outputs, with the bounds of the simulation."""
+    bounds = (drawable(r, r.lower), drawable(r, r.upper)) if np.isfinite(r.lower).any() else None
     predictions = {"one step": drawable(r, r.one_step)}
     if INFINITE in r.fits:
         predictions["simulation"] = drawable(r, r.free_run)
-    return predictions
-
-
-def curves(r: Validation) -> Chart:
-    """Return a chart of measured and predicted outputs, with the bounds of the simulation."""
-    bounds = _bounds_of(r)
     caption = _ERROR_NOTE + (" The band shows the model's bounds in simulation." if bounds else "")
     return validation_chart(
-        r.time, r.measured, _predictions(r), f"{_name(r)}: measured and predicted", bounds=bounds, run=r.run,
+        r.time, r.measured, predictions, f"{_name(r)}: measured and predicted", bounds=bounds, run=r.run,
         caption=caption, robot=r.robot,
     )  # fmt: skip
 
 
 def _section(r: Validation, *, drawn: bool) -> Section:
     """Return the section of one result, with its curves unless `drawn`."""
-    charts = [*([] if drawn else [curves(r)]), _residuals(r)]
-    text = [f"{said[0].upper()}{said[1:]}." for said in remarks(r)]
-    return Section(_name(r), text=text, tables=_run_tables(r), charts=charts)
-
-
-def _residuals(r: Validation) -> Chart:
     tests = r.residual_tests
-    return residual_chart(
+    residuals = residual_chart(
         (tests.lags, tests.autocorrelation, tests.bound),
         (tests.cross_lags, tests.cross_correlation, tests.cross_bound),
-        "Residual tests of the one-step errors",
-        caption=_RESIDUAL_NOTE,
-        robot=r.robot,
-    )
+        "Residual tests of the one-step errors", caption=_RESIDUAL_NOTE, robot=r.robot,
+    )  # fmt: skip
+    charts = [residuals] if drawn else [curves(r), residuals]
+    text = [f"{said[0].upper()}{said[1:]}." for said in remarks(r)]
+    return Section(_name(r), text=text, tables=_run_tables(r), charts=charts)
 
 
 def remarks(r: Validation) -> list[str]:
@@ -223,9 +211,3 @@ def drawable(r: Validation, values: Matrix) -> Matrix:
     most = _MAX_ANGLE if angles else _MAX_RATIO * float(np.nanmax(np.abs(r.measured), initial=0.0))
     with np.errstate(invalid="ignore"):
         return np.where(np.abs(values) < most, values, np.nan)
-
-
-def _bounds_of(r: Validation) -> tuple[Matrix, Matrix] | None:
-    if not np.isfinite(r.lower).any():
-        return None
-    return drawable(r, r.lower), drawable(r, r.upper)

@@ -422,7 +422,7 @@ def prepare(
         return excitation, Changes()
     ramped = _ramp(wanted, excitation.sample_time, ramp_s)
     clipped, P = ramped, ramped
-    shares = {"ramp": _share(ramped, wanted)}
+    shares = {"ramp": float(np.mean(ramped != wanted))}
     if limits is not None:
         clipped = np.clip(ramped, limits.lowest, limits.position)
         shares |= {
@@ -433,7 +433,7 @@ def prepare(
         if limits.slack < limits.position:
             shares["position"] = float(np.mean(ramped > limits.position))
         P = _slew(clipped, limits.speed * excitation.sample_time, to_rest=ramp_s > 0)
-        shares["speed"] = _share(P, clipped)
+        shares["speed"] = float(np.mean(clipped != P))
     return replace(excitation, set_points=P), Changes(**shares)
 
 
@@ -477,10 +477,6 @@ def _slew_one(wanted: Vector, step: float) -> Vector:
         if abs(move) > step + _STEP_ROUNDING:
             values[k] = values[k - 1] + math.copysign(step, move)
     return np.array(values)
-
-
-def _share(changed: Matrix, before: Matrix) -> float:
-    return float(np.mean(changed != before))
 
 
 def _require_bound(name: str, value: float, unit: str, *, zero: bool) -> None:

@@ -25,7 +25,6 @@ from ._table_format import sniff
 SURE = 0.9
 _TILT = (*OUTPUTS, "inclination", "orientation", "pitch_reference", "roll_reference")
 _GROUPS = {"motor set-points": SET_POINTS, "motor positions": MOTOR_POSITIONS, "motor velocities": MOTOR_VELOCITIES}
-_AS_LOGGED = "as logged"
 # However strong the correlation, a sign that contradicts the titles deserves a question.
 _MOST_SURE = 0.89
 
@@ -104,19 +103,6 @@ def _unit_doubts(draft: Draft, found: dict[str, Unit]) -> list[Doubt]:
     return doubts
 
 
-def sign_doubt(axis: str, name: str, r: float) -> Doubt:
-    """Return the doubt in the sign of an angle that was inverted because it falls while the motors' `name` rises."""
-    order = "; or motors 2 and 3 are swapped" if axis == "roll" else ""
-    why = f"as logged {axis} falls as {name} rises (correlation {r:.2f}), and recordings have both rise{order}"
-    return Doubt(f"sign of {axis}", (axis,), "turned round", min(_MOST_SURE, 0.5 - 0.5 * r), why, (_AS_LOGGED,))
-
-
-def duplicates_doubt(rows: int, first: int) -> Doubt:
-    """Return the doubt in rows with one time stamp."""
-    why = f"time stands still at {rows} row(s), first at row {first}"
-    return Doubt("rows of one time stamp", ("time",), "the first", 0.8, why, ("last",))
-
-
 def jitter_doubt(shortest: float, longest: float, usual: float) -> Doubt:
     """Return the doubt in a clock that jitters: rows may be equidistant and their stamps [s] late."""
     why = (
@@ -124,15 +110,6 @@ def jitter_doubt(shortest: float, longest: float, usual: float) -> Doubt:
         f"gap is seen; if rows were taken evenly write `sample_time_s = {usual:.4g}` into [time]"
     )
     return Doubt("clock", ("time",), "rows as they are stamped, resampled", 0.8, why)
-
-
-def one_axis_doubt(axis: str) -> Doubt:
-    """Return the doubt in a log of one angle: a neck has two, so the other may be missing."""
-    other = "roll" if axis == "pitch" else "pitch"
-    why = (
-        f"no column is {other} or answers the motors like it, so the robot has one output; log {other} too if it tilts"
-    )
-    return Doubt(ONE_AXIS, (axis,), f"{axis} only", 0.8, why)
 
 
 def settle_doubt(layout: Layout, doubt: Doubt, choice: str) -> Layout:
@@ -151,16 +128,16 @@ def _change_sources(layout: Layout, channels: Sequence[str], *, unit: str | None
     sources = {name: source for name, source in layout.channels.items() if name in channels}
     found = {n: replace(s, unit=unit or s.unit, sign=sign * s.sign) for n, s in sources.items()}
     rest = {
-        name: replace(source, unit=unit, terms=source.terms if name != "time" else _without_factor(source.terms))
+        # The factor of a time belongs to its old unit.
+        name: replace(
+            source,
+            unit=unit,
+            terms=source.terms if name != "time" or len(source.terms) > 1 else (replace(source.terms[0], factor=1.0),),
+        )
         for name in ("inclination", "orientation", "time")
         if unit is not None and name in channels and (source := getattr(layout, name)) is not None
     }
     return replace(layout, channels={**layout.channels, **found}, **rest)
-
-
-def _without_factor(terms: tuple) -> tuple:
-    """Return the terms of a time without the factor of another unit."""
-    return tuple(replace(term, factor=1.0) for term in terms) if len(terms) == 1 else terms
 
 
 _NO_CHANNELS = ("time", "run", "inclination", "orientation")
@@ -246,7 +223,11 @@ def _guess(path: Path, neck: Robot) -> Guess:
     check_lines, sign_doubts = _check_signs(draft)
     layout, clock_lines, clock_doubts = _choose_clock(draft, found, _layout(draft, found, robot))
     missing = _missing(draft, layout)
-    other_doubts = [*sign_doubts, *([one_axis_doubt(robot.outputs.names[0])] if robot is not neck else [])]
+    other_doubts = list(sign_doubts)
+    if robot is not neck:  # a log of one angle, although a neck has two
+        axis, other = robot.outputs.names[0], "roll" if robot.outputs.names[0] == "pitch" else "pitch"
+        why = f"no column is {other} or answers the motors like it, so the robot has one output; log {other} too if it"
+        other_doubts.append(Doubt(ONE_AXIS, (axis,), f"{axis} only", 0.8, f"{why} tilts"))
     doubts = sorted([*doubts_of(draft, found), *clock_doubts, *other_doubts], key=lambda doubt: doubt.confidence)
     remarks = {name: _why(draft, found, name) for name in draft.picks}
     remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in other_doubts}
@@ -264,9 +245,8 @@ def _guess(path: Path, neck: Robot) -> Guess:
     lines += [f"not sure: {doubt.why} ({percent(doubt.confidence)} sure of {doubt.taken})" for doubt in clock_doubts]
     lines += [*check_lines, *_left_out(draft)]
     head = f"# Proposed by `softneck import --guess` for {path.name!r}; edit it.\n\n"
-    return Guess(layout, "", tuple(lines), missing, tuple(doubts), remarks, head)._rewrite(
-        layout, remarks, missing, tuple(doubts)
-    )
+    guess = Guess(layout, "", tuple(lines), missing, tuple(doubts), remarks, head)
+    return guess._rewrite(layout, remarks, missing, guess.doubts)
 
 
 def _layout(draft: Draft, found: dict[str, Unit], robot: Robot) -> Layout:
@@ -307,7 +287,8 @@ def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple
         if one and (step == 0).any():
             layout = replace(layout, duplicates="first")
             if not layout.merge:
-                doubts.append(duplicates_doubt(int((step == 0).sum()), int(np.argmax(step == 0)) + 1))
+                why = f"time stands still at {(step == 0).sum()} row(s), first at row {np.argmax(step == 0) + 1}"
+                doubts.append(Doubt("rows of one time stamp", ("time",), "the first", 0.8, why, ("last",)))
         if one and not layout.merge and (limits := jitter(draft.values("time"))) is not None:
             scale = nominal_step(draft, found) / limits[2]
             doubts.append(jitter_doubt(*(scale * limit for limit in limits)))
@@ -386,7 +367,10 @@ def _check_signs(draft: Draft) -> tuple[list[str], list[Doubt]]:
         pick = draft.picks[axis]
         draft.picks[axis] = replace(pick, sign=-pick.sign)
         lines.append(f"{falls}: turned round; if that is wrong, write `sign = {pick.sign:g}`")
-        doubts.append(sign_doubt(axis, name, r))
+        order = "; or motors 2 and 3 are swapped" if axis == "roll" else ""
+        why = f"as logged {axis} falls as {name} rises (correlation {r:.2f}), and recordings have both rise{order}"
+        sure = min(_MOST_SURE, 0.5 - 0.5 * r)
+        doubts.append(Doubt(f"sign of {axis}", (axis,), "turned round", sure, why, ("as logged",)))
     return lines, doubts
 
 

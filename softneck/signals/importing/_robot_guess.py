@@ -86,10 +86,14 @@ def guess_robot(path: str | Path) -> RobotGuess:
         raise DataError(f"{path}: beside {', '.join(motors)} no column moves that could be an output.")
     robot, units = _propose_robot(path, table, motors, outputs)
     layout = _layout(table, robot, motors, outputs, (time, run))
-    unknown = [f"{title}: its unit is unknown here and taken as 1" for title in rest if _unknown_unit(title)]
+    unknown = [
+        f"{title}: its unit is unknown here and taken as 1"
+        for title in rest
+        if _UNIT.search(title) and not _unit_of(table, title)
+    ]
     lines = (
         *table.lines,
-        *unknown,
+        *(f"{title}: its unit is unknown here and taken as 1" for title in unknown),
         f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
         f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and have no other role",
         "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
@@ -246,14 +250,6 @@ def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column])
             "them; leave out columns by a layout of your own."
         )
     return named[0]
-
-
-def _unknown_unit(title: str) -> bool:
-    match = _UNIT.search(title)
-    try:
-        return match is not None and not to_si(match[1])
-    except DataError:
-        return True
 
 
 def _unit_of(table: SniffResult, title: Column) -> str | None:

@@ -22,6 +22,7 @@ from softneck.core import (
     Vector,
     as_path,
     atomic_write,
+    error_reason,
     finite_matrix,
     require_file,
     require_numbers,
@@ -93,14 +94,11 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
         require_package("pyarrow")
     with atomic_write(path, force=force) as temporary:
         if suffix == ".csv":
-            _write_csv(_columns_by_title(recording), temporary, _robot_line(recording.robot))
+            robot = recording.robot  # the preset `neck` needs no line
+            line = f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n" if robot.in_header() else ""
+            _write_csv(_columns_by_title(recording), temporary, line)
         else:
             recording_frame(recording).to_parquet(temporary, index=False)
-
-
-def _robot_line(robot: Robot) -> str:
-    """Return the line that names the robot; the preset `neck` needs none."""
-    return f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n" if robot.in_header() else ""
 
 
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path, before: str) -> None:
@@ -294,7 +292,7 @@ def read_table(source: Path, suffix: str, form: TextForm) -> pd.DataFrame:
                 encoding=form.encoding,
             )
     except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
-        raise _table_error(source, error) from error
+        raise FileFormatError(f"{source}: cannot be read as a table ({error_reason(error)}).") from error
 
 
 def _read_parquet(source: Path) -> pd.DataFrame:
@@ -307,12 +305,7 @@ def _read_parquet(source: Path) -> pd.DataFrame:
         # Without the metadata of pandas, which may be damaged; an index is an ordinary column.
         return file.read().to_pandas(ignore_metadata=True)
     except (ValueError, OSError, ArithmeticError, MemoryError, ArrowException) as error:
-        raise _table_error(source, error) from error
-
-
-def _table_error(source: Path, error: Exception) -> FileFormatError:
-    reason = (str(error).splitlines() or [""])[0][:120]
-    return FileFormatError(f"{source}: cannot be read as a table ({reason}).")
+        raise FileFormatError(f"{source}: cannot be read as a table ({error_reason(error)}).") from error
 
 
 def _columns(frame: pd.DataFrame) -> dict[str, pd.Series]:

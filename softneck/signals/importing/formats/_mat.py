@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SoftneckError, largest_unpacked, require_package
+from softneck.core import DataError, FileFormatError, SoftneckError, error_reason, largest_unpacked, require_package
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,17 +72,12 @@ class _Elements:
         return bytes(self.next()[1]).decode("utf-8", errors="replace")
 
 
-def is_mat5(data: bytes) -> bool:
-    """Return whether a file has the header of version 5."""
-    return len(data) >= _HEADER_BYTES and data[124:128] in (b"\x00\x01IM", b"\x01\x00MI")
-
-
 def read_mat5(data: bytes) -> Iterator[tuple[str, np.ndarray]]:
     """Yield name -> real numeric array of a file; structures and cells are opened.
 
     A field is `structure.field`; an element of a cell or of an array of structures is `name{1}`.
     """
-    if not is_mat5(data):
+    if len(data) < _HEADER_BYTES or data[124:128] not in (b"\x00\x01IM", b"\x01\x00MI"):
         raise ValueError("neither version 5 nor 7.3; save it with -v7")
     left = largest_unpacked(len(data))
     file = _Elements(memoryview(data), "<" if data[126:128] == b"IM" else ">", _HEADER_BYTES)
@@ -157,8 +152,7 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
     except SoftneckError:
         raise
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise FileFormatError(f"{source}: cannot be read as a MAT file ({reason}).") from error
+        raise FileFormatError(f"{source}: cannot be read as a MAT file ({error_reason(error)}).") from error
     return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import MOST_UNPACKED, DataError, FileFormatError, require_package, require_unpacked
+from softneck.core import MOST_UNPACKED, DataError, FileFormatError, error_reason, require_package, require_unpacked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -107,8 +107,7 @@ def mcap_table(source: Path) -> pd.DataFrame:
     except (DataError, FileFormatError):
         raise
     except Exception as error:  # readers and decoders raise anything for damaged bytes
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise FileFormatError(f"{source}: cannot be read as MCAP ({reason}).") from error
+        raise FileFormatError(f"{source}: cannot be read as MCAP ({error_reason(error)}).") from error
     frame = pd.DataFrame(rows)
     if frame.empty or not len(frame.columns):
         also = f" (not decoded: {', '.join(sorted(skipped))})" if skipped else ""
@@ -160,7 +159,10 @@ def _numbers(content: Any, name: str, depth: int) -> Iterator[tuple[str, float]]
     elif hasattr(content, "sec") and hasattr(content, "nanosec"):
         yield name, float(content.sec) + 1e-9 * float(content.nanosec)
     elif isinstance(content, Mapping) or hasattr(content, "__slots__") or hasattr(content, "__dict__"):
-        fields = content if isinstance(content, Mapping) else {key: getattr(content, key) for key in _fields(content)}
+        fields = content
+        if not isinstance(content, Mapping):
+            keys = getattr(content, "__slots__", None) or vars(content)
+            fields = {key: getattr(content, key) for key in keys if not key.startswith("_")}
         for key, value in fields.items():
             yield from _numbers(value, f"{name}.{key}", depth + 1)
     else:
@@ -171,7 +173,3 @@ def _numbers(content: Any, name: str, depth: int) -> Iterator[tuple[str, float]]
         if len(items) <= _MOST_NUMBERS:  # longer lists are pictures, clouds and maps
             for place, item in enumerate(items):
                 yield from _numbers(item, f"{name}[{place}]", depth + 1)
-
-
-def _fields(content: Any) -> list[str]:
-    return [key for key in getattr(content, "__slots__", None) or vars(content) if not key.startswith("_")]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from softneck.core import DataError, FileFormatError, require_package
+from softneck.core import DataError, FileFormatError, error_reason, require_package
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,8 +54,7 @@ def sheet_cells(source: Path, sheet: str | None) -> tuple[str, Cells]:
     except DataError:
         raise
     except Exception as error:  # readers raise anything for damaged bytes
-        reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise FileFormatError(f"{source}: cannot be read as a spreadsheet ({reason}).") from error
+        raise FileFormatError(f"{source}: cannot be read as a spreadsheet ({error_reason(error)}).") from error
 
 
 def _try(source: Path) -> None:

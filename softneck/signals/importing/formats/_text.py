@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, Vector, open_zip, require_size, require_table
+from softneck.core import DataError, FileFormatError, Vector, error_reason, open_zip, require_size, require_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -193,5 +193,4 @@ def _moments(text: pd.Series, name: str) -> pd.DatetimeIndex:
     try:
         return pd.DatetimeIndex(pd.to_datetime(text, format="mixed", dayfirst=day_first, utc=True))
     except (ValueError, OverflowError) as error:
-        reason = (str(error).splitlines() or [""])[0][:100]
-        raise DataError(f"column `{name}` cannot be read as dates ({reason}).") from error
+        raise DataError(f"column `{name}` cannot be read as dates ({error_reason(error)}).") from error
