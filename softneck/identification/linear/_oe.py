@@ -1,9 +1,9 @@
-"""Output error: transfer functions with dead time whose free run fits best.
+"""Output error: transfer functions with dead time, fitted by their simulation error, by variable projection.
 
-Output error of one axis by variable projection: only the poles are searched, all else is linear in them.
+Only the poles are searched, as the prediction is linear in all other parameters of an axis:
 
-`y(k) = B(q) / F(q) u(k - d) + c(q) / F(q) pulse(k) + e(k)`: B by least squares for each F, and c, the start of each
-run, projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivatives are exact, by filters.
+`y(k) = B(q) / F(q) u(k - d) + c(q) / F(q) pulse(k) + e(k)`, with B by least squares for each F, and c, the start
+of each run, projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivatives are exact, by filters.
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ from softneck.core import (
     SettingsError,
     Vector,
     one_blas_thread,
-    require_between,
     require_one_of,
-    require_positive,
     require_whole,
     silent,
 )
@@ -37,25 +35,23 @@ from ._regression import (
     MAX_DELAY,
     arx_rows,
     axis_arrays,
+    check_delays,
     functions_found,
     linear_in_si,
     require_excitation,
     with_offset,
 )
-from ._srivc_fit import SrivcFitOptions, deviations
+from ._srivc_fit import Runs, SrivcFitOptions, deviations
 
-# A time constant beyond a third of the longest run is no more than a drift that each run's start makes up for.
+# Time constants are at most a third of the longest run; slower poles only fit a drift.
 _RUNS_PER_TIME_CONSTANT = 3.0
-_ITERATIONS = 50
-# A step that changes the sum of squares by less than this part changes no digit that noise leaves.
-_TOLERANCE = 1e-10
-# Time constants from which the search starts, beside that of least squares: the robot's, and those around it.
-_TIME_CONSTANTS = (0.05, 0.2, 0.8)
-
+_MAX_ITERATIONS = 50
+# Relative decrease of the sum of squares at which the search ends: far below the noise.
+_COST_TOLERANCE = 1e-10
+# Starts of the search beside least squares [scaled s]: a neck's time constant and values around it.
+_START_TIME_CONSTANTS_S = (0.05, 0.2, 0.8)
 # -log of the rounding of a double.
-_ROUNDING = 36.0
-
-Runs = Sequence[tuple[Vector, Vector]]
+_LOG_PRECISION = 36.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -67,70 +63,75 @@ class OutputErrorFit:
         b: (nb,) numerator.
         cost: sum of squared errors.
         covariance: (nf + nb, nf + nb) of (f, b), if the output noise is white.
-        rows: measured samples.
     """
 
     f: Vector
     b: Vector
     cost: float
     covariance: Matrix
-    rows: int
 
 
 def fit_output_error(runs: Runs, nf: int, nb: int, d: int, starts: Sequence[Vector]) -> OutputErrorFit | None:
-    """Return the best fit over all `starts` (nf,); None where none is stable."""
+    """Fit one axis at dead time `d` from all `starts` (nf,); None where no fit is stable."""
     best: tuple[float, Vector] | None = None
     radius = largest_radius(runs)
     for start in starts:
-        found = _search(runs, nb, d, _inside(start, radius), radius)
+        found = _search(runs, nb, d, _limit_poles(start, radius), radius)
         if best is None or found[0] < best[0]:
             best = found
     if best is None or not np.isfinite(best[0]):
         return None
-    return _finish(runs, nf, nb, d, best[1])
+    f = best[1]
+    X, y, bases = _columns(runs, f, nb, d)
+    b = np.linalg.lstsq(X, y)[0]
+    r = y - X @ b
+    J = np.column_stack([_pole_columns(runs, f, b, d, bases), X])
+    cost = float(r @ r)
+    covariance = cost / max(y.size - nf - nb - nf * len(runs), 1) * np.linalg.pinv(J.T @ J, hermitian=True)
+    return OutputErrorFit(f=f, b=b, cost=cost, covariance=covariance)
 
 
 def default_starts(nf: int, sample_time: float, least_squares: Vector | None) -> list[Vector]:
-    """Return denominators to start from: that of least squares, and poles at spread time constants."""
+    """Return denominators to start from: that of least squares, and those of typical time constants."""
     starts = [] if least_squares is None else [least_squares]
-    for tau in _TIME_CONSTANTS:
+    for tau in _START_TIME_CONSTANTS_S:
         poles = np.exp(-sample_time / (tau * np.geomspace(1.0, 0.3, nf)))
         starts.append(np.poly(poles)[1:])
     return starts
 
 
 def largest_radius(runs: Runs) -> float:
-    """Return the bound on the poles: they must settle within a run."""
+    """Return the bound on the size of the poles, which must settle within a run."""
     return float(np.exp(-_RUNS_PER_TIME_CONSTANT / max(u.size for u, _ in runs)))
 
 
 def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[float, Vector]:
-    """Levenberg-Marquardt over f on the projected problem (Kaufman's derivative)."""
-    cost, r, J = _projected(runs, f, nb, d)
+    """Minimise the projected cost over f by Levenberg and Marquardt, with Kaufman's derivative."""
+    cost, r, J = _project_linear(runs, f, nb, d)
     damping = 1e-3
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         H, g = J.T @ J, J.T @ r
         gained = 0.0
         while damping < 1e8:
             step = np.linalg.solve(H + damping * np.diag(np.maximum(np.diag(H), 1e-300)), g)
             trial = f + step
             if pole_radius(trial) <= radius:
-                new = _projected(runs, trial, nb, d)
+                new = _project_linear(runs, trial, nb, d)
                 if new[0] < cost:
                     gained = cost - new[0]
                     f, (cost, r, J) = trial, new
                     damping = max(damping / 10.0, 1e-12)
                     break
             damping *= 10.0
-        if gained <= _TOLERANCE * cost:
+        if gained <= _COST_TOLERANCE * cost:
             break
     return cost, f
 
 
-def _projected(runs: Runs, f: Vector, nb: int, d: int) -> tuple[float, Vector, Matrix]:
-    """Return cost, residual and derivative of the prediction by f, b and the starts eliminated."""
+def _project_linear(runs: Runs, f: Vector, nb: int, d: int) -> tuple[float, Vector, Matrix]:
+    """Return cost, residual and derivative of the prediction by f, with b and the starts eliminated."""
     X, y, starts = _columns(runs, f, nb, d)
-    Q = _basis(X)
+    Q = _orthonormal_basis(X)
     r = y - Q @ (Q.T @ y)
     b = np.linalg.lstsq(X, y)[0]
     S = _pole_columns(runs, f, b, d, starts)
@@ -138,54 +139,43 @@ def _projected(runs: Runs, f: Vector, nb: int, d: int) -> tuple[float, Vector, M
 
 
 def _columns(runs: Runs, f: Vector, nb: int, d: int) -> tuple[Matrix, Vector, list[Matrix]]:
-    """Return regressors of b (rows, nb) and outputs (rows,), the starts projected out, and each run's projector."""
+    """Return regressors of b (rows, nb) and outputs (rows,) without starts, and each run's basis of starts."""
     parts, targets, bases = [], [], []
     for u, y in runs:
         there = np.isfinite(y)
-        Q = _start_basis(f, u.size, there)
-        parts.append(_without(Q, _input_columns(u, f, nb, d)[there]))
-        targets.append(_without(Q, y[there]))
+        response = _start_responses(f, u.size)
+        Q = _orthonormal_basis(response[there[: len(response)]])
+        parts.append(_project_off(Q, _input_columns(u, f, nb, d)[there]))
+        targets.append(_project_off(Q, y[there]))
         bases.append(Q)
     return np.concatenate(parts), np.concatenate(targets), bases
 
 
 def _pole_columns(runs: Runs, f: Vector, b: Vector, d: int, bases: list[Matrix]) -> Matrix:
-    """Return the derivative of the output by f, `-q^-i / F y`, the starts projected out."""
+    """Return the derivative of the output by f, `-q^-i / F y`, without the starts' part."""
     F = np.concatenate([[1.0], f])
     parts = []
     for (u, y), Q in zip(runs, bases, strict=True):
         there = np.isfinite(y)
         forced = _input_columns(u, f, b.size, d) @ b
-        # The whole output, with its own start, is what F filters.
+        # F filters the whole output, with its own start.
         left = y[there] - forced[there]
         response = _start_responses(f, u.size)
         n = len(response)
         output = forced
         output[:n] += response @ np.linalg.lstsq(response[there[:n]], left[: int(there[:n].sum())])[0]
-        S = np.column_stack([_late(-_filtered(F, output), i) for i in range(1, f.size + 1)])[there]
-        parts.append(_without(Q, S))
+        S = np.column_stack([_delay(-_filter_all_pole(F, output), i) for i in range(1, f.size + 1)])[there]
+        parts.append(_project_off(Q, S))
     return np.concatenate(parts)
 
 
-def _finish(runs: Runs, nf: int, nb: int, d: int, f: Vector) -> OutputErrorFit:
-    X, y, bases = _columns(runs, f, nb, d)
-    b = np.linalg.lstsq(X, y)[0]
-    r = y - X @ b
-    J = np.column_stack([_pole_columns(runs, f, b, d, bases), X])
-    rows = y.size
-    free = max(rows - nf - nb - nf * len(runs), 1)
-    cost = float(r @ r)
-    covariance = cost / free * np.linalg.pinv(J.T @ J, hermitian=True)
-    return OutputErrorFit(f=f, b=b, cost=cost, covariance=covariance, rows=rows)
-
-
 def _input_columns(u: Vector, f: Vector, nb: int, d: int) -> Matrix:
-    """Return `u(k - d - j) / F` for j = 1..nb as (time, nb), u(0) held before the record."""
+    """Return `u(k - d - j) / F` for j = 1..nb as (time, nb), with u(0) before the recording."""
     from scipy.signal import lfilter
 
     F = np.concatenate([[1.0], f])
     gain = u[0] / F.sum()
-    # From equilibrium with the held input; the start of the run takes up whatever else it was.
+    # The filter starts in equilibrium; the start of the run accounts for the difference.
     z0 = np.zeros(f.size)
     for i in range(f.size - 1, -1, -1):
         z0[i] = -f[i] * gain + (z0[i + 1] if i + 1 < f.size else 0.0)
@@ -198,50 +188,45 @@ def _input_columns(u: Vector, f: Vector, nb: int, d: int) -> Matrix:
 
 
 def _start_responses(f: Vector, size: int) -> Matrix:
-    """Return `q^-i / F` of a pulse at the first sample, (up to size, nf): all that a start can be."""
-    # What has died away below rounding is left out: a second or two of a long run.
-    pulse = np.zeros(min(size, int(_ROUNDING / -np.log(max(pole_radius(f), 0.1))) + f.size + 1))
+    """Return `q^-i / F` of a pulse at the first sample, (up to size, nf), a basis of all starts."""
+    # The responses end where they are below rounding, after a second or two.
+    pulse = np.zeros(min(size, int(_LOG_PRECISION / -np.log(max(pole_radius(f), 0.1))) + f.size + 1))
     pulse[0] = 1.0
-    first = _filtered(np.concatenate([[1.0], f]), pulse)
-    return np.column_stack([_late(first, i) for i in range(f.size)])
+    first = _filter_all_pole(np.concatenate([[1.0], f]), pulse)
+    return np.column_stack([_delay(first, i) for i in range(f.size)])
 
 
-def _start_basis(f: Vector, size: int, there: np.ndarray) -> Matrix:
-    response = _start_responses(f, size)
-    return _basis(response[there[: len(response)]])
-
-
-def _without(Q: Matrix, X: Matrix) -> Matrix:
-    """Return `X` with its first rows projected off the basis of a start."""
+def _project_off(Q: Matrix, X: Matrix) -> Matrix:
+    """Return `X` with its first rows projected off the basis `Q` of a start."""
     rest = X.copy()
     n = len(Q)
     rest[:n] -= Q @ (Q.T @ X[:n])
     return rest
 
 
-def _filtered(F: Vector, x: Vector) -> Vector:
+def _filter_all_pole(F: Vector, x: Vector) -> Vector:
     from scipy.signal import lfilter
 
     return np.asarray(lfilter([1.0], F, x))
 
 
-def _basis(X: Matrix) -> Matrix:
-    """Return an orthonormal basis of the columns, those left out that add nothing."""
+def _orthonormal_basis(X: Matrix) -> Matrix:
+    """Return an orthonormal basis of the columns' span."""
     U, s, _ = np.linalg.svd(X, full_matrices=False)
     return U[:, s > 1e-12 * max(float(s.max(initial=0.0)), 1e-300)]
 
 
-def _late(x: Vector, samples: int) -> Vector:
+def _delay(x: Vector, samples: int) -> Vector:
     return np.concatenate([np.zeros(samples), x[: x.size - samples]]) if samples else x
 
 
 def pole_radius(f: Vector) -> float:
-    """Return the size of the largest root of z^n + f_1 z^(n-1) + ..."""
+    """Return the absolute value of the largest root of z^n + f_1 z^(n-1) + ..."""
     return float(np.abs(np.roots(np.concatenate([[1.0], f]))).max(initial=0.0))
 
 
-def _inside(f: Vector, radius: float) -> Vector:
-    """Return `f` with its poles drawn within `radius`."""
+def _limit_poles(f: Vector, radius: float) -> Vector:
+    """Return `f` with its poles moved within `radius`."""
     poles = np.roots(np.concatenate([[1.0], f]))
     size = np.abs(poles)
     if size.max(initial=0.0) <= radius:
@@ -250,11 +235,11 @@ def _inside(f: Vector, radius: float) -> Vector:
 
 
 SOURCES = ("set_points", "positions")
-# Of a standard normal 95 % lie within.
-_NORMAL = 1.959964
-_CAUTION = (
-    "intervals say how far noise moves the estimate of one linear system; on a neck that is nonlinear they do not "
-    "hold its gain, pole and dead time elsewhere in its range: take a `family` for that"
+# 97.5 % quantile of the standard normal distribution, for 95 % intervals.
+_NORMAL_QUANTILE = 1.959964
+_INTERVALS_CAUTION = (
+    "the intervals cover noise on one linear system; the gain, pole and dead time of a nonlinear neck vary more over "
+    "its range: use a `family` for that"
 )
 
 
@@ -262,17 +247,17 @@ _CAUTION = (
 class OutputError:
     """Transfer functions from redefined inputs (of a neck theta_i, phi_i) by output error (Ljung 1999, 4.2 and 10.2).
 
-    Each output follows its direction, given or learned from the data.
-    Unbiased under output noise, where `rls` is not. It has no noise model: a prediction some samples ahead is the
-    free run started again from the measured outputs.
+    Each output follows its direction, given or learned from the data. The fit is unbiased under output noise, where
+    that of `rls` is biased. It has no noise model: a prediction some samples ahead is a simulation that starts from
+    the measured outputs.
 
     Attributes:
         nf, nb: poles, and coefficients of the numerator.
-        delay: dead time [s]; None takes the one of the least cost.
+        delay: dead time [s]; None takes the one of the smallest cost.
         max_delay: end of that search [s]; None: one and a half time constants of the robot (of a neck 0.3 s).
-        source: what drives the model: "set_points", or "positions" of the motors, which in free run the drive model
-            makes from the set-points.
-        intervals: find 95 % intervals of K, pole, dead time and static gain as well, in the findings (one pole only).
+        source: input of the model: "set_points", or "positions" of the motors, which the drive model simulates from
+            the set-points.
+        intervals: add 95 % intervals of K, pole, dead time and static gain to the findings (one pole only).
     """
 
     nf: int = 1
@@ -285,17 +270,14 @@ class OutputError:
     def __post_init__(self) -> None:
         require_whole("nf", self.nf, 1, 10)
         require_whole("nb", self.nb, 1, 100)
-        if self.delay is not None:
-            require_between("delay", self.delay, 0.0, 1e6, "s")
-        if self.max_delay is not None:
-            require_positive("max_delay", self.max_delay, "s")
+        check_delays(self.delay, self.max_delay)
         require_one_of("source", self.source, SOURCES)
         if self.intervals and (self.nf, self.nb) != (1, 1):
             raise SettingsError("`intervals` are those of one pole; set `nf` and `nb` to 1 with it.")
 
     @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
-        """Identify both axes; runs are never joined and each has its own start, missed samples are not judged.
+        """Identify all axes; each run has its own start, and missed samples do not count.
 
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
@@ -311,10 +293,10 @@ class OutputError:
             found.append(fit)
             delays.append(d)
         arrays, functions = self._arrays(scaled, found, delays)
-        said = {}
+        intervals = {}
         if self.intervals:
             each = [settings._intervals(Ts, *one) for one in zip(inputs, found, delays, strict=True)]
-            said = {"intervals": dict(zip(names, each, strict=True)), "caution": _CAUTION}
+            intervals = {"intervals": dict(zip(names, each, strict=True)), "caution": _INTERVALS_CAUTION}
         findings = {
             **functions,
             "delay_criterion": "output_error",
@@ -322,7 +304,7 @@ class OutputError:
             "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
             "least_squares_beside": beside,
             **_warnings(names, inputs, found),
-            **said,
+            **intervals,
         }
         progress(1.0, "done")
         return scaled.model("oe", self, linear_in_si, arrays=arrays, findings=_in_si(findings, scaled, self.nf))
@@ -332,8 +314,8 @@ class OutputError:
     ) -> tuple[dict[str, Matrix], dict[str, Any]]:
         """Return the arrays of the runtime, and the findings that belong to them.
 
-        A model of one pole starts from its last measured output; one of more poles has a Kalman observer, as the last
-        outputs determine a slow state beside a fast one only through their noise. So has one with an offset.
+        A model of one pole starts from its last measured output. One of more poles or with an offset has a Kalman
+        observer, as noise on the last outputs would determine its slow states.
         """
         drive = fit_drive(scaled.data)
         a, b = [fit.f for fit in found], [fit.b for fit in found]
@@ -352,9 +334,10 @@ class OutputError:
     def _fit_axis(
         self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str
     ) -> tuple[OutputErrorFit, int, list[list[float]], dict[str, Any]]:
-        """Return the best fit, its dead time, the cost curve (delay [s], fit [%], one-step rms), and plain ARX."""
+        """Return the best fit, its dead time, the cost curve (delay [s], fit [%], one-step rms) and ARX findings."""
         columns = [(y[:, None], u[:, None]) for u, y in runs]
-        spread = _spread(runs)
+        outputs = np.concatenate([y[np.isfinite(y)] for _, y in runs])
+        spread = float(np.sum((outputs - outputs.mean()) ** 2))
         best: tuple[OutputErrorFit, int] | None = None
         curve: list[list[float]] = []
         last: list[Vector] = []
@@ -362,7 +345,7 @@ class OutputError:
             Phi, Y = arx_rows(columns, self.nf, self.nb, d)
             require_excitation(name, Phi)
             arx = np.linalg.lstsq(Phi, Y[:, 0])[0]
-            # The optimum of one dead time is a good start for the next; all others only where there is none yet.
+            # The optimum of one dead time is a good start for the next.
             starts = [*last, arx[: self.nf]] if last else default_starts(self.nf, sample_time, arx[: self.nf])
             fit = fit_output_error(runs, self.nf, self.nb, d, starts)
             if fit is None:
@@ -378,38 +361,33 @@ class OutputError:
         d = best[1]
         again = fit_output_error(runs, self.nf, self.nb, d, [best[0].f, *default_starts(self.nf, sample_time, None)])
         fit = again if again is not None and again.cost < best[0].cost else best[0]
-        return fit, d, curve, _beside(columns, self.nf, self.nb, d, sample_time)
+        return fit, d, curve, _least_squares_findings(columns, self.nf, self.nb, d, sample_time)
 
     def _intervals(
         self, sample_time: float, runs: list[tuple[Vector, Vector]], fit: OutputErrorFit, delay: int
     ) -> dict[str, list[float]]:
-        """Return name -> [low, high], by the continuous-time model that ends nearest to the one found."""
+        """Return 95 % intervals [low, high] by name, from the best continuous-time fit near the discrete one."""
         if not -1.0 < fit.f[0] < 0.0:
             return {}
         search = SrivcFitOptions(
             sample_time=sample_time, max_delay=self.max_delay or MAX_DELAY, free_delay=self.delay is None
         )
         pole, late = -float(np.log(-fit.f[0])) / sample_time, delay * sample_time
-        # The cost has a kink at each sample of dead time: from the middle of those on both sides as well.
-        starts = (
-            [late, *(max(late + side * sample_time, 0.0) for side in (-0.5, 0.5))] if self.delay is None else [late]
-        )
-        tried = [near for start in starts if (near := search.start(runs, pole, start)) is not None]
-        if not tried:
+        # The cost has a kink at each whole sample of dead time, so the search also starts half a sample beside it.
+        sides = (-0.5, 0.5) if self.delay is None else ()
+        starts = [late, *(max(late + side * sample_time, 0.0) for side in sides)]
+        fits = [near for start in starts if (near := search.start(runs, pole, start)) is not None]
+        if not fits:
             return {}
-        best = min(tried, key=lambda near: near.cost)
+        best = min(fits, key=lambda near: near.cost)
         K, p, L = float(best.model.b[0]), float(best.model.a[0]), best.model.delay
-        gain, a, late, b = _NORMAL * deviations(search, runs, best)[0]
+        gain, a, late, b = _NORMAL_QUANTILE * deviations(search, runs, best)[0]
         found = {"K": [K - b, K + b], "pole": [p - a, p + a], "static_gain": [K / p - gain, K / p + gain]}
         return found if self.delay is not None else {**found, "delay_s": [max(L - late, 0.0), L + late]}
 
 
 def _axis_runs(scaled: ScaledData, source: str) -> list[list[tuple[Vector, Vector]]]:
-    """Return (input, output) of each run for each output, from set-points or logged positions.
-
-    Raises:
-        DataError: positions are asked for and were not logged, or only in part.
-    """
+    """Return (input, output) of each run for each output; raise DataError for positions that were not logged."""
     if source == "positions" and not scaled.data.has_motor_positions:
         raise DataError("no motor positions were logged; use `source=set_points`.")
     runs: list[list[tuple[Vector, Vector]]] = [[] for _ in scaled.directions.names]
@@ -426,7 +404,7 @@ def _axis_runs(scaled: ScaledData, source: str) -> list[list[tuple[Vector, Vecto
 
 
 def _in_si(findings: dict[str, Any], scaled: ScaledData, nf: int) -> dict[str, Any]:
-    """Return the findings of scaled quantities in SI."""
+    """Convert findings of scaled quantities to SI."""
     second, names = scaled.scaling.second, scaled.directions.names
     curves = findings["delay_curve"]
     for name, unit, gain, std in zip(
@@ -434,8 +412,8 @@ def _in_si(findings: dict[str, Any], scaled: ScaledData, nf: int) -> dict[str, A
     ):
         curves[name] = [[second * d, fit, unit * rms] for d, fit, rms in curves[name]]
         std[nf:] = [gain * value for value in std[nf:]]
-        units = {"K": gain / second, "pole": 1.0 / second, "static_gain": gain, "delay_s": second,
-                 "slowest_pole_1_per_s": 1.0 / second}  # fmt: skip
+        units = {"K": gain / second, "static_gain": gain, "delay_s": second}
+        units |= dict.fromkeys(("pole", "slowest_pole_1_per_s"), 1.0 / second)
         beside = findings["least_squares_beside"][name]
         for key in beside:
             beside[key] = None if beside[key] is None else units.get(key, 1.0) * beside[key]
@@ -445,33 +423,26 @@ def _in_si(findings: dict[str, Any], scaled: ScaledData, nf: int) -> dict[str, A
     return findings
 
 
-def _beside(columns: list[tuple[Matrix, Matrix]], na: int, nb: int, d: int, sample_time: float) -> dict[str, Any]:
-    """Return what plain least squares (ARX) makes of the same orders and dead time: its bias under noise shows."""
+def _least_squares_findings(
+    columns: list[tuple[Matrix, Matrix]], na: int, nb: int, d: int, sample_time: float
+) -> dict[str, Any]:
+    """Fit ARX of the same orders and dead time by least squares, to compare with its bias under output noise."""
     Phi, Y = arx_rows(columns, na, nb, d)
     theta = np.linalg.lstsq(Phi, Y[:, 0])[0]
-    slowest = pole_radius(theta[:na])
+    slowest, fit = pole_radius(theta[:na]), free_run_fit(columns, theta[:na], theta[None, na:], d)
     return {
         "slowest_pole_1_per_s": float(-np.log(slowest)) / sample_time if slowest > 0.0 else None,
         "static_gain": float(theta[na:].sum() / (1.0 + theta[:na].sum())),
-        "free_run_fit": _finite(free_run_fit(columns, theta[:na], theta[None, na:], d)),
+        "free_run_fit": fit if np.isfinite(fit) else None,
     }
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
-def _spread(runs: list[tuple[Vector, Vector]]) -> float:
-    y = np.concatenate([y[np.isfinite(y)] for _, y in runs])
-    return float(np.sum((y - y.mean()) ** 2))
 
 
 def _warnings(
     names: tuple[str, ...], runs: list[list[tuple[Vector, Vector]]], found: list[OutputErrorFit]
 ) -> dict[str, list[str]]:
-    said = [
+    warnings = [
         f"{name}: its slowest pole is at the bound of a third of the longest run, a drift; lower `nf` or record longer."
         for name, axis, fit in zip(names, runs, found, strict=True)
         if pole_radius(fit.f) > largest_radius(axis) - 1e-3 * (1.0 - largest_radius(axis))
     ]
-    return {"warnings": said} if said else {}
+    return {"warnings": warnings} if warnings else {}

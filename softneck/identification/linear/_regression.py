@@ -1,4 +1,4 @@
-"""Rows of linear regressions (Eq. 26) over runs that are never joined, and whether they determine anything."""
+"""Rows of linear regressions (Eq. 26), checks of their excitation, and arrays of linear models."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, Matrix, Vector
+from softneck.core import DataError, Matrix, Vector, require_between, require_positive
 from softneck.robot import Scaling
 from softneck.signals import Recording
 
@@ -17,29 +17,37 @@ from ..models._fitting import ScaledData
 from ..models._linear_systems import history_array, system_of
 from ..models._model import WARM_UP, Model
 
-# Dead times are searched up to here, in scaled seconds: one and a half time constants.
+# Default end of the search for the dead time [scaled s]: one and a half time constants.
 MAX_DELAY = 0.3
 
 
+def check_delays(delay: float | None, max_delay: float | None) -> None:
+    """Raise SettingsError for a dead time or a bound on it that is out of range."""
+    if delay is not None:
+        require_between("delay", delay, 0.0, 1e6, "s")
+    if max_delay is not None:
+        require_positive("max_delay", max_delay, "s")
+
+
 def with_offset(kind: str, arrays: Mapping[str, Matrix], recording: Recording) -> dict[str, Matrix]:
-    """Return the arrays of a state space with an offset: what its free run is off on the mean."""
+    """Add an offset to the arrays of a state space: the mean error of its simulation."""
     offset = np.zeros(recording.outputs.shape[1])
     late = np.concatenate([np.arange(len(run)) for run in recording.runs()]) >= WARM_UP
-    for _ in range(2):  # the start of the free run depends on the offset a little
-        model = Model(kind=kind, sample_time=recording.sample_time, arrays={**arrays, "offset": offset},
-                      robot=recording.robot)  # fmt: skip
+    for _ in range(2):  # again, as the start of the simulation depends on the offset
+        now = {**arrays, "offset": offset}
+        model = Model(kind=kind, sample_time=recording.sample_time, arrays=now, robot=recording.robot)
         error = (recording.outputs - model.simulate(recording)[:, : offset.size])[late]
         offset = offset + (np.nanmean(error, axis=0) if np.isfinite(error).any(axis=0).all() else 0.0)
     return {**arrays, "offset": offset}
 
 
 def linear_in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
-    """Return the arrays of scaled transfer functions, which rest at zero, or of a scaled state space, in SI."""
+    """Convert the arrays of scaled transfer functions, which rest at zero, or of a scaled state space to SI."""
     out, motor = scaling.output_unit, scaling.motor_unit
     if "a" in arrays:
         return {**arrays, "b": arrays["b"] * (out / motor)[:, None]}
     A, B, C, K = system_of(arrays)
-    units = np.resize(out, len(A))  # states say (y, y, ..)
+    units = np.resize(out, len(A))  # states are (y, y, ..)
     A, B, K = units[:, None] * A / units, units[:, None] * B / motor, units[:, None] * K / out
     found = {**arrays, "A": A, "B": B, "K": K}
     if "offset" in arrays:
@@ -66,41 +74,34 @@ def axis_arrays(
 def functions_found(
     scaled: ScaledData, a: Sequence[Vector], b: Sequence[Vector], delays: Sequence[int]
 ) -> dict[str, Any]:
-    """Return the finding with the transfer functions, in SI, of a model whose arrays hold them in one state space."""
+    """Return the transfer functions in SI as a finding, for a model whose arrays are one state space."""
     rows = zip(scaled.directions.names, a, b, delays, scaled.gains, strict=True)
-    return {
-        "transfer_functions": {
-            name: {"a": f.tolist(), "b": (gain * g).tolist(), "delay": int(d)} for name, f, g, d, gain in rows
-        }
-    }
+    found = {name: {"a": f.tolist(), "b": (gain * g).tolist(), "delay": int(d)} for name, f, g, d, gain in rows}
+    return {"transfer_functions": found}
 
 
 def no_base(motors: int = 3, outputs: int = 2) -> dict[str, Matrix]:
-    """Return the arrays of a set that stands alone."""
+    """Return the arrays of a set without a base model."""
     empty = np.zeros((outputs, 0))
     return {"redefinition": np.zeros((outputs + 1, motors)), "a": empty, "b": empty, "delay": np.zeros(outputs)}
 
 
 def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, least: int = 1) -> None:
-    """Raise FileFormatError unless orders, at least `least`, dead times and source are within the histories."""
+    """Raise FileFormatError for orders (below `least`), dead times or a source outside the histories."""
     if "A" in arrays:
         within(np.array([sizes["n"]]), sizes["outputs"], sizes["outputs"] * sizes["H"], "the order")
         within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
         within(arrays["delay"][1:], 0, 1, "the source")
         return
-    within(
-        np.array([sizes["c"]]),
-        sizes["outputs"],
-        max(sizes["outputs"], sizes["motors"]) + 1,
-        "the number of redefined inputs",
-    )
+    most = max(sizes["outputs"], sizes["motors"]) + 1
+    within(np.array([sizes["c"]]), sizes["outputs"], most, "the number of redefined inputs")
     within(arrays["delay"], 0, sizes["H"] - sizes["nb"], "a dead time")
     within(np.array([sizes["na"]]), least, sizes["H"], "the order")
     within(arrays.get("source", np.zeros(1)), 0, 1, "the source")
 
 
-# Columns of unit length: above it rounding and noise decide the parameters; a real record stays below 1e4.
-_WORST_CONDITION = 1e8
+# Condition number of unit columns above which rounding and noise decide; real recordings stay below 1e4.
+_MAX_CONDITION = 1e8
 
 
 def arx_rows(
@@ -109,7 +110,7 @@ def arx_rows(
     """Return phi(t-1) of Eq. 26 (rows, n) and y(t) (rows, ny) of all runs; a row with a missed sample is left out.
 
     Args:
-        runs: outputs (time, ny) and inputs (time, nu) of each run; the first output is the one described.
+        runs: outputs (time, ny) and inputs (time, nu) of each run; the first output is the modelled one.
         na, nb: samples of each output and each input.
         delay: dead time in samples; the newest input is u(t - delay - 1).
         lag: rows skipped at the start of each run; as many as needed by default.
@@ -135,18 +136,12 @@ def arx_rows(
     return np.ascontiguousarray(Phi[good]), np.ascontiguousarray(y[good])
 
 
-def condition(Phi: Matrix) -> float:
-    """Return the condition number of the regressors, their columns scaled to unit length; inf for a zero column."""
-    norms = np.linalg.norm(Phi, axis=0)
-    if Phi.shape[0] < Phi.shape[1] or norms.min(initial=np.inf) == 0.0:
-        return float("inf")
-    return float(np.linalg.cond(Phi / norms))
-
-
 def require_excitation(what: str, Phi: Matrix) -> float:
-    """Return the condition number of the regressors; raise DataError where they do not determine the parameters."""
-    number = condition(Phi)
-    if not number <= _WORST_CONDITION:
+    """Return the condition number of the regressors, with columns of unit length; raise DataError for a large one."""
+    norms, number = np.linalg.norm(Phi, axis=0), float("inf")
+    if Phi.shape[0] >= Phi.shape[1] and norms.min(initial=np.inf) > 0.0:
+        number = float(np.linalg.cond(Phi / norms))
+    if not number <= _MAX_CONDITION:
         raise DataError(
             f"{what}: the data does not determine the {Phi.shape[1]} parameters (condition number {number:.2g}, "
             f"{len(Phi)} rows): its input stands still, repeats another, or the order is too high. "

@@ -34,25 +34,26 @@ from ._regression import (
     MAX_DELAY,
     arx_rows,
     axis_arrays,
+    check_delays,
     functions_found,
     linear_in_si,
     require_excitation,
     with_offset,
 )
 
-_RUNTIME = "softneck.identification.linear._ud_runtime"
-# In U D U' a start this weak costs no digits: it pulls a result by less than 1e-12 over the regressors' information.
+_UD_RUNTIME = "softneck.identification.linear._ud_runtime"
+# Start of F. In U D U' it costs no digits, and biases a result by less than 1e-12 over the regressors' information.
 EXACT_START = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class RecursionState(ReprMixin):
-    """What the recursion remembers.
+    """State of the recursion.
 
     Attributes:
         theta: (n,) parameters.
         factor, scale: (n, n) and (n,): F = U D U' with U' = `factor` + I and D = `scale`.
-        tally: (4,) rows taken in and their squared errors (both forgotten with lambda), dead-zone rows, projections.
+        tally: (4,) number of rows and their squared errors (both forgotten with lambda), dead-zone rows, projections.
     """
 
     theta: Vector
@@ -68,7 +69,7 @@ class RecursionState(ReprMixin):
 
     @property
     def noise_std(self) -> float:
-        """Standard deviation of the equation error, from the rows that are not forgotten."""
+        """Standard deviation of the equation error."""
         free = self.tally[0] - self.theta.size
         return float(np.sqrt(max(self.tally[1], 0.0) / free)) if free > 0 else float("nan")
 
@@ -85,10 +86,10 @@ class RecursionState(ReprMixin):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RecursionHistory:
-    """The course of a recursion.
+    """Errors and parameters of a recursion over time.
 
     Attributes:
-        error: (rows,) epsilon(t+1) of Eq. 30, before each row was taken in.
+        error: (rows,) epsilon(t+1) of Eq. 30, before the update.
         theta: (rows, n) parameters after it.
         covariance: (rows, n) diagonal of F after it.
     """
@@ -100,15 +101,15 @@ class RecursionHistory:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recursion:
-    """Eq. 28-30 in Bierman's form, with forgetting and what keeps it safe.
+    """Recursive least squares (Eq. 28-30) in Bierman's form, with forgetting and safeguards.
 
     Attributes:
         parameters: n, length of theta.
         forgetting: lambda in (0, 1]; 1 is Eq. 29, below it is CFF-RLS.
-        covariance_bound: on the trace of F, kept by shrinking it; without excitation, forgetting lets F grow without
-            end (from 0.99 on a constant input to 1e30 within minutes). 0 for none.
+        covariance_bound: on the trace of F; without excitation and with forgetting F grows exponentially (to 1e30
+            within minutes at 0.99). 0 for none.
         dead_zone: errors up to this size [unit of y] change nothing.
-        poles: how many of the first parameters are a_1, a_2, ... of Eq. 23 to keep stable; 0 for no projection.
+        poles: number of the first parameters that are a_1, a_2, ... of Eq. 23, kept stable; 0 for no projection.
         pole_radius: bound on those poles; a step beyond it is halved until it is within.
         start_covariance: diagonal of F(0).
     """
@@ -144,32 +145,34 @@ class Recursion:
         )
 
     def step(self, state: RecursionState, phi: ArrayLike, y: float) -> RecursionState:
-        """Take one row in: regressor `phi` (n,) and output `y`; a NaN in either changes nothing."""
+        """Update by one row, regressor `phi` (n,) and output `y`; a NaN in either changes nothing."""
         row = np.ascontiguousarray(phi, dtype=np.float64).reshape(1, -1)
         return self.run(state, row, np.array([y], dtype=np.float64))[0]
 
     def run(
         self, state: RecursionState, regressors: Matrix, targets: Vector, *, keep: bool = False
     ) -> tuple[RecursionState, RecursionHistory]:
-        """Take all rows in; return the state and its course, which is empty unless `keep`.
+        """Update by all rows; return the state and the history, which is empty unless `keep`.
 
         Args:
-            state: to start from; it stays as it is.
+            state: to start from; it is not changed.
             regressors: (rows, n).
             targets: (rows,).
-            keep: return the course as well.
+            keep: whether to keep the history.
         """
         Phi, y = self._rows(regressors, targets)
         after = RecursionState(
             theta=state.theta.copy(), factor=state.factor.copy(), scale=state.scale.copy(), tally=state.tally.copy()
         )
         n = self.parameters
-        course = np.zeros((len(y) if keep else 0, 1 + 2 * n))
+        history = np.zeros((len(y) if keep else 0, 1 + 2 * n))
         guards = np.array([self.forgetting, self.covariance_bound, self.dead_zone, self.poles, self.pole_radius])
-        load_functions(_RUNTIME).ud_guarded(Phi, y, after.theta, after.factor, after.scale, guards, after.tally, course)
+        load_functions(_UD_RUNTIME).ud_guarded(
+            Phi, y, after.theta, after.factor, after.scale, guards, after.tally, history
+        )
         if not np.isfinite(after.theta).all():
             raise DataError("the recursion is no longer finite; scale the regressors to the order of one.")
-        return after, RecursionHistory(error=course[:, 0], theta=course[:, 1 : 1 + n], covariance=course[:, 1 + n :])
+        return after, RecursionHistory(error=history[:, 0], theta=history[:, 1 : 1 + n], covariance=history[:, 1 + n :])
 
     def _rows(self, regressors: Matrix, targets: Vector) -> tuple[Matrix, Vector]:
         Phi = np.ascontiguousarray(regressors, dtype=np.float64)
@@ -186,10 +189,9 @@ def require_forgetting(value: float) -> None:
     """Raise SettingsError unless `value` is in (0, 1]."""
     require_positive("forgetting", value)
     if value > 1.0:
-        raise SettingsError(f"`forgetting` must be above 0 and at most 1, where 1 forgets nothing; got {value:g}.")
+        raise SettingsError(f"`forgetting` must be above 0 and at most 1, where 1 means no forgetting; got {value:g}.")
 
 
-_UD = "softneck.identification.linear._ud_runtime"
 STRUCTURES = ("siso", "miso", "mimo")
 Curve = list[list[float]]
 
@@ -219,13 +221,10 @@ class Rls:
     stable: bool = False
 
     def __post_init__(self) -> None:
-        # A hundred samples are 2 s: no neck remembers longer.
+        # 100 samples are 2 s at 20 ms, ten time constants of a neck.
         require_whole("na", self.na, 1, 100)
         require_whole("nb", self.nb, 1, 100)
-        if self.delay is not None:
-            require_between("delay", self.delay, 0.0, 1e6, "s")
-        if self.max_delay is not None:
-            require_positive("max_delay", self.max_delay, "s")
+        check_delays(self.delay, self.max_delay)
         require_forgetting(self.forgetting)
         require_one_of("structure", self.structure, STRUCTURES)
         require_between("covariance_bound", self.covariance_bound, 0.0, 1e15)
@@ -249,11 +248,11 @@ class Rls:
 
     @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
-        """Identify pitch from theta_i and roll from phi_i, or both from the motors.
+        """Identify each output from its redefined input (of a neck theta_i, phi_i), or all from the motors.
 
         Args:
             recordings: one or several of one sample time; their runs are never joined.
-            progress: called with the part done and a word on it.
+            progress: called with the part done and a word.
 
         Raises:
             DataError: too short, constant, without two usable rows, or not enough excitation.
@@ -270,8 +269,8 @@ class Rls:
             for (name, curve), unit in units
         }
         progress(1.0, "done")
-        return scaled.model("rls", self, linear_in_si, arrays=arrays,
-                          findings={"delay_criterion": "free_run", **findings})  # fmt: skip
+        findings = {"delay_criterion": "free_run", **findings}
+        return scaled.model("rls", self, linear_in_si, arrays=arrays, findings=findings)
 
     def _fit_siso(self, scaled: ScaledData, progress: Progress) -> tuple[dict[str, Matrix], dict]:
         drive, directions, gains = fit_drive(scaled.data), scaled.directions, scaled.gains
@@ -300,7 +299,7 @@ class Rls:
     def _search(
         self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
     ) -> tuple[int, Vector, Vector, Curve, float]:
-        """Return delay [samples], theta, its std, the cost curve (delay [s], free-run fit [%], one-step rms), cond."""
+        """Return delay [samples], theta, its std, cost curve (delay [s], simulation fit [%], one-step rms), cond."""
         best: tuple[float, int, Vector, Vector, float] | None = None
         curve: Curve = []
         for d in delay_samples(self.delay, self.max_delay or MAX_DELAY, sample_time, runs):
@@ -322,21 +321,16 @@ class Rls:
         Phi, Y = arx_rows(runs, self.na, self.nb, d)
         y = np.ascontiguousarray(Y[:, 0])
         number = require_excitation(name, Phi)
-        theta, F = self._recurse(Phi, y)
-        e = y - Phi @ theta
-        rms = float(np.sqrt(np.mean(e**2)))
-        free = max(y.size - theta.size, 1)
-        return theta, rms * np.sqrt(y.size / free * np.diag(F)), rms, number
-
-    def _recurse(self, Phi: Matrix, y: Vector) -> tuple[Vector, Matrix]:
-        n = Phi.shape[1]
-        recursion = self._recursion(n)
+        recursion = self._recursion(Phi.shape[1])
         state = recursion.initial_state()
         if self.forgetting < 1.0 or self.stable:
             state, _ = recursion.run(state, Phi, y)
         else:
-            load_functions(_UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
-        return state.theta, state.covariance
+            load_functions(_UD_RUNTIME).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
+        theta = state.theta
+        rms = float(np.sqrt(np.mean((y - Phi @ theta) ** 2)))
+        free = max(y.size - theta.size, 1)
+        return theta, rms * np.sqrt(y.size / free * np.diag(state.covariance)), rms, number
 
     def _fit_motors(self, scaled: ScaledData, progress: Progress) -> tuple[dict[str, Matrix], dict]:
         """Fit all outputs over the motors; "miso" takes a dead time each, "mimo" one for all."""
@@ -355,12 +349,17 @@ class Rls:
             curves = {name: curve for name, (*_, curve, _) in zip(names, found, strict=True)}
             return arrays, {"delay_curve": curves, "condition_number": [number for *_, number in found]}
         best, curves = None, {name: [] for name in names}
-        tried = delay_samples(self.delay, self.max_delay or MAX_DELAY, Ts, runs)
-        for step, d in enumerate(tried):
-            progress(step / len(tried), f"{1e3 * d * Ts:.0f} ms")
-            both = [self._least_squares(_own_first(runs, axis), d, name) for axis, name in enumerate(names)]
+        # The regressors of each output take its own past first.
+        orders = [[axis, *(other for other in range(len(names)) if other != axis)] for axis in range(len(names))]
+        delays = delay_samples(self.delay, self.max_delay or MAX_DELAY, Ts, runs)
+        for step, d in enumerate(delays):
+            progress(step / len(delays), f"{1e3 * d * Ts:.0f} ms")
+            both = [
+                self._least_squares([(Y[:, order], U) for Y, U in runs], d, name)
+                for order, name in zip(orders, names, strict=True)
+            ]
             arrays = motor_arrays(self, [theta for theta, *_ in both], [d] * len(names), drive)
-            fits = _fits(Model(kind="rls", sample_time=Ts, arrays=arrays, robot=recording.robot), recording)
+            fits = _simulation_fits(Model(kind="rls", sample_time=Ts, arrays=arrays, robot=recording.robot), recording)
             for name, fit, (_, _, rms, _) in zip(names, fits, both, strict=True):
                 curves[name].append([d * Ts, fit, rms])
             cost = -sum(fits)
@@ -372,7 +371,7 @@ class Rls:
 
 
 def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: Matrix) -> dict[str, Matrix]:
-    """Return the runtime's arrays of parameters over the motors, one vector for each output."""
+    """Return the runtime's arrays of parameters over the motors, with one vector for each output."""
     na, nb, common = settings.na, settings.nb, min(delays)
     p = max(na, nb + max(delays) - common)
     outputs, motors = len(thetas), len(drive)
@@ -381,7 +380,7 @@ def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: 
         A[:na, axis, axis] = theta[:na]
         rest = theta[na:]
         if settings.structure == "mimo":
-            for other in _others(axis, outputs):
+            for other in (other for other in range(outputs) if other != axis):
                 A[:na, axis, other] = rest[:na]
                 rest = rest[na:]
         late = d - common
@@ -389,16 +388,8 @@ def motor_arrays(settings: Rls, thetas: list[Vector], delays: list[int], drive: 
     return lss_arrays(varx_system(A, B), delay=common, drive=drive, history=p + common)
 
 
-def _others(axis: int, outputs: int) -> list[int]:
-    return [other for other in range(outputs) if other != axis]
-
-
-def _own_first(runs: list[tuple[Matrix, Matrix]], axis: int) -> list[tuple[Matrix, Matrix]]:
-    return [(Y[:, [axis, *_others(axis, Y.shape[1])]], U) for Y, U in runs]
-
-
-def _fits(model: Model, recording: Recording) -> list[float]:
-    """Return the free-run fits [%] of all outputs; -inf where the model is unstable."""
+def _simulation_fits(model: Model, recording: Recording) -> list[float]:
+    """Return the simulation fits [%] of all outputs; -inf where the model is unstable."""
     axes = range(recording.outputs.shape[1])
     if np.abs(np.linalg.eigvals(model.arrays["A"])).max() >= 1.0:
         return [-np.inf for _ in axes]
@@ -407,18 +398,14 @@ def _fits(model: Model, recording: Recording) -> list[float]:
     return [nrmse_fit(recording.outputs[starts, axis], simulated[starts, axis]) for axis in axes]
 
 
-_PARTS = ("theta", "factor", "scale", "tally")
-_AXES = ("pitch", "roll")
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class OnlineState:
-    """What has been seen and learnt so far.
+    """State of `OnlineRls`.
 
     Attributes:
         recursions: of pitch and roll.
-        inputs: (delay + nb, 3) set-points, the newest first; NaN before the first.
-        outputs: (na, 2) angles, the newest first; NaN where missed.
+        inputs: (delay + nb, 3) set-points, newest first; NaN before the first.
+        outputs: (na, 2) angles, newest first; NaN where missed.
     """
 
     recursions: tuple[RecursionState, RecursionState]
@@ -428,7 +415,7 @@ class OnlineState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OnlineRls:
-    """`Rls` sample by sample: after as many calls it has learnt what `Rls.fit` would have.
+    """`Rls` sample by sample, with the same result as `Rls.fit` after as many rows.
 
     Attributes:
         settings: with a dead time given.
@@ -451,7 +438,7 @@ class OnlineRls:
         return round((self.settings.delay or 0.0) / self.sample_time)
 
     def initial_state(self) -> OnlineState:
-        """Return the state before anything was seen."""
+        """Return the state before the first sample."""
         recursion = self.settings.recursion()
         return OnlineState(
             recursions=(recursion.initial_state(), recursion.initial_state()),
@@ -460,10 +447,7 @@ class OnlineRls:
         )
 
     def step(self, state: OnlineState, set_points: ArrayLike, measured: ArrayLike) -> OnlineState:
-        """Learn from what is known at t_k: set-points (3,) held from now on, and measured pitch and roll (2,) [rad].
-
-        A missed angle is NaN; rows that would need it are left out.
-        """
+        """Update by set-points (3,) from t_k on and pitch and roll (2,) [rad] measured at t_k; NaN where missed."""
         u = finite_vector("set_points", set_points, 3)
         y = np.asarray(measured, dtype=np.float64).ravel()
         if y.size != 2:
@@ -479,7 +463,7 @@ class OnlineRls:
         )
 
     def model(self, state: OnlineState) -> Model:
-        """Return what has been learnt as a model, as `Rls.fit` returns it; its drives follow their set-points."""
+        """Return the present model, as `Rls.fit` does; its drives follow their set-points."""
         thetas = [recursion.theta for recursion in state.recursions]
         drive = np.zeros((3, 2))
         s = self.settings

@@ -1,4 +1,4 @@
-"""The identified plant: one class for all kinds, as their runtimes share one `step` form."""
+"""The identified plant: one class for all kinds, as their runtimes share the form of `step`."""
 
 from __future__ import annotations
 
@@ -52,14 +52,13 @@ if TYPE_CHECKING:
     import control
     from matplotlib.figure import Figure
 
-
-#: A free run starts from this many measured samples, for every kind; they are not scored.
+#: A simulation starts with this many measured samples, for every kind; they are not scored.
 WARM_UP = 25
-_MOTORS = ("simulated", "measured")
-# A sample time of so many time constants is a slip: a neck's 10 s.
-_LONGEST_SAMPLE = 50.0
-# Kinds whose next output is looked up among the points of a set: which of them decide depends on the state.
-_SEARCHING = ("nlsm",)
+_MOTOR_SOURCES = ("simulated", "measured")
+# A longer sample time, of a neck 10 s, is a mistake in the file.
+_MAX_SAMPLE_TIME_CONSTANTS = 50.0
+# Kinds without a symbolic form: they look their output up among the points of a set.
+_SET_BASED_KINDS = ("nlsm",)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -69,11 +68,11 @@ class Model(ReprMixin):
     Attributes:
         kind: name in the table of kinds.
         sample_time: [s].
-        arrays: what the runtime reads, in its order.
-        settings: what the estimator was asked for.
-        findings: what it found: cost curves, noise, parameters.
-        training_rows: hashes of the rows it was trained on (see `row_hashes`).
-        robot: whose plant it is; the shapes below are a neck's, with 3 motors and 2 outputs.
+        arrays: of the runtime, in its order.
+        settings: of the estimator.
+        findings: of the estimator: cost curves, noise, parameters.
+        training_rows: hashes of the training rows (see `row_hashes`).
+        robot: of the plant; the shapes below are a neck's, with 3 motors and 2 outputs.
     """
 
     kind: str
@@ -98,10 +97,10 @@ class Model(ReprMixin):
         )
 
     def initial_state(self, recording: Recording | None = None, **parameters: float) -> State:
-        """Return the state at t_0: at rest, or as if the neck had stood at the first row of `recording`.
+        """Return the state at t_0: at rest, or at rest in the first row of `recording`.
 
         Args:
-            recording: whose first pitch, roll and motor positions the neck had held before, and whose payload it bears.
+            recording: its first outputs and motor positions are those at rest, and its payload is taken.
             **parameters: start values by name (`pitch_start`, `roll_start` [rad], ...), without a recording.
         """
         block = self.block()
@@ -113,16 +112,19 @@ class Model(ReprMixin):
         y0 = np.nan_to_num(recording.outputs[0])
         logged = recording.motor_positions[0]
         m0 = np.where(np.isfinite(logged), logged, recording.set_points[0])
-        start = block.initial_state(use_measurement=1.0, **self._starts(y0), **_payload_of(recording, block))
-        held = np.tile(np.concatenate([m0, y0, m0]), (memory_of(self.arrays), 1))
-        state, _ = block.run(start, held)
+        given = {f"{name}_start": float(y) for name, y in zip(self.robot.outputs.names, y0, strict=True)}
+        if any(port.name == "payload" for port in block.parameters):
+            given["payload"] = float(recording.channels["payload"][0]) if "payload" in recording.channels else 0.0
+        start = block.initial_state(use_measurement=1.0, **given)
+        at_rest = np.tile(np.concatenate([m0, y0, m0]), (memory_of(self.arrays), 1))
+        state, _ = block.run(start, at_rest)
         outputs = start.outputs.copy()
         outputs[y0.size : y0.size + m0.size] = m0
-        # The last `step` moved the outputs of now; set them back to what the first row says.
+        # The last `step` moved the present outputs; set them back to the first row.
         values = state.values.copy()
         set_now(self.kind, self.arrays, values, m0, y0)
-        # Of motors that are held at m0, as the start takes them to be.
-        outputs[-1] = block.run(State(values, state.parameters, outputs), held[:1])[1][0, -1]
+        # The validity is that of motors at rest at m0.
+        outputs[-1] = block.run(State(values, state.parameters, outputs), at_rest[:1])[1][0, -1]
         return State(values, state.parameters, outputs)
 
     def step(self, state: State, inputs: ArrayLike, *, measured: ArrayLike | None = None) -> tuple[State, Vector]:
@@ -155,8 +157,8 @@ class Model(ReprMixin):
     def jacobian(self, state: State, inputs: ArrayLike) -> _linear.Jacobian:
         """Return the derivatives A (n, n), B (n, 3), C (n_out, n), D (n_out, 3) of `step(state, inputs)`.
 
-        They are exact, from the text of the step itself. Rows and columns of the state are in the order of
-        `state.values`, those of the outputs in that of `step`. At a kink the derivative to the right counts.
+        They are exact, from the source of the step. States are in the order of `state.values`, outputs in that of
+        `step`. At a kink it is the derivative to the right.
 
         Args:
             state: at t_k.
@@ -170,13 +172,13 @@ class Model(ReprMixin):
     def linearize(
         self, at: State | Mapping[str, float] | ArrayLike | None = None, *, units: str = "SI"
     ) -> control.StateSpace:
-        """Return the linear system from the motors' set-points to the outputs that the model is near a state.
+        """Linearize the model at a state, from the motors' set-points to the outputs.
 
-        States that no input moves, or that no output shows, are left out. It has `dt` and the signals' names.
+        States that no input reaches or that reach no output are removed. The system has `dt` and the signals' names.
 
         Args:
-            at: the state, whose motors are told to stay where they are; or set-points [rad], (3,) or by name
-                (`motor_setpoint_1`, ..), under which the model has come to rest; None for zero.
+            at: the state, with set-points at its motor positions; or set-points [rad], (3,) or by name
+                (`motor_setpoint_1`, ..), under which the model is simulated to rest; None for zero.
             units: as of `ss`.
 
         Raises:
@@ -185,29 +187,32 @@ class Model(ReprMixin):
         return _linear.linearize(self, at, units)
 
     def simulate(self, recording: RecordingLike, *, motors: str = "simulated", warm_up: int = WARM_UP) -> Labelled:
-        """Free run: return the outputs (time, n_out) [rad] from set-points alone; row 0 is the start.
+        """Simulate the outputs (time, n_out) [rad] from set-points alone (free run); row 0 is the start.
 
-        The result is an array that knows its channels: `["pitch"]`, `.to_pandas()`, `.to_xarray()`, `.plot()`.
+        The result is an array with named channels: `["pitch"]`, `.to_pandas()`, `.to_xarray()`, `.plot()`.
 
         Args:
-            recording: whose set-points drive the model, or what stands for one (see `identify`), or set-points alone
-                (time, motors) in SI, from rest; its first `warm_up` samples align each run.
+            recording: a recording or its source (see `identify`), or set-points alone (time, motors) in SI, from rest.
             motors: "measured" feeds logged motor positions throughout, as the paper does.
-            warm_up: samples at the start of each run in which the measured outputs are fed.
+            warm_up: samples at the start of each run that are fed with measured outputs.
         """
-        recording = self._opened(recording)
-        require_one_of("motors", motors, _MOTORS)
-        return self._labelled(recording, [self._free_run(run, motors, warm_up) for run in recording.runs()])
+        recording = self._open(recording)
+        require_one_of("motors", motors, _MOTOR_SOURCES)
+        parts: list[Matrix] = []
+        for run in recording.runs():
+            start, rows = self.initial_state(run), _input_rows(run, motors, outputs=False)
+            rows[:warm_up] = _input_rows(run, "measured")[:warm_up]
+            parts.append(np.vstack([start.outputs, self.block().run(start, rows)[1][:-1]]))
+        return self._label(recording, parts)
 
     def predict(self, recording: RecordingLike, horizon: int = 1, *, motors: str = "simulated") -> Labelled:
         """Return the outputs (time, n_out) [rad] predicted `horizon` samples ahead from measured ones.
 
-        The result is labelled as that of `simulate`.
-
-        The first rows of each run, with no such past, are predicted from its first row.
+        The result has named channels, as that of `simulate`. The first rows of each run, which have no such past, are
+        predicted from its first row.
         """
-        recording = self._opened(recording)
-        require_one_of("motors", motors, _MOTORS)
+        recording = self._open(recording)
+        require_one_of("motors", motors, _MOTOR_SOURCES)
         require_whole("horizon", horizon, 1, 1_000_000)
         parts: list[Matrix] = []
         for run in recording.runs():
@@ -219,30 +224,30 @@ class Model(ReprMixin):
                 free = _input_rows(run, motors, outputs=False)
                 predicted = self.block().run_horizon(start, rows, free, horizon)
             parts.append(np.vstack([start.outputs, predicted[:-1]]))
-        return self._labelled(recording, parts)
+        return self._label(recording, parts)
 
     def score(self, recording: RecordingLike) -> float:
         """Return R2 of the simulation, the mean over the outputs, as scikit-learn's `score` does.
 
-        1 is perfect, 0 is as good as the mean, below it is worse. Of the paper's fit in % it is `1 - (1 - fit/100)^2`.
-        All rows count but those that align each run; `softneck.validate` leaves out rows that were trained on.
+        1 is perfect, 0 is as good as the mean. Of the paper's fit in % it is `1 - (1 - fit/100)^2`. All rows after the
+        warm-up of each run count; `softneck.validate` leaves out training rows.
         """
-        recording = self._opened(recording)
+        recording = self._open(recording)
         judged = np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
         Y, free = recording.outputs[judged], np.asarray(self.simulate(recording))[judged]
         return float(np.mean([r_squared(y, free[:, k]) for k, y in enumerate(Y.T)]))
 
     def plot(self, recording: RecordingLike, title: str = "") -> Figure:
         """Return a matplotlib figure of the measured outputs and the simulation, each with its error below."""
-        recording = self._opened(recording)
+        recording = self._open(recording)
         free = np.asarray(self.simulate(recording))[:, : self._sizes[1]]
         draw = resolve("softneck.plots:validation_figure")
         return draw(
             recording.time, recording.outputs, {"free run": free}, title, run=recording.run, robot=recording.robot
         )
 
-    def _opened(self, recording: RecordingLike) -> Recording:
-        """Return the recording that this model is to run along; an array is of its robot and sample time."""
+    def _open(self, recording: RecordingLike) -> Recording:
+        """Open and check a recording; an array of set-points gets this model's robot and sample time."""
         if isinstance(recording, np.ndarray):
             U = finite_matrix("set_points", recording, self._sizes[0])
             recording = Recording.from_arrays(U, sample_time=self.sample_time, robot=self.robot)
@@ -251,23 +256,22 @@ class Model(ReprMixin):
         self.check(recording)
         return recording
 
-    def _labelled(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
+    def _label(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
         return Labelled(np.concatenate(parts), recording.time, {port.name: port.unit for port in self.block().outputs})
 
     def adapted(self, recording: Recording, *, window: float | None = None) -> Model:
-        """Return the model refitted to the latest data, held to what it is where these say nothing.
+        """Refit the model to the latest data, regularized towards its present parameters.
 
-        Of the window every third block of ten time constants is held out: where an output is worse there, this model
-        is kept.
-        `findings["adaptation"]` says what became of it.
+        Every third block of ten time constants is held out. Where an output is worse there, this model is kept.
+        `findings["adaptation"]` describes the result.
 
         Args:
-            recording: whose last `window` [s] is looked at; None: 150 time constants, of a neck 30 s.
+            recording: its last `window` [s] is used; by default 150 time constants, of a neck 30 s.
 
         Raises:
             SettingsError: a kind that cannot adapt.
         """
-        # Above this room: what moves is known by kind.
+        # Resolved by name, as `adaptation` imports this module.
         return resolve("softneck.identification.adaptation._adapt:adapted")(self, recording, window)
 
     def tf(
@@ -286,8 +290,8 @@ class Model(ReprMixin):
             output: its name, of a neck "pitch" or "roll".
             angle_unit: of the output in SI, "rad" or "deg".
             input: a redefined input ("theta_i", "phi_i", "delta_i"; "flexion_input", "cocontraction") or a motor's
-                set-point, the others held; None takes the redefined input of `output` (Eq. 9, 10).
-            continuous: return K/(s + p) and the like, the dead time as a Pade approximation.
+                set-point, with the others constant; None takes the redefined input of `output` (Eq. 9, 10).
+            continuous: return the continuous-time form, with a Pade approximation of the dead time.
             pade: its order; 0 leaves the dead time out.
             units: as of `ss`.
         """
@@ -296,44 +300,47 @@ class Model(ReprMixin):
         return _linear.transfer_function(self, output, input, angle_unit, units)
 
     def ss(self, *, units: str = "SI") -> control.StateSpace:
-        """Return the state space to the outputs from the redefined inputs, or from the motors where it has them.
+        """Return the state space to the outputs, from the redefined inputs or the motors as the kind has them.
 
         Args:
             units: "SI" (rad, Pa, m, V), with the signals' names; "robot": motors in the unit of the robot's files and
-                outputs in the one that people see, with names that say it: `pressure_setpoint [kPa]`, `flexion [deg]`.
+                outputs in their display unit, with units in the names: `pressure_setpoint [kPa]`, `flexion [deg]`.
         """
         return _linear.state_space(self, units)
 
     def casadi(self) -> casadi.Function:
-        """Return one step in free run as a function of symbols, (x, u) -> (x_next, y), from the runtime's own text.
+        """Return one step of the simulation as a CasADi function, (x, u) -> (x_next, y), from the runtime's source.
 
-        x is `State.values`, u (3,) the set-points [rad], y the outputs one sample later. At kinks derivatives are those
-        of one side.
+        x is `State.values`, u (3,) the set-points [rad], y the outputs one sample later. Derivatives at kinks are
+        one-sided.
 
         Raises:
             SettingsError: a kind that searches a set (`nlsm`, or `guarded` over it).
         """
         from softneck.runtime import step_function
 
-        held = [self.kind, *(kind for kind, _ in members(self.arrays))]
-        for kind in held:
-            if kind in _SEARCHING:
+        for kind in (self.kind, *(kind for kind, _ in members(self.arrays))):
+            if kind in _SET_BASED_KINDS:
                 raise SettingsError(f"a model of kind `{kind}` searches its set; it cannot become a CasADi function.")
         start = self.block().initial_state(use_measurement=0.0, noise_std=0.0)
         return step_function(self.block(), start.parameters, inputs=self._sizes[0])
 
     def summary(self) -> str:
-        """Return a few lines on what the model is, in degrees."""
+        """Return a few lines on the model, in degrees."""
         lines = [f"{self.kind}: {KINDS[self.kind].summary}", f"sample time {1e3 * self.sample_time:g} ms"]
         if self.robot.in_header():
-            lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs "
-                         f"{', '.join(self.robot.outputs.names)}")  # fmt: skip
+            outputs = ", ".join(self.robot.outputs.names)
+            lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs {outputs}")
         known = payloads(self.arrays)
         if known is not None:
             lines.append(f"parameter `payload`: the recordings had {known[0]:g} to {known[1]:g} kg")
         if self.kind in _linear.KINDS:
             lines += _linear.describe(self)
-        lines += [f"{key}: {_short(value)}" for key, value in self.findings.items() if _is_plain(value)]
+        lines += [
+            f"{key}: {_short_text(value)}"
+            for key, value in self.findings.items()
+            if isinstance(value, int | float | str) or (isinstance(value, list) and len(value) <= 4)
+        ]
         if not self.arrays.get("ground", np.zeros(0)).size:
             lines.append("no validity in this file: identify it again")
         if self.kind == "nn":
@@ -378,14 +385,11 @@ class Model(ReprMixin):
 
     @property
     def _sizes(self) -> tuple[int, int]:
-        """How many motors and how many outputs."""
+        """The numbers of motors and outputs."""
         return len(self.robot.motors.names), len(self.robot.outputs.names)
 
-    def _starts(self, y0: Vector) -> dict[str, float]:
-        return {f"{name}_start": float(y) for name, y in zip(self.robot.outputs.names, y0, strict=True)}
-
     def check(self, recording: Recording) -> None:
-        """Raise DataError for what this model cannot run along: no recording, another robot or sample time."""
+        """Raise DataError for a recording of another robot or sample time, or with fewer than 2 rows."""
         if not isinstance(recording, Recording):
             raise DataError(f"a recording is needed; got a {type(recording).__name__}.")
         require_same_robot(recording.robot, self.robot, "a model and a recording")
@@ -397,23 +401,9 @@ class Model(ReprMixin):
         if len(recording) < 2:
             raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")
 
-    def _free_run(self, run: Recording, motors: str, warm_up: int) -> Matrix:
-        start = self.initial_state(run)
-        rows = _input_rows(run, motors, outputs=False)
-        rows[:warm_up] = _input_rows(run, "measured")[:warm_up]
-        _, outputs = self.block().run(start, rows)
-        return np.vstack([start.outputs, outputs[:-1]])
-
-
-def _payload_of(run: Recording, block: Block) -> dict[str, float]:
-    """Return the payload of a run, that of its first row, where the model knows of any; none logged is none."""
-    if all(port.name != "payload" for port in block.parameters):
-        return {}
-    return {"payload": float(run.channels["payload"][0]) if "payload" in run.channels else 0.0}
-
 
 def _check_header(model: Model) -> None:
-    if not 0.0 < model.sample_time < _LONGEST_SAMPLE * (model.robot.time_constant_s or np.inf):
+    if not 0.0 < model.sample_time < _MAX_SAMPLE_TIME_CONSTANTS * (model.robot.time_constant_s or np.inf):
         raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for {model.robot.name}.")
     if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
         raise FileFormatError("its settings and findings must be tables.")
@@ -431,6 +421,7 @@ def load_model(path: str | Path) -> Model:
 
 
 def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
+    """Return the block's inputs (time, n_in), NaN for positions that are not `source` "measured"."""
     U, Y = run.set_points, run.outputs
     motors, both = U.shape[1], U.shape[1] + Y.shape[1]
     rows = np.full((len(run), both + motors), np.nan)
@@ -442,7 +433,7 @@ def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
 
 
 def _held_out_lines(found: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """Return the fits [%] on the rows held out, for people."""
+    """Return the lines of a summary on the hold-out."""
     if not found:
         return []
     tables = {"persistence": "persistence", "one_step": "one step", "fit": "free run"}
@@ -453,23 +444,19 @@ def _held_out_lines(found: Mapping[str, Any], names: Sequence[str]) -> list[str]
     return lines
 
 
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, int | float | str) or (isinstance(value, list) and len(value) <= 4)
-
-
-def _short(value: Any) -> str:
+def _short_text(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(_short(item) for item in value)
+        return ", ".join(map(_short_text, value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def embed_model(model: Model) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return what the header of a controller or an observer says of its model, and its arrays by their names there."""
+    """Return the header and the renamed arrays of a model that is part of a controller's or observer's file."""
     arrays = {f"model_{name}": array for name, array in model.arrays.items()}
     return model._header(), {**arrays, "model_training_rows": model.training_rows}
 
 
 def embedded_model(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Model:
-    """Return the model of which the file's header says `header`."""
+    """Return the model that `embed_model` put into a file with this header."""
     names = [*header["arrays"], "training_rows"]
     return Model.from_archive(dict(header), {name: arrays[f"model_{name}"] for name in names})

@@ -140,7 +140,7 @@ def test_intervals_are_around_the_model_and_in_its_file(tmp_path: Path) -> None:
         assert low < b / (1.0 + a) < high
         # The truth's dead time is whole samples, of which the first is the hold's.
         assert bounds["delay_s"][0] - 1e-3 < model.arrays["delay"][axis] * TS < bounds["delay_s"][1] + 1e-3
-    assert "do not hold its gain" in model.summary()
+    assert "of a nonlinear neck vary more" in model.summary()
     model.save(tmp_path / "m.npz")
     assert load_model(tmp_path / "m.npz").findings["intervals"] == model.findings["intervals"]
     plain = OutputError(max_delay=0.12).fit(recording)
