@@ -1,9 +1,9 @@
 """Simplified refined instrumental variables in continuous time, one axis (Young and Jakeman 1980; Garnier 2015).
 
-`yhat = B(s)/A(s) u(t - L)` is simulated exactly for an input that is held between samples, with the start of each run
-as free parameters. The instruments are what the model itself says, `-s^i/A yhat` and `s^j/A u`, free of noise; the
-regressors have in addition the filtered errors, joined by straight lines. The dead time is taken along by its
-derivative, `-yhat'`. At the solution the errors are orthogonal to the instruments.
+`yhat = B(s)/A(s) u(t - L)` is simulated exactly for an input that is constant between samples, with the start of each
+run as free parameters. The instruments come from the simulation, `-s^i/A yhat` and `s^j/A u`, and are free of noise.
+The regressors also include the filtered errors, linear between samples. The dead time enters by its derivative,
+`-yhat'`. At the solution the errors are orthogonal to the instruments.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from softneck.core import Matrix, Vector
 from softneck.runtime import load_functions
 
-_RUNTIME = "softneck.identification.linear._continuous_runtime"
-_ITERATIONS = 40
-# A step that moves the fit by less than this part of the error is rounding.
-_TOLERANCE = 1e-9
-# Errors stay for so long at most, scaled: five time constants.
-_CORRELATED = 1.0
+_CT_RUNTIME = "softneck.identification.linear._continuous_runtime"
+_MAX_ITERATIONS = 40
+# Relative decrease of the cost at which the search ends; less is rounding.
+_COST_TOLERANCE = 1e-9
+# Longest correlation of errors [scaled s]: five time constants.
+_MAX_CORRELATION_S = 1.0
 Runs = Sequence[tuple[Vector, Vector]]
 
 
@@ -45,15 +45,15 @@ class Continuous:
         return np.concatenate([self.a, self.b, [self.delay]])
 
     def discretize(self, sample_time: float) -> tuple[Vector, Vector, int]:
-        """Return a, b and the whole samples of delay of the same system with its input held: exact, also between."""
+        """Discretize by a zero-order hold, exactly for any dead time; return a, b and the whole samples of delay."""
         A, e, C = self.canonical()
-        d, old, new, Ad = _held(A, e, self.delay, sample_time)
+        d, old, new, Ad = _discretize_zoh(A, e, self.delay, sample_time)
         a = np.real(np.poly(Ad))
         above = [np.real(np.poly(Ad - np.outer(g, C))) - a for g in (new, old)]
         return a[1:], np.concatenate([above[0][1:], [0.0]]) + np.concatenate([[0.0], above[1][1:]]), d
 
     def canonical(self) -> tuple[Matrix, Vector, Vector]:
-        """Return A (n, n), e (n,), C (n,) in controllable form: the states are X, X', ..."""
+        """Return A (n, n), e (n,), C (n,) in controllable form, with the states X, X', ..."""
         n = self.a.size
         A = np.eye(n, k=1)
         A[-1] = -self.a[::-1]
@@ -66,15 +66,14 @@ class Continuous:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SrivcFit:
-    """A model and what it leaves over.
+    """A fitted model with its simulation.
 
     Attributes:
         model: the transfer function.
         cost: sum of squared errors.
         simulated: (time,) of each run.
-        starts: of each run, what each run began with, and its offset.
-        information: (p, p) instruments' moments per squared noise, of (a, b, L), all else eliminated.
-        rows: measured samples.
+        starts: initial states of each run, and its offset.
+        information: (p, p) moments of the instruments of (a, b, L), with the starts eliminated.
     """
 
     model: Continuous
@@ -82,22 +81,20 @@ class SrivcFit:
     simulated: list[Vector]
     starts: Sequence[Vector]
     information: Matrix
-    rows: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SrivcFitOptions:
-    """How a fit is made.
+    """Settings of the fit.
 
     Attributes:
         sample_time: [s].
         order: poles n.
-        offset: estimate a constant on the output of each run as well (for windows around an operating point).
+        offset: estimate a constant on the output of each run too (for windows around an operating point).
         max_delay: bound on the dead time [s].
-        free_delay: take the dead time along; otherwise it stays.
+        free_delay: estimate the dead time too.
         fastest: bound on the poles [1/s].
-        runs_per_time_constant: bound on time constants, as a part of the longest run: what is slower is a drift that
-            each run's start makes up for.
+        runs_per_time_constant: the longest run over the largest time constant; slower poles only fit a drift.
     """
 
     sample_time: float
@@ -109,32 +106,33 @@ class SrivcFitOptions:
     runs_per_time_constant: float = 3.0
 
     def start(self, runs: Runs, pole: float, delay: float) -> SrivcFit | None:
-        """Return a fit from A = (s + pole)^n: one step of least squares, then `improve`."""
+        """Fit from A = (s + pole)^n by one step of least squares and `improve`."""
         a = np.real(np.poly(np.full(self.order, -pole)))[1:]
         first = Continuous(a=a, b=np.zeros(1), delay=delay)
         starts = [np.zeros(self.order + self.offset) for _ in runs]
         return self.improve(runs, first, starts)
 
     def improve(self, runs: Runs, model: Continuous, starts: Sequence[Vector]) -> SrivcFit | None:
-        """Return the fit that the iteration ends in; None where there is no stable one."""
+        """Iterate from a model and starts to the fit; None where there is no stable one."""
         fit, moves = self._step(runs, model, starts)
-        longest = max(u.size for u, _ in runs) * self.sample_time
-        for _ in range(_ITERATIONS):
-            better = self._line(runs, fit, moves, self.runs_per_time_constant / longest)
+        slowest = self.runs_per_time_constant / (max(u.size for u, _ in runs) * self.sample_time)
+        for _ in range(_MAX_ITERATIONS):
+            better = self._search_line(runs, fit, moves, slowest)
             if better is None:
                 break
             gained = fit.cost - better[0].cost
             fit, moves = better
-            if gained <= _TOLERANCE * fit.cost:
+            if gained <= _COST_TOLERANCE * fit.cost:
                 break
         return fit if np.any(fit.model.b) else None
 
-    def _line(
+    def _search_line(
         self, runs: Runs, fit: SrivcFit, moves: tuple[Vector, Sequence[Vector]], slowest: float
     ) -> tuple[SrivcFit, tuple] | None:
+        """Halve the step until the cost falls; return the fit and its next step, or None."""
         size = 1.0
         for _ in range(12):
-            model = self._moved(fit.model, size * moves[0], slowest)
+            model = self._add_step(fit.model, size * moves[0], slowest)
             if model is not None:
                 starts = [s + size * move for s, move in zip(fit.starts, moves[1], strict=True)]
                 new = self._step(runs, model, starts)
@@ -143,7 +141,8 @@ class SrivcFitOptions:
             size *= 0.5
         return None
 
-    def _moved(self, model: Continuous, step: Vector, slowest: float) -> Continuous | None:
+    def _add_step(self, model: Continuous, step: Vector, slowest: float) -> Continuous | None:
+        """Add a step of (a, b, L) to a model; None where a pole leaves its bounds."""
         n = self.order
         a, b = model.a + step[:n], model.b + step[n : n + model.b.size]
         poles = np.roots(np.concatenate([[1.0], a]))
@@ -155,31 +154,25 @@ class SrivcFitOptions:
     def _step(
         self, runs: Runs, model: Continuous, starts: Sequence[Vector]
     ) -> tuple[SrivcFit, tuple[Vector, list[Vector]]]:
-        """Return the fit at `model` and the move from it: of (a, b, L) and of the starts."""
-        rows = [self._rows(u, y, model, start) for (u, y), start in zip(runs, starts, strict=True)]
+        """Return the fit at `model` and the next step, of (a, b, L) and of the starts."""
+        rows = [self._run_columns(u, y, model, start) for (u, y), start in zip(runs, starts, strict=True)]
         cost = sum(float(r.errors @ r.errors) for r in rows)
         Z = np.concatenate([r.instruments_off for r in rows])
         Phi = np.concatenate([r.regressors_off for r in rows])
         e = np.concatenate([r.errors_off for r in rows])
         kept = slice(None) if self.free_delay else slice(0, -1)
         if not np.any(model.b):
-            kept = slice(self.order, -1)  # nothing simulated yet: least squares of the numerator alone
+            kept = slice(self.order, -1)  # at the start: least squares of the numerator alone
         step = np.zeros(Phi.shape[1])
         moment = Z[:, kept].T @ Phi[:, kept]
         step[kept] = np.linalg.lstsq(moment, Z[:, kept].T @ e)[0]
-        moves = [r.nuisance_move(step) for r in rows]
-        fit = SrivcFit(
-            model=model,
-            cost=cost,
-            simulated=[r.simulated for r in rows],
-            starts=starts,
-            information=Z.T @ Z,
-            rows=e.size,
-        )
-        return fit, (step, moves)
+        simulated = [r.simulated for r in rows]
+        fit = SrivcFit(model=model, cost=cost, simulated=simulated, starts=starts, information=Z.T @ Z)
+        return fit, (step, [r.start_step(step) for r in rows])
 
-    def _rows(self, u: Vector, y: Vector, model: Continuous, start: Vector) -> _RunColumns:
-        n, functions = self.order, load_functions(_RUNTIME)
+    def _run_columns(self, u: Vector, y: Vector, model: Continuous, start: Vector) -> _RunColumns:
+        """Simulate one run and return its errors, instruments and regressors."""
+        n, functions = self.order, load_functions(_CT_RUNTIME)
         A, e, C = model.canonical()
         big, drive = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
         for i in range(3):
@@ -187,9 +180,9 @@ class SrivcFitOptions:
         big[3 * n - 1, :n] = C
         big[3 * n - 1, n] += 1.0
         drive[:n] = e
-        d, old, new, transition = _held(big, drive, model.delay, self.sample_time)
+        d, old, new, transition = _discretize_zoh(big, drive, model.delay, self.sample_time)
         states = np.zeros((u.size, 3 * n))
-        # Before the record the first input was held.
+        # At rest under the first input before the recording.
         states[0, 0] = u[0] / model.a[-1]
         states[0, n : 2 * n] = start[:n]
         functions.ct_simulate(transition, old, new, u, d, states[0].copy(), states)
@@ -197,7 +190,7 @@ class SrivcFitOptions:
         there = np.isfinite(y)
         errors = np.where(there, y - simulated, 0.0)
         filtered = np.zeros((u.size, n))
-        functions.ct_filter(*_joined(A, e, self.sample_time), errors, filtered)
+        functions.ct_filter(*_discretize_foh(A, e, self.sample_time), errors, filtered)
         late = np.concatenate([np.full(min(d + 1, u.size), u[0]), u[: max(u.size - d - 1, 0)]])
         slope = -(states[:, :n] @ (C @ A) + C[-1] * late)
         columns = np.column_stack([states[:, :1], slope])
@@ -215,7 +208,7 @@ class SrivcFitOptions:
 
 
 class _RunColumns:
-    """One run's columns, and the same with its start projected off."""
+    """Columns of one run, and the same with its start projected off."""
 
     def __init__(
         self, *, simulated: Vector, errors: Vector, instruments: Matrix, regressors: Matrix, nuisance: Matrix
@@ -229,31 +222,30 @@ class _RunColumns:
         self.regressors_off = regressors - Q @ (Q.T @ regressors)
         self.errors_off = errors - Q @ (Q.T @ errors)
 
-    def nuisance_move(self, step: Vector) -> Vector:
-        """Return how the start moves where (a, b, L) move by `step`."""
+    def start_step(self, step: Vector) -> Vector:
+        """Return the step of the start for a `step` of (a, b, L)."""
         return np.linalg.lstsq(self._nuisance, self.errors - self._regressors @ step)[0]
 
 
-def _held(A: Matrix, e: Vector, delay: float, sample_time: float) -> tuple[int, Vector, Vector, Matrix]:
+def _discretize_zoh(A: Matrix, e: Vector, delay: float, sample_time: float) -> tuple[int, Vector, Vector, Matrix]:
     """Return whole samples of delay, the weights of the older and newer input, and the transition over a sample."""
+    from scipy.linalg import expm
+
+    def discretize(time: float) -> tuple[Matrix, Vector]:
+        n = e.size
+        joint = np.zeros((n + 1, n + 1))
+        joint[:n, :n], joint[:n, n] = A, e
+        E = np.asarray(expm(joint * time))
+        return E[:n, :n], E[:n, n]
+
     d = int(np.floor(delay / sample_time + 1e-9))
     rest = min(max(delay - d * sample_time, 0.0), sample_time)
-    first, second = _expm_pair(A, e, rest), _expm_pair(A, e, sample_time - rest)
+    first, second = discretize(rest), discretize(sample_time - rest)
     return d, second[0] @ first[1], second[1], second[0] @ first[0]
 
 
-def _expm_pair(A: Matrix, e: Vector, time: float) -> tuple[Matrix, Vector]:
-    from scipy.linalg import expm
-
-    n = e.size
-    joint = np.zeros((n + 1, n + 1))
-    joint[:n, :n], joint[:n, n] = A, e
-    E = np.asarray(expm(joint * time))
-    return E[:n, :n], E[:n, n]
-
-
-def _joined(A: Matrix, e: Vector, Ts: float) -> tuple[Matrix, Vector, Vector]:
-    """Return the transition and the weights of an input's sample and the next one, joined by a straight line."""
+def _discretize_foh(A: Matrix, e: Vector, Ts: float) -> tuple[Matrix, Vector, Vector]:
+    """Return the transition and the weights of this and the next sample of an input linear between them."""
     from scipy.linalg import expm
 
     n = e.size
@@ -264,7 +256,7 @@ def _joined(A: Matrix, e: Vector, Ts: float) -> tuple[Matrix, Vector, Vector]:
 
 
 def _free_responses(A: Matrix, size: int, sample_time: float) -> Matrix:
-    """Return the first row of exp(A t), (size, n): what starts can leave on the output."""
+    """Return the first row of exp(A t), (size, n), a basis of the responses to a start."""
     from scipy.linalg import expm
 
     n = A.shape[0]
@@ -273,24 +265,18 @@ def _free_responses(A: Matrix, size: int, sample_time: float) -> Matrix:
     states = np.zeros((size, n))
     zero = np.zeros(n)
     for i in range(n):
-        load_functions(_RUNTIME).ct_simulate(Ad, zero, zero, np.zeros(size), 0, np.eye(n)[i], states)
+        load_functions(_CT_RUNTIME).ct_simulate(Ad, zero, zero, np.zeros(size), 0, np.eye(n)[i], states)
         rows[:, i] = states[:, 0]
     return rows
 
 
 def deviations(search: SrivcFitOptions, runs: Runs, fit: SrivcFit) -> tuple[Vector, float]:
-    """Return standard deviations of static gain, pole, dead time and K, and the fit [%] about each run's mean.
-
-    Args:
-        search: how `fit` was found; with one pole.
-        runs: that it was fitted to.
-        fit: the model and what it leaves over.
-    """
+    """Return standard deviations of static gain, pole, dead time and K of a one-pole fit, and the fit [%]."""
     errors = [(y - s)[np.isfinite(y)] for (_, y), s in zip(runs, fit.simulated, strict=True)]
     spread = sum(float(np.sum((y[np.isfinite(y)] - np.nanmean(y)) ** 2)) for _, y in runs)
     e = np.concatenate(errors)
-    # Errors that stay for n samples count as one in n.
-    variance = float(np.mean(e**2)) * _correlation_time(errors, round(_CORRELATED / search.sample_time))
+    # Errors correlated over n samples count as one in n.
+    variance = float(np.mean(e**2)) * _correlation_time(errors, round(_MAX_CORRELATION_S / search.sample_time))
     covariance = variance * np.linalg.pinv(fit.information, hermitian=True)
     p, K = fit.model.a[0], fit.model.b[0]
     slope = np.array([-K / p**2, 1.0 / p, 0.0])
@@ -300,7 +286,7 @@ def deviations(search: SrivcFitOptions, runs: Runs, fit: SrivcFit) -> tuple[Vect
 
 
 def _correlation_time(errors: Sequence[Vector], lags: int) -> float:
-    """Return the sum of the autocorrelation over both sides, while it is positive, at least 1."""
+    """Return the correlation time [samples], the sum of the autocorrelation while it is positive; 1 or more."""
     power = sum(float(e @ e) for e in errors)
     total = 1.0
     for k in range(1, lags + 1):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,31 +34,31 @@ from ..models._fitting import SAME_EXCITATION, ScaledData, training_recording
 from ..models._linear_systems import history_array
 from ..models._model import Model
 from ..models._regressors import eq21_table, regression, regressor_scale, spread_table
-from ._nn_training import FUNCTIONS, AxisData, Best, Layers, axis_data, random_layers, train_axis
+from ._nn_training import FUNCTIONS, AxisData, Best, axis_data, random_layers, train_axis
 
-# Of the starts: from hardly any to one that smooths; the hold-out decides between them.
-_DECAYS = (0.03, 0.1, 0.01)
-_HOLD_OUT = 0.2
-# Neurons of the paper; of a robot whose time constant is learned so many that each weight has its rows.
-_PAPER, _LEAST_NEURONS, _ROWS_EACH = (25, 25), 4, 4
-# A hold-out shorter than this says nothing [rows].
-_LEAST = 75
-# Each of the three motions that nobody recorded is so long, of the record and [s]: all tendons have their turn in 8 s.
-_HINT, _HINT_SECONDS = 1.0 / 9.0, (8.0, 15.0)
+# Weight decays of the starts, from hardly any to strong smoothing; the hold-out decides between them.
+_START_DECAYS = (0.03, 0.1, 0.01)
+_HOLD_OUT_SHARE = 0.2
+# Neurons of the paper. Of a robot whose time constant is learned, each weight needs 4 rows.
+_PAPER_HIDDEN, _MIN_NEURONS, _ROWS_PER_WEIGHT = (25, 25), 4, 4
+# A shorter hold-out gives no usable fit.
+_MIN_HOLD_OUT_ROWS = 75
+# Length of each test motion, as a share of the recording and its limits [s]: in 8 s every tendon moves alone.
+_HINT_SHARE, _HINT_LIMITS_S = 1.0 / 9.0, (8.0, 15.0)
 INTERRUPTED = "training was interrupted; this is the best network until then"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """What all networks of one fit are trained and judged on.
+    """Training and hold-out data of all networks of one fit.
 
     Attributes:
-        train, judge: to learn from, and to choose by.
+        train, judge: the training recording and the hold-out.
         drive: simulates the motors.
         table: the regressor.
-        hints: motions that nobody recorded with what the line says of them; None for none.
+        hints: test motions with the outputs of the linear model; None for none.
         prior: weight of their errors.
-        has_time_constant: whether the robot gives its time constant.
+        has_time_constant: whether the robot file gives it.
     """
 
     train: Recording
@@ -70,17 +70,17 @@ class _Problem:
     has_time_constant: bool
 
     def training(self, axis: int) -> tuple[AxisData, Matrix, Matrix]:
-        """Return what is learnt from, with the scales of the record alone."""
-        own, inputs, output = self.prepared(self.train, axis, None)
+        """Return the training data of an axis, with the scales of the recording without hints."""
+        own, inputs, output = self.prepare(self.train, axis, None)
         if self.hints is None:
             return own, inputs, output
         weights = np.concatenate([np.ones(len(self.train)), np.full(len(self.hints), self.prior)])
-        return self.prepared(concatenate([self.train, self.hints]), axis, (inputs, output), weights)
+        return self.prepare(concatenate([self.train, self.hints]), axis, (inputs, output), weights)
 
-    def prepared(
+    def prepare(
         self, recording: Recording, axis: int, scale: tuple | None, weights: Vector | None = None
     ) -> tuple[AxisData, Matrix, Matrix]:
-        """Return the data of an axis along logged motors (simulated ones where none were logged) and simulated ones."""
+        """Return the data of an axis along logged and simulated motors; without logged ones both are simulated."""
         motors = np.concatenate([self.drive.simulate(run.set_points, drive_start(run)) for run in recording.runs()])
         if not recording.has_motor_positions:
             logged = dict(zip(recording.robot.motor_positions, motors.T, strict=True))
@@ -90,21 +90,21 @@ class _Problem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
-    """NLARX network by Levenberg-Marquardt: series-parallel, then refined over growing windows of free run.
+    """NLARX network by Levenberg-Marquardt: series-parallel, then refined over growing simulation windows.
 
-    Several starts, stopped early; of all networks seen on the way that with the best free run on the hold-out is
-    kept: on `hold_out`, else on the last fifth of each run, which is then not trained on.
+    Of the networks of all starts and steps, the one with the best simulation of the hold-out is kept. The hold-out is
+    `hold_out`, else the last fifth of each run, which is then not trained on.
 
     Attributes:
-        hidden: neurons of the two layers; None takes (25, 25), of a robot whose time constant is learned no more than
-            its rows tell apart.
+        hidden: neurons of the two layers; None takes (25, 25), or of a robot whose time constant is learned as many as
+            its rows determine.
         iterations: series-parallel steps of the best start; each other start takes a third.
-        refine: steps over windows of 1, 5 and 25 time constants of free run, together; 0 leaves the paper's training.
+        refine: steps over simulation windows of 1, 5 and 25 time constants, in all; 0 is the paper's training.
         starts: random starts for each axis.
-        decay: weight of the squared weights beside the squared error of scaled outputs; None tries 0.03, 0.1 and
-            0.01 in turn over the starts.
-        prior: weight of an error against the line (`oe`) on motions that nobody recorded beside one against the
-            record; 0 leaves them out, and so does a robot whose time constant is learned.
+        decay: weight of the squared weights, relative to the squared error of scaled outputs; None tries 0.03, 0.1
+            and 0.01 in turn over the starts.
+        prior: weight of errors against the linear model (`oe`) on test motions, relative to errors against the
+            recording. Robots whose time constant is learned have none.
         seed: of the starting weights.
     """
 
@@ -143,7 +143,7 @@ class Network:
 
         Args:
             recordings: one or several of one sample time; their runs are never joined.
-            hold_out: another excitation, on whose free run to choose.
+            hold_out: another excitation, to choose the network by its simulation.
             progress: called with the part done and the loss and hold-out fit.
 
         Raises:
@@ -151,13 +151,13 @@ class Network:
         """
         scaled = ScaledData.of(training_recording(recordings, all_motors=True))
         recording, drive = scaled.data, scaled.drive
-        # The paper's lags and training suit a robot whose pace is known beforehand; where it is learned, rows are few
-        # for its time constant or many, and the simulation decides.
+        # The paper's lags and training suit a robot with a known time constant. If it is learned, a recording may have
+        # few or many rows for it, and the simulation decides.
         table = eq21_table(recording) if scaled.has_time_constant else spread_table(recording)
-        sized = self._sized(recording, table, scaled.has_time_constant)
+        sized = self._choose_hidden(recording, table, scaled.has_time_constant)
         if hold_out is None:
-            train, judge = recording.split(1.0 - _HOLD_OUT)
-            if all(len(run) < _LEAST for run in judge.runs()):
+            train, judge = recording.split(1.0 - _HOLD_OUT_SHARE)
+            if all(len(run) < _MIN_HOLD_OUT_ROWS for run in judge.runs()):
                 train, judge = recording, recording
         else:
             train, judge = recording, scaled.scale(hold_out)
@@ -183,37 +183,35 @@ class Network:
         progress(1.0, "done")
         return scaled.model("nn", sized, _in_si, arrays=arrays, findings=findings)
 
-    def _sized(self, recording: Recording, table: Matrix, has_time_constant: bool) -> Network:
-        """Return these settings with the numbers of neurons to take.
-
-        Raises:
-            DataError: fewer rows than weights.
-        """
+    def _choose_hidden(self, recording: Recording, table: Matrix, has_time_constant: bool) -> Network:
+        """Choose the numbers of neurons; raise DataError for fewer rows than weights."""
         rows = min(regression(recording, table, axis)[1].size for axis in range(recording.outputs.shape[1]))
-        hidden = self.hidden or _PAPER
+        hidden = self.hidden or _PAPER_HIDDEN
         if self.hidden is None and not has_time_constant:
-            sizes = [(n, n) for n in range(_PAPER[0], _LEAST_NEURONS, -1)]
-            fitting = (size for size in sizes if _ROWS_EACH * _weights(len(table), size) <= rows)
-            hidden = next(fitting, (_LEAST_NEURONS, _LEAST_NEURONS))
-        if rows < _weights(len(table), hidden):
+            sizes = [(n, n) for n in range(_PAPER_HIDDEN[0], _MIN_NEURONS, -1)]
+            fitting = (size for size in sizes if _ROWS_PER_WEIGHT * _weight_count(len(table), size) <= rows)
+            hidden = next(fitting, (_MIN_NEURONS, _MIN_NEURONS))
+        if rows < _weight_count(len(table), hidden):
             raise DataError(
-                f"{rows} rows are fewer than the network's {_weights(len(table), hidden)} weights. "
+                f"{rows} rows are fewer than the network's {_weight_count(len(table), hidden)} weights. "
                 "Record longer or use fewer neurons."
             )
         return replace(self, hidden=hidden)
 
     def _train(self, problem: _Problem, progress: Progress) -> tuple[list[dict], bool]:
-        """Return the arrays of all axes, and whether Ctrl-C ended it."""
-        told = [(0.0, name) for name in problem.train.robot.outputs.names]
+        """Train all axes; return their arrays, and whether Ctrl-C ended the training."""
+        # (part done, text) of each axis.
+        reports = [(0.0, name) for name in problem.train.robot.outputs.names]
         stop = threading.Event()
         interrupted = False
-        # Before the threads start: Python 3.11 cannot parse two texts at once.
+        # Compile before the threads start: Python 3.11 cannot parse two texts at once.
         load_functions(FUNCTIONS)
         with ThreadPoolExecutor(2) as pool:
-            jobs = [pool.submit(self._axis, problem, axis, told, stop) for axis in range(len(told))]
+            jobs = [pool.submit(self._train_axis, problem, axis, reports, stop) for axis in range(len(reports))]
             while not all(job.done() for job in jobs):
                 try:
-                    _report(jobs, told, progress)
+                    wait(jobs, timeout=0.1)
+                    progress(*min(reports))
                 except KeyboardInterrupt:
                     interrupted = True
                     stop.set()
@@ -222,43 +220,45 @@ class Network:
                     raise
             return [job.result() for job in jobs], interrupted
 
-    def _axis(self, problem: _Problem, axis: int, told: list[tuple[float, str]], stop: threading.Event) -> dict:
+    def _train_axis(
+        self, problem: _Problem, axis: int, reports: list[tuple[float, str]], stop: threading.Event
+    ) -> dict:
         name = problem.train.robot.outputs.names[axis]
         expected = self.iterations * (1.0 + self.starts / 3.0) + self.refine
 
-        def tell(what: str) -> None:
-            # Early stops leave steps out: it may jump at the end, never fall.
-            told[axis] = (min(told[axis][0] + 1.0 / (expected + self.starts + 4), 0.99), f"{name}: {what}")
+        def report(text: str) -> None:
+            # Early stops skip steps, so the part done may jump at the end.
+            reports[axis] = (min(reports[axis][0] + 1.0 / (expected + self.starts + 4), 0.99), f"{name}: {text}")
 
         data, inputs, output = problem.training(axis)
-        best = Best(problem.prepared(problem.judge, axis, (inputs, output))[0], tell, stop.is_set)
-        decays = tuple(_DECAYS[i % 3] if self.decay is None else self.decay for i in range(self.starts))
-        layers: Layers = train_axis(
-            data, best, hidden=self.hidden or _PAPER, decays=decays, iterations=self.iterations, refine=self.refine,
-            rng=np.random.default_rng([self.seed, axis]),
-        )  # fmt: skip
+        best = Best(problem.prepare(problem.judge, axis, (inputs, output))[0], report, stop.is_set)
+        decays = tuple(_START_DECAYS[i % 3] if self.decay is None else self.decay for i in range(self.starts))
+        hidden, rng = self.hidden or _PAPER_HIDDEN, np.random.default_rng([self.seed, axis])
+        layers = train_axis(
+            data, best, hidden=hidden, decays=decays, iterations=self.iterations, refine=self.refine, rng=rng
+        )
         correction = fit_correction(best.hold_out.one_step_errors(layers), problem.train.sample_time)
         found = {name: getattr(layers, name) for name in ("W1", "b1", "W2", "b2", "w3", "b3")}
         return {**found, "input_scale": inputs, "output_scale": output, "correction": correction, "fit": best.free}
 
 
 def _hints(train: Recording, drive: LoadedDrive) -> Recording | None:
-    """Return motions that nobody recorded with the outputs of the linear model of `train`; None where it has none.
+    """Return test motions with the outputs of the linear model of `train`; None where it cannot be fitted.
 
-    A network is free where nothing was recorded, and each start uses that freedom otherwise.
+    They constrain the network where nothing was recorded, where the networks of different starts differ.
     """
     try:
-        line = OutputError().fit(train)
+        linear = OutputError().fit(train)
     except DataError:
         return None
-    seconds = float(np.clip(_HINT * len(train) * train.sample_time, *_HINT_SECONDS))
-    # A record that hardly moves is slow beyond measure.
+    seconds = float(np.clip(_HINT_SHARE * len(train) * train.sample_time, *_HINT_LIMITS_S))
+    # Of a recording that hardly moves, test motions would be too slow.
     most = round(2.0 * seconds / train.sample_time)
     motions, names = [], train.robot.outputs.names
-    # Not the motions by which `identify auto` compares kinds: those have another seed.
+    # `identify auto` compares kinds on motions of another seed.
     for whole in make_test_motions(train, seconds, seed=1):
         motion = whole.rows(0, min(most, len(whole)))
-        Y = line.simulate(motion, warm_up=1)[:, : len(names)]
+        Y = linear.simulate(motion, warm_up=1)[:, : len(names)]
         motors = drive.simulate(motion.set_points, motion.set_points[0])
         positions = zip(train.robot.motor_positions, motors.T, strict=True) if train.has_motor_positions else ()
         motions.append(motion.with_channels(**dict(zip(names, Y.T, strict=True)), **dict(positions)))
@@ -266,7 +266,7 @@ def _hints(train: Recording, drive: LoadedDrive) -> Recording | None:
 
 
 def _in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
-    """Return the arrays of a network in SI: what it sees are numbers without units anyway."""
+    """Convert the arrays of a network to SI; its scaled inputs have no unit."""
     rests, units = regressor_scale(arrays["table"], scaling)
     mean, spread = arrays["input_scale"].transpose(1, 0, 2)
     middle, size = arrays["output_scale"].T
@@ -279,17 +279,12 @@ def _in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matrix]:
     }
 
 
-def _weights(inputs: int, hidden: tuple[int, int]) -> int:
+def _weight_count(inputs: int, hidden: tuple[int, int]) -> int:
     return random_layers(inputs, hidden, np.random.default_rng(0)).vector().size
 
 
-def _report(jobs: list[Future], told: list[tuple[float, str]], progress: Progress) -> None:
-    wait(jobs, timeout=0.1)
-    slower = min(told)
-    progress(slower[0], slower[1])
-
-
 def check_nn(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
+    """Check the regressor table and the correction of a network."""
     check_table(arrays["table"], sizes)
     if (arrays["correction"] < 0).any() or (arrays["correction"] >= 1).any():
-        raise FileFormatError("its correction's memory and gain are not from 0 to 1, so that it would not die out.")
+        raise FileFormatError("memory and gain of its correction must be from 0 to below 1, so that it decays.")

@@ -61,7 +61,7 @@ def trained(start: Layers, inputs: np.ndarray, target: np.ndarray, iterations: i
     """The cost after each step of a training by one-step errors."""
     costs: list[float] = []
 
-    def errors(w: np.ndarray, *, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    def errors(w: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
         output, J = jacobian(start.like(w), inputs)
         return target - output, J if derivatives else None
 
@@ -69,7 +69,7 @@ def trained(start: Layers, inputs: np.ndarray, target: np.ndarray, iterations: i
         costs.append(cost)
         return True
 
-    levenberg(errors, start.vector(), iterations=iterations, decay=decay, seen=seen)
+    levenberg(errors, start.vector(), iterations=iterations, decay=decay, on_step=seen)
     return costs
 
 

@@ -59,13 +59,13 @@ def test_the_sensitivities_of_a_free_run_are_central_differences() -> None:
 
 
 def test_a_step_into_the_void_is_shortened() -> None:
-    def errors(w: np.ndarray, *, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
+    def errors(w: np.ndarray, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
         # log of a negative number is NaN, where the first full step leads.
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.log(w) - 3.0, -1.0 / w[:, None] if derivatives else None
 
     # d(errors)/dw = 1/w, and `errors` hands out the derivatives of what was subtracted: the negative.
-    w = levenberg(errors, np.array([100.0]), iterations=60, decay=1e-12, seen=lambda _w, _c: True)
+    w = levenberg(errors, np.array([100.0]), iterations=60, decay=1e-12, on_step=lambda _w, _c: True)
     assert w[0] == pytest.approx(np.exp(3.0), rel=1e-6)
 
 
