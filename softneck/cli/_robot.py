@@ -71,11 +71,11 @@ def show(file: str | None, as_json: bool) -> None:
 @common_options("force")
 def new(file: Path, preset: str, force: bool, as_json: bool) -> None:
     """Write a preset, or another robot's file, into FILE (robot.toml), to edit."""
-    from softneck.robot import PRESETS, preset_text
+    from softneck.robot import ROBOT_PRESETS, preset_text
 
     if file.suffix.lower() != ".toml":
         raise SettingsError(f"{file}: must end in `.toml`, by which softneck recognises the file.")
-    taken = preset not in PRESETS and Path(preset).is_file()
+    taken = preset not in ROBOT_PRESETS and Path(preset).is_file()
     text = _text_for_folder(Path(preset), file.parent) if taken else preset_text(preset)
     with atomic_write(file, force=force) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -268,7 +268,7 @@ def study_command(
     folder = output if output is not None else Path("build") / "studies" / study_file.stem
     with progress(f"study of {len(study.points)} runs", quiet=as_json) as report:
         runs = cosim.run_study(study, folder, workers=workers, force=_anew(study, folder, output, force), report=report)
-    plots.write_page(folder / "report.html", study_page(cosim.read_description(folder), runs), force=True)
+    plots.write_page(folder / "report.html", study_page(cosim.read_study_description(folder), runs), force=True)
     paths = cosim.write_worst(study, runs, folder / "worst", count=_WORST_RUNS)
     if as_json:
         print_json(_summary(runs, folder, study.objectives, paths))
@@ -283,8 +283,8 @@ def study_command(
 
 def _anew(study: cosim.Study, folder: Path, output: Path | None, force: bool) -> bool:
     """Return whether an existing study may be replaced: under build/, or with --force."""
-    there = output is None and (folder / cosim.DESCRIPTION).is_file()
-    return force or (there and cosim.read_description(folder).get("digest") != study.digest)
+    there = output is None and (folder / cosim.STUDY_FILE).is_file()
+    return force or (there and cosim.read_study_description(folder).get("digest") != study.digest)
 
 
 def _summary(runs: pd.DataFrame, folder: Path, objectives: tuple[str, ...], worst: list[Path]) -> dict[str, Any]:

@@ -109,14 +109,9 @@ def require_table(path: Path, *, zeros: bool = False) -> None:
     """Raise FileFormatError if a text is not a table: too large, too wide, or with zero bytes (unless `zeros`)."""
     require_size(path)
     _require_memory(path, _TEXT_GROWTH * path.stat().st_size)
-    require_lines(path, zeros=zeros, columns=True)
-
-
-def require_lines(path: Path, *, zeros: bool = False, columns: bool = False) -> None:
-    """Raise FileFormatError if a text has a line that is too long, too many `columns`, or zeros unless allowed."""
     with path.open("rb") as file:
         part = file.read(_WINDOW_BYTES)
-        for line in part.splitlines() if columns else ():
+        for line in part.splitlines():
             require_numbers(path, 1, 1 + max(line.count(mark) for mark in (b",", b";", b"\t", b" ")))
         while part:
             if not zeros and b"\0" in part:

@@ -10,7 +10,7 @@ from .parts._fmu_part import FmuPart as FmuPart
 from .parts._fmu_part import simulate_fmu as simulate_fmu
 from .parts._isolated import IsolatedPart as IsolatedPart
 from .studies._run_study import study as study
-from .studies._store import grouped as grouped
+from .studies._store import group_runs as group_runs
 from .studies._store import pareto_front as pareto_front
 from .studies._store import rank as rank
 from .studies._store import read_runs as read_runs
@@ -31,8 +31,8 @@ from .loops._simulate import run_setup as run_setup
 from .studies._run_study import Crew as Crew
 from .studies._run_study import crew as crew
 from .studies._run_study import run_study as run_study
-from .studies._store import DESCRIPTION as DESCRIPTION
+from .studies._store import STUDY_FILE as STUDY_FILE
 from .studies._store import pareto_rows as pareto_rows
-from .studies._store import read_description as read_description
+from .studies._store import read_study_description as read_study_description
 from .studies._store import write_worst as write_worst
 from .studies._study import Study as Study

@@ -30,7 +30,7 @@ from ._loop import System as System
 from ._references import AheadReference as AheadReference
 from ._references import RobotReference as RobotReference
 from ._references import make_reference as make_reference
-from ._references import reference_key as reference_key
+from ._references import reference_field as reference_field
 from ._references import reference_keys as reference_keys
 from ._references import same_quantity as same_quantity
 from ._result import SETTLING_BAND as SETTLING_BAND

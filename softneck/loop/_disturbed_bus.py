@@ -75,23 +75,12 @@ class ActiveFault:
 
 
 class FaultStages:
-    """All faults of a loop in the form that `_faults_runtime` reads.
-
-    Attributes:
-        lists, arrays: the same content, for interpreted and for compiled rows.
-    """
+    """All faults of a loop as `_faults_runtime` reads them: `lists` for interpreted, `arrays` for compiled rows."""
 
     def __init__(
         self, detours: Sequence[list[int]], sensors: Sequence[ActiveFault], plant: Sequence[ActiveFault], rows: int
     ) -> None:
-        """Lay out the faults of a run of `rows` rows.
-
-        Args:
-            detours: positions of the plant's outputs and of their copies, then of the plant's inputs and their copies.
-            sensors: the faults of outputs, in the file's order.
-            plant: the faults of inputs.
-            rows: number of rows.
-        """
+        """Lay out the faults of outputs (`sensors`) and inputs (`plant`); `detours` as from `_FaultRouting`."""
         self._acting = (*sensors, *plant)
         codes, slots, spans, held = [], [], [], 0
         for i, acting in enumerate(self._acting):

@@ -203,6 +203,14 @@ def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
     )
 
 
+def reference_field(kind: str, key: str, robot: Robot) -> str | None:
+    """Return the value that a key sets in a reference of `kind`; None for an unknown key."""
+    try:
+        return reference_key(kind, key, robot)[0]
+    except SettingsError:
+        return None
+
+
 def reference_keys(made: object, robot: Robot = _NECK) -> dict[str, float | str] | None:
     """Return the keys of a loop file that describe a reference; None if it is not a step, ramp, sine or rotation."""
     if not isinstance(made, RobotReference):

@@ -112,7 +112,7 @@ def metrics(result: LoopResult, *, angle: str = "true") -> Metrics:
             f"max_rate_{_word(unit)}_s": float(moves.max(initial=0.0)) / result.sample_time,
             "effort": float(np.sum(P**2) * result.sample_time),
             f"total_variation_{_word(unit)}": float(moves.sum()),
-            "limit_violation_s": float(_outside_range(P, robot).sum() * result.sample_time),
+            "limit_violation_s": float(_outside_range(P, robot) * result.sample_time),
             "slack_s": _slack(result),
         },
         # Only an identified plant has it.
@@ -128,14 +128,13 @@ def metric_names(robot: Robot) -> tuple[str, ...]:
     return (*(f"{axis}.{end}" for axis in robot.outputs.names for end in ends), *(f"motors.{name}" for name in moved))
 
 
-def _outside_range(P: np.ndarray, robot: Robot) -> np.ndarray:
-    """Return (time,) whether a set-point (time, motors) is outside the range of its motor."""
+def _outside_range(P: np.ndarray, robot: Robot) -> int:
+    """Return the number of rows with a set-point (time, motors) outside the range of its motor."""
     low, high = robot.motors.setpoint_min, robot.motors.setpoint_max
-    beyond = np.zeros(P.shape, dtype=bool)
-    if low is not None and high is not None:
-        rounding = 1e-9 * np.abs([low, high]).max()
-        beyond = (np.array(low) - rounding > P) | (np.array(high) + rounding < P)
-    return np.asarray(beyond.any(axis=1))
+    if low is None or high is None:
+        return 0
+    rounding = 1e-9 * np.abs([low, high]).max()
+    return int(((np.array(low) - rounding > P) | (np.array(high) + rounding < P)).any(axis=1).sum())
 
 
 def _word(unit: str) -> str:

@@ -49,13 +49,7 @@ def row_actions(
     Sequential, as on the hardware: the plant is read, then observer and controller step, each with the outputs of the
     earlier ones, then the plant. Jacobi: all parts step with the bus at t_k, and their outputs are read at t_k+1.
 
-    Args:
-        parts: name -> part.
-        taps: part -> its inputs.
-        ratios: part -> its sample time in rows.
-        order: "sequential" or "jacobi".
-        disturbed: whether there are faults.
-        closed: whether there is a reference.
+    `ratios` are the sample times of the parts in rows; `closed` loops have a reference.
 
     Raises:
         SettingsError: an algebraic loop.
@@ -144,17 +138,10 @@ class LoopRows:
         reference: Matrix | None = None,
         checked: bool = True,
     ) -> None:
-        """Lay out the signals of a loop.
+        """Lay out the signals of a loop with this `step` [s] of a row.
 
-        Args:
-            parts: name -> part.
-            wiring: connections of the parts.
-            actions: of a row, from `row_actions`.
-            step: time of a row [s].
-            starts: name -> outputs at the start, of those that have started.
-            faults: laid out by `place_faults`.
-            reference: (rows, 4) of a reference that is no part.
-            checked: stop where an output becomes NaN or infinite.
+        `starts` are the outputs of the parts that have started, `reference` (rows, outputs + 2) is one that is no part.
+        `checked` stops the run where an output becomes NaN or infinite.
         """
         self.names, self._parts = tuple(parts), tuple(parts.values())
         self._actions, self._faults = tuple(zip(*actions, strict=True)), faults or FaultStages([[]] * 4, [], [], 0)
@@ -214,11 +201,6 @@ class LoopRows:
 def _is_its_block(part: Part) -> TypeGuard[BlockPart]:
     """Return whether a part only steps its block; a subclass may override `advance`."""
     return isinstance(part, BlockPart) and type(part).advance is BlockPart.advance
-
-
-def can_compile(parts: Mapping[str, Part]) -> bool:
-    """Return whether all parts are blocks whose runtimes numba compiled."""
-    return all(_is_its_block(part) and load_runtime(part.block.runtime).compiled for part in parts.values())
 
 
 # Ratio of two sample times that should be whole; 1e-6 allows 0.02 / 0.01 in binary and nothing else.
@@ -304,18 +286,19 @@ class LoopRun:
         self._wiring, self._faults = place_faults(
             loop.faults, wiring, self._parts, step=self.step, rows=self.rows, robot=loop.robot
         )  # fmt: skip
-        self._columns = _columns(self._wiring) if closed else _plain_columns(self._wiring)
+        plain = {f"{item.part}.{item.port.name}": item.slot for item in self._wiring.named}
+        self._columns = _columns(self._wiring) if closed else plain
         self._table = np.empty((self.rows, self._wiring.start.size))
         self._reference = _reference_table(loop, self.step, self.rows) if isinstance(loop, Loop) else None
-        self._compile = compiled and can_compile(self._parts)
+        self._compile = compiled and all(
+            _is_its_block(part) and load_runtime(part.block.runtime).compiled for part in self._parts.values()
+        )
         self._running: LoopRows | None = None
 
     def __enter__(self) -> LoopRun:
-        """Return the run."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release the parts."""
         self.close()
 
     def close(self) -> None:
@@ -352,8 +335,10 @@ class LoopRun:
                 )
             finally:
                 self.row = running.row
-            if problem:
-                self._explain(running, part)
+            if problem:  # raises the DataError of the part's inputs or outputs
+                name, time = running.names[part], self.row * self.step
+                self._wiring.taps[name].read(running.bus, time)
+                self._require_finite(name, running.held[part], time)
             if report is not None and self.row % stride == 0:
                 report(self.row / self.rows)
             if pace is not None:
@@ -366,12 +351,6 @@ class LoopRun:
                 self.rows = self.row
                 break
         return self.row == self.rows
-
-    def _explain(self, running: LoopRows, part: int) -> None:
-        """Raise the DataError of the part that stopped the rows, for its inputs or outputs."""
-        name, time = running.names[part], self.row * self.step
-        self._wiring.taps[name].read(running.bus, time)
-        self._require_finite(name, running.held[part], time)
 
     def result(self) -> LoopResult:
         """Return the signals of all rows so far."""
@@ -434,11 +413,6 @@ def _columns(wiring: Wiring) -> dict[str, int]:
     for item in wiring.named:
         columns[_signal_name(item, columns, faulty)] = item.slot
     return columns
-
-
-def _plain_columns(wiring: Wiring) -> dict[str, int]:
-    """Return "part.output" -> position on the bus."""
-    return {f"{item.part}.{item.port.name}": item.slot for item in wiring.named}
 
 
 def _in_si(values: Vector, port: Port) -> tuple[Vector, str]:

@@ -39,13 +39,7 @@ def _sources(wanted: str, robot: Robot) -> tuple[tuple[str, str], ...]:
 
 @dataclass(frozen=True, slots=True)
 class BusSignal:
-    """A position on the bus that a result has as a signal.
-
-    Attributes:
-        slot: position in the bus.
-        part: of the signal; "sensor" and "fault" for copies that faults change.
-        port: name and unit.
-    """
+    """A position on the bus that a result has as a signal; `part` is "sensor" or "fault" for copies of faults."""
 
     slot: int
     part: str
@@ -139,7 +133,10 @@ def wire(
 
     taps = {}
     for name, part in parts.items():
-        _check_constants(name, part, constants.get(name, {}))
+        names = [port.name for port in part.inputs]
+        for constant in constants.get(name, {}):
+            if constant not in names:
+                raise SettingsError(f"`{constant}` is not an input of the {name}; its inputs are {', '.join(names)}.")
         finder = _SourceFinder(name, parts, slots, constants.get(name, {}), links, robot)
         places = []
         for value in map(finder.source, part.inputs):
@@ -151,7 +148,12 @@ def wire(
         taps[name] = _tap(name, part, places, ports, connections or {})
     start = np.array([port.start for _, port in ports] + extra)
     named = tuple(BusSignal(i, part, port) for i, (part, port) in enumerate(ports))
-    return Wiring(start, named, _spans(parts, len(reference_ports(robot)) if closed else 0), taps)
+    spans, first = {}, 0
+    for name, part in parts.items():
+        spans[name] = slice(first, first + len(part.outputs))
+        first += len(part.outputs)
+    spans.setdefault("reference", slice(first, len(ports)))
+    return Wiring(start, named, spans, taps)
 
 
 def _links(
@@ -197,13 +199,6 @@ def _check_plant(plant: Part, constants: Mapping[str, float], robot: Robot) -> N
     for name in constants:
         if name in robot.set_points:
             raise SettingsError(f"the plant's input `{name}` has two writers: the controller and a constant.")
-
-
-def _check_constants(name: str, part: Part, constants: Mapping[str, float]) -> None:
-    names = [port.name for port in part.inputs]
-    for constant in constants:
-        if constant not in names:
-            raise SettingsError(f"`{constant}` is not an input of the {name}; its inputs are {', '.join(names)}.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,12 +290,3 @@ def _factor(origin: str, source: Port, target: str, port: Port) -> float:
     if si_a != si_b:
         raise SettingsError(f"{origin} is in [{source.unit}] but {target} in [{port.unit}]; give both the same unit.")
     return a / b
-
-
-def _spans(parts: Mapping[str, Part], references: int) -> dict[str, slice]:
-    spans, first = {}, 0
-    for name, part in parts.items():
-        spans[name] = slice(first, first + len(part.outputs))
-        first += len(part.outputs)
-    spans.setdefault("reference", slice(first, first + references))
-    return spans

@@ -32,14 +32,14 @@ from softneck.cosim import (
     find_python,
     is_loop_file,
     load_loop,
-    read_description,
     read_runs,
+    read_study_description,
     read_toml,
     simulate,
 )
 from softneck.identification import INFINITE, Rules, bandwidth_of, judge, judged_parts
 from softneck.plots import Section, Table, cell, loop_chart, page, recording_chart, validation_chart
-from softneck.robot import FILE
+from softneck.robot import ROBOT_FILE
 from softneck.signals import Recording, assess_quality, doubts_in, import_log, read_layout, read_recording
 
 from ._study_page import study_sections
@@ -105,7 +105,7 @@ def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
         name = path.relative_to(root).as_posix()
         progress(number / len(files), name)
         try:
-            if path.name.endswith(_LAYOUT_ENDING) or path.name == FILE:
+            if path.name.endswith(_LAYOUT_ENDING) or path.name == ROBOT_FILE:
                 if found := doubts_in(path):
                     project.doubts[name] = found
             else:
@@ -213,7 +213,7 @@ def _read_fmu(project: Project, path: Path, name: str) -> None:
 
 def _read_json(project: Project, path: Path, name: str) -> None:
     if path.name == "study.json" and _is_study(path):
-        description, runs = read_description(path.parent), read_runs(path.parent)
+        description, runs = read_study_description(path.parent), read_runs(path.parent)
         project.studies[Path(name).parent.as_posix()] = (description, runs)
         return
     content = _content(path)
@@ -292,7 +292,7 @@ def _doubts(project: Project) -> dict[str, list[str]]:
     """Return the doubts about the logs and the robots."""
     found: dict[str, list[str]] = {}
     for name, doubts in project.doubts.items():
-        found.setdefault("the robot" if Path(name).name == FILE else "the log", []).extend(doubts)
+        found.setdefault("the robot" if Path(name).name == ROBOT_FILE else "the log", []).extend(doubts)
     return found
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.cosim import grouped, pareto_front, rank, worst_runs
+from softneck.cosim import group_runs, pareto_front, rank, worst_runs
 from softneck.plots import Chart, Section, Table, cell, distribution_chart, influence_chart, page, pareto_chart
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def _overview(description: Mapping[str, Any], runs: pd.DataFrame, objectives: li
     tables = [Table("What varied", ["key", "kind", "values"], rows, text=3)]
     by = _groups(study["vary"])
     if by:
-        table = grouped(runs, by, objectives)
+        table = group_runs(runs, by, objectives)
         tables.append(
             Table("By group", list(table.columns), [[cell(v) for v in row] for row in table.to_numpy()], len(by))
         )
@@ -160,7 +160,7 @@ def _failures(runs: pd.DataFrame) -> Section:
 
 
 def _split(runs: pd.DataFrame, vary: Mapping[str, Any]) -> list[tuple[str, pd.DataFrame]]:
-    """Return the runs grouped by the first key with names as values; else all together."""
+    """Return the runs group_runs by the first key with names as values; else all together."""
     by = _groups(vary)
     if not by:
         return [("runs", runs)]

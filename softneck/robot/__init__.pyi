@@ -8,11 +8,11 @@ from ._channels import Motors as Motors
 from ._channels import Outputs as Outputs
 from ._channels import is_set_point as is_set_point
 from ._channels import motor_positions_among as motor_positions_among
-from ._file import KEYS as KEYS
-from ._file import OPTIONAL as OPTIONAL
-from ._file import PRESETS as PRESETS
+from ._file import OPTIONAL_KEYS as OPTIONAL_KEYS
+from ._file import ROBOT_KEYS as ROBOT_KEYS
+from ._file import ROBOT_PRESETS as ROBOT_PRESETS
 from ._file import preset_text as preset_text
-from ._loading import FILE as FILE
+from ._loading import ROBOT_FILE as ROBOT_FILE
 from ._loading import load_for_robot as load_for_robot
 from ._loading import robot_file_of as robot_file_of
 from ._scaling import MOTOR_RANGE as MOTOR_RANGE

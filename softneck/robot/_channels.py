@@ -52,8 +52,9 @@ class Motors:
         _positive("motors.nominal", self.nominal, self.unit)
         check_range("motors", "setpoint_min", "setpoint_max", self.setpoint_min, self.setpoint_max)
         _positive("motors.rate_limit", self.rate_limit, f"{self.unit}/s")
-        if not set(self.sign) <= {1.0, -1.0}:
-            raise SettingsError(f"`motors.sign` must be 1 or -1; got {_first_not(self.sign, (1.0, -1.0)):g}.")
+        for sign in self.sign:
+            if sign not in (1.0, -1.0):
+                raise SettingsError(f"`motors.sign` must be 1 or -1; got {sign:g}.")
 
     @property
     def shown(self) -> str:
@@ -180,10 +181,6 @@ def _one_each(table: str, names: Sequence[str], *values: Sequence[float] | None)
 def _positive(key: str, values: Sequence[float] | None, unit: str) -> None:
     if values is not None and min(values) <= 0.0:
         raise SettingsError(f"`{key}` must be positive [{unit}]; got {min(values):g}.")
-
-
-def _first_not(values: Sequence[float], allowed: Sequence[float]) -> float:
-    return next(value for value in values if value not in allowed)
 
 
 KINDS = ("tendons", "identified", "matrix")

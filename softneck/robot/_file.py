@@ -15,10 +15,10 @@ from softneck.core import FileFormatError, SettingsError, SoftneckError, did_you
 
 from ._channels import Directions, Motors, Outputs
 
-PRESETS = ("neck", "arm", "antagonist", "finger", "trunk4")
+ROBOT_PRESETS = ("neck", "arm", "antagonist", "finger", "trunk4")
 #: Table -> its keys and their types; "" is the top of the file. "each" is one number for all channels, or a list of one
 # for each channel.
-KEYS: dict[str, dict[str, str]] = {
+ROBOT_KEYS: dict[str, dict[str, str]] = {
     "": {"name": "text", "extends": "text", "sample_time_s": "number", "time_constant_s": "number"},
     "motors": {"names": "texts", "unit": "text", "setpoint_min": "each", "setpoint_max": "each", "rate_limit": "each",
                "sign": "each", "nominal": "each", "rest": "each"},
@@ -42,7 +42,7 @@ KEY_OF = {
     "drives": "drives.file",
 }
 #: Keys that may be absent: learned from data, or 1 (`sign`).
-OPTIONAL = ("time_constant_s", "nominal", "rest", "sign")
+OPTIONAL_KEYS = ("time_constant_s", "nominal", "rest", "sign")
 _TYPE_TEXTS = {
     "text": "a text",
     "texts": "a list of texts",
@@ -59,8 +59,6 @@ _IN_UNIT = {
         ("sensor", "noise_std"),
     ),
 }
-
-
 # Keys for the size and speed of motions: a robot with directions of its own does not inherit them.
 _OF_DIRECTIONS = (("", "time_constant_s"), *((table, key) for table in ("motors", "outputs")
                                              for key in ("nominal", "rest")))  # fmt: skip
@@ -86,7 +84,7 @@ def preset_text(name: str) -> str:
     Raises:
         SettingsError: no such preset.
     """
-    require_one_of("the robot preset", name, PRESETS)
+    require_one_of("the robot preset", name, ROBOT_PRESETS)
     return files("softneck.robot").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -103,14 +101,15 @@ def fields(table: Mapping[str, Any]) -> dict[str, Any]:
     """
     _check(table)
     whole = _extend(table)
+    hint = f"write it, or `extends` one of {', '.join(ROBOT_PRESETS)}."
     for name in ("motors", "outputs", "directions"):
         if name not in whole:
-            raise SettingsError(f"there is no table `[{name}]`; write it, or `extends` one of {', '.join(PRESETS)}.")
+            raise SettingsError(f"there is no table `[{name}]`; {hint}")
     motors, outputs = dict(whole["motors"]), dict(whole["outputs"])
     for name, part in (("motors", motors), ("outputs", outputs)):
         for key in ("names", "unit"):
             if key not in part:
-                raise SettingsError(f"`{name}.{key}` is missing; write it, or `extends` one of {', '.join(PRESETS)}.")
+                raise SettingsError(f"`{name}.{key}` is missing; {hint}")
     directions = {key: _tuple(value) for key, value in whole["directions"].items()}
     if "kind" not in directions:
         raise SettingsError('`directions.kind` is missing; it is "tendons", "identified" or "matrix".')
@@ -141,17 +140,17 @@ def _check(table: Mapping[str, Any]) -> None:
     if not isinstance(table, Mapping):
         raise SettingsError("a robot is made of tables.")
     for key, value in table.items():
-        if key in KEYS[""]:
-            _check_value(key, value, KEYS[""][key])
-        elif key in KEYS and isinstance(value, Mapping):
+        if key in ROBOT_KEYS[""]:
+            _check_value(key, value, ROBOT_KEYS[""][key])
+        elif key in ROBOT_KEYS and isinstance(value, Mapping):
             for inner, item in value.items():
-                if inner not in KEYS[key]:
-                    raise _unknown(f"{key}.{inner}", inner, list(KEYS[key]), f"{key}.")
-                _check_value(f"{key}.{inner}", item, KEYS[key][inner])
-        elif key in KEYS and key:
+                if inner not in ROBOT_KEYS[key]:
+                    raise _unknown(f"{key}.{inner}", inner, list(ROBOT_KEYS[key]), f"{key}.")
+                _check_value(f"{key}.{inner}", item, ROBOT_KEYS[key][inner])
+        elif key in ROBOT_KEYS and key:
             raise SettingsError(f"`{key}` must be a table; write `[{key}]` and its keys below.")
         else:
-            raise _unknown(key, key, [*KEYS[""], *(name for name in KEYS if name)], "")
+            raise _unknown(key, key, [*ROBOT_KEYS[""], *(name for name in ROBOT_KEYS if name)], "")
 
 
 def _unknown(shown: str, key: str, known: list[str], prefix: str) -> SettingsError:
@@ -192,7 +191,7 @@ def _extend(table: Mapping[str, Any]) -> dict[str, Any]:
         for where, key in _OF_DIRECTIONS:
             (base[where] if where else base).pop(key, None)
     found = {key: value for key, value in {**base, **table}.items() if key != "extends"}
-    for name in KEYS:
+    for name in ROBOT_KEYS:
         # Directions are replaced as a whole: angles of one and a matrix of the other would not fit.
         if isinstance(base.get(name), Mapping) and isinstance(table.get(name), Mapping) and name != "directions":
             found[name] = {**base[name], **table[name]}

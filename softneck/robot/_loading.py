@@ -9,10 +9,10 @@ from typing import Any
 
 from softneck.core import DataError, SettingsError, as_path, load
 
-from ._file import PRESETS, shortest_path
+from ._file import ROBOT_PRESETS, shortest_path
 from ._robot import Robot
 
-FILE = "robot.toml"
+ROBOT_FILE = "robot.toml"
 _LOG = logging.getLogger(__name__)
 
 
@@ -43,15 +43,15 @@ def find_robot(given: str | Path | Robot | None = None, *, beside: str | Path | 
 def robot_file_of(beside: str | Path) -> Path | None:
     """Return the `robot.toml` in the folder of the file `beside` or in one above it; None if there is none."""
     folders = Path(beside).resolve().parents
-    return next((folder / FILE for folder in folders if (folder / FILE).is_file()), None)
+    return next((folder / ROBOT_FILE for folder in folders if (folder / ROBOT_FILE).is_file()), None)
 
 
 def _read_named(given: str | Path) -> Robot:
     as_path(given)
-    if str(given) in PRESETS:
+    if str(given) in ROBOT_PRESETS:
         return Robot.preset(str(given))
     if not Path(given).is_file():
-        raise SettingsError(f"`{given}` is neither a robot preset ({', '.join(PRESETS)}) nor a file.")
+        raise SettingsError(f"`{given}` is neither a robot preset ({', '.join(ROBOT_PRESETS)}) nor a file.")
     return Robot.read(given)
 
 

@@ -110,12 +110,8 @@ class Robot(ReprMixin):
         if not self.name.strip() or not self.name.isprintable():
             raise SettingsError(f"`name` must be one line of text; got {self.name!r}.")
         self.directions.check(len(self.motors.names), len(self.outputs.names))
-        for key, unit in (
-            ("sample_time_s", "s"),
-            ("time_constant_s", "s"),
-            ("winch_radius_m", "m"),
-            ("rate_hz", "1/s"),
-        ):
+        units = {"sample_time_s": "s", "time_constant_s": "s", "winch_radius_m": "m", "rate_hz": "1/s"}
+        for key, unit in units.items():
             if (value := getattr(self, key)) is not None:
                 require_positive(key, value, unit)
         for key in ("noise_std", "delay_s"):
@@ -167,7 +163,18 @@ class Robot(ReprMixin):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the tables of its `robot.toml`, without `extends` and without values that are not given."""
-        return _table(self)
+        table: dict[str, Any] = {"name": self.name}
+        for name in ("motors", "outputs", "directions"):
+            part = getattr(self, name)
+            values = {key: getattr(part, key) for key in _file.ROBOT_KEYS[name]}
+            table[name] = {key: _shorten(key, value) for key, value in values.items() if value not in (None, ())}
+        if set(self.motors.sign) == {1.0}:
+            del table["motors"]["sign"]
+        for attribute, key in _file.KEY_OF.items():
+            where, _, last = key.rpartition(".")
+            if (value := getattr(self, attribute)) is not None:
+                (table.setdefault(where, {}) if where else table)[last] = value
+        return {key: table[key] for key in ("name", "sample_time_s", *_file.ROBOT_KEYS) if key in table}
 
     @property
     def folder(self) -> Path | None:
@@ -267,13 +274,27 @@ class Robot(ReprMixin):
 
     def label(self) -> str:
         """Return name, short hash and file, to identify a robot in messages."""
-        return (
-            f"`{self.name}` ({self.hash[:8]}{'' if self.file is None else f', from {_file.shortest_path(self.file)}'})"
-        )
+        origin = "" if self.file is None else f", from {_file.shortest_path(self.file)}"
+        return f"`{self.name}` ({self.hash[:8]}{origin})"
 
     def summary(self) -> str:
         """Return a few lines on the robot."""
-        return _summary(self)
+        motors, outputs, angles = self.motors, self.outputs, self.directions.angles_deg
+        set_points = _range_text(motors.setpoint_min, motors.setpoint_max, motors.unit)
+        lines = [
+            f"{self.name}: {len(motors.names)} motor(s) [{motors.unit}], {len(outputs.names)} output(s)",
+            f"motors: {', '.join(motors.names)}; set-points {set_points}",
+            f"outputs: {', '.join(outputs.names)} [{outputs.display_unit}]; "
+            + _range_text(outputs.min, outputs.max, outputs.unit),
+            f"directions: {self.directions.kind}"
+            + (f" at {', '.join(f'{a:g}' for a in angles)} deg" if angles else ""),
+        ]
+        values = {key: getattr(self, name) for name, key in _file.KEY_OF.items()}
+        given = [f"{key} = {value}" for key, value in values.items() if value is not None]
+        absent = [key for key, value in values.items() if value is None and key not in _file.OPTIONAL_KEYS]
+        lines += [f"given: {', '.join(given)}"] if given else []
+        lines += [f"not given: {', '.join(absent)}"] if absent else []
+        return "\n".join(lines)
 
 
 @cache
@@ -290,45 +311,7 @@ def _preset(name: str) -> Robot:
     return Robot(**_file.fields(_file.preset_table(name)))
 
 
-def _table(robot: Robot) -> dict[str, Any]:
-    """Return the tables of a robot's file, without values that are not given."""
-    table: dict[str, Any] = {"name": robot.name}
-    for name in ("motors", "outputs", "directions"):
-        part = getattr(robot, name)
-        values = {key: getattr(part, key) for key in _file.KEYS[name]}
-        table[name] = {key: _short(key, value) for key, value in values.items() if value is not None and value != ()}
-    if set(robot.motors.sign) == {1.0}:
-        del table["motors"]["sign"]
-    for attribute, key in _file.KEY_OF.items():
-        where, _, last = key.rpartition(".")
-        if (value := getattr(robot, attribute)) is not None:
-            (table.setdefault(where, {}) if where else table)[last] = value
-    return {key: table[key] for key in ("name", "sample_time_s", *_file.KEYS) if key in table}
-
-
-def _summary(robot: Robot) -> str:
-    """Return a few lines on a robot."""
-    motors, outputs = robot.motors, robot.outputs
-    lines = [
-        f"{robot.name}: {len(motors.names)} motor(s) [{motors.unit}], {len(outputs.names)} output(s)",
-        f"motors: {', '.join(motors.names)}; set-points "
-        + _range(motors.setpoint_min, motors.setpoint_max, motors.unit),
-        f"outputs: {', '.join(outputs.names)} [{outputs.display_unit}]; "
-        + _range(outputs.min, outputs.max, outputs.unit),
-        f"directions: {robot.directions.kind}"
-        + (
-            f" at {', '.join(f'{a:g}' for a in robot.directions.angles_deg)} deg" if robot.directions.angles_deg else ""
-        ),
-    ]
-    values = {key: getattr(robot, name) for name, key in _file.KEY_OF.items()}
-    given = [f"{key} = {value}" for key, value in values.items() if value is not None]
-    absent = [key for key, value in values.items() if value is None and key not in _file.OPTIONAL]
-    lines += [f"given: {', '.join(given)}"] if given else []
-    lines += [f"not given: {', '.join(absent)}"] if absent else []
-    return "\n".join(lines)
-
-
-def _short(key: str, value: Any) -> Any:
+def _shorten(key: str, value: Any) -> Any:
     """Return a value as in a file: one number if all are equal."""
     if isinstance(value, tuple):
         if key in ("names", "angles_deg", "matrix"):
@@ -337,7 +320,7 @@ def _short(key: str, value: Any) -> Any:
     return value
 
 
-def _range(low: tuple[float, ...] | None, high: tuple[float, ...] | None, unit: str) -> str:
+def _range_text(low: tuple[float, ...] | None, high: tuple[float, ...] | None, unit: str) -> str:
     if low is None and high is None:
         return "no range given"
     a = "-inf" if low is None else f"{min(low):g}"

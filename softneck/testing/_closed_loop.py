@@ -34,11 +34,7 @@ class LimitsExceeded(AssertionError):
 class ClosedLoop:
     """The value of the fixture `closed_loop`: call it to run a loop.
 
-    Attributes:
-        folder: of relative paths.
-        plot: file of the plot of a failure.
-        file, settings: defaults from the markers.
-        limits: from the markers; every loop must hold them.
+    `file`, `settings` and `limits` are from the markers, `plot` is the file for the plot of a failure.
     """
 
     folder: Path
@@ -73,13 +69,7 @@ class ClosedLoop:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
-    """A loop that ran in a test.
-
-    Attributes:
-        result: signals, metrics.
-        plot: file of the plot of a failure.
-        axis: the output of limits without one.
-    """
+    """A loop that ran in a test; `axis` is the output of limits without one."""
 
     result: Result
     plot: Path

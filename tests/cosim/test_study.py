@@ -29,7 +29,7 @@ from softneck.cosim import (
 )
 from softneck.cosim.loops._loop_table import loop_table
 from softneck.cosim.studies._run_study import failed_row
-from softneck.cosim.studies._store import Store, read_description, write_worst
+from softneck.cosim.studies._store import Store, read_study_description, write_worst
 from softneck.loop import StepReference
 from softneck.loop._faults import make_fault
 from softneck.loop._result import metric_names
@@ -445,7 +445,7 @@ def test_a_study_goes_by_the_outputs_and_units_of_its_robot(tmp_path: Path) -> N
     # What goes by the step is as large a part of each; what is in mm goes with it.
     assert runs.loc[0, "level.rms_error_mm"] / 41.0 == pytest.approx(runs.loc[1, "level.rms_error_mm"] / 44.0)
     assert not {"pitch.rms_error_deg", "motors.max_rad"} & set(runs.columns)
-    page = study_page(read_description(tmp_path / "out"), runs)
+    page = study_page(read_study_description(tmp_path / "out"), runs)
     assert "has level.rms_error_mm" in page
     with pytest.raises(SettingsError, match=r"`pitch.rms_error_deg` is not a metric .*level.rise_s.*motors.max_bar"):
         make_study(loop, vary={}, objectives=["pitch.rms_error_deg"])

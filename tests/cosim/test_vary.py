@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.cosim.studies._study import StudyPoints, flattened, make_vary
+from softneck.cosim.studies._study import StudyPoints, flatten_keys, make_vary
 
 
 def points(vary: dict[str, Any], runs: int | None = None, seed: int = 0) -> StudyPoints:
@@ -71,7 +71,7 @@ def test_labels_of_choices() -> None:
 
 def test_nested_and_quoted_keys_are_the_same() -> None:
     nested = {"plant": {"parameters": {"payload": {"uniform": [0, 1]}}}, "duration_s": [1.0, 2.0]}
-    assert dict(flattened(nested)) == {"plant.parameters.payload": {"uniform": [0, 1]}, "duration_s": [1.0, 2.0]}
+    assert dict(flatten_keys(nested)) == {"plant.parameters.payload": {"uniform": [0, 1]}, "duration_s": [1.0, 2.0]}
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from softneck.core._certificate import certificate_contents
 from softneck.cosim import load_loop, load_ssp, load_study
 from softneck.cosim.parts._fmu_part import FmuPart
 from softneck.cosim.parts._variables import read_block
-from softneck.cosim.studies._store import read_description, read_runs
+from softneck.cosim.studies._store import read_runs, read_study_description
 from softneck.drives.bus._read import load_drives
 from softneck.drives.logs._cycle import Cycle
 from softneck.drives.logs._log_file import read_run_log
@@ -250,7 +250,9 @@ TARGETS: dict[str, Target] = {
     "tune": Target(".toml", read_tune_requirements, [copy("softneck", "tuning", "requirements.toml")]),
     "certificate": Target(".json", read_certificate, [certificate]),
     "baseline": Target(".json", load_baseline, [copy("tests", "drives", "paper.supervision.json")]),
-    "study_json": Target("", lambda path: read_description(path.parent), [text('{"study": {"loop": {}, "runs": 3}}')]),
+    "study_json": Target(
+        "", lambda path: read_study_description(path.parent), [text('{"study": {"loop": {}, "runs": 3}}')]
+    ),
 }  # fmt: skip
 
 # What damages files of many forms: sizes and counts at their ends, what opens without closing, words with a meaning.

@@ -14,7 +14,7 @@ import tomli_w
 
 from softneck import signals, tuning, verification
 from softneck.core import OutputFileError, SettingsError, atomic_write, settings_text, to_si
-from softneck.robot import KEYS, OPTIONAL, Robot
+from softneck.robot import OPTIONAL_KEYS, ROBOT_KEYS, Robot
 from softneck.signals import Recording
 
 from ..shared._console import note
@@ -61,7 +61,7 @@ _METRIC = re.compile(r"`([\w.]+)`.* cannot be: ")
 def lacking(robot: Robot) -> list[str]:
     """Return the keys of motors and sensor that controller and observer need and the robot file lacks."""
     told = robot.as_dict()
-    asked = [(table, key) for table in ("motors", "sensor") for key in KEYS[table] if key not in OPTIONAL]
+    asked = [(table, key) for table in ("motors", "sensor") for key in ROBOT_KEYS[table] if key not in OPTIONAL_KEYS]
     return [f"{table}.{key}" for table, key in asked if key not in told.get(table, {})]
 
 

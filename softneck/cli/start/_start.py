@@ -118,10 +118,10 @@ def _require_known(requirements: Path | None, kinds: str | None) -> None:
 
 def _robot_of(log: Path, robot: str | None) -> str | None:
     """Return the robot's name for commands in another folder; None if no robot is given or found."""
-    from softneck.robot import PRESETS, find_robot
+    from softneck.robot import ROBOT_PRESETS, find_robot
 
     file = find_robot(robot, beside=log).file  # reports errors in it
-    return robot if robot in PRESETS or file is None else str(file.absolute())
+    return robot if robot in ROBOT_PRESETS or file is None else str(file.absolute())
 
 
 def _read_options(logs: tuple[str, ...], given: dict[str, Any], *, yes: bool, guided: bool) -> Options:

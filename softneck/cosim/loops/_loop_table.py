@@ -13,7 +13,7 @@ from softneck.loop import (
     Part,
     fault_field,
     fault_keys,
-    reference_key,
+    reference_field,
     reference_keys,
     same_quantity,
 )
@@ -71,11 +71,8 @@ def with_values(table: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str
 def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] | None], robot: Robot = _NECK) -> None:
     """Raise SettingsError unless the loop has the key.
 
-    Args:
-        table: of the loop.
-        key: dotted, such as "plant.parameters.payload", "reference.pitch_deg", "fault.0.start_s".
-        names: part -> parameters and inputs that may be set; None if the part does not list them.
-        robot: of the loop.
+    Keys are dotted, such as "plant.parameters.payload" or "fault.0.start_s"; `names` has the parameters and inputs of
+    each part, None if the part does not list them.
     """
     head, _, rest = key.partition(".")
     if not rest:
@@ -95,19 +92,11 @@ def check_key(table: Mapping[str, Any], key: str, names: Mapping[str, set[str] |
         if OBJECT not in reference and "fmu" not in reference:
             kind = str(reference.get("kind"))
             if not (rest == "file" and kind == "recording"):
-                _check_field(key, rest, _field(kind, rest, robot), f"a {kind} reference")
+                _check_field(key, rest, reference_field(kind, rest, robot), f"a {kind} reference")
             return
     elif head not in table:
         raise SettingsError(f"the loop has no {head}, so no key `{key}`.")
     _check_part_key(key, head, rest, names)
-
-
-def _field(kind: str, key: str, robot: Robot) -> str | None:
-    """Return the value that a key sets in a reference of `kind`; None for an unknown key."""
-    try:
-        return reference_key(kind, key, robot)[0]
-    except SettingsError:
-        return None
 
 
 def set_sources(key: str) -> bool:

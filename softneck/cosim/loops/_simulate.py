@@ -278,12 +278,7 @@ _MIN_VALIDITY = 0.5
 
 
 def validity_remarks(result: LoopResult, plant: Part) -> tuple[str, ...]:
-    """Return the warning for the first sample with the plant's `validity` under 0.5, and its cause; empty if none.
-
-    Args:
-        result: all signals of the run.
-        plant: with the ranges of its training.
-    """
+    """Return the warning for the first sample with the plant's `validity` under 0.5, and its cause; empty if none."""
     if "validity" not in result.signals:
         return ()
     validity = result["validity"]
@@ -304,11 +299,6 @@ def describe_excess_range(controller: Part, parameters: Mapping[str, float], rob
     """Return a line if a controller may send a motor outside the range of `robot`, else "".
 
     A controller fits robots that differ only in limits, so it may be designed for wider ones.
-
-    Args:
-        controller: with the ranges of its outputs and the parameter `position_limit`.
-        parameters: of the loop.
-        robot: of the loop.
     """
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     if motors.setpoint_min is None or motors.setpoint_max is None:
@@ -347,13 +337,7 @@ def _validity_cause(result: LoopResult, plant: Part, row: int) -> str:
 
 
 def _nearest_end(plant: Part, places: Vector, robot: Robot) -> str:
-    """Return the motor that was held nearest to an end of its training range, which is all that an FMU has.
-
-    Args:
-        plant: with minimum and maximum of its set-points.
-        places: (motors,) where the motors were held.
-        robot: of the loop.
-    """
+    """Return the motor, held at `places` (motors,), nearest to an end of its training range in the FMU `plant`."""
     unit, worst, found = robot.motors.unit, -1.0, "its motors have a combination of values that was not in training"
     ports = {port.name: port for port in plant.inputs}
     for name, motor, place in zip(robot.set_points, robot.motor_positions, places, strict=True):

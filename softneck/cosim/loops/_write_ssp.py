@@ -1,4 +1,4 @@
-"""A loop as an SSP 1.0 archive: its FMUs, who feeds whom, parameters, places, in one file for other masters."""
+"""Write a loop as an SSP 1.0 archive: FMUs, connections, parameters and layout, in one file for other masters."""
 
 from __future__ import annotations
 
@@ -35,14 +35,7 @@ _WIDTH, _HEIGHT, _GAP = 40.0, 50.0, 30.0
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """One FMU of the system, with the FMU's own names.
-
-    Attributes:
-        name: in the system.
-        source: path in the archive.
-        inputs, outputs: connectors.
-        values: parameters and constant inputs.
-    """
+    """One FMU of the system, with the FMU's own names; `values` are parameters and constant inputs."""
 
     name: str
     source: str
@@ -55,7 +48,7 @@ class Component:
 class Connection:
     """A connection from (component, output) to (component, input): factor * value + offset.
 
-    `explicit` ones say so even where that is the value itself: their units differ, and nobody is to convert them.
+    `explicit` writes the factor also if it is 1: units differ, and other masters must not convert them.
     """
 
     origin: tuple[str, str]
@@ -70,7 +63,7 @@ def system_description(
 ) -> bytes:
     """Return the XML text of a system of `components`, stepped by `step` [s] for `duration` [s].
 
-    SSP prescribes no master; two notes say which one computes what we do: OMSimulator's own, and ours.
+    SSP prescribes no master; annotations of OMSimulator and of softneck describe one with the results of softneck.
     """
     root = Element(
         "ssd:SystemStructureDescription", {**_SPACES, "version": "1.0", "name": name, "generationTool": "softneck"}
@@ -84,17 +77,17 @@ def system_description(
     connections = SubElement(system, "ssd:Connections")
     for link in links:
         _connection(connections, link)
-    # No SystemGeometry: OMSimulator refuses a file that has one, and the boxes of the components say as much.
+    # No SystemGeometry: OMSimulator refuses a file that has one.
     master = {"description": "oms-ma", "stepSize": repr(step)}
     settings = {**master, "absoluteTolerance": "1e-4", "relativeTolerance": "1e-4"}
     notes = SubElement(system, "ssd:Annotations")
     SubElement(SubElement(_omsimulator(notes), "oms:SimulationInformation"), "oms:FixedStepMaster", settings)
-    # Behind that of OMSimulator, which looks at the first alone.
+    # After that of OMSimulator, which reads only the first annotation.
     note = SubElement(notes, "ssc:Annotation", {"type": "softneck"})
     SubElement(note, "Master", {"order": "jacobi", "stepSize": repr(step)})
     _units(root, components)
     experiment = SubElement(root, "ssd:DefaultExperiment", {"startTime": "0", "stopTime": repr(duration)})
-    # Where this is missing OMSimulator says that the file is deprecated.
+    # Without this OMSimulator reports the file as deprecated.
     results = {"resultFile": f"{name}_res.mat", "bufferSize": "1"}
     SubElement(_omsimulator(SubElement(experiment, "ssd:Annotations")), "oms:SimulationInformation", results)
     indent(root)
@@ -148,7 +141,7 @@ def _connection(connections: Element, link: Connection) -> None:
     if (link.factor, link.offset) == (1.0, 0.0) and not link.explicit:
         SubElement(connections, "ssd:Connection", head)
         return
-    # Masters that convert by units themselves must not do it twice.
+    # Masters that convert units themselves must not convert twice.
     connection = SubElement(connections, "ssd:Connection", {**head, "suppressUnitConversion": "true"})
     offset = {"offset": repr(link.offset)} if link.offset else {}
     SubElement(connection, "ssc:LinearTransformation", {"factor": repr(link.factor), **offset})
@@ -169,7 +162,7 @@ def _units(root: Element, components: Sequence[Component]) -> None:
         try:
             factor, si = to_si(name)
         except DataError:
-            SubElement(unit, "ssc:BaseUnit")  # a foreign FMU's own unit: known by name only
+            SubElement(unit, "ssc:BaseUnit")  # an unknown unit of another tool's FMU
             continue
         scale = {} if factor == 1.0 else {"factor": repr(factor)}
         base = {name: str(power) for name, power in SI_BASES.get(si, {}).items()}
@@ -182,7 +175,7 @@ def _corner(name: str, number: int) -> tuple[float, float]:
 
 
 def block_without_python(path: Path) -> Block | None:
-    """Return the block in an FMU that runs Python, None for an FMU that needs neither Python nor another tool.
+    """Return the block in a Python FMU; None for an FMU that needs neither Python nor another tool.
 
     Raises:
         SettingsError: the FMU needs another tool, or was made by another version of softneck.
@@ -196,31 +189,31 @@ def block_without_python(path: Path) -> Block | None:
         experiment = description.model.coSimulation
         if experiment is not None and experiment.needsExecutionTool:
             raise SettingsError(
-                f"{path}: needs another program where it runs (needsExecutionTool), so that the SSP file would too; "
-                "give a file of softneck instead, or use `--backend python`."
+                f"{path}: needs another program to run (needsExecutionTool), and so would the SSP file; "
+                "use a softneck file instead, or `--backend python`."
             )
         return None
 
 
 # Fixed, so that the same loop gives the same bytes.
-_DATE = (1980, 1, 1, 0, 0, 0)
+_ARCHIVE_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_ssp(loop: Loop | LoopSetup | System, path: str | Path, *, force: bool = False, compiled: bool = True) -> Path:
-    """Write `loop`, or a system that `load_ssp` returned, as an SSP 1.0 archive and return its path.
+    """Write `loop`, or a system of `load_ssp`, as an SSP 1.0 archive and return its path.
 
-    Parts that are not FMUs become some; so does the reference. A master that sets all inputs first and then steps all
-    computes what `simulate` does with order "jacobi".
+    Other parts and the reference become FMUs. A master that sets all inputs first and then steps all FMUs has the
+    results of `simulate` with order "jacobi".
 
     Args:
-        loop: a loop or what `load_loop` returned.
+        loop: a loop, with limits as from `load_loop` or without.
         path: `NAME.ssp`.
         force: replace an existing file.
-        compiled: nothing in the file needs Python: Python FMUs of ours that the loop names are made again as compiled
-            ones, all others stay what they are. False: what is made here runs Python.
+        compiled: build compiled FMUs, also from Python FMUs of softneck, so that the file needs no Python. False: new
+            FMUs run Python.
 
     Raises:
-        SettingsError: faults, a part that can be no FMU, or one that needs Python; the line names it.
+        SettingsError: faults, a part that cannot become an FMU, or one that needs Python; the message names it.
         OutputFileError: the file exists or cannot be written.
     """
     target = Path(path)
@@ -257,48 +250,39 @@ def _fmu_of(name: str, part: Part, folder: Path, compiled: bool, robot: Robot) -
     if isinstance(part, FmuPart | IsolatedPart):
         block = block_without_python(part.path) if compiled else None
         if block is None:
-            # One that came out of an archive of ours has its name already.
+            # An FMU from an archive of softneck already has the name of its part.
             bare = part.path.name.removeprefix(f"{name}_")
-            renamed = folder / (bare if bare == f"{name}.fmu" else f"{name}_{bare}")
-            renamed.write_bytes(part.path.read_bytes())
-            return renamed
+            copied = folder / (bare if bare == f"{name}.fmu" else f"{name}_{bare}")
+            copied.write_bytes(part.path.read_bytes())
+            return copied
     if block is None:
-        raise SettingsError(
-            f"the {name} is a {type(part).__name__}, of which no FMU can be built; give an FMU or a file."
-        )
-    told = (robot.name, robot.hash) if robot.in_header() else None
-    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{block.kind} of a loop", robot=told)
+        raise SettingsError(f"the {name} is a {type(part).__name__}, which cannot become an FMU; use an FMU or a file.")
+    annotation = (robot.name, robot.hash) if robot.in_header() else None
+    target, info = folder / f"{name}.fmu", FmuInfo(description=f"{block.kind} of a loop", robot=annotation)
     if compiled:
         build_compiled_fmu(block, target, info=info)
         return target
     return build_fmu(block, target, info=info)
 
 
-@dataclass(frozen=True, slots=True)
-class _Names:
-    """Our names -> those of the FMU, where a mapping renames them."""
-
-    table: Mapping[str, str]
-
-    def of(self, name: str) -> str:
-        return self.table.get(name, name)
-
-
-def _names(part: Part) -> _Names:
-    return _Names(part.native_names if isinstance(part, FmuPart | IsolatedPart) else {})
+def _fmu_name(part: Part, name: str) -> str:
+    """Return the FMU's own name of a variable."""
+    return part.native_names.get(name, name) if isinstance(part, FmuPart | IsolatedPart) else name
 
 
 def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring: Wiring) -> Component:
-    names = _names(part)
+    def with_fmu_name(port: Port) -> Port:
+        return replace(port, name=_fmu_name(part, port.name))
+
     tap = wiring.taps[name]
     constants = {
         port.name: wiring.start[slot]
         for port, owner, slot in zip(tap.ports, tap.owners, tap.slots.tolist(), strict=True)
-        # NaN is what an FMU of ours takes by itself where nobody connects.
+        # NaN is the default of an unconnected input in an FMU of softneck.
         if not owner and wiring.start[slot] == wiring.start[slot]
     }
     known = {port.name: port for port in (*part.inputs, *_parameters(part))}
-    # What is an FMU only here has this parameter only here; see `Loop.parameters`.
+    # A block gets this parameter only as an FMU; see `Loop.parameters`.
     defaults = {USE_MOTOR_POSITIONS: 1.0} if USE_MOTOR_POSITIONS in known and isinstance(loop, Loop) else {}
     values = {**constants, **defaults, **loop.parameters.get(name, {})}
     for key in values:
@@ -307,20 +291,16 @@ def _component(name: str, part: Part, source: Path, loop: Loop | System, wiring:
     return Component(
         name=name,
         source=f"resources/{source.name}",
-        inputs=tuple(_renamed(port, names) for port in part.inputs),
-        outputs=tuple(_renamed(port, names) for port in part.outputs),
-        values=tuple((_renamed(known[key], names), float(value)) for key, value in values.items()),
+        inputs=tuple(map(with_fmu_name, part.inputs)),
+        outputs=tuple(map(with_fmu_name, part.outputs)),
+        values=tuple((with_fmu_name(known[key]), float(value)) for key, value in values.items()),
     )
 
 
 def _parameters(part: Part) -> tuple[Port, ...]:
-    if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, where our whole numbers are Real
+    if isinstance(part, BlockPart):  # becomes an FMU of FMI 2.0, with whole numbers as Real
         return tuple(replace(port, integer=False) for port in with_modelled_drives(part.block).parameters)
     return getattr(part, "parameters", ())
-
-
-def _renamed(port: Port, names: _Names) -> Port:
-    return replace(port, name=names.of(port.name))
 
 
 def _links(loop: Loop | System, wiring: Wiring) -> list[Connection]:
@@ -333,10 +313,10 @@ def _links(loop: Loop | System, wiring: Wiring) -> list[Connection]:
         ):
             if owner:
                 output = next(item.port for item in wiring.named if item.slot == slot)
-                origin = (owner, _names(parts[owner]).of(output.name))
-                target = (name, _names(parts[name]).of(port.name))
-                said = isinstance(loop.connections.get(f"{name}.{port.name}"), Link) and output.unit != port.unit
-                links.append(Connection(origin, target, factor, offset, said))
+                origin = (owner, _fmu_name(parts[owner], output.name))
+                target = (name, _fmu_name(parts[name], port.name))
+                is_link = isinstance(loop.connections.get(f"{name}.{port.name}"), Link)
+                links.append(Connection(origin, target, factor, offset, is_link and output.unit != port.unit))
     return links
 
 
@@ -344,7 +324,7 @@ def _write(target: Path, members: Mapping[str, bytes], *, force: bool) -> None:
     try:
         with atomic_write(target, force=force) as temporary, zipfile.ZipFile(temporary, "w") as archive:
             for name, data in members.items():
-                info = zipfile.ZipInfo(name, _DATE)
+                info = zipfile.ZipInfo(name, _ARCHIVE_DATE)
                 info.compress_type = zipfile.ZIP_DEFLATED
                 archive.writestr(info, data)
     except OSError as error:

@@ -110,15 +110,19 @@ class FmuPart:
             SettingsError: a parameter that the FMU does not have.
             FmuError: the FMU refused; the message says why.
         """
-        bank, values = self._parameter_bank(parameters)
+        known = [port.name for port in self.parameters]
+        for name in parameters:
+            if name not in known:
+                listed = ", ".join(known) or "none"
+                raise SettingsError(f"`{name}` is not a parameter of {self.path}; it has {listed}.")
+        bank, values = self._bank(parameters), np.array([float(value) for value in parameters.values()])
         self.messages.clear()
         native = self._prepare_instance()
         self._call("setup", native.setup, time)
         bank.bind(native)
         self._call("parameters", bank.write, values)
         self._call("inputs", self._inputs.write, np.array([port.start for port in self.inputs]))
-        self._call("initialisation", native.enter, time)
-        self._call("initialisation", native.exit)
+        self._call("initialisation", native.initialise, time)
         return self._call("outputs", self._outputs.read)
 
     def advance(self, time: float, inputs: Vector) -> Vector:
@@ -167,11 +171,9 @@ class FmuPart:
         self._call("its state", self._native.set_state, state)
 
     def __enter__(self) -> FmuPart:
-        """Return the part itself."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close."""
         self.close()
 
     def _prepare_instance(self) -> Native:
@@ -180,7 +182,7 @@ class FmuPart:
 
         if self._native is not None and not self._broken:
             try:
-                self._native.reset()
+                self._native.fmu.reset()
                 return self._native
             except (FMICallException, CallError):
                 self._broken = True
@@ -197,14 +199,6 @@ class FmuPart:
 
     def _bank(self, names: Iterable[str]) -> Bank:
         return Bank([self._description.variables[name] for name in names], self._description.version)
-
-    def _parameter_bank(self, parameters: Mapping[str, float]) -> tuple[Bank, Vector]:
-        known = [port.name for port in self.parameters]
-        for name in parameters:
-            if name not in known:
-                listed = ", ".join(known) or "none"
-                raise SettingsError(f"`{name}` is not a parameter of {self.path}; it has {listed}.")
-        return self._bank(parameters), np.array([float(value) for value in parameters.values()])
 
     def _call(self, what: str, call: Callable[..., Any], *arguments: Any) -> Any:
         from fmpy.fmi1 import FMICallException
@@ -257,10 +251,6 @@ def _sample_time(description: Description, given: float | None) -> float:
     return float(step)
 
 
-# Relative tolerance of sample times: rounding of decimal numbers in files.
-_SAME_SAMPLE_TIME = 1e-6
-
-
 def drive_fmu(
     path: str | Path,
     inputs: Mapping[str, Vector],
@@ -270,18 +260,10 @@ def drive_fmu(
     start_time: float = 0.0,
     report: Callable[[float], None] | None = None,
 ) -> Matrix:
-    """Step an FMU through rows of inputs and return its outputs (rows, n_out); row k is at t_k.
+    """Step an FMU through rows of inputs, name -> (rows,), and return its outputs (rows, n_out); row k is at t_k.
 
     Row 0 of a plant has its outputs at the start, row k its outputs after the inputs up to row k - 1. Row k of an
-    observer or controller has its outputs for the inputs of row k.
-
-    Args:
-        path: the FMU.
-        inputs: input name -> (rows,); other inputs keep their start values.
-        parameters: values by name.
-        outputs: names; default: all, in the FMU's order.
-        start_time: [s].
-        report: called regularly with the done fraction.
+    observer or controller has its outputs for the inputs of row k. Inputs without a column keep their start value.
 
     Raises:
         DataError: inputs of different lengths or unknown names.
@@ -332,7 +314,7 @@ def simulate_fmu(
         FmuError: the FMU refused; the message says why.
     """
     part = FmuPart(path)
-    if not np.isclose(part.sample_time, recording.sample_time, rtol=_SAME_SAMPLE_TIME):
+    if not np.isclose(part.sample_time, recording.sample_time, rtol=1e-6):  # rounding of decimals
         raise DataError(
             f"{path}: runs at {part.sample_time:g} s and the recording is at {recording.sample_time:g} s; "
             "resample the recording."

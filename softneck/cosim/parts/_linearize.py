@@ -272,13 +272,8 @@ def realize(
 ) -> tuple[Matrix, Matrix, Matrix, Matrix, float]:
     """Return A, B, C, D of the lowest order with the pulse responses of `part`, and their relative error.
 
-    Args:
-        part: to step; the outputs of plants and references come one sample after the inputs.
-        first: number of its steps so far.
-        held: (inputs,) the constant inputs.
-        moved, sizes: positions of the inputs with pulses, and their typical sizes.
-        shown: positions of the outputs.
-        name: for messages.
+    `held` (inputs,) are the constant inputs after `first` steps, `moved` and `sizes` the positions and sizes of those
+    with pulses, `shown` the positions of the outputs.
 
     Raises:
         SettingsError: no inputs or outputs, or no input moves an output.

@@ -16,7 +16,7 @@ import numpy as np
 
 from softneck.core import Vector
 
-from ._variables import Description, types_of
+from ._variables import FMI_TYPES, Description
 
 if TYPE_CHECKING:
     from fmpy.model_description import ScalarVariable
@@ -102,20 +102,17 @@ class Native:
         found.argtypes, found.restype = types, ctypes.c_int
         return found
 
-    def enter(self, time: float) -> None:
-        """Set up the experiment at `time` [s] and enter initialisation."""
-        if self.version == 2:
-            self.fmu.enterInitializationMode()
-        else:
-            self.fmu.enterInitializationMode(startTime=time)
-
     def setup(self, time: float) -> None:
         """Set the start time of FMI 2.0; FMI 3.0 gets it on entering initialisation."""
         if self.version == 2:
             self.fmu.setupExperiment(None, time, None)
 
-    def exit(self) -> None:
-        """Leave initialisation."""
+    def initialise(self, time: float) -> None:
+        """Enter initialisation at `time` [s] and leave it."""
+        if self.version == 2:
+            self.fmu.enterInitializationMode()
+        else:
+            self.fmu.enterInitializationMode(startTime=time)
         self.fmu.exitInitializationMode()
 
     def step(self, time: float, size: float) -> None:
@@ -123,10 +120,6 @@ class Native:
         status = self._step(self.fmu.component, time, size, *self._step_rest)  # pyright: ignore[reportOptionalCall]
         if status > OK_OR_WARNING:
             raise CallError(f"fmi{self.version}DoStep", status)
-
-    def reset(self) -> None:
-        """Return to the state after instantiation."""
-        self.fmu.reset()
 
     def release(self, *, broken: bool, is_softneck: bool) -> None:
         """Terminate and free the instance as far as FMI allows."""
@@ -183,7 +176,7 @@ class Bank:
         """Prepare the buffers for `variables`, in the vector's order."""
         self.size, self.version = len(variables), version
         self._groups: list[_Group] = []
-        types = types_of(version)
+        types = FMI_TYPES[version]
         suffixes = [types[v.type][2] for v in variables]
         for suffix in dict.fromkeys(suffixes):
             places = [i for i, other in enumerate(suffixes) if other == suffix]

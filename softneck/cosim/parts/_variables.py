@@ -20,8 +20,8 @@ from softneck.runtime import Block, Port, bundle, compiled_name
 if TYPE_CHECKING:
     from fmpy.model_description import ModelDescription, ScalarVariable
 
-# FMI type -> (C type, numpy type, name in fmi2Get... or fmi3Get...); FMI 2.0 above, FMI 3.0 below.
-TYPES: dict[str, tuple[Any, Any, str]] = {
+# FMI type -> (C type, numpy type, name in fmi2Get... or fmi3Get...).
+_TYPES_2: dict[str, tuple[Any, Any, str]] = {
     "Real": (ctypes.c_double, np.float64, "Real"),
     "Integer": (ctypes.c_int, np.int32, "Integer"),
     "Enumeration": (ctypes.c_int, np.int32, "Integer"),
@@ -40,19 +40,15 @@ _TYPES_3: dict[str, tuple[Any, Any, str]] = {
 }
 
 
-def types_of(version: int) -> dict[str, tuple[Any, Any, str]]:
-    """Return FMI type -> (C type, numpy type, name in the C calls) of an FMI version."""
-    return TYPES if version == 2 else _TYPES_3
+# FMI version -> its types.
+FMI_TYPES = {2: _TYPES_2, 3: _TYPES_3}
 
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """The annotation of softneck in its FMUs; empty for others.
+    """The annotation of softneck in its FMUs, empty for others; `missing` are variables whose NaN is "not measured".
 
-    Attributes:
-        kind, role: of the block, "" for other FMUs.
-        missing: names of variables whose NaN means "not measured".
-        robot: name and hash of its robot, "" for necks and other FMUs.
+    `robot` has name and hash, "" for necks.
     """
 
     kind: str = ""
@@ -115,11 +111,7 @@ def read_description(
 ) -> Description:
     """Read the description of the FMU `path`, unpacked in `folder`.
 
-    Args:
-        path: for messages.
-        folder: where it is unpacked.
-        names: the FMU's variable name -> ours, for FMUs with other names.
-        units: our name -> unit, for FMUs that state none or a wrong one.
+    `names` (the FMU's variable name -> ours) and `units` (our name -> unit) are as in `FmuPart`.
 
     Raises:
         FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
@@ -139,7 +131,7 @@ def read_description(
     absent = sorted(set(names) - known)
     if absent:
         raise FileFormatError(f"{path}: has no variable {', '.join(absent)}; it has {', '.join(sorted(known))}.")
-    numbers = [v for v in model.modelVariables if v.type in types_of(version) and not v.dimensions]
+    numbers = [v for v in model.modelVariables if v.type in FMI_TYPES[version] and not v.dimensions]
     variables: dict[str, ScalarVariable] = {}
     for variable in numbers:
         name = names.get(variable.name, variable.name)

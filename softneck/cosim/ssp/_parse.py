@@ -1,4 +1,4 @@
-"""The XML of an SSP archive as plain values: systems, components, connectors, connections, bindings, units."""
+"""Read the XML of an SSP archive: systems, components, connectors, connections, bindings, units."""
 
 from __future__ import annotations
 
@@ -11,23 +11,33 @@ from urllib.parse import unquote
 
 from softneck.core import FileFormatError
 
-_SSP = "http://ssp-standard.org/SSP1/SystemStructure"
-SSD, SSC, SSV, SSM = (f"{{{_SSP}{name}}}" for name in ("Description", "Common", "ParameterValues", "ParameterMapping"))
-_FMU = "application/x-fmu-sharedlibrary"
-# What a loop can carry; FMI 3 has more names for numbers, and SSP 2.0 takes them over.
-_REAL = ("Real", "Float64", "Float32")
-_WHOLE = ("Integer", *(f"{u}Int{bits}" for u in ("", "U") for bits in (8, 16, 32, 64)))
-_NUMBERS = (*_REAL, *_WHOLE, "Boolean")
-_NAMES = ("Enumeration", "String", "Binary", "Clock")
-_KINDS = ("input", "output", "parameter", "calculatedParameter", "structuralParameter", "constant", "local", "inout")
-# Systems within systems; honest ones have some.
-_DEEPEST = 50
-_SOURCES = (None, "", "SSD", "component")
+_NAMESPACE = "http://ssp-standard.org/SSP1/SystemStructure"
+SSD, SSC, SSV, SSM = (
+    f"{{{_NAMESPACE}{name}}}" for name in ("Description", "Common", "ParameterValues", "ParameterMapping")
+)
+_FMU_TYPE = "application/x-fmu-sharedlibrary"
+# Types that a loop has; those of FMI 3 are also in SSP 2.0.
+_WHOLE_TYPES = ("Integer", *(f"{u}Int{bits}" for u in ("", "U") for bits in (8, 16, 32, 64)))
+_NUMBER_TYPES = ("Real", "Float64", "Float32", *_WHOLE_TYPES, "Boolean")
+OTHER_TYPES = ("Enumeration", "String", "Binary", "Clock")
+_CONNECTOR_KINDS = (
+    "input",
+    "output",
+    "parameter",
+    "calculatedParameter",
+    "structuralParameter",
+    "constant",
+    "local",
+    "inout",
+)
+# Nested systems: real archives have a few.
+_MAX_DEPTH = 50
+_SOURCE_BASES = (None, "", "SSD", "component")
 
 
 @dataclass(frozen=True, slots=True)
 class Connector:
-    """A connector: its kind, its unit ("" where none is said) and its type ("" likewise)."""
+    """A connector with kind, unit and type; "" if not given."""
 
     kind: str
     unit: str = ""
@@ -36,7 +46,7 @@ class Connector:
 
 @dataclass(frozen=True, slots=True)
 class Affine:
-    """factor * value + offset, after conversion of units unless that is suppressed."""
+    """factor * value + offset, after conversion of units unless it is suppressed."""
 
     factor: float = 1.0
     offset: float = 0.0
@@ -45,7 +55,7 @@ class Affine:
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """From (element, connector) to (element, connector); an element of "" is the system itself."""
+    """A connection from (element, connector) to (element, connector); the element "" is the system itself."""
 
     start: tuple[str, str]
     end: tuple[str, str]
@@ -54,7 +64,7 @@ class Connection:
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A value of a parameter set: the number or text, its unit, its type."""
+    """A value of a parameter set with its unit and type."""
 
     value: float | str
     unit: str
@@ -63,7 +73,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """A parameter set, with its mapping (target, source, affine) where it has one, and its own units."""
+    """A parameter set with its mapping (target, source, affine), if any, and its own units."""
 
     values: Mapping[str, Value]
     mapping: tuple[tuple[str, str, Affine], ...] | None
@@ -72,7 +82,7 @@ class Binding:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """SI value = factor * value + offset, of base units with these exponents."""
+    """A unit: SI value = factor * value + offset, with exponents of base units."""
 
     base: tuple[tuple[str, int], ...]
     factor: float = 1.0
@@ -81,7 +91,7 @@ class Unit:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """One FMU: its path in the archive, its connectors, its bindings."""
+    """An FMU with its path in the archive, its connectors and bindings."""
 
     source: str
     connectors: Mapping[str, Connector]
@@ -90,7 +100,7 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class SystemNode:
-    """A system: its own connectors and bindings, its elements, who feeds whom."""
+    """A system with its own connectors and bindings, its elements and connections."""
 
     connectors: Mapping[str, Connector] = field(default_factory=dict)
     bindings: tuple[Binding, ...] = ()
@@ -100,15 +110,7 @@ class SystemNode:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """What `SystemStructure.ssd` says.
-
-    Attributes:
-        name: of the system.
-        root: the outermost system.
-        units: by name.
-        stop: end of the default experiment [s], None where there is none.
-        step, order: of the master, where an annotation says them.
-    """
+    """The content of `SystemStructure.ssd`: `stop` [s] of the experiment, `step` [s] and `order` of the master."""
 
     name: str
     root: SystemNode
@@ -118,18 +120,17 @@ class Structure:
     order: str | None
 
 
-class Reader:
-    """Reads the structure of an archive that is unpacked in `folder`; `where` stands in messages."""
+class StructureReader:
+    """Reads the structure of an archive unpacked in `folder`; `where` is its path for messages."""
 
     def __init__(self, where: Path, folder: Path) -> None:
-        """Read nothing yet."""
         self.where, self.folder = where, folder
 
     def structure(self) -> Structure:
-        """Return what the archive's `SystemStructure.ssd` says.
+        """Return the structure in the archive's `SystemStructure.ssd`.
 
         Raises:
-            FileFormatError: no valid structure, or one with what a loop cannot carry; the line names it.
+            FileFormatError: no valid structure, or features that a loop does not have; the message names them.
         """
         root = self._xml("SystemStructure.ssd")
         if root.tag != f"{SSD}SystemStructureDescription" or root.get("version", "1.0") not in ("1.0", "2.0"):
@@ -140,7 +141,7 @@ class Reader:
         experiment = root.find(f"{SSD}DefaultExperiment")
         start, stop = (None if experiment is None else experiment.get(key) for key in ("startTime", "stopTime"))
         begin = 0.0 if start is None else self._number("startTime", start)
-        if begin != 0.0:  # FMUs may know the time of day: a run shifted to 0 would be another one
+        if begin != 0.0:  # FMUs may depend on time: a run shifted to 0 would be another one
             raise self._wrong("SystemStructure.ssd", f"begins at {begin:g} s; softneck's runs begin at 0 s")
         span = None if stop is None else self._number("stopTime", stop)
         if span is not None and span <= 0.0:
@@ -163,7 +164,7 @@ class Reader:
             raise FileFormatError(f"{self.where}: `{source}` is outside the archive; softneck reads members only.")
         try:
             found = (self.folder / path).is_file()
-        except (OSError, ValueError):  # a name that no file can have
+        except (OSError, ValueError):  # not a valid file name
             found = False
         if not found:
             raise FileFormatError(f"{self.where}: has no member `{source[:200]}`, which its structure names.")
@@ -171,9 +172,9 @@ class Reader:
 
     def _xml(self, name: str) -> ET.Element:
         data = self.file(name).read_bytes()
-        # Entities have no place in SSP; they could make a few bytes into gigabytes.
+        # SSP has no entities, which could expand a few bytes to gigabytes.
         if b"<!DOCTYPE" in data or "<!DOCTYPE".encode("utf-16-le") in data or "<!DOCTYPE".encode("utf-16-be") in data:
-            raise self._wrong(name, "has a DOCTYPE, which SSP does not know")
+            raise self._wrong(name, "has a DOCTYPE, which SSP does not have")
         try:
             return ET.fromstring(data)
         except (ET.ParseError, ValueError, LookupError) as error:
@@ -198,7 +199,7 @@ class Reader:
         return number
 
     def _master(self, root: ET.Element) -> tuple[float | None, str | None]:
-        """Return step [s] and order of our annotation; else the step of OMSimulator's, whose order is its own."""
+        """Return step [s] and order of softneck's annotation; else the step of OMSimulator's and None."""
         for note in root.iter(f"{SSC}Annotation"):
             master = note.find("Master") if note.get("type") == "softneck" else None
             if master is not None:
@@ -212,8 +213,8 @@ class Reader:
         return None, None
 
     def _system(self, node: ET.Element, depth: int = 0) -> SystemNode:
-        if depth > _DEEPEST:
-            raise self._wrong("SystemStructure.ssd", f"has systems within systems, more than {_DEEPEST} of them")
+        if depth > _MAX_DEPTH:
+            raise self._wrong("SystemStructure.ssd", f"has more than {_MAX_DEPTH} nested systems")
         if node.find(f"{SSD}SignalDictionaries") is not None:
             raise self._wrong("SystemStructure.ssd", "uses signal dictionaries, which softneck does not read")
         elements: dict[str, Component | SystemNode] = {}
@@ -238,11 +239,11 @@ class Reader:
         )
 
     def _component(self, name: str, node: ET.Element) -> Component:
-        kind, source = node.get("type", _FMU), node.get("source", "")
-        if kind != _FMU or not source or node.get("implementation", "CoSimulation") not in ("CoSimulation", "any"):
+        kind, source = node.get("type", _FMU_TYPE), node.get("source", "")
+        if kind != _FMU_TYPE or not source or node.get("implementation", "CoSimulation") not in ("CoSimulation", "any"):
             raise self._wrong(
                 "SystemStructure.ssd",
-                f"has the component `{name}` of type {kind} ({node.get('implementation', 'no implementation said')}); "
+                f"has the component `{name}` of type {kind} ({node.get('implementation', 'no implementation given')}); "
                 "softneck runs FMUs for co-simulation in the archive",
             )
         self.file(source)
@@ -252,7 +253,7 @@ class Reader:
         connectors = {}
         for item in node.iterfind(f"{SSD}Connectors/{SSD}Connector"):
             name, kind = item.get("name", ""), item.get("kind", "")
-            if kind not in _KINDS:
+            if kind not in _CONNECTOR_KINDS:
                 raise self._wrong("SystemStructure.ssd", f"has the connector `{name}` of unknown kind `{kind}`")
             typed = next((part for part in item if part.tag.startswith(SSC)), None)
             type_ = "" if typed is None else typed.tag.removeprefix(SSC)
@@ -267,7 +268,7 @@ class Reader:
         ):
             ends = f"{node.get('startElement', '')}.{node.get('startConnector', '')}"
             raise self._wrong(
-                "SystemStructure.ssd", f"maps single values on the way from `{ends}`; only lines are read"
+                "SystemStructure.ssd", f"maps single values from `{ends}`; softneck reads factor and offset"
             )
         start, end = (
             (node.get(f"{which}Element", ""), node.get(f"{which}Connector", "")) for which in ("start", "end")
@@ -310,10 +311,10 @@ class Reader:
 
     def _outside(self, node: ET.Element, component: str | None) -> ET.Element:
         base, source = node.get("sourceBase"), node.get("source", "")
-        if base not in _SOURCES or (base == "component" and component is None):
-            raise self._wrong("SystemStructure.ssd", f"has the source base `{base}`, which SSP does not know there")
+        if base not in _SOURCE_BASES or (base == "component" and component is None):
+            raise self._wrong("SystemStructure.ssd", f"has the source base `{base}`, which SSP does not have there")
         if base == "component":
-            raise self._wrong("SystemStructure.ssd", f"reads `{source}` out of an FMU, which softneck does not")
+            raise self._wrong("SystemStructure.ssd", f"reads `{source}` from an FMU, which softneck does not")
         return self._xml(source)
 
     def _value(self, node: ET.Element) -> Value:
@@ -322,9 +323,9 @@ class Reader:
         if typed is None:
             raise self._wrong("parameter set", f"has no value for `{name}`")
         kind, text = typed.tag.removeprefix(SSV), typed.get("value", "")
-        if kind in _NAMES:
+        if kind in OTHER_TYPES:
             return Value(text, "", kind)
-        if kind not in _NUMBERS:
+        if kind not in _NUMBER_TYPES:
             raise self._wrong("parameter set", f"has `{name}` of unknown type {kind}")
         if kind == "Boolean":
             if text.strip() not in ("true", "false", "1", "0"):

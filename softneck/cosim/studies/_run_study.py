@@ -46,30 +46,24 @@ _CONNECT_S = 10
 
 @dataclass(slots=True, eq=False)
 class Crew:
-    """Workers.
-
-    Attributes:
-        size: how many there are.
-        pool: gives them work, as futures.
-        start: makes a pool of so many new ones; None where a dead one is replaced by others.
-    """
+    """The workers of a study or a search: their number, their pool, and how to start a new pool of a given size."""
 
     size: int
     pool: Executor
     start: Callable[[int], Executor] | None = None
 
     def renew(self, *, alone: bool) -> None:
-        """Take new workers after one broke and took its pool along; a single one if `alone`."""
+        """Start new workers after one broke the pool; a single one if `alone`."""
         if self.start is not None:
-            _end(self.pool, kill=True)
+            _shut_down(self.pool, kill=True)
             self.pool = self.start(1 if alone else self.size)
 
 
-class Here(Executor):
-    """This process: no second one, nothing to send; a part that crashes takes all along."""
+class SameProcess(Executor):
+    """Executor in this process, without sending of objects; a crash ends the process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future:
-        """Do the work now."""
+        """Run the function now."""
         future: Future = Future()
         future.set_result(fn(*args, **kwargs))
         return future
@@ -77,7 +71,7 @@ class Here(Executor):
 
 @contextlib.contextmanager
 def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
-    """Yield the workers: a cluster's, so many local processes (as many as cores by default), or this process for 0.
+    """Yield the workers: a cluster, a number of local processes (default: one for each core), or this process for 0.
 
     Raises:
         SettingsError: an impossible number of workers, both at once, or a scheduler that cannot be reached.
@@ -93,11 +87,12 @@ def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
             finally:
                 pool.shutdown(wait=False)
         return
-    number = _cores() if workers is None else workers
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    number = cores if workers is None else workers
     if isinstance(number, bool) or not isinstance(number, int) or number < 0:
         raise SettingsError(f"`workers` must be a whole number of at least 1 (0: this process); got {number!r}.")
     if number == 0:
-        yield Crew(1, Here())
+        yield Crew(1, SameProcess())
         return
     with tempfile.TemporaryDirectory(prefix="softneck-study-", ignore_cleanup_errors=True) as folder:
         start = partial(_processes, folder)
@@ -105,9 +100,9 @@ def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
         try:
             yield found
         except BaseException:
-            _end(found.pool, kill=True)
+            _shut_down(found.pool, kill=True)
             raise
-        _end(found.pool, kill=False)
+        _shut_down(found.pool, kill=False)
 
 
 def _client(address: str) -> Any:
@@ -124,25 +119,25 @@ def _client(address: str) -> Any:
 
 
 def _processes(folder: str, size: int) -> Executor:
-    """Return a pool of loky: started anew (no forked threads), without a second import of the user's script."""
+    """Return a pool of loky, whose processes neither fork threads nor import the user's script again."""
     from loky import ProcessPoolExecutor
 
     return ProcessPoolExecutor(size, timeout=None, initializer=_begin_worker, initargs=(folder,), env=_ENVIRONMENT)
 
 
-def _end(pool: Any, *, kill: bool) -> None:
+def _shut_down(pool: Any, *, kill: bool) -> None:
     pool.shutdown(wait=True, kill_workers=kill)
 
 
 def check_sendable(what: Any) -> None:
-    """Raise SettingsError if `what` cannot go to another process."""
+    """Raise SettingsError if `what` cannot be sent to another process."""
     import cloudpickle
 
     try:
         cloudpickle.dumps(what)
     except SoftneckError:
         raise
-    except Exception as error:  # whatever a user's object raises when it is taken apart
+    except Exception as error:  # of the user's objects
         raise SettingsError(
             f"the loop holds a part that cannot be sent to another process ({error}); use workers = 0, "
             'or python = "package.module:factory".'
@@ -150,13 +145,9 @@ def check_sendable(what: Any) -> None:
 
 
 def _begin_worker(folder: str) -> None:
-    # Ctrl-C is the parent's to handle; what FMUs unpack goes where the parent removes it.
+    # The parent handles Ctrl-C, and removes the folder with the unpacked FMUs.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     tempfile.tempdir = folder
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 Row = dict[str, Any]
@@ -164,15 +155,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chunk:
-    """Some runs of a study: all that a worker needs to know.
-
-    Attributes:
-        digest: of the study; runs of one study share opened files.
-        loop: its table.
-        folder: where relative paths start.
-        points: what to run.
-        metrics: the names of all that a run is judged by.
-    """
+    """Some runs of a study with the data that a worker needs; runs with one `digest` share opened files."""
 
     digest: str
     loop: Mapping[str, Any]
@@ -182,29 +165,28 @@ class Chunk:
 
 
 def run_chunk(chunk: Chunk) -> list[Row]:
-    """Return a row for each run, failed ones with their error."""
-    return [run_point(chunk, point) for point in chunk.points]
+    """Return a row for each run: number, sample, seed, labels, metrics, whether limits hold, error, seconds."""
+    return [_run_point(chunk, point) for point in chunk.points]
 
 
-def run_point(chunk: Chunk, point: Point) -> Row:
-    """Return the row of one run: number, sample, seed, labels, metrics, whether limits hold, error, seconds."""
+def _run_point(chunk: Chunk, point: Point) -> Row:
     begin = time.perf_counter()
     row: Row = {"run": point.run, "sample": point.sample, "seed": point.seed, **point.labels}
     row |= dict.fromkeys(chunk.metrics)
     row |= {"holds": None, "error": ""}
     try:
-        row |= _judged(chunk, point)
+        row |= _run_loop(chunk, point)
     except SoftneckError as error:
         row["error"] = " ".join(str(error).split())
-    except Exception as error:  # whatever a part of the user's raises costs its run, not the study
+    except Exception as error:  # an error in a user's part ends its run, not the study
         row["error"] = " ".join(f"{type(error).__name__}: {error}".split())
     row["seconds"] = time.perf_counter() - begin
     return row
 
 
 def release(digest: str) -> None:
-    """Close what this thread has opened for a study; worker processes end with all that they hold."""
-    opened = _opened(digest, threading.get_ident())
+    """Close the parts that this thread has opened for a study."""
+    opened = _opened_parts(digest, threading.get_ident())
     for part in opened.values():
         if hasattr(part, "advance"):
             part.close()
@@ -212,18 +194,18 @@ def release(digest: str) -> None:
 
 
 def failed_row(point: Point, error: str, metrics: Sequence[str]) -> Row:
-    """Return the row of a run that no process could finish."""
+    """Return the row of a run that could not be finished."""
     row: Row = {"run": point.run, "sample": point.sample, "seed": point.seed, **point.labels}
     return row | dict.fromkeys(metrics) | {"holds": False, "error": error, "seconds": None}
 
 
-def _judged(chunk: Chunk, point: Point) -> Row:
-    opened = _opened(chunk.digest, threading.get_ident())
+def _run_loop(chunk: Chunk, point: Point) -> Row:
+    opened = _opened_parts(chunk.digest, threading.get_ident())
     setup = make_loop(with_values(chunk.loop, point.values), chunk.folder, opened=opened)
     try:
         result = run_setup(setup, compiled=True, keep=True)
     finally:
-        # FMUs stay loaded for the next run; what this run alone holds is released.
+        # FMUs stay loaded for the next run; parts of this run alone are closed.
         kept = [id(part) for part in opened.values()]
         for part in setup.loop.parts.values():
             if id(part) not in kept:
@@ -234,17 +216,17 @@ def _judged(chunk: Chunk, point: Point) -> Row:
 
 
 @lru_cache(maxsize=64)
-def _opened(digest: str, thread: int) -> dict[Any, Any]:
-    """Return what this thread has opened for a study: a Dask worker may have several, and an FMU serves one."""
+def _opened_parts(digest: str, thread: int) -> dict[Any, Any]:
+    """Return this thread's cache of opened parts of a study: an FMU cannot serve two threads of a Dask worker."""
     del digest, thread
     return {}
 
 
-# So much work at a time [s]: a kill loses no more than this, and giving out costs little of it.
+# Work of a chunk [s]: lost if the worker is killed, and long beside the cost of sending it.
 _CHUNK_S = 0.5
-_LARGEST_CHUNK = 200
-# A run whose worker dies is tried alone; after so many dead workers it is the run's fault.
-_TRIALS = 2
+_MAX_CHUNK_RUNS = 200
+# A run whose worker dies is repeated alone; after this many dead workers it is recorded as failed.
+_MAX_TRIALS = 2
 
 
 def study(
@@ -260,25 +242,25 @@ def study(
     force: bool = False,
     report: Progress | None = None,
 ) -> pd.DataFrame:
-    """Run a loop many times and return a row for each run: what varied, metrics, whether limits hold, error.
+    """Run a loop many times and return a row for each run: varied values, metrics, whether limits hold, error.
 
-    The numbers depend on the study and its seed alone, not on workers or the order in which runs end.
+    The results depend only on the study and its seed, not on workers or the order in which runs end.
 
     Args:
-        loop: a loop file, its table, a loop; or a study file or a `Study`, to which no other setting is added.
+        loop: a loop file, its table, a loop; or a study file or a `Study` without further settings.
         vary: dotted key -> {"grid": [...]}, {"choices": [...]}, {"uniform": [low, high]}, {"log_uniform": ...},
             {"normal": [mean, standard deviation]} or {"seed": True}; as [vary] in a study file.
-        runs: how many; each random sample meets every point of the grids before the next one.
-        seed: of all that is drawn.
-        objectives: metrics to be small.
-        workers: local processes, as many as cores if not given; 0 for this process.
+        runs: number of runs; each random sample is run at all points of the grids.
+        seed: of all random values.
+        objectives: metrics to minimise.
+        workers: number of local processes; default: one for each core; 0 for this process.
         dask: address of a Dask scheduler instead.
-        output: folder that keeps the runs as they end, in `runs.csv`; nothing is kept without one.
-        force: replace the study that `output` holds; else the same one goes on, and another is an error.
-        report: called with the part done and a word; a bar in a terminal if not given.
+        output: folder for the results, `runs.csv`; default: nothing is kept.
+        force: replace the study in `output`; else the same one is continued, and another is an error.
+        report: called with the done fraction and a word; default: a progress bar in a terminal.
 
     Raises:
-        SettingsError: a key that the loop does not have, an empty range, no runs, another study's folder.
+        SettingsError: a key that the loop does not have, an empty range, no runs, a folder with another study.
 
     Example:
         >>> import softneck
@@ -294,7 +276,7 @@ def study(
         >>> runs["reference.pitch_deg"].tolist()
         [5.0, 10.0]
     """
-    # A file without `vary` is a study file: a loop file alone has nothing to vary.
+    # A file without `vary` is a study file.
     given = load_study(Path(loop)) if isinstance(loop, str | Path) and vary is None else loop
     made = given if isinstance(given, Study) else make_study(
         given, vary=vary or {}, runs=runs, seed=seed, objectives=objectives
@@ -324,100 +306,99 @@ def run_study(
     with crew(workers, study.dask if dask is None and workers is None else dask) as members:
         store = Store(study, folder, force=force)
         try:
-            _Work(study, store, members, report).run()
+            _StudyRun(study, store, members, report).run()
         finally:
             release(study.digest)
     return store.finish()
 
 
-class _Work:
-    """The runs that are left, those that are out, and those whose worker died."""
+class _StudyRun:
+    """The runs of a study that are left, that are running, and those whose worker died."""
 
     def __init__(self, study: Study, store: Store, members: Crew, report: Progress) -> None:
         self._study, self._store, self._crew, self._report = study, store, members, report
         self._left = deque(run for run in range(len(study.points)) if run not in store.done)
         self._suspects: deque[int] = deque()
         self._deaths: dict[int, int] = {}
-        self._out: dict[Future, list[int]] = {}
+        self._running: dict[Future, list[int]] = {}
         self._seconds, self._ended, self._failed = 0.0, 0, 0
         self._digest, self._alone = study.digest, False
 
     def run(self) -> None:
-        """Give out and take in until all runs are written down."""
-        while self._left or self._suspects or self._out:
-            self._give()
-            done, _ = wait(self._out, return_when=FIRST_COMPLETED)
+        """Submit runs and collect rows until all are written."""
+        while self._left or self._suspects or self._running:
+            self._submit_next()
+            done, _ = wait(self._running, return_when=FIRST_COMPLETED)
             for future in done:
-                if future in self._out:
-                    self._take(future)
+                if future in self._running:
+                    self._collect(future)
 
-    def _give(self) -> None:
+    def _submit_next(self) -> None:
         if self._suspects:
-            # Alone, so that a death says whose fault it is.
-            if not self._out:
+            # Alone, so that another death shows which run is at fault.
+            if not self._running:
                 self._submit([self._suspects.popleft()])
             return
-        if self._alone and not self._out and self._left:
+        if self._alone and not self._running and self._left:
             self._alone = False
             self._crew.renew(alone=False)
         # Two chunks for each worker: one runs while the other waits.
-        while self._left and not self._alone and len(self._out) < 2 * self._crew.size:
+        while self._left and not self._alone and len(self._running) < 2 * self._crew.size:
             self._submit([self._left.popleft() for _ in range(self._chunk())])
 
     def _chunk(self) -> int:
-        """Return how many runs to give out at once: few at first, while their time is unknown, and at the end."""
+        """Return the number of runs to submit at once: few while their duration is unknown, and at the end."""
         known = self._ended and self._seconds / self._ended
         wanted = int(_CHUNK_S / max(known, 1e-6)) if known else 1
         fair = -(-len(self._left) // (4 * self._crew.size))
-        return max(1, min(wanted, fair, _LARGEST_CHUNK, len(self._left)))
+        return max(1, min(wanted, fair, _MAX_CHUNK_RUNS, len(self._left)))
 
     def _submit(self, runs: list[int]) -> None:
         points = [self._study.points[run] for run in runs]
         chunk = Chunk(self._digest, self._study.loop, self._study.folder, points, self._study.metrics)
         try:
-            self._out[self._crew.pool.submit(run_chunk, chunk)] = runs
+            self._running[self._crew.pool.submit(run_chunk, chunk)] = runs
         except BrokenExecutor:
-            # The pool broke since the last look; its other work comes back as suspect.
+            # The pool broke in the meantime; its other runs become suspects.
             self._suspects.extend(runs)
-            self._broken()
+            self._restart()
 
-    def _take(self, future: Future) -> None:
-        runs = self._out.pop(future)
+    def _collect(self, future: Future) -> None:
+        runs = self._running.pop(future)
         try:
             self._write(future.result())
         except BrokenExecutor:
-            self._died(runs)
-            self._broken()
+            self._retry_alone(runs)
+            self._restart()
         except CancelledError as error:
             raise OutputFileError(
-                "the Dask scheduler went away; what is done is kept; the same command goes on."
+                "the Dask scheduler is gone; finished runs are kept; run the same command again to continue."
             ) from error
         except OutputFileError:
             raise
-        except Exception as error:  # a worker died under Dask, or what it ran could not come back
+        except Exception as error:  # a worker of Dask died, or its result could not be sent
             if len(runs) > 1:
                 self._suspects.extend(runs)
             else:
-                self._write([self._failed_row(runs[0], f"its worker failed: {type(error).__name__}: {error}")])
+                self._write_failure(runs[0], f"its worker failed: {type(error).__name__}: {error}")
 
-    def _failed_row(self, run: int, message: str) -> Row:
-        return failed_row(self._study.points[run], message, self._study.metrics)
+    def _write_failure(self, run: int, message: str) -> None:
+        self._write([failed_row(self._study.points[run], message, self._study.metrics)])
 
-    def _died(self, runs: list[int]) -> None:
-        """Try the runs of a worker that died again, each alone; give up on one that was alone already."""
+    def _retry_alone(self, runs: list[int]) -> None:
+        """Repeat the runs of a dead worker, each alone; record one as failed that was alone already."""
         for run in runs:
-            alone = len(runs) == 1 and not self._out
+            alone = len(runs) == 1 and not self._running
             self._deaths[run] = self._deaths.get(run, 0) + int(alone)
-            if self._deaths[run] >= _TRIALS:
-                message = f"its worker process died {_TRIALS} times with it alone"
-                self._write([self._failed_row(run, message)])
+            if self._deaths[run] >= _MAX_TRIALS:
+                self._write_failure(run, f"its worker process died {_MAX_TRIALS} times with it alone")
             else:
                 self._suspects.append(run)
 
-    def _broken(self) -> None:
-        """Take back all that was out and start new workers; what had ended is kept."""
-        for future, runs in list(self._out.items()):
-            del self._out[future]
+    def _restart(self) -> None:
+        """Take back all running chunks, keep the finished ones, and start new workers."""
+        for future, runs in list(self._running.items()):
+            del self._running[future]
             try:
                 self._write(future.result(timeout=60.0))
             except Exception:  # went down with the pool
@@ -431,5 +412,5 @@ class _Work:
         self._seconds += sum(row["seconds"] or 0.0 for row in rows)
         self._failed += sum(bool(row["error"]) for row in rows)
         total, done = len(self._study.points), len(self._store.done)
-        said = f"{done} of {total}" + (f", {self._failed} failed" if self._failed else "")
-        self._report(done / total, said)
+        text = f"{done} of {total}" + (f", {self._failed} failed" if self._failed else "")
+        self._report(done / total, text)

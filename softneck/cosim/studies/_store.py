@@ -1,4 +1,4 @@
-"""The runs of a study on disk: small files as runs end, one table when all have; and what they say."""
+"""The runs of a study on disk, as small files and finally one table, and their evaluation."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from softneck.core import (
     SettingsError,
     Vector,
     atomic_write,
+    error_reason,
     require_table,
     settings_text,
 )
@@ -34,40 +35,33 @@ from ._study import Study, Vary
 if TYPE_CHECKING:
     import pandas as pd
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
-RUNS, DESCRIPTION, _PARTS = "runs.csv", "study.json", "runs.parts"
-# Small files are joined whenever there are so many of them: a folder stays readable, a merge stays rare.
+RUNS_FILE, STUDY_FILE, _PARTS_FOLDER = "runs.csv", "study.json", "runs.parts"
+# Number of small files at which they are merged.
 _MERGE_AT = 100
-# [characters] What a run's error may fill of its line.
-_LONGEST = 2000
+# Longest text of a run's error [characters].
+_MAX_ERROR_LENGTH = 2000
 
 
 class Store:
-    """The folder of a study: `study.json` says what it is, tables (`.csv`) hold the runs that ended.
+    """The folder of a study: `study.json` describes it, and tables (`.csv`) hold the finished runs.
 
-    A run counts from the moment its file has its final name; a file that was being written does not count.
-
-    Attributes:
-        folder: of the study.
-        done: numbers of the runs that ended.
+    A run is finished when its file has its final name; `done` are the numbers of finished runs.
     """
 
     def __init__(self, study: Study, folder: Path, *, force: bool = False) -> None:
-        """Begin the study in `folder`, or go on with what is there of the same one; anew with `force`.
+        """Start the study in `folder`, or continue the same one there; with `force` replace any study.
 
         Raises:
             SettingsError: the folder holds another study and `force` is not given.
         """
-        self.folder, self._study, self._parts = folder, study, folder / _PARTS
-        if (folder / DESCRIPTION).is_file() and not force:
+        self.folder, self._study, self._parts = folder, study, folder / _PARTS_FOLDER
+        if (folder / STUDY_FILE).is_file() and not force:
             self._check_same(study)
         else:
-            self._clear()
+            shutil.rmtree(self._parts, ignore_errors=True)
+            (folder / RUNS_FILE).unlink(missing_ok=True)
             text = json.dumps(_description(study), indent=2) + "\n"
-            with atomic_write(folder / DESCRIPTION, force=True) as temporary:
+            with atomic_write(folder / STUDY_FILE, force=True) as temporary:
                 temporary.write_text(text, encoding="utf-8")
         try:
             self._parts.mkdir(parents=True, exist_ok=True)
@@ -77,7 +71,7 @@ class Store:
         self._files = len(list(self._parts.glob("*.csv")))
 
     def add(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write rows of runs that ended; they are there to stay when this returns."""
+        """Write rows of finished runs; they are on the disk when this returns."""
         table = self._frame([{name: _cell(value) for name, value in row.items()} for row in rows])
         self._write(table, self._parts / f"{rows[0]['run']:08d}-{uuid.uuid4().hex[:8]}.csv")
         self.done.update(row["run"] for row in rows)
@@ -87,13 +81,13 @@ class Store:
             self._files = 1
 
     def frame(self) -> pd.DataFrame:
-        """Return all runs that ended, in the order of their numbers."""
+        """Return all finished runs in the order of their numbers."""
         files = _files(self.folder)
         return read_tables(files, self._study.vary) if files else self._frame([])
 
     def finish(self) -> pd.DataFrame:
-        """Write all runs into one file, remove the small ones, return the table."""
-        self._merge(self.folder / RUNS)
+        """Write all runs into one file, remove the small ones, and return the table."""
+        self._merge(self.folder / RUNS_FILE)
         shutil.rmtree(self._parts, ignore_errors=True)
         return self.frame()
 
@@ -107,7 +101,7 @@ class Store:
         files = list(self._parts.glob("*.csv"))
         whole = target.parent == self.folder
         self._write(self.frame() if whole else read_tables(files, self._study.vary), target)
-        # Killed here, the runs are there twice; `read_tables` takes each once.
+        # If the process is killed here, runs are there twice; `read_tables` reads each once.
         for file in files:
             file.unlink(missing_ok=True)
 
@@ -116,25 +110,21 @@ class Store:
         with atomic_write(path, force=True) as temporary:
             table.to_csv(temporary, index=False, encoding="utf-8", lineterminator="\n")
 
-    def _clear(self) -> None:
-        shutil.rmtree(self._parts, ignore_errors=True)
-        (self.folder / RUNS).unlink(missing_ok=True)
-
     def _check_same(self, study: Study) -> None:
-        there = read_description(self.folder)
+        there = read_study_description(self.folder)
         if there.get("digest") == study.digest:
             return
         now = study.description()
         differs = [key for key in now if json.loads(json.dumps(now[key])) != there.get("study", {}).get(key)]
         raise SettingsError(
             f"{self.folder}: holds another study (other {', '.join(differs) or 'content'}); "
-            "give the study that began it, another folder, or --force to replace it. Nothing was changed."
+            "use the study of this folder, another folder, or --force to replace it. Nothing was changed."
         )
 
 
-def read_description(folder: Path) -> dict[str, Any]:
-    """Return what `study.json` says; raise FileFormatError if it describes no study."""
-    path = folder / DESCRIPTION
+def read_study_description(folder: Path) -> dict[str, Any]:
+    """Return the content of `study.json`; raise FileFormatError if it describes no study."""
+    path = folder / STUDY_FILE
     try:
         content = json.loads(settings_text(path, MOST_JSON))
     except (OSError, ValueError, RecursionError) as error:
@@ -145,14 +135,14 @@ def read_description(folder: Path) -> dict[str, Any]:
 
 
 def read_runs(folder: str | Path) -> pd.DataFrame:
-    """Return the runs of a study's folder that ended so far, finished or not.
+    """Return the finished runs in a study's folder, also of a study that is not finished.
 
     Raises:
-        FileFormatError: the folder holds no study.
+        FileFormatError: the folder has no study.
     """
     import pandas as pd
 
-    said = read_description(Path(folder))["study"]
+    said = read_study_description(Path(folder))["study"]
     varied = said.get("vary") if isinstance(said, dict) else None
     kinds = {}
     for key, item in varied.items() if isinstance(varied, dict) else ():
@@ -163,7 +153,7 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
 
 
 def read_tables(files: Sequence[Path], vary: Mapping[str, Vary]) -> pd.DataFrame:
-    """Return the rows of all files, each run once, in the order of their numbers."""
+    """Return the rows of all files in the order of their numbers, each run once."""
     import pandas as pd
 
     parts = [_read(path, vary) for path in files]
@@ -185,25 +175,24 @@ def _read(path: Path, vary: Mapping[str, Vary]) -> pd.DataFrame:
                 raise ValueError(f"no column `{name}`")
         types: Any = column_types(names, vary)
         with warnings.catch_warnings():
-            # pandas only warns of rows that are longer than the header.
+            # pandas only warns about rows that are longer than the header.
             warnings.simplefilter("error", pd.errors.ParserWarning)
             return pd.read_csv(
                 path, dtype=types, index_col=False, keep_default_na=False,
                 na_values={name: [""] for name, kind in types.items() if kind in ("float64", "boolean")},
             )  # fmt: skip
     except (ValueError, OSError, ArithmeticError, MemoryError, pd.errors.ParserWarning) as error:
-        said = (str(error).splitlines() or [type(error).__name__])[0][:120]
-        raise FileFormatError(f"{path}: holds runs that cannot be read ({said}).") from error
+        raise FileFormatError(f"{path}: holds runs that cannot be read ({error_reason(error)}).") from error
 
 
 def column_types(names: Iterable[str], vary: Mapping[str, Vary]) -> dict[str, Any]:
-    """Return the type of each column of a study's runs: of what is neither named here nor varies, numbers."""
+    """Return the type of each column of a study's runs; metrics are floats."""
     known = {"run": "int64", "sample": "int64", "seed": "int64", "holds": "boolean", "error": "str"}
-    known |= {key: _type_of(item) for key, item in vary.items()}
+    known |= {key: _column_type(item) for key, item in vary.items()}
     return {name: known.get(name, "float64") for name in names}
 
 
-def _type_of(vary: Vary) -> str:
+def _column_type(vary: Vary) -> str:
     if vary.kind == "seed":
         return "int64"
     labels = vary.labels
@@ -213,17 +202,17 @@ def _type_of(vary: Vary) -> str:
 
 
 def _files(folder: Path) -> list[Path]:
-    whole = folder / RUNS
-    # Temporary names begin with a dot; they are files that nobody finished.
-    small = [path for path in (folder / _PARTS).glob("*.csv") if not path.name.startswith(".")]
+    whole = folder / RUNS_FILE
+    # Temporary names begin with a dot; these files were not finished.
+    small = [path for path in (folder / _PARTS_FOLDER).glob("*.csv") if not path.name.startswith(".")]
     return ([whole] if whole.is_file() else []) + sorted(small)
 
 
 def _cell(value: Any) -> Any:
-    """Return a text as one line that a reader of tables takes."""
+    """Return a text as one line without characters that readers of tables refuse."""
     if not isinstance(value, str):
         return value
-    line = " ".join(value.split()).replace("\0", "?")[:_LONGEST]
+    line = " ".join(value.split()).replace("\0", "?")[:_MAX_ERROR_LENGTH]
     return line.encode("utf-8", "backslashreplace").decode()
 
 
@@ -234,11 +223,8 @@ def _description(study: Study) -> dict[str, Any]:
     }  # fmt: skip
 
 
-WORST = "worst"
-
-
 def rank(runs: pd.DataFrame, objectives: Sequence[str]) -> pd.DataFrame:
-    """Return the runs, best first: those that keep limits by the objectives in turn, then others, then failed."""
+    """Return the runs, best first: those that keep limits by their objectives, then others, then failed ones."""
     import pandas as pd
 
     _check(runs, objectives)
@@ -250,9 +236,9 @@ def rank(runs: pd.DataFrame, objectives: Sequence[str]) -> pd.DataFrame:
 
 
 def pareto_front(runs: pd.DataFrame, objectives: Sequence[str]) -> pd.DataFrame:
-    """Return the runs that no other run beats in one objective without losing in another, by the first objective.
+    """Return the runs that no other run dominates, sorted by the first objective.
 
-    Failed runs and those that never reach an objective are left out.
+    Failed runs and those without a finite objective are left out.
     """
     _check(runs, objectives)
     finite = np.isfinite(runs[list(objectives)].to_numpy(float)).all(axis=1)
@@ -262,7 +248,7 @@ def pareto_front(runs: pd.DataFrame, objectives: Sequence[str]) -> pd.DataFrame:
 
 
 def pareto_rows(values: Matrix) -> np.ndarray:
-    """Return which rows of (n, m) no other row dominates; in lexical order only rows of the front can dominate."""
+    """Return whether each row of (n, m) is dominated by no other; in lexical order only the front can dominate."""
     keep = np.zeros(len(values), dtype=bool)
     front = np.empty((0, values.shape[1]))
     for i in np.lexsort(values.T[::-1]):
@@ -273,8 +259,8 @@ def pareto_rows(values: Matrix) -> np.ndarray:
     return keep
 
 
-def grouped(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) -> pd.DataFrame:
-    """Return for each combination of values of `by`: runs, failed ones, share that holds, spread of the metrics."""
+def group_runs(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) -> pd.DataFrame:
+    """Return for each combination of values of `by`: runs, failed runs, share that holds, spread of the metrics."""
     import pandas as pd
 
     rows = []
@@ -292,34 +278,34 @@ def grouped(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) -> pd
 
 
 def _spread(y: Vector) -> dict[str, float]:
-    """Return median, 95 % quantile and worst; runs that never reach the metric count as infinitely bad."""
+    """Return median, 95 % quantile and worst value; a metric that is not reached counts as infinity."""
     y = np.where(np.isfinite(y), y, np.inf)
     if not y.size:
         return dict.fromkeys(("median", "95 %", "worst"), math.nan)
-    # Of an observed value, not between two: infinity has no neighbours to mix with.
+    # An observed value: interpolation with infinity has no meaning.
     quantiles = np.quantile(y, [0.5, 0.95], method="inverted_cdf")
     return {"median": float(quantiles[0]), "95 %": float(quantiles[1]), "worst": float(y.max())}
 
 
 def worst_runs(runs: pd.DataFrame, objectives: Sequence[str], count: int = 3) -> pd.DataFrame:
-    """Return the last `count` of the ranking, worst first: failed runs, then runs that break limits."""
+    """Return the last `count` runs of the ranking, worst first: failed runs, then runs that break limits."""
     return rank(runs, objectives).iloc[::-1].head(count)
 
 
 def write_worst(study: Study, runs: pd.DataFrame, folder: str | Path, *, count: int = 3) -> list[Path]:
     """Write the worst runs as loop files `run_NUMBER.toml`, which `softneck simulate` runs; return their paths.
 
-    Their relative paths start where those of the study's loop do, by the key `folder`.
+    Their key `folder` makes relative paths start where those of the study's loop do.
 
     Raises:
-        SettingsError: the loop holds parts that are not files; `Study.setup(run)` gives such a loop.
+        SettingsError: the loop holds parts that are not files; `Study.setup(run)` returns its loops.
     """
     target = Path(folder)
     paths = []
     for number, error in worst_runs(runs, study.objectives, count)[["run", "error"]].itertuples(index=False):
         table = study.table(int(number))
         if has_objects(table):
-            raise SettingsError("the loop holds parts that are not files; take its worst runs by `Study.setup(run)`.")
+            raise SettingsError("the loop holds parts that are not files; use `Study.setup(run)` for its worst runs.")
         start = os.path.relpath(study.folder / str(table.pop("folder", "")), target.resolve())
         remark = f"# Run {number} of study {study.name}" + (f"; it failed: {error}" if error else ".")
         text = f"{remark}\n" + tomli_w.dumps({"folder": Path(start).as_posix(), **table})
@@ -331,7 +317,7 @@ def write_worst(study: Study, runs: pd.DataFrame, folder: str | Path, *, count: 
 
 
 def has_objects(table: Any) -> bool:
-    """Return whether parts stand in a loop's table themselves."""
+    """Return whether a loop's table holds parts as objects."""
     if isinstance(table, Mapping):
         return OBJECT in table or any(has_objects(value) for value in table.values())
     return isinstance(table, list) and any(has_objects(item) for item in table)

@@ -1,4 +1,4 @@
-"""A study: one loop, the ranges of what varies in it, the points drawn from them, and its objectives."""
+"""A study: one loop, the ranges of its varied keys, the points drawn from them, and its objectives."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ import numpy as np
 
 from softneck.core import FileFormatError, Matrix, ReprMixin, SettingsError, SoftneckError, file_hash
 from softneck.design import own_attributes, own_controller
-from softneck.loop import Loop, LoopRun, error_unit, metric_names, reference_key
+from softneck.loop import Loop, LoopRun, error_unit, metric_names, reference_field
 from softneck.robot import Robot, find_robot
 from softneck.runtime import Block
 
 from ..loops._loop_file import LoopSetup, load_loop, make_loop, normal_table
-from ..loops._loop_parts import OBJECT, SOURCES, PartOpener, read_toml
+from ..loops._loop_parts import OBJECT, SOURCES, PartOpener, read_toml, refuse_unknown
 from ..loops._loop_table import check_key, loop_table, set_sources, settable, with_values
 
-KINDS = ("grid", "uniform", "log_uniform", "normal", "choices", "seed")
-# A run's seed fits what FMUs take as `noise_seed`.
+VARY_KINDS = ("grid", "uniform", "log_uniform", "normal", "choices", "seed")
+# Seeds of runs must fit the FMUs' parameter `noise_seed`.
 _SEED_RANGE = 2**31 - 2
-# Of a tenth of a second each on two cores: half a day and more.
-_MOST_RUNS = 1_000_000
+# At 0.1 s a run on two cores this takes half a day.
+_MAX_RUNS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,10 +37,10 @@ class Vary:
     """How one key varies.
 
     Attributes:
-        kind: "grid" (each value, all combinations with the other grids), "uniform" and "log_uniform" (between two
-            bounds), "normal" (mean and standard deviation), "choices" (one of some values), "seed" (the run's own).
-        values: the values of a grid or of choices; the two numbers of the others.
-        labels: what tables call the values of a grid or of choices.
+        kind: "grid" (all values, in all combinations with other grids), "uniform" and "log_uniform" (between two
+            bounds), "normal" (mean and standard deviation), "choices" (one of some values), "seed" (of the run).
+        values: the values of a grid or of choices; two numbers for the other kinds.
+        labels: of the values of a grid or of choices in tables.
     """
 
     kind: str
@@ -49,7 +49,7 @@ class Vary:
 
     @property
     def is_grid(self) -> bool:
-        """Whether each value is taken, not drawn."""
+        """Whether all values are used."""
         return self.kind == "grid"
 
     @property
@@ -58,7 +58,7 @@ class Vary:
         return self.kind not in ("grid", "seed")
 
     def pick(self, u: float) -> tuple[Any, Any]:
-        """Return the value at quantile `u` (0 to 1) and what a table shows of it."""
+        """Return the value at quantile `u` (0 to 1) and its label in tables."""
         from scipy.stats import norm
 
         if self.kind == "choices":
@@ -75,46 +75,41 @@ class Vary:
 
 
 def make_vary(key: str, given: Any) -> Vary:
-    """Return how `key` varies from a table such as {"uniform": [0.0, 0.3]}; a plain list is a grid.
+    """Return the range of `key` from a table such as {"uniform": [0.0, 0.3]}; a plain list is a grid.
 
     Raises:
-        SettingsError: no such kind, an empty or contradictory range.
+        SettingsError: unknown kind, or an empty or contradictory range.
     """
     if isinstance(given, Vary):
         return given
     if isinstance(given, list | tuple):
         given = {"grid": given}
-    if not isinstance(given, Mapping) or len(given) != 1 or next(iter(given)) not in KINDS:
-        raise SettingsError(f"[vary] `{key}` needs exactly one of {', '.join(KINDS)}; got {given!r}.")
+    if not isinstance(given, Mapping) or len(given) != 1 or next(iter(given)) not in VARY_KINDS:
+        raise SettingsError(f"[vary] `{key}` needs exactly one of {', '.join(VARY_KINDS)}; got {given!r}.")
     kind, values = next(iter(given.items()))
     if kind == "seed":
         if values is not True:
-            raise SettingsError(f"[vary] `{key}`: write seed = true for the run's own seed.")
+            raise SettingsError(f"[vary] `{key}`: write seed = true for the seed of the run.")
         return Vary("seed")
     if kind in ("grid", "choices"):
-        return _listed(key, kind, values)
-    return _range(key, kind, values)
+        return _parse_values(key, kind, values)
+    return _parse_range(key, kind, values)
 
 
-def flattened(tables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield dotted key and range of [vary], whether the keys were quoted or nested tables."""
+def flatten_keys(tables: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield dotted key and range of [vary], from quoted keys or nested tables."""
     for key, value in tables.items():
-        if isinstance(value, Mapping) and value and not set(value) & set(KINDS):
-            yield from ((f"{key}.{rest}", inner) for rest, inner in flattened(value))
+        if isinstance(value, Mapping) and value and not set(value) & set(VARY_KINDS):
+            yield from ((f"{key}.{rest}", inner) for rest, inner in flatten_keys(value))
         else:
             yield key, value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """One run of a study.
+    """One run of a study, with values in the loop and labels in tables by key.
 
-    Attributes:
-        run: number, from 0.
-        sample: number of the random sample; runs of one sample differ only in their grid values.
-        seed: of the sample.
-        values: key -> what is put into the loop.
-        labels: key -> what tables show.
+    Runs of one random sample have its seed and differ only in grid values.
     """
 
     run: int
@@ -125,21 +120,21 @@ class Point:
 
 
 class StudyPoints:
-    """The points of a study: every sample at every point of the grid, in that order; drawn ahead, by the seed alone."""
+    """The points of a study: all samples at all points of the grid; they depend on the seed alone."""
 
     def __init__(self, vary: Mapping[str, Vary], runs: int | None, seed: int) -> None:
         """Draw the samples.
 
         Raises:
-            SettingsError: no runs, nothing that varies, or a number of runs that does not fit the grid.
+            SettingsError: no runs, no varied key, or a number of runs that does not fit the grid.
         """
         if not vary:
             raise SettingsError("the study varies nothing: give [vary] at least one key.")
         self._vary = vary
         grids = [[(key, i) for i in range(len(item.values))] for key, item in vary.items() if item.is_grid]
         size = math.prod(map(len, grids))
-        if size > _MOST_RUNS:
-            raise SettingsError(f"the grid has {size} points; at most {_MOST_RUNS} fit. Make it smaller, or draw.")
+        if size > _MAX_RUNS:
+            raise SettingsError(f"the grid has {size} points; at most {_MAX_RUNS} fit. Make it smaller, or draw.")
         self._grid = list(product(*grids))
         drawn = [key for key, item in vary.items() if item.is_drawn]
         random = bool(drawn) or any(item.kind == "seed" for item in vary.values())
@@ -150,11 +145,9 @@ class StudyPoints:
         self._seeds = (states % _SEED_RANGE).astype(np.int64)
 
     def __len__(self) -> int:
-        """Return the number of runs."""
         return self.runs
 
     def __getitem__(self, run: int) -> Point:
-        """Return one point."""
         sample, place = divmod(run, len(self._grid))
         seed = int(self._seeds[sample])
         chosen = dict(self._grid[place])
@@ -172,21 +165,19 @@ class StudyPoints:
 def _number_of_runs(runs: int | None, grid: int, *, random: bool) -> int:
     if runs is None:
         if random:
-            raise SettingsError("`runs` is missing: say how many; only a study of grids alone knows it by itself.")
+            raise SettingsError("`runs` is missing; only a study of grids alone does not need it.")
         return grid
-    if isinstance(runs, bool) or not isinstance(runs, int) or not 1 <= runs <= _MOST_RUNS:
-        raise SettingsError(f"`runs` must be a whole number between 1 and {_MOST_RUNS}; got {runs!r}.")
+    if isinstance(runs, bool) or not isinstance(runs, int) or not 1 <= runs <= _MAX_RUNS:
+        raise SettingsError(f"`runs` must be a whole number between 1 and {_MAX_RUNS}; got {runs!r}.")
     if not random and runs != grid:
         raise SettingsError(f"the grid has {grid} points and nothing is random, but `runs` is {runs}; leave it out.")
     if runs < grid:
-        raise SettingsError(
-            f"the grid has {grid} points; `runs` is {runs}: make it at least that, or the grid smaller."
-        )
+        raise SettingsError(f"the grid has {grid} points; `runs` is {runs}: raise `runs`, or reduce the grid.")
     return runs
 
 
 def _quantiles(samples: int, keys: int, seed: int) -> Matrix:
-    """Return a Latin hypercube (samples, keys) of 0 to 1, none of them exactly 0 or 1."""
+    """Return a Latin hypercube (samples, keys) between 0 and 1, without these ends."""
     from scipy.stats import qmc
 
     if keys == 0:
@@ -195,7 +186,7 @@ def _quantiles(samples: int, keys: int, seed: int) -> Matrix:
     return np.clip(drawn, 1e-12, 1.0 - 1e-12)
 
 
-def _listed(key: str, kind: str, values: Any) -> Vary:
+def _parse_values(key: str, kind: str, values: Any) -> Vary:
     if isinstance(values, Mapping):
         labels, chosen = tuple(map(str, values)), tuple(values.values())
     elif isinstance(values, list | tuple):
@@ -211,7 +202,7 @@ def _listed(key: str, kind: str, values: Any) -> Vary:
 
 
 def _labels(values: Sequence[Any]) -> tuple[Any, ...]:
-    """Return what tables show: the value itself, the file of a table, the kind of an object."""
+    """Return labels for tables: the value itself, the file of a table, the kind of an object."""
     plain = [value if isinstance(value, bool | int | float | str) else _name(value) for value in values]
     if all(isinstance(value, int | float) and not isinstance(value, bool) for value in plain):
         return tuple(plain)
@@ -226,7 +217,7 @@ def _name(value: Any) -> str:
     return str(getattr(value, "kind", "") or type(value).__name__)
 
 
-def _range(key: str, kind: str, values: Any) -> Vary:
+def _parse_range(key: str, kind: str, values: Any) -> Vary:
     numbers = isinstance(values, list | tuple) and len(values) == 2 and all(
         isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value) for value in values
     )  # fmt: skip
@@ -238,14 +229,14 @@ def _range(key: str, kind: str, values: Any) -> Vary:
             raise SettingsError(f"[vary] `{key}`: the standard deviation must be positive; got {high:g}.")
     elif not low < high:
         raise SettingsError(
-            f"[vary] `{key}`: the {kind} range from {low:g} to {high:g} is empty; the lower bound first."
+            f"[vary] `{key}`: the {kind} range from {low:g} to {high:g} is empty; write the lower bound first."
         )
     elif kind == "log_uniform" and low <= 0.0:
         raise SettingsError(f"[vary] `{key}`: log_uniform needs positive bounds; got {low:g}.")
     return Vary(kind, (low, high))
 
 
-_TOP = ("loop", "runs", "seed", "objectives", "dask", "vary")
+_STUDY_KEYS = ("loop", "runs", "seed", "objectives", "dask", "vary")
 Source = str | Path | Mapping[str, Any] | Loop | LoopSetup
 
 
@@ -255,13 +246,13 @@ class Study(ReprMixin):
 
     Attributes:
         loop: the table of a loop, as in a loop file.
-        vary: dotted key -> how it varies.
-        runs: how many; None for all points of the grids.
-        seed: of everything that is drawn.
-        objectives: metrics to be small; the first one ranks, all of them span the Pareto front.
+        vary: dotted key -> its range.
+        runs: number of runs; None for all points of the grids.
+        seed: of all random values.
+        objectives: metrics to minimise; the first one ranks, all of them span the Pareto front.
         folder: where relative paths of the loop start.
         name: for titles.
-        dask: address of a Dask scheduler that runs it, such as tcp://head:8786, unless `workers` are asked for.
+        dask: address of a Dask scheduler, such as tcp://head:8786, which `workers` override.
     """
 
     loop: Mapping[str, Any]
@@ -280,20 +271,19 @@ class Study(ReprMixin):
             raise SettingsError(f"`seed` must be a whole number that is not negative; got {self.seed!r}.")
         for metric in self.objectives:
             if metric not in self.metrics:
-                raise SettingsError(
-                    f"`{metric}` is not a metric that can be an objective; use some of {', '.join(self.metrics)}."
-                )
+                listed = ", ".join(self.metrics)
+                raise SettingsError(f"`{metric}` is not a metric that can be an objective; use some of {listed}.")
         if not self.objectives:
             raise SettingsError("`objectives` is empty; name at least one metric.")
 
     @cached_property
     def metrics(self) -> tuple[str, ...]:
-        """The names of all that a run is judged by."""
+        """The names of the metrics of a run."""
         return metric_names(_robot_of(self.loop, self.vary, self.folder))
 
     @cached_property
     def points(self) -> StudyPoints:
-        """The runs: what each puts into the loop."""
+        """The points of all runs, with their values in the loop."""
         return StudyPoints(self.vary, self.runs, self.seed)
 
     def table(self, run: int) -> dict[str, Any]:
@@ -307,10 +297,10 @@ class Study(ReprMixin):
         return make_loop(self.table(run), self.folder, opened=opened)
 
     def check(self) -> None:
-        """Open the loop of the first run with each part in turn, and find every key in it.
+        """Open the loop of the first run with each part in turn, and check that it has all keys.
 
         Raises:
-            SettingsError: a key that the loop does not have, or a loop that cannot be.
+            SettingsError: a key that the loop does not have, or an invalid loop.
         """
         first = self.points[0].values
         kinds = {key: value for key, value in first.items() if set_sources(key)}
@@ -333,7 +323,7 @@ class Study(ReprMixin):
         LoopRun(loop)
 
     def description(self) -> dict[str, Any]:
-        """Return what the study is, as JSON values, with the hash of every file that it names."""
+        """Return the study as JSON values, with the hash of each of its files."""
         files = sorted(set(_texts([self.loop, [v.values for v in self.vary.values()]])))
         hashes = {name: file_hash(self.folder / name) for name in files if (self.folder / name).is_file()}
         return {
@@ -349,7 +339,7 @@ class Study(ReprMixin):
 
     @property
     def digest(self) -> str:
-        """A hash of all that decides the numbers."""
+        """A hash of all settings and files that the results depend on."""
         return hashlib.sha256(json.dumps(self.description(), sort_keys=True).encode()).hexdigest()
 
 
@@ -366,14 +356,14 @@ def make_study(
 ) -> Study:
     """Return a study of `loop`: a loop file, its table, or a loop; `vary` is as [vary] in a study file.
 
-    Without `objectives` they are the error of the axis that the reference is about, and the moves of the motors.
+    Default objectives are the error of the axis that the reference moves, and the total variation of the motors.
 
     Raises:
-        SettingsError: an empty or contradictory range, or no such metric.
+        SettingsError: an empty or contradictory range, or an unknown metric.
         FileFormatError: no such loop file.
     """
-    table, start = _opened(loop)
-    chosen = {key: make_vary(key, given) for key, given in flattened(vary)}
+    table, start = _open_loop(loop)
+    chosen = {key: make_vary(key, given) for key, given in flatten_keys(vary)}
     start = Path(folder) if folder else start
     return Study(
         loop=table, vary=chosen, runs=runs, seed=seed, folder=start, name=name, dask=dask,
@@ -382,26 +372,24 @@ def make_study(
 
 
 def load_study(path: str | Path) -> Study:
-    """Read a study file; its loop file is looked for beside it.
+    """Read a study file; relative paths start at its folder.
 
     Raises:
-        FileFormatError: no such file or no TOML.
+        FileFormatError: no such file, or not TOML.
         SettingsError: unknown or missing keys, an empty or contradictory range.
     """
     source = Path(path)
     table = read_toml(source)
     try:
         made = _from_table(source, table)
-        len(made.points)  # numbers of runs that cannot be are the file's fault too
+        len(made.points)  # raises for an impossible number of runs
         return made
     except SoftneckError as error:
         raise (error if str(error).startswith(str(source)) else type(error)(f"{source}: {error}")) from error
 
 
 def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
-    for key in table:
-        if key not in _TOP:
-            raise SettingsError(f"unknown key `{key}` of a study; it takes {', '.join(_TOP)}.")
+    refuse_unknown("a study", table, _STUDY_KEYS)
     if "loop" not in table:
         raise SettingsError("`loop` is missing: name the loop file.")
     if not isinstance(table.get("vary", {}), dict):
@@ -416,7 +404,7 @@ def _from_table(source: Path, table: Mapping[str, Any]) -> Study:
     )  # fmt: skip
 
 
-def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
+def _open_loop(loop: Source) -> tuple[Mapping[str, Any], Path]:
     if isinstance(loop, str | Path):
         path = Path(loop)
         if not path.is_file():
@@ -433,7 +421,7 @@ def _opened(loop: Source) -> tuple[Mapping[str, Any], Path]:
 
 
 def _with_robot(table: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return a loop file's table with the robot beside it where no part can say whose it is: runs know no file."""
+    """Return a loop file's table, with the robot beside the file if no part has a robot; runs do not have the file."""
     parts = [*(table.get(name) for name in SOURCES), *table.get("part", [])]
     if "robot" in table or any({"model", "file"} & set(part or ()) for part in parts):
         return table
@@ -444,7 +432,7 @@ def _with_robot(table: dict[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _robot_of(table: Mapping[str, Any], vary: Mapping[str, Vary], folder: Path) -> Robot:
-    """Return whose loop it is, as the table and its first files say; what is wrong with them `Study.check` says."""
+    """Return the robot of the table and its first files, or the neck; `Study.check` reports errors in them."""
     opener = PartOpener(folder / str(table.get("folder", ".")))
     try:
         made = with_values(table, {key: vary[key].values[0] for key in vary if set_sources(key)})
@@ -457,22 +445,18 @@ def _robot_of(table: Mapping[str, Any], vary: Mapping[str, Vary], folder: Path) 
 
 
 def _objectives(table: Mapping[str, Any], robot: Robot) -> tuple[str, ...]:
-    """Return the error of the first output that the reference is about, or else the limits, and the motors' moves."""
+    """Return the error of the first output in the reference, or else in the limits, and the motors' total variation."""
     reference = table.get("reference", {})
-    stated = {_asked(reference, key, robot) for key, value in reference.items() if value and key != "kind"}
+    moving = {
+        reference_field(str(reference.get("kind")), key, robot)
+        for key, value in reference.items()
+        if value and key != "kind"
+    }
     limited = {name.partition(".")[0] for name in table.get("limits", {})}
     names = robot.outputs.names
-    axis = next((name for asked in (stated, limited) for name in names if name in asked), names[0])
-    moved = next(name for name in metric_names(robot) if name.startswith("motors.total_variation_"))
-    return (f"{axis}.rms_error_{error_unit(robot)[0]}", moved)
-
-
-def _asked(reference: Mapping[str, Any], key: str, robot: Robot) -> str:
-    """Return the output that a key of [reference] is about; "" where it is about something else."""
-    try:
-        return reference_key(str(reference.get("kind")), key, robot)[0]
-    except (KeyError, SettingsError):
-        return ""
+    axis = next((name for group in (moving, limited) for name in names if name in group), names[0])
+    variation = next(name for name in metric_names(robot) if name.startswith("motors.total_variation_"))
+    return (f"{axis}.rms_error_{error_unit(robot)[0]}", variation)
 
 
 def _texts(value: Any) -> list[str]:
@@ -485,7 +469,7 @@ def _texts(value: Any) -> list[str]:
 
 
 def _plain(value: Any) -> Any:
-    """Return `value` as JSON; of a part that is not a file, a hash of what it does."""
+    """Return `value` as JSON; a part that is not a file becomes a hash of its content."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

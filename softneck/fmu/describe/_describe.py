@@ -14,7 +14,7 @@ from softneck.core import FileFormatError, SettingsError, settings_text
 from softneck.design import own_controller
 from softneck.identification import Validation
 from softneck.plant import NeckParameters, VirtualNeck
-from softneck.robot import PRESETS, Robot, load_for_robot
+from softneck.robot import ROBOT_PRESETS, Robot, load_for_robot
 from softneck.runtime import Block, Port
 
 
@@ -179,7 +179,7 @@ def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot |
             f"{path}: no FMU can be built from a `{path.suffix}` file; give a model, controller or observer "
             "(.npz), a neck, robot or loop file (.toml), or a preset (paper, lab, rough, trunk)."
         )
-    if name in PRESETS:
+    if name in ROBOT_PRESETS:
         return VirtualNeck.of(Robot.preset(name))
     if has_keys(path, {"motors", "outputs", "directions", "extends"}):
         return VirtualNeck.of(Robot.read(path))
