@@ -64,11 +64,9 @@ class Timeline:
 
 
 def timeline(time: Vector, run: np.ndarray | None = None) -> Timeline:
-    """Place rows on a time axis that never runs back.
+    """Place rows at `time` (rows,) [s], which may restart with a `run` (rows,), on a time axis that never runs back.
 
-    Args:
-        time: (rows,) [s]; may restart with a run.
-        run: (rows,) run or segment numbers; a step that is no sample time starts a segment too.
+    A step that is no sample time starts a segment too.
     """
     time = np.asarray(time, dtype=np.float64)
     shape = time.shape if run is None else run.shape
@@ -143,7 +141,6 @@ def validation_chart(
         predictions: name -> (time, outputs); NaN for missing ones.
         bounds: lower and upper (time, outputs) of a model, drawn as a band.
         run: (time,) segment numbers, which no line connects; None breaks lines where the time jumps.
-        robot: of the outputs; gives their display unit.
     """
     line = timeline(time, run)
     panels, unit, there = [], robot.outputs.display_unit, np.where(np.isfinite(measured).any(axis=0), measured, 0.0)
@@ -191,7 +188,6 @@ def loop_chart(
         signals: name -> (time,) in SI: outputs (and their _reference, _measured, _estimate), motor_setpoint_1..n,
             motor_position_1..n, tension_1..n [N].
         limits: metric -> limit; those of overshoot and settling time are drawn for a step.
-        robot: of the loop; gives the display units.
     """
     panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
@@ -328,12 +324,8 @@ def frequency_response_chart(
 ) -> Chart:  # fmt: skip
     """Describe gain, phase and coherence of one entry of a frequency response, beside models.
 
-    Args:
-        frequency: (n,) [rad/s].
-        response: (n,) complex, NaN if unknown.
-        radius: (n,) radius of the 95 % confidence circles.
-        coherence: (n,) 0 to 1.
-        models: name -> (n,) complex.
+    All are (n,) over `frequency` [rad/s]: the complex `response` (NaN if unknown), the `radius` of its 95 % confidence
+    circles, `coherence` from 0 to 1, and the complex responses of `models` by name.
     """
     size = np.abs(response)
     # A logarithmic axis has no zero, and the phase of a circle around zero is undefined.
@@ -390,9 +382,7 @@ def pareto_chart(
 ) -> Chart:
     """Describe runs by two metrics, and their Pareto front.
 
-    Args:
-        groups: name -> (x, y) of its runs; only finite ones are drawn.
-        front: (x, y) of the front, by rising x.
+    `groups` holds name -> (x, y) of its runs, of which finite ones are drawn; `front` is (x, y) by rising x.
     """
     curves = []
     for (name, (x, y)), (colour, _) in zip(groups.items(), curve_styles(), strict=False):
@@ -406,11 +396,7 @@ def pareto_chart(
 
 
 def distribution_chart(values: Mapping[str, Mapping[str, Vector]], title: str, *, caption: str = "") -> Chart:
-    """Describe the distribution of metrics over runs: a panel for each metric, a curve for each group.
-
-    Args:
-        values: metric -> group -> (n,); only finite values count.
-    """
+    """Describe distributions over runs, metric -> group -> (n,): a panel for each metric, a curve for each group."""
     panels = []
     for metric, groups in values.items():
         known = {name: np.asarray(v, float)[np.isfinite(np.asarray(v, float))] for name, v in groups.items()}
@@ -427,10 +413,8 @@ def influence_chart(
 ) -> Chart:
     """Describe the influence of numeric settings on a metric: a panel for each setting, a point for each run.
 
-    Args:
-        inputs: key -> (n,) values.
-        metric: label and (n,) values.
-        failed: (n,) whether a run breaks a limit, which has another colour.
+    `inputs` holds key -> (n,) settings, `metric` a label and (n,) values, and `failed` (n,) marks runs that break a
+    limit, which have another colour.
     """
     label, y = metric
     bad = np.asarray(failed, dtype=bool)

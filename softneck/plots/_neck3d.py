@@ -27,9 +27,6 @@ def neck_view(recording: Recording, *, title: str = "The neck") -> str:
     The angles give the bend of a link of constant curvature (one angle: in a plane); `compression` shortens it if
     recorded. Tendons are coloured by `tension_1..` if recorded, else by the motors.
 
-    Args:
-        recording: of a robot bent by tendons.
-
     Raises:
         DataError: no sample of the angles, a tilt beyond 90 deg, or another kind of robot.
     """

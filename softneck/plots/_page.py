@@ -20,11 +20,7 @@ from ._interactive import LICENCE, draw, gzip_base64, library
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Table(ReprMixin):
-    """A table of text; cells "holds" and "fails" are coloured.
-
-    Attributes:
-        text: number of left columns with words instead of numbers.
-    """
+    """A table, whose first `text` columns hold words instead of numbers; cells "holds" and "fails" are coloured."""
 
     caption: str
     head: Sequence[str]

@@ -33,11 +33,7 @@ def import_page(
 ) -> str:
     """Return the HTML page of an import.
 
-    Args:
-        recording: the result; None if something is missing.
-        doubts: of the guess, the least certain first.
-        lines: of the guess, and notes of the import.
-        problems: missing entries, or the reason for no recording.
+    `lines` are those of the guess and notes of the import, `problems` missing entries or the reason for no recording.
     """
     charts = _charts(frame, layout, recording)
     sections = [_doubts_section(doubts, problems, lines, charts[:1]), _mapping(frame, layout, recording)]
@@ -56,7 +52,7 @@ def _import_verdict(doubts: Sequence[Doubt], problems: Sequence[str], recording:
     if problems or recording is None:
         return f"No recording: {problems[0] if problems else 'something is missing'}"
     made = f"A recording of {len(recording)} rows was made"
-    return f"{made}; {len(doubts)} guesses are for you to confirm." if doubts else f"{made}; no guess is in doubt."
+    return f"{made}; guesses to confirm: {len(doubts)}." if doubts else f"{made}; no guess is in doubt."
 
 
 def _doubts_section(
@@ -166,7 +162,7 @@ def _made_panel(recording: Recording, names: Sequence[str]) -> Panel:
         for k, name in enumerate(names)
     ]  # fmt: skip
     # Colours and order are those of the columns beside it; a phone has no room for a second legend.
-    return Panel(curves, f"recording [{unit}]", x_label="time [s]", title="made", legend=False)
+    return Panel(curves, f"in the recording [{unit}]", x_label="time [s]", title="recording", legend=False)
 
 
 _FAULTS = (("missed", RED), ("frozen", PURPLE), ("clipped", ORANGE), ("outliers", GREEN))

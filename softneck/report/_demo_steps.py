@@ -115,12 +115,7 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class PackagedFmu:
-    """An FMU and its largest difference from the Python model in simulation.
-
-    Attributes:
-        rows: number of compared samples.
-        difference: largest over all outputs, in their SI units.
-    """
+    """An FMU and its largest difference [SI] from the Python model in simulation, over all outputs and `rows`."""
 
     path: Path
     rows: int

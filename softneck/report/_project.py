@@ -90,9 +90,6 @@ class Project:
 def read_project(folder: str | Path, *, progress: Progress = silent) -> Project:
     """Read all files of a project; loops are simulated, except those that name Python code.
 
-    Args:
-        progress: called with the finished share and a word.
-
     Raises:
         FileFormatError: no such folder, or no softneck file in it.
     """
@@ -194,11 +191,8 @@ def _read_archive(project: Project, path: Path, name: str) -> None:
     role = {"family": project.families, "observer": project.observers, "controller": project.controllers}
     thing = load(path)
     if header.get("kind") != "loop_state" and hasattr(thing, "summary"):
-        role.get(_role(str(header.get("kind"))), project.models)[name] = thing
-
-
-def _role(kind: str) -> str:
-    return KINDS[kind].role if kind in KINDS else ""
+        kind = str(header.get("kind"))
+        role.get(KINDS[kind].role if kind in KINDS else "", project.models)[name] = thing
 
 
 def _read_fmu(project: Project, path: Path, name: str) -> None:
@@ -339,7 +333,9 @@ def _models(project: Project, progress: Progress) -> Section:
             except (SoftneckError, AttributeError):
                 # Another sample time, or only rows that the model was trained on.
                 continue
-            rows.append([f"{name} on {data}", str(result.rows_scored), *_fits(result)])
+            fits = [cell(result.fits[str(h)], ".1f") for h in _HORIZONS]
+            fits += [cell(result.rmse_deg[INFINITE], ".2f"), cell(result.persistence["1"], ".1f")]
+            rows.append([f"{name} on {data}", str(result.rows_scored), *fits])
             if len(charts) < _MAX_CHARTS:
                 free_run = {"simulation": drawable(result, result.free_run)}
                 charts.append(validation_chart(
@@ -357,11 +353,6 @@ def _models(project: Project, progress: Progress) -> Section:
     if len(project.recordings) > _MAX_RECORDINGS:
         words.append(f"Judged on the first {_MAX_RECORDINGS} of {len(project.recordings)} recordings.")
     return Section("Models", text=words, tables=tables, charts=charts)
-
-
-def _fits(result: Any) -> list[str]:
-    cells = [cell(result.fits[str(h)], ".1f") for h in _HORIZONS]
-    return [*cells, cell(result.rmse_deg[INFINITE], ".2f"), cell(result.persistence["1"], ".1f")]
 
 
 def _summaries(title: str, things: Mapping[str, Any]) -> Section:

@@ -83,9 +83,7 @@ class Reproduction:
 def reproduce(settings: ReproduceSettings, *, tell: Tell) -> Reproduction:
     """Run the paper's sections 3 to 7 on the virtual neck, and its identification on other necks.
 
-    Args:
-        settings: of the run.
-        tell: announces a stage and returns its progress callback.
+    `tell` announces a stage and returns its progress callback.
     """
     begin = time.monotonic()
     experiments = record_experiments(NeckParameters.paper(), duration=settings.duration, tell=tell)

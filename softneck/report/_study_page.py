@@ -22,12 +22,7 @@ _KEY_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_")
 
 
 def study_page(description: Mapping[str, Any], runs: pd.DataFrame) -> str:
-    """Return the HTML page of a study.
-
-    Args:
-        description: content of the folder's `study.json`.
-        runs: its table.
-    """
+    """Return the HTML page of a study from its folder's `study.json` and its table of runs."""
     name = description["name"]
     return page(
         "Study" if name == "study" else f"Study {name}", study_sections(description, runs),

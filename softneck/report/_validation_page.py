@@ -34,9 +34,6 @@ def validation_page(results: Sequence[Validation], *, title: str = "Validation")
     """Return the HTML page of all results, with interactive charts.
 
     Models that were judged on the same rows first have one chart of all their simulations.
-
-    Args:
-        results: of `validate`, one for each model and recording.
     """
     together = _comparisons(results)
     note = VALIDATION_NOTE.format(outputs="/".join(results[0].robot.outputs.names))

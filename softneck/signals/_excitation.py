@@ -122,17 +122,10 @@ def signal(name: str, *, duration: float | None = None, seed: int = 0, robot: Ro
         raise SettingsError(f"`{name}` is {longest:g} s long by definition; got a duration of {length:g} s.")
     time = np.arange(round(length / Ts)) * Ts
     t = time / second
-    rng = np.random.default_rng(seed)
-    makers = {
-        "eq22": lambda: eq22(t, pulls),
-        "steps": lambda: _make_steps(t, pulls),
-        "sine": lambda: _make_sine(t, pulls),
-        "rotation": lambda: _make_rotation(t, pulls),
-        "aprbs": lambda: _make_aprbs(t, rng, pulls),
-        "multisine": lambda: _make_multisine(t, rng, pulls),
-        "mixed": lambda: _make_mixed(t, rng, pulls),
-    }
-    return Excitation(name, time, _in_range(makers[name](), robot), Ts)
+    fixed = {"eq22": eq22, "steps": _make_steps, "sine": _make_sine, "rotation": _make_rotation}
+    drawn = {"aprbs": _make_aprbs, "multisine": _make_multisine, "mixed": _make_mixed}
+    P = fixed[name](t, pulls) if name in fixed else drawn[name](t, np.random.default_rng(seed), pulls)
+    return Excitation(name, time, _in_range(P, robot), Ts)
 
 
 def _in_range(P: Matrix, robot: Robot) -> Matrix:

@@ -127,7 +127,7 @@ def test_a_preview_shows_doubts_first_and_what_was_made(call: Call, tmp_path: Pa
     assert (doubt["about"], doubt["channels"], doubt["choices"]) == ("sign of roll", ["roll"], ["as logged"])
     assert 0.0 < doubt["confidence"] < 0.9
     page = (tmp_path / "p.html").read_text()
-    order = [page.index(word) for word in ("<h2>Doubts", "sign of roll", "<h2>Mapping", "<h2>Raw and made",
+    order = [page.index(word) for word in ("<h2>Doubts", "sign of roll", "<h2>Mapping", "<h2>Raw columns and channels",
                                            "<h2>Left out", "column &#39;fan&#39;")]  # fmt: skip
     assert order == sorted(order)
     by_layout = call("import", "log.csv", "--layout", "r.layout.toml", "-o", "s.csv", "--html", "q.html")

@@ -125,7 +125,7 @@ def test_a_wrong_sign_is_turned_round_doubted_and_can_be_taken_as_logged(tmp_pat
     frame.to_csv(path, index=False)
     guess = guess_layout(path)
     (doubt,) = guess.doubts
-    assert (doubt.about, doubt.taken, doubt.choices) == ("sign of roll", "turned round", ("as logged",))
+    assert (doubt.about, doubt.taken, doubt.choices) == ("sign of roll", "inverted", ("as logged",))
     assert 0.5 < doubt.confidence < 0.9, "the likelier answer is taken, and asked about"
     assert guess.layout.channels["roll"].sign == -1.0
     assert guess.layout == parse_layout(guess.text)

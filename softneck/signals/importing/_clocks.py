@@ -33,12 +33,7 @@ _TOLERANCE_RATIO = 0.03
 
 @dataclass(frozen=True, slots=True)
 class SampleTime:
-    """An estimated sample time [s]: the median over motors, and the smallest and largest.
-
-    Attributes:
-        value, lowest, highest: [s].
-        motors: number of motors that agree.
-    """
+    """An estimated sample time [s]: the median over so many `motors`, and the smallest and largest."""
 
     value: float
     lowest: float
@@ -58,10 +53,6 @@ def estimate_sample_time(channels: Mapping[str, Vector], run: np.ndarray) -> Sam
 
     Rates that are differences lack motion faster than their step, so both sides are averaged. Both carry noise, so T is
     the ratio of their lengths (the geometric mean of the two regressions).
-
-    Args:
-        channels: with motor_position_j [rad] and motor_velocity_j [rad/s], each (time,).
-        run: (time,) run numbers.
     """
     periods = []
     for position, speed in zip(MOTOR_POSITIONS, MOTOR_VELOCITIES, strict=True):

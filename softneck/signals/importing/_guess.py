@@ -366,11 +366,11 @@ def _check_signs(draft: Draft) -> tuple[list[str], list[Doubt]]:
             continue
         pick = draft.picks[axis]
         draft.picks[axis] = replace(pick, sign=-pick.sign)
-        lines.append(f"{falls}: turned round; if that is wrong, write `sign = {pick.sign:g}`")
+        lines.append(f"{falls}: inverted; if that is wrong, write `sign = {pick.sign:g}`")
         order = "; or motors 2 and 3 are swapped" if axis == "roll" else ""
         why = f"as logged {axis} falls as {name} rises (correlation {r:.2f}), and recordings have both rise{order}"
         sure = min(_MOST_SURE, 0.5 - 0.5 * r)
-        doubts.append(Doubt(f"sign of {axis}", (axis,), "turned round", sure, why, ("as logged",)))
+        doubts.append(Doubt(f"sign of {axis}", (axis,), "inverted", sure, why, ("as logged",)))
     return lines, doubts
 
 

@@ -260,7 +260,7 @@ def by_shapes(draft: Draft) -> None:
 
 
 def _answer(draft: Draft, axis: str, column: str | int, r: float) -> None:
-    inverted = "; turned round, so that it rises with it" if r < 0 else ""
+    inverted = "; inverted, so that it rises with it" if r < 0 else ""
     why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; none that moves as far does so more"
     draft.pick(axis, column, why + inverted, sign=-1.0 if r < 0 else 1.0, confidence=_confidence(r))
 

@@ -36,13 +36,7 @@ _FOLLOW_SPREAD, _LATE, _LATE_SPREAD = 0.2, 0.05, 2.0
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The likeliest unit of a group of columns.
-
-    Attributes:
-        unit: "rad" or "deg".
-        probability: over all units of the other groups.
-        alone: whether set-points and positions have different units.
-    """
+    """The likeliest unit of a group, and its probability; `alone`: set-points and positions have different units."""
 
     unit: str
     probability: float
@@ -50,11 +44,9 @@ class Verdict:
 
 
 def judge(reaches: Mapping[str, float], titled: Mapping[str, str]) -> dict[str, Verdict]:
-    """Return the units of the logged groups among `set-points`, `positions` and `tilt`.
+    """Return the units of the logged groups among `set-points`, `positions` and `tilt`, by their largest magnitudes.
 
-    Args:
-        reaches: group -> largest magnitude as logged.
-        titled: group -> unit in its titles, which is kept.
+    A unit in the titles of a group is kept.
     """
     groups = [name for name in ("set-points", "positions", "tilt") if name in reaches]
     odds: dict[tuple[str, ...], float] = {}

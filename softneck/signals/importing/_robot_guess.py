@@ -42,13 +42,7 @@ class NamedColumns:
 
 @dataclass(frozen=True, slots=True)
 class RobotGuess:
-    """A proposed robot and layout.
-
-    Attributes:
-        robot: its directions are to be identified.
-        layout: maps the log to its channels.
-        lines: reasons for each column.
-    """
+    """A robot, whose directions are to be identified, a layout of its log, and the reasons for each column."""
 
     robot: Robot
     layout: Layout

@@ -26,13 +26,7 @@ _TIME_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Channels at logged times, run by run.
-
-    Attributes:
-        time: (time,) [s].
-        run: (time,) numbers of the runs.
-        channels: name -> (time,).
-    """
+    """Channels at logged times [s], run by run; all (time,)."""
 
     time: Vector
     run: np.ndarray
