@@ -1,4 +1,4 @@
-"""Numbers of the virtual neck out of recordings: what nobody can measure is fitted, what a ruler tells stays."""
+"""Calibration of the virtual neck from recordings: dimensions stay, all other numbers are fitted."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ _BY_LOGARITHM = (
 )  # fmt: skip
 _BY_STEPS = {"stiffness_asymmetry": 0.2, "stiffness_angle": 0.5, "rest_pitch": 0.02, "rest_roll": 0.02}
 # The first part of each run is fitted, the rest judged; both in one free run from the set-points alone.
-_TRAINED = 0.7
+_TRAINING_SHARE = 0.7
 # By definition of issue 29: a neck that follows less [%] is not the user's.
 LEAST_FIT = 85.0
 # Held at the first set-points for so long [s] before a run, as a recording begins; rows from one judged to the next.
 _SETTLED, _THIN = 3.0, 2
 # A number a factor of e away from its start, or five steps, counts as this error [rad] of one row: next to nothing.
-_PRIOR = 0.01
+_PRIOR_ERROR_RAD = 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class Calibration(ReprMixin):
-    """A neck and how well it follows what it was not fitted to.
+    """A neck and its fits on held-out rows.
 
     Attributes:
         neck: the numbers.
@@ -64,7 +64,7 @@ class Calibration(ReprMixin):
 
     @property
     def worst(self) -> float:
-        """The least of all fits [%]."""
+        """The lowest fit [%]."""
         return float(self.fits.min())
 
     def toml(self) -> str:
@@ -162,7 +162,7 @@ class _Run:
         return cls(U, run.outputs, run.sample_time)
 
     def simulate(self, neck: NeckParameters) -> Matrix:
-        """Return what the sensor would show (time, 2) [rad]."""
+        """Return the simulated sensor outputs (time, 2) [rad]."""
         block = VirtualNeck(neck).block(sample_time=self.sample_time)
         seen = [[port.name for port in block.outputs].index(f"{axis}_measured") for axis in ("pitch", "roll")]
         Y = block.run(block.initial_state(), self.inputs)[1][:, seen]
@@ -171,7 +171,7 @@ class _Run:
     @property
     def trained(self) -> int:
         """Rows that are fitted."""
-        return round(_TRAINED * len(self.outputs))
+        return round(_TRAINING_SHARE * len(self.outputs))
 
     def fits(self, neck: NeckParameters) -> Vector:
         """Return the fits (2,) on the rows that were not fitted [%]."""
@@ -214,7 +214,7 @@ def _search(
             e = _errors(runs, neck_of(x))
         except SettingsError:  # it buckles, or its tendons miss the link
             e = np.full(size, 1.0)
-        return np.concatenate([e, _PRIOR * x])
+        return np.concatenate([e, _PRIOR_ERROR_RAD * x])
 
     # Steps of a thousandth: far above rounding, and what friction and latency do in steps is averaged over a run.
     found = least_squares(

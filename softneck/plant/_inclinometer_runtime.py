@@ -1,4 +1,4 @@
-"""The inclinometer behind its attitude filter: transport delay, noise, drift, quantisation, dropouts.
+"""The inclinometer with its attitude filter: transport delay, noise, drift, quantisation, dropouts.
 
 The filter itself (first order) is part of the neck's differential equation. Here its output is looked up
 `delay` ago and spoilt.
@@ -15,7 +15,7 @@ INCLINOMETER_SAMPLE_SIZE = 6
 
 
 class InclinometerSample(StateVector):
-    """What was there to be seen at one instant."""
+    """Angles and rates at one instant."""
 
     angles = cells("2", "filtered pitch and roll [rad]")
     slopes = cells("2", "of these [rad/s]")
@@ -29,7 +29,7 @@ class InclinometerHistory(StateVector):
 
 
 class InclinometerNoise(StateVector):
-    """What is wrong with the sensor, and what it says."""
+    """Errors of the sensor and its last output."""
 
     bias = cells("2", "of pitch and roll [rad]")
     rate_bias = cells("2", "of pitch rate and roll rate [rad/s]")
@@ -94,7 +94,7 @@ def inclinometer_measure(
     generator: np.ndarray,
     c: tuple[float, float, float, float, float, float, float],
 ) -> None:
-    """Turn what arrives now into the held measurements, if it does.
+    """Update the held measurements with the sample that arrives now, if any.
 
     `c` is (drift std, drift's memory per sample, rate bias std, its memory, noise std, rate noise std,
     quantum). Biases are Ornstein-Uhlenbeck processes, sampled exactly. A lost sample draws as many random
@@ -132,7 +132,7 @@ def inclinometer_dropout(noise: InclinometerNoise, generator: np.ndarray, begins
 
 
 def inclinometer_shown(noise: InclinometerNoise) -> tuple[float, float, float, float, float]:
-    """Return (pitch, roll, pitch rate, roll rate, whether they have arrived now) as the sensor says them."""
+    """Return the sensor's (pitch, roll, pitch rate, roll rate, whether they have arrived now)."""
     return noise.angles[0], noise.angles[1], noise.rates[0], noise.rates[1], noise.arrives
 
 

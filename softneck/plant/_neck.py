@@ -122,7 +122,7 @@ class VirtualNeck(ReprMixin):
 
     @classmethod
     def of(cls, robot: Robot, neck: NeckParameters | None = None) -> VirtualNeck:
-        """Return the virtual plant that stands for a robot.
+        """Return the virtual plant of a robot.
 
         What the robot gives of winch, limits and sensor takes the place of the neck's; the preset `neck` gives nothing.
 
@@ -186,7 +186,7 @@ class VirtualNeck(ReprMixin):
         )
 
     def ranges(self) -> Matrix:
-        """Return the least and the largest set-point of each motor, (motors, 2) [rad]."""
+        """Return lower and upper limit of each set-point, (motors, 2) [rad]."""
         return _ranges(self.robot, self.parameters.position_limit)
 
     def _parameter_ports(self) -> tuple[Port, ...]:
@@ -216,7 +216,7 @@ class VirtualNeck(ReprMixin):
 
 
 def _ranges(robot: Robot, limit: float) -> Matrix:
-    """Return the least and the largest set-point of each motor [rad]; +-`limit` where none is given."""
+    """Return lower and upper limit of each set-point [rad]; +-`limit` if none is given."""
     scale, motors = to_si(robot.motors.unit)[0], len(robot.motors.names)
     given = zip((robot.motors.setpoint_min, robot.motors.setpoint_max), (-limit, limit), strict=True)
     low, high = (np.full(motors, end) if side is None else scale * np.array(side) for side, end in given)
@@ -224,7 +224,7 @@ def _ranges(robot: Robot, limit: float) -> Matrix:
 
 
 def require_tendons(robot: Robot, what: str = "the virtual plant") -> None:
-    """Raise SettingsError of `what` unless tendons on winches bend the robot."""
+    """Raise SettingsError unless tendons on winches bend the robot; `what` names the caller."""
     for part, unit in (("motors", robot.motors.unit), ("outputs", robot.outputs.unit)):
         if to_si(unit)[1] != "rad":
             raise SettingsError(

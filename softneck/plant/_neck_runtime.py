@@ -59,7 +59,7 @@ def neck_motors(setup: np.ndarray) -> int:
 
 
 class VirtualNeckArrays(Arrays):
-    """How the neck is sampled; what it is made of are its parameters."""
+    """Sampling of the neck; its physics are parameters."""
 
     setup = array(
         "1, numbers",
@@ -72,7 +72,7 @@ class VirtualNeckArrays(Arrays):
 
 
 class VirtualNeckState(NeckBody):
-    """The body, and what drives and inclinometer keep of the past."""
+    """State of the body, and past values of drives and inclinometer."""
 
     random = cells("6", "generator of the sensor's noise")
     noise = cells("9", "see `InclinometerNoise`")

@@ -25,7 +25,7 @@ from softneck.runtime import Port
 from ._presets import PRESETS, SENSORS
 
 # What `sample` scales: nobody has measured these on the neck.
-_UNCERTAIN = (
+_UNCERTAIN_NAMES = (
     "bending_stiffness", "bending_stiffening", "bending_damping", "axial_stiffness", "axial_damping",
     "hysteresis_torque", "hysteresis_angle", "platform_mass", "link_mass", "tendon_stiffness", "tendon_damping",
     "pretension", "guide_friction", "position_gain", "gear_friction", "sensor_lag", "sensor_delay", "drive_latency",
@@ -167,7 +167,7 @@ class NeckParameters(ReprMixin):
 
     @classmethod
     def from_toml(cls, path: str | Path) -> NeckParameters:
-        """Return a preset with what the file overrides; `preset = "lab"` in it starts from that one.
+        """Return a preset with the values of the file; `preset = "lab"` in it starts from that one.
 
         Raises:
             FileFormatError: no such file, no TOML, or a key that is not a parameter.
@@ -255,7 +255,7 @@ class NeckParameters(ReprMixin):
         """
         require_between("spread", spread, 0.0, 0.5)
         for _ in range(100):
-            changes = {name: self._scaled(name, spread, rng) for name in _UNCERTAIN}
+            changes = {name: self._scale_randomly(name, spread, rng) for name in _UNCERTAIN_NAMES}
             for name, size in (("stiffness_asymmetry", 0.05), ("rest_pitch", 0.005), ("rest_roll", 0.005)):
                 changes[name] = getattr(self, name) + size * spread / 0.2 * float(rng.standard_normal())
             try:
@@ -270,7 +270,7 @@ class NeckParameters(ReprMixin):
             noise_std=0.0, noise_quantum=0.0, drift_std=0.0, rate_noise_std=0.0, rate_bias_std=0.0, dropout_rate=0.0
         )
 
-    def _scaled(self, name: str, spread: float, rng: np.random.Generator) -> float:
+    def _scale_randomly(self, name: str, spread: float, rng: np.random.Generator) -> float:
         number = float(np.clip(rng.standard_normal(), -2.5, 2.5))
         return float(getattr(self, name)) * math.exp(spread * number)
 

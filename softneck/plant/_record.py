@@ -29,7 +29,7 @@ def record(
     noise: bool = True,
     internal_step: float = INTERNAL_STEP,
 ) -> Recording:
-    """Run a signal on the virtual neck and return what would be logged.
+    """Run a signal on the virtual neck and return the recording.
 
     Row k holds the set-points of t_k and what was measured at t_k, before they act. A sample that the
     inclinometer dropped is NaN.
@@ -89,7 +89,7 @@ def record(
 
 
 def _channels(robot: Robot) -> dict[str, str]:
-    """Return what is recorded beside the set-points: channel of the recording -> output of the neck."""
+    """Return the recorded outputs: channel of the recording -> output of the neck."""
     outputs, motors = robot.outputs.names, range(1, len(robot.motors.names) + 1)
     return {
         **{name: f"{name}_measured" for name in outputs},

@@ -1,4 +1,4 @@
-"""The neck with torques on its winches instead of set-points: what simulated drives turn.
+"""The neck with torques on its winches instead of set-points, for simulated drives.
 
 The state is that of the virtual neck; the integrals of its speed loops carry the torques, and its drives have
 no bandwidth of their own, so that the differential equation stays one and the same.

@@ -44,7 +44,7 @@ class Script:
     def reference(self) -> tuple[float, ...]:
         return getattr(self.act, "reference", ())
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         return index >= self.rows
 
 

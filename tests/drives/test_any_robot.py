@@ -255,7 +255,7 @@ def test_an_experiment_is_recorded_logged_and_replayed(tmp_path: Path, count: in
     )
     with RunLogger(tmp_path / "run.mcap", wait=True) as log:
         session = Session(file=file, link=link_to(file), log=log, facts={"record": played.facts()})
-        result = record_signal([one for one, _ in played.prepared()], session)
+        result = record_signal([one for one, _ in played.prepare_runs()], session)
     assert result.completed
     recording = result.recording
     assert recording is not None
@@ -282,14 +282,14 @@ def test_set_points_of_another_robot_are_not_played(tmp_path: Path) -> None:
     write_recording(tmp_path / "neck.csv", neck)
     played = Experiment(signal=str(tmp_path / "neck.csv"), limits=drive_limits(default_drives()), robot=robot(2))
     with pytest.raises(SoftneckError, match=r"`robot of 2` .* and `neck`|`neck` .* and `robot of 2`"):
-        played.prepared()
+        played.prepare_runs()
 
 
 def test_signals_by_name_are_those_of_the_robot_within_its_ranges() -> None:
     moved = Robot.preset("trunk4")
     file = default_drives(robot=moved)
     played = Experiment(signal="aprbs", limits=drive_limits(file), duration=8.0, robot=moved, ranges=file.ranges)
-    ((excitation, _),) = played.prepared()
+    ((excitation, _),) = played.prepare_runs()
     assert excitation.set_points.shape == (400, 4)
     assert np.abs(excitation.set_points).max() <= 6.0
 

@@ -183,8 +183,8 @@ def test_limits_beyond_the_drives() -> None:
     file = default_drives()
     link = link_to(file)
     axis = link.neck.drives[0].axis
-    keep = axis._allowed
-    axis._allowed = lambda key, value: keep(key, value) and not (key == (0x6085, 0) and value > 1000)
+    keep = axis._is_allowed
+    axis._is_allowed = lambda key, value: keep(key, value) and not (key == (0x6085, 0) and value > 1000)
     text = _row(link, file, "limits")
     assert "node 1 refuses the value" in text
     assert "beyond what the drive takes" in text

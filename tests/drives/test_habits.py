@@ -185,7 +185,7 @@ def test_a_drive_that_takes_its_mode_late_must_hold_until_then(mode: int, holds:
 
 
 def test_a_mode_that_a_drive_does_not_have_is_not_asked_for_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.drives.simulated._habits._MODES", (1, 3, 6))
+    monkeypatch.setattr("softneck.drives.simulated._habits._KNOWN_MODES", (1, 3, 6))
     report = preflight(linked(mode_when="enabled"), default_drives())
     assert [row.found for row in report.rows if row.found.startswith("6502h")] == [
         "6502h is 001F0065h, mode 8 is refused"
@@ -283,7 +283,7 @@ def test_a_late_mode_that_is_not_taken_stops_the_run_before_anything_moves(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if what == "refused":
-        monkeypatch.setattr("softneck.drives.simulated._habits._MODES", (1, 3, 6))
+        monkeypatch.setattr("softneck.drives.simulated._habits._KNOWN_MODES", (1, 3, 6))
     bench = Bench(habits=WireHabits(mode_when="enabled"))
     if what == "lost":
         bench.link.lose = lambda _from_master, frame: 0x580 <= frame.identifier < 0x680

@@ -170,7 +170,7 @@ def test_our_master_finds_foreign_slaves_and_writes_and_reads_all_their_objects(
             for (index, subindex), item in PROFILES[profile]().items.items():
                 if (index, subindex) in NUMBERS and item.writable:
                     value = -(2 ** (8 * item.size - 1)) if item.signed else 2 ** (8 * item.size) - 1
-                    assert objects.written(index, subindex, value) == value, f"{index:04X}h:{subindex}"
+                    assert objects.write_checked(index, subindex, value) == value, f"{index:04X}h:{subindex}"
             with pytest.raises(SdoError, match="node 2 refuses") as refused:
                 objects.write(0x6041, 0, 1)
             assert refused.value.aborted

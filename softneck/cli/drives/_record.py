@@ -54,7 +54,7 @@ def record_command(
         robot=moved,
         ranges=() if moved is None else chosen.file.ranges,
     )  # fmt: skip
-    prepared = experiment.prepared()
+    prepared = experiment.prepare_runs()
     files = {"signal": signal_name} if Path(signal_name).is_file() else {}
     with moving(asked, chosen, "record", force=force, homed=True, seed=seed, **files) as (session, keyboard):
         if isinstance(session.link, drives.VirtualLink):

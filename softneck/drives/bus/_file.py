@@ -1,4 +1,4 @@
-"""What a drives file says: node ids, gear, encoder, signs, limits, sensor, guarding, and what the drives move."""
+"""The drives file: node ids, gear, encoder, signs, limits, sensor, guarding, and the robot that the drives move."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _RPDO, _TPDO, _GUARD, _SLOPES = 6, 8, 1, 8
 
 
 def frame_bits(size: int, *, remote: bool = False) -> int:
-    """Return the bits of a frame with `size` bytes, with stuffing and the gap behind it.
+    """Return the bits of a frame of `size` bytes, with stuffing and interframe space.
 
     A remote request carries none of them. (Davis, Burns et al. 2007, Eq. 2: g = 34 bits are stuffed beside the data.)
     """
@@ -126,7 +126,7 @@ class ZeroSettings(Ranged):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Neck(Ranged):
-    """What turns motor current into tension.
+    """Constants that convert motor current into tension.
 
     Attributes:
         winch_radius: [m].
@@ -141,7 +141,7 @@ class Neck(Ranged):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class DrivesFile(ReprMixin):
-    """All that a drives file (`drives.toml`) says.
+    """The content of a drives file (`drives.toml`).
 
     Attributes:
         profile: "ipos2015" or "ds402".
@@ -223,7 +223,7 @@ class DrivesFile(ReprMixin):
 
     @property
     def moves(self) -> Robot:
-        """What the drives move: the neck where no robot is spoken of."""
+        """The robot that the drives move; the neck if the file names none."""
         return self.robot or NECK
 
     @property
@@ -251,7 +251,7 @@ class DrivesFile(ReprMixin):
 
     @property
     def guard_cycles(self) -> int:
-        """Cycles between two signs of life of ours: five of them fit into the guarding time."""
+        """Cycles between two heartbeats of the master: five of them fit into the guarding time."""
         return max(1, math.floor(self.guarding.time / 5.0 / self.cycle + 1e-9))
 
     def master_settings(
@@ -303,7 +303,7 @@ class DrivesFile(ReprMixin):
 
 
 def default_drives(profile: str = "ipos2015", *, robot: Robot | None = None, **changes: Any) -> DrivesFile:
-    """Return the file for simulated drives that nobody wrote one for: nodes from 1 on, the lab's set-up."""
+    """Return the default file of simulated drives: nodes from 1 on, the lab's set-up."""
     entries = []
     for node, sign in enumerate((robot or NECK).motors.sign, start=1):
         entries.append(DriveEntry(node=node, scale=DriveScale(peak_current=10.0, reversed=sign < 0.0)))

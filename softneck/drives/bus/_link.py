@@ -1,4 +1,4 @@
-"""What carries frames: simulated drives in virtual time, or a bus of python-can."""
+"""Links that carry frames: simulated drives in virtual time, or a bus of python-can."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HARMLESS = ("virtual", "udp_multicast")
 
 
 class BusError(SoftneckError):
-    """A bus cannot be opened or does not work; the line says which and why."""
+    """A bus cannot be opened or does not work; the message names bus and reason."""
 
 
 class Link(Protocol):
@@ -45,12 +45,12 @@ class Link(Protocol):
         ...
 
     def receive(self, timeout: float) -> list[Frame]:
-        """Return what came, waiting for at most `timeout` [s] where nothing is there."""
+        """Return the received frames; wait for at most `timeout` [s] if there are none."""
         ...
 
 
 class VirtualLink:
-    """The bus to simulated drives in virtual time: waiting is what lets time pass.
+    """The bus to simulated drives in virtual time, which advances while the master waits.
 
     Attributes:
         neck: what hangs on it: the virtual neck with its drives, or springs in the place of another robot.
@@ -100,14 +100,14 @@ class VirtualLink:
         return Reading(*self.neck.newest[1:])
 
     def pass_time(self) -> None:
-        """Let one cycle pass: drives, neck, and what the drives say by themselves."""
+        """Advance one cycle: drives, neck, and the frames that the drives send by themselves."""
         self.neck.move()
         self._step += 1
         if self.sampling and self._step % self._samples == 0:
             self.neck.sample(self.now)
 
     def receive(self, timeout: float) -> list[Frame]:
-        """Return what is there; else let time pass until something comes or `timeout` [s] is over."""
+        """Return the received frames; if there are none, advance time until one comes or `timeout` [s] is over."""
         passed = 0.0
         # What rounding leaves of a time-out is a cycle too: whoever waits until it is over would wait for ever.
         while not self._inbox and (passed < timeout - 1e-9 or passed == 0.0 < timeout):
@@ -117,7 +117,7 @@ class VirtualLink:
         return self.drain()
 
     def drain(self) -> list[Frame]:
-        """Return what is there now."""
+        """Return the frames received so far."""
         frames = list(self._inbox)
         self._inbox.clear()
         return frames
@@ -151,7 +151,7 @@ class CanLink:
         return time.monotonic()
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send all; a bus that refuses is told to the master as bus-off."""
+        """Send all frames; report a bus that refuses to the master as bus-off."""
         import can
 
         for frame in frames:
@@ -275,7 +275,7 @@ class GuardedLink:
         self._link.send(frames)
 
     def receive(self, timeout: float) -> list[Frame]:
-        """Return what came, waiting for at most `timeout` [s] where nothing is there."""
+        """Return the received frames; wait for at most `timeout` [s] if there are none."""
         until = self.now + timeout
         while True:
             now = self.now
@@ -303,7 +303,7 @@ _NUMBERS = re.compile(r"\[Errno (\d+)\] ?")
 
 
 def reason(error: BaseException) -> str:
-    """Return what `error` says as one sentence, with advice where its number is a known one.
+    """Return `error` as one sentence, with advice for a known error number.
 
     Libraries wrap the operating system's errors and keep the number in the text only.
     """

@@ -1,4 +1,4 @@
-"""Which objects of a drive a run needs and what is written to them, per profile."""
+"""Objects of a drive that a run needs, and their values, per profile."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _FOLLOWING_TIME = 200
 # Our own node number, for heartbeats.
 MASTER_NODE = 127
 # Speeds of the profile ds402: counts per second.
-_PLAIN = "ds402"
+_RAW_PROFILE = "ds402"
 
 _CURRENT = {"ipos2015": 0x207E, "ds402": 0x6078}
 # Rated current of the motor, to which 6073h and 6078h are relative (maxon 118739) [A].
@@ -46,36 +46,36 @@ _ANY_GUARDING = frozenset(index for index, _ in GUARDING_OBJECTS)
 
 def speed_units(speed: float, entry: DriveEntry, profile: str) -> int:
     """Return a speed [rad/s] in the drive's units."""
-    if profile == _PLAIN:
+    if profile == _RAW_PROFILE:
         return round(speed * entry.scale.counts_per_radian)
     return speed_to_internal(speed, entry.scale)
 
 
 def speed_of_units(units: int, entry: DriveEntry, profile: str) -> float:
     """Return a speed [rad/s] of the drive's units."""
-    return units / entry.scale.counts_per_radian if profile == _PLAIN else internal_to_speed(units, entry.scale)
+    return units / entry.scale.counts_per_radian if profile == _RAW_PROFILE else internal_to_speed(units, entry.scale)
 
 
 def current_write(current: float, entry: DriveEntry, profile: str) -> Write:
     """Return the write that limits the motor's current [A]."""
-    if profile == _PLAIN:
+    if profile == _RAW_PROFILE:
         return Write(0x6073, 0, round(1000.0 * current / RATED_CURRENT))
     return Write(0x207F, 0, abs(current_to_internal(current, entry.scale)))
 
 
 def ampere(entry: DriveEntry, profile: str) -> float:
-    """Return the current for one unit of what the drive tells [A]."""
-    return 1e-3 * RATED_CURRENT if profile == _PLAIN else abs(internal_to_current(1, entry.scale))
+    """Return the current of one unit of the drive's reading [A]."""
+    return 1e-3 * RATED_CURRENT if profile == _RAW_PROFILE else abs(internal_to_current(1, entry.scale))
 
 
 def _acceleration(value: float, entry: DriveEntry, profile: str) -> int:
-    if profile == _PLAIN:
+    if profile == _RAW_PROFILE:
         return abs(round(value * entry.scale.counts_per_radian))
     return abs(acceleration_to_internal(value, entry.scale))
 
 
 def option_writes() -> list[Write]:
-    """What a drive does when connection, master or itself fails: latch Fault after a quick-stop ramp."""
+    """Reactions of a drive to a failure of connection, master or itself: Fault after a quick-stop ramp."""
     return [Write(0x6007, 0, 1), Write(0x605E, 0, 2), Write(0x605A, 0, 2)]
 
 

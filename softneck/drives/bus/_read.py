@@ -74,7 +74,7 @@ _KEYS: dict[str, dict[str, tuple[str, float]]] = {
         for name, kind in _CLASSES.items()
     },
 }  # fmt: skip
-_TOP = ("profile", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
+_TOP_KEYS = ("profile", "bus", "guarding", "drive", "limits", "stop", "sensor", "watch", "zero", "ramp", "neck",
         "supervision")  # fmt: skip
 # Table -> keys that files have had and nobody set -> what they are now, always.
 _GONE: dict[str, dict[str, float]] = {
@@ -87,9 +87,9 @@ _GONE: dict[str, dict[str, float]] = {
 
 
 def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | None = None) -> DrivesFile:
-    """Return what a table with the keys of a drives file describes for `robot`; files are looked for in `folder`."""
+    """Return the drives file of a table for `robot`; `folder` holds the files that it names."""
     table = require_table(table, robot)
-    _refuse_unknown("the file", table, _TOP)
+    _refuse_unknown("the file", table, _TOP_KEYS)
     if "profile" not in table:
         raise SettingsError(f"`profile` is missing; it is one of {', '.join(PROFILES)}.")
     entries, motors = table.get("drive"), len((robot or NECK).motors.names)
@@ -105,7 +105,7 @@ def make_drives(table: Mapping[str, Any], folder: Path = Path(), robot: Robot | 
     for name, setting in _CLASSES.items():
         if name not in table:
             continue
-        values[_FIELDS.get(name, name)] = _made(f"[{name}]", setting, name, _table(name, table[name]))
+        values[_FIELDS.get(name, name)] = _build(f"[{name}]", setting, name, _table(name, table[name]))
     if "sensor" in table:
         values |= _sensor(dict(_table("sensor", table["sensor"])), folder)
     values |= _values("[bus]", "bus", _table("bus", table.get("bus", {})))
@@ -141,14 +141,14 @@ def _drive(number: int, entry: Any) -> DriveEntry:
     scale = {key: value for key, value in content.items() if key in _KEYS["scale"]}
     rest = {key: value for key, value in content.items() if key in _KEYS["drive"]}
     try:
-        made = _made(where, DriveScale, "scale", scale)
+        made = _build(where, DriveScale, "scale", scale)
         return DriveEntry(scale=made, **_values(where, "drive", rest))
     except (SettingsError, DataError) as error:
         text = str(error)
         raise SettingsError(text if text.startswith(where) else f"{where}: {text}") from error
 
 
-def _made(where: str, setting: type, name: str, content: Mapping[str, Any]) -> Any:
+def _build(where: str, setting: type, name: str, content: Mapping[str, Any]) -> Any:
     try:
         return setting(**_values(where, name, content))
     except SettingsError as error:
@@ -161,13 +161,13 @@ def _values(where: str, name: str, content: Mapping[str, Any]) -> dict[str, Any]
     return {keys[key][0]: _value(f"{where} {key}", value, keys[key][1]) for key, value in content.items()}
 
 
-_WHOLE = ("node", "vendor", "product", "serial", "bit_rate")
+_INTEGER_KEYS = ("node", "vendor", "product", "serial", "bit_rate")
 
 
 def _value(where: str, value: Any, factor: float) -> Any:
     key = where.rpartition(" ")[2]
     if factor == 0.0:
-        wanted: type = bool if key == "reversed" else int if key in _WHOLE else str
+        wanted: type = bool if key == "reversed" else int if key in _INTEGER_KEYS else str
         if not isinstance(value, wanted) or (wanted is int and isinstance(value, bool)):
             words = {bool: "true or false", int: "a whole number", str: "a text"}
             raise SettingsError(f"{where} must be {words[wanted]}; got {value!r}.")

@@ -1,4 +1,4 @@
-"""What a robot says to its drives file: how many drives, which limits are the tighter ones, which way motors count."""
+"""Values that a robot gives its drives file: number of drives, tighter limits, signs of motors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..master._settings import ChannelSettings, LimitSettings
 
 # What the watch needs to know of a robot; the defaults are the neck's.
 _WATCHED = {"gain": "static output for one radian along its direction", "pole_per_s": "of the lag on the way there"}
-_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
+_NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 def robot_of(given: str | Path | Robot | None, beside: Path | None) -> Robot | None:
@@ -43,11 +43,11 @@ def robot_of(given: str | Path | Robot | None, beside: Path | None) -> Robot | N
 
 def count_word(count: int) -> str:
     """Return a number of drives in words."""
-    return _NUMBERS[count]
+    return _NUMBER_WORDS[count]
 
 
 def require_table(table: Mapping[str, Any], robot: Robot | None) -> Mapping[str, Any]:
-    """Return the table of a drives file with what the robot says and the file does not.
+    """Return the table of a drives file, completed by the robot's values.
 
     Raises:
         SettingsError: both say it and differ, or none says what the watch needs of a robot that is no neck.
@@ -71,7 +71,7 @@ def require_table(table: Mapping[str, Any], robot: Robot | None) -> Mapping[str,
 
 
 def require_signs(turned: Sequence[bool], robot: Robot) -> None:
-    """Raise SettingsError where the robot's `sign` and what is `turned`, by `reversed`, contradict each other.
+    """Raise SettingsError if the robot's `sign` and `reversed` of the drives contradict each other.
 
     `reversed` decides; a robot that counts no motor the other way says nothing about it.
     """
@@ -86,7 +86,7 @@ def require_signs(turned: Sequence[bool], robot: Robot) -> None:
 
 
 def channels_of(robot: Robot | None, limits: LimitSettings) -> ChannelSettings | None:
-    """Return what the master must know of the robot; None where none is spoken of."""
+    """Return the robot's channels for the master; None if no robot is given."""
     if robot is None:
         return None
     weights = robot.weights()

@@ -46,7 +46,7 @@ class SdoError(SoftneckError):
     """A drive refused an object or did not answer."""
 
     def __init__(self, message: str, *, aborted: bool = False, code: int = 0) -> None:
-        """Say what happened; `aborted` tells a refusal from silence, `code` is the drive's reason."""
+        """Create the error; `aborted` distinguishes a refusal from a time-out, `code` is the drive's reason."""
         super().__init__(message)
         self.aborted, self.code = aborted, code
 
@@ -113,8 +113,8 @@ class Objects:
         data = (value & ((1 << 8 * kind.size) - 1)).to_bytes(kind.size, "little")
         self._call(index, subindex, lambda: self._client.download(index, subindex, data), value=value)
 
-    def written(self, index: int, subindex: int, value: int) -> int:
-        """Write a number and return what the drive says that it has now: what was written where it may keep silent."""
+    def write_checked(self, index: int, subindex: int, value: int) -> int:
+        """Write a number and return the drive's value read back; a write-only object returns the number written."""
         self.write(index, subindex, value)
         try:
             return self.read(index, subindex)
@@ -144,7 +144,7 @@ class Objects:
 
 
 class _Network:
-    """What canopen's client needs of a network: sending, and the answer being there afterwards."""
+    """The part of a network that canopen's client needs: sending, with the answer available afterwards."""
 
     def __init__(self, link: Link, client: SdoClient, answer: int) -> None:
         self._link, self._client, self._answer = link, client, answer

@@ -74,7 +74,7 @@ Axes = tuple[tuple[int, float], ...]
 
 
 def axes_of(said: Sequence[str], outputs: Sequence[str]) -> Axes:
-    """Return what a list such as `["-roll", "pitch"]` says: the first output is the sensor's second, reversed.
+    """Parse a list such as `["-roll", "pitch"]`: the first output is the sensor's second, reversed.
 
     The sensor's own axes go by the outputs' names, in their order; an empty list is a sensor that sits as it should.
 
@@ -100,14 +100,14 @@ def said_of(axes: Axes, outputs: Sequence[str]) -> tuple[str, ...]:
 
 
 def inverse(axes: Axes) -> Axes:
-    """Return the way back: what the sensor's own axes are of the outputs."""
+    """Return the inverse: the sensor's axes in terms of the outputs."""
     back = [(0, 1.0)] * len(axes)
     for output, (number, sign) in enumerate(axes):
         back[number] = (output, sign)
     return tuple(back)
 
 
-def turned(sample: Reading, axes: Axes) -> Reading:
-    """Return what the robot's outputs are in a sample of the sensor's own axes."""
+def to_robot_axes(sample: Reading, axes: Axes) -> Reading:
+    """Convert a sample from the sensor's axes to the robot's outputs."""
     values, rates = (tuple(sign * given[number] for number, sign in axes) for given in (sample.values, sample.rates))
     return sample_of(values, rates, valid=sample.valid)

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from softneck.core import DataError, require_finite, require_positive
 
 # maxon 134777, sold as "24:1"; the lab's logged positions are scaled with 24, 1.4 % less than the winch turned.
-_GEAR = 1539.0 / 65.0
+_GEAR_RATIO = 1539.0 / 65.0
 # maxon 201937: 512 lines, four edges each.
 _COUNTS_PER_TURN = 2048.0
 # 6081h, 60FFh, 606Ch: 65536 is one count per slow-loop sample; 6083h, 6085h the same per sample squared.
-_FRACTION = 65536.0
+_COUNTS_PER_SAMPLE_SCALE = 65536.0
 # Current in internal units: A x 65520 / (2 I_peak).
 _CURRENT_RANGE = 65520.0
 _INT16, _INT32 = 2**15 - 1, 2**31 - 1
@@ -24,7 +24,7 @@ _INT16, _INT32 = 2**15 - 1, 2**31 - 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveScale:
-    """What turns SI into a drive's units.
+    """Factors from SI to a drive's units.
 
     Attributes:
         peak_current: of the drive [A]: 10 or 20, by its type (iPOS4808 or iPOS3604 and their set-up); no default,
@@ -36,7 +36,7 @@ class DriveScale:
     """
 
     peak_current: float
-    gear: float = _GEAR
+    gear: float = _GEAR_RATIO
     counts_per_turn: float = _COUNTS_PER_TURN
     slow_loop: float = 1e-3
     reversed: bool = False
@@ -111,7 +111,7 @@ def internal_to_current(units: int, scale: DriveScale) -> float:
 
 
 def _speed_factor(scale: DriveScale) -> float:
-    return _FRACTION * scale.counts_per_radian * scale.slow_loop
+    return _COUNTS_PER_SAMPLE_SCALE * scale.counts_per_radian * scale.slow_loop
 
 
 def _current_factor(scale: DriveScale) -> float:

@@ -1,4 +1,4 @@
-"""Commissioning: who is there, small guarded moves, what they say, and the files that would be right."""
+"""Commissioning: scan, small guarded moves, their results, and corrected files."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from ..bus._read import drives_table
 from ..running._bus_loop import RunEnd, Session
 from ..running._preflight import scan
 from ..simulated._springs import SimulatedSprings
-from ._findings import Finding, fatal, known_before, require_answers, typed
-from ._identify import LATE, Expected, Identified, identify, proposed
+from ._findings import Finding, fatal, known_before, require_answers, with_type_currents
+from ._identify import LATE, Expected, Identified, apply_findings, identify
 from ._measure import expected_of, measure
 from ._moves import PULLED, Guards, Moves
 
 DRIVES, ROBOT = "drives.toml", "robot.toml"
-_REMARK = "# Proposed by `softneck drives commission`; read it before it is used.\n"
+_FILE_HEAD = "# Proposed by `softneck drives commission`; read it before it is used.\n"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Commissioned:
-    """What a commissioning found.
+    """The result of a commissioning.
 
     Attributes:
         believed: the drives file as it was given.
@@ -64,11 +64,11 @@ class Commissioned:
 
     @property
     def holds(self) -> bool:
-        """Whether all is as the files say, and was looked at."""
+        """Whether everything was checked and agrees with the files."""
         return not self.findings
 
     def require(self) -> None:
-        """Raise CheckFailedError with what was found, in one line."""
+        """Raise CheckFailedError with the findings in one line."""
         if self.ended is not None and self.ended.master.supervisor.rehome:
             self.ended.require()
         if self.findings:
@@ -94,7 +94,7 @@ class Commissioned:
 
 
 def motor_table(result: Commissioned, motor: int) -> dict[str, Any]:
-    """Return what was found of motor `motor` of the drives file as it was given, from 1 on, in SI units."""
+    """Return the result of motor `motor` of the given drives file, from 1 on, in SI units."""
     found, entry = result.identified, result.believed.drives[motor - 1]
     one = None if found is None else found.motors[motor - 1]
     table: dict[str, Any] = {"motor": motor, "node": entry.node, "outcome": "not moved"}
@@ -166,19 +166,19 @@ def commission(
     if fatal(told):
         return Commissioned(file, tuple(told), None, None, None, file, file.moves)
     # Whose type says what its current is relative to is led by that from the first move on.
-    believed, peaks = typed(file, found)
+    believed, peaks = with_type_currents(file, found)
     moves, ended = measure(replace(session, file=believed), guards, motors=motors or range(1, count + 1), report=report)
     pulled = any(moved.outcome == PULLED for moved in moves.motors)
     expected = expected_of(believed, guards, neck) if pulled else None
     seen = identify(moves, believed, expected, types=peaks)
-    right = proposed(believed, seen)
+    right = apply_findings(believed, seen)
     return Commissioned(
         file, (*told, *seen.findings), moves, seen, expected, right, _robot(right, seen, expected), ended
     )
 
 
 def _robot(file: DrivesFile, found: Identified, expected: Expected | None) -> Robot:
-    """Return the robot file's content with what was found of the sensor, and which drives file is right."""
+    """Return the robot file with the measured sensor values and the proposed drives file."""
     robot = file.moves
     motors = robot.motors
     if min(motors.sign) < 0.0:
@@ -214,12 +214,12 @@ def require_folder(folder: Path, *, force: bool) -> None:
 
 
 def write_files(folder: Path, result: Commissioned, *, force: bool) -> dict[str, str]:
-    """Write the proposed drives and robot file; return what -> path. Where nothing moved there is none to propose."""
+    """Write the proposed drives and robot file; return name -> path. Without moves there are none."""
     if result.moves is None:
         return {}
     # All in memory before the first is written.
     texts = {DRIVES: tomli_w.dumps(drives_table(result.file)), ROBOT: tomli_w.dumps(result.robot.as_dict())}
     for name, text in texts.items():
         with atomic_write(folder / name, force=force) as temporary:
-            temporary.write_text(_REMARK + text, encoding="utf-8")
+            temporary.write_text(_FILE_HEAD + text, encoding="utf-8")
     return {Path(name).stem: str(folder / name) for name in texts}

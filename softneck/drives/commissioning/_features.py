@@ -1,4 +1,4 @@
-"""What one motor's moves show, as numbers: a hinge of slack and tension, directions, friction, lag and noise.
+"""Features of one motor's moves: hinge of slack and tension, directions, friction, lag and noise.
 
 Pure functions of what was measured, in the drive's own counts and current units.
 """
@@ -18,7 +18,7 @@ from ._moves import PERIOD, PULLED, REST, SWEEP, WIGGLE, MotorMoves, counts_per_
 # Candidates for where a hinge bends; samples over which a way counts as up or down.
 _BENDS, _OVER = 60, 20
 # The upper part of the way by which sign and direction are told.
-_TOP = 0.1
+_TOP_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class Features:
 
 
 def features(moved: MotorMoves) -> Features | None:
-    """Return what the moves of a motor show; None of one that did not pull its tendon, or of too few rows."""
+    """Return the features of a motor's moves; None if it did not pull its tendon, or for too few rows."""
     if moved.outcome != PULLED or not moved.rows(WIGGLE).any():
         return None
     rows = moved.rows(SWEEP) & np.isfinite(moved.outputs).all(axis=1)
@@ -63,7 +63,7 @@ def features(moved: MotorMoves) -> Features | None:
     pull = _pull(counts, current)
     x = pull * (counts - moved.counts[0])
     level = np.mean(outputs[x < np.quantile(x, 0.3)], axis=0)
-    away = np.mean(outputs[x > np.max(x) - _TOP * np.ptp(x)], axis=0) - level
+    away = np.mean(outputs[x > np.max(x) - _TOP_SHARE * np.ptp(x)], axis=0) - level
     direction = away / max(float(np.linalg.norm(away)), 1e-12)
     tilt = (outputs - level) @ direction
     passed = np.zeros(x.size)
@@ -96,7 +96,7 @@ def _pull(counts: Vector, current: Vector) -> int:
     Friction acts against either way, a tendon to one side only: over the way up and down it is what remains.
     """
     order = np.argsort(counts)
-    edge = max(int(_TOP * counts.size), 1)
+    edge = max(int(_TOP_SHARE * counts.size), 1)
     ends = current[order[-edge:]].mean() + current[order[:edge]].mean()
     return 1 if ends > 0.0 else -1
 

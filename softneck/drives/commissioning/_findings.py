@@ -1,4 +1,4 @@
-"""What a commissioning finds, by name, and what is to be done about it."""
+"""Findings of a commissioning, each with its advice."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..running._preflight import several_devices
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is not as the files say.
+    """One deviation from the files.
 
     Attributes:
         name: in two words, such as `exchanged motors`.
@@ -33,7 +33,7 @@ class Finding:
     factor: float = 0.0
 
     def table(self) -> dict[str, Any]:
-        """Return what JSON holds of it."""
+        """Return the JSON values."""
         table: dict[str, Any] = {
             "name": self.name,
             "motors": list(self.motors),
@@ -55,11 +55,11 @@ class Finding:
 PEAKS: Mapping[str, float] = {"iPOS3604": 10.0, "iPOS4808": 20.0}
 PRODUCTS: Mapping[int, str] = {27014101: "iPOS4808"}
 # What keeps everything from moving.
-_FATAL = ("duplicate node", "no drive")
+_FATAL_FINDINGS = ("duplicate node", "no drive")
 
 
 def require_answers(found: Sequence[Mapping[str, Any]], where: str) -> None:
-    """Raise CheckFailedError if nobody is on the bus."""
+    """Raise CheckFailedError if no node answers."""
     if not found:
         raise CheckFailedError(
             f"{where}: no node answers. Are the drives on, is the bit rate right, is the line terminated (60 ohm "
@@ -74,7 +74,7 @@ def peak_of(drive: Mapping[str, Any]) -> float | None:
 
 
 def known_before(file: DrivesFile, found: Sequence[Mapping[str, Any]]) -> list[Finding]:
-    """Return what the drives on the bus say without moving; `found` is of `scan`."""
+    """Return the findings of a scan, before any move; `found` is of `scan`."""
     by_node = {item["node"]: item for item in found}
     findings = []
     for j, entry in enumerate(file.drives, start=1):
@@ -99,8 +99,8 @@ def known_before(file: DrivesFile, found: Sequence[Mapping[str, Any]]) -> list[F
 
 
 def fatal(findings: Sequence[Finding]) -> bool:
-    """Return whether nothing may move before these are put right."""
-    return any(one.name in _FATAL for one in findings)
+    """Return whether these findings forbid any move."""
+    return any(one.name in _FATAL_FINDINGS for one in findings)
 
 
 def _serial(file: DrivesFile, motor: int, drive: Mapping[str, Any]) -> list[Finding]:
@@ -120,7 +120,7 @@ def _type(file: DrivesFile, motor: int, drive: Mapping[str, Any]) -> list[Findin
     return [Finding("wrong type", text, "Take the proposed `peak_current_A`.", (motor,), factor=peak / said)]
 
 
-def typed(file: DrivesFile, found: Sequence[Mapping[str, Any]]) -> tuple[DrivesFile, dict[int, float]]:
+def with_type_currents(file: DrivesFile, found: Sequence[Mapping[str, Any]]) -> tuple[DrivesFile, dict[int, float]]:
     """Return the file with the peak currents of the drives' types, and those: motor, from 1 on -> [A]."""
     by_node = {item["node"]: peak_of(item) for item in found}
     peaks = {j: peak for j, node in enumerate(file.nodes, start=1) if (peak := by_node.get(node)) is not None}

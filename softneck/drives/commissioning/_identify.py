@@ -30,19 +30,19 @@ _MOTOR, _NECK = 0.15, 0.25
 # A scale this far from a power of two is none: then it is what was measured (0.35: 27 %).
 _NO_POWER = 0.35
 # Of a rise of some units the slope is known to this part of one.
-_UNIT = 0.4
+_SLOPE_TOLERANCE = 0.4
 # From one turn of the motor to the next an index comes within this part.
-_INDEX = 0.02
+_INDEX_TOLERANCE = 0.02
 # A sensor that is late by less than two samples is on time [s]; one whose noise is beyond this tells neither that nor
 # gears and currents (the lab's first inclinometer has 0.27 deg, its second 0.04) [rad].
 LATE, _NOISY = 0.04, math.radians(0.15)
 # Nor does a motor whose tilt for a turn is known worse than to this part: half and twice are 0.7 and 1.4 away.
-_UNCLEAR = 0.25
+_SLOPE_LIMIT = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What the moves of drives that are set up as the file says would show.
+    """Expected features of drives that are set up as in the file.
 
     Attributes:
         gain: tilt for one radian of each tendon's winch [rad/rad].
@@ -59,7 +59,7 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Of one motor, how many times as large it is as the drives file says; 1 where that is right, or not told."""
+    """Ratios of one motor's values to those of the drives file; 1 if correct or not measurable."""
 
     lines: float = 1.0
     gear: float = 1.0
@@ -68,7 +68,7 @@ class Scale:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identified:
-    """What the moves say.
+    """The result of the moves.
 
     Attributes:
         findings: what is not as the files say.
@@ -92,7 +92,7 @@ class Identified:
 def identify(
     moves: Moves, file: DrivesFile, expected: Expected | None, *, types: Mapping[int, float] | None = None
 ) -> Identified:
-    """Return what `moves` say about `file`.
+    """Compare `moves` with `file` and return the result.
 
     Args:
         moves: as measured.
@@ -105,17 +105,22 @@ def identify(
     seen = tuple(None if (moved := moves.of(j)) is None else features(moved) for j in range(1, count + 1))
     mounting, turned = _mounting(seen, file)
     order = range(count) if mounting is None else mounting.order
-    lags = [one.lag for one in seen if one is not None and math.isfinite(one.lag) and one.error < _UNCLEAR]
+    lags = [one.lag for one in seen if one is not None and math.isfinite(one.lag) and one.error < _SLOPE_LIMIT]
     noises = [one.noise for one in seen if one is not None]
     noise = float(np.median(noises)) if noises else math.nan
     quiet = noise < _NOISY
     scales = _scales(seen, file, expected, types or {}, order, quiet=quiet)
     late = float(np.median(lags)) - expected.lag if lags and quiet and expected is not None else math.nan
-    findings = [*_unmoved(moves, count), *_signs(seen, file), *_scale_findings(scales, file, seen), *turned]
+    findings = [
+        *_still_motors(moves, count),
+        *_signs(seen, file),
+        *_scale_findings(scales, file, seen),
+        *turned,
+    ]
     findings += [Finding(
         "unclear", f"its tilt for a turn is known to {100.0 * one.error:.0f} % only: gear, current and lateness were "
         "not judged", "Does its tendon slide, is the sensor loose? Put it right and commission it anew.", (j,),
-    ) for j, one in enumerate(seen, start=1) if quiet and one is not None and one.error >= _UNCLEAR]  # fmt: skip
+    ) for j, one in enumerate(seen, start=1) if quiet and one is not None and one.error >= _SLOPE_LIMIT]  # fmt: skip
     if noises and not quiet:
         findings.append(Finding(
             "sensor noise", f"{math.degrees(noise):.2f} deg at rest, {math.degrees(_NOISY):.2f} at most: gears, "
@@ -131,7 +136,7 @@ def identify(
 
 
 def seen_by(moves: Moves, file: DrivesFile, source: str) -> Expected | None:
-    """Return what moves of drives that are right show, for `identify` to expect; None where none pulled."""
+    """Return the expected features from moves of correct drives, for `identify`; None if none pulled."""
     per_motor = []
     for moved in moves.motors:
         one, entry = features(moved), file.drives[moved.motor - 1]
@@ -158,11 +163,11 @@ def _scales(
 ) -> tuple[Scale, ...]:
     """Return the scales of each motor: lines by the index, gear by the tilt, then the current's by the force."""
     rows = [(j, one, file.drives[j]) for j, one in enumerate(seen)
-            if one is not None and one.gain > 0.0 < one.force and one.error < _UNCLEAR]  # fmt: skip
+            if one is not None and one.gain > 0.0 < one.force and one.error < _SLOPE_LIMIT]  # fmt: skip
     scales = [Scale() for _ in seen]
     for j, one, entry in rows:
         lines = one.turn / entry.scale.counts_per_turn
-        scales[j] = Scale(lines=lines if one.turn and abs(lines - 1.0) > _INDEX else 1.0)
+        scales[j] = Scale(lines=lines if one.turn and abs(lines - 1.0) > _INDEX_TOLERANCE else 1.0)
     known = [(abs(entry.scale.counts_per_radian), ampere(entry, file.profile)) for _, _, entry in rows]
     gains = np.array([one.gain * counts for (_, one, _), (counts, _) in zip(rows, known, strict=True)])
     forces = np.array([one.force * counts * unit for (_, one, _), (counts, unit) in zip(rows, known, strict=True)])
@@ -175,7 +180,9 @@ def _scales(
     gears = factors(_logs(gains, expected and expected.gain, tendons) - np.log2(lines), errors)
     peaks = _logs(forces, expected and expected.force, tendons) - np.log2(lines) - 2.0 * np.log2(gears)
     # A current comes in whole units, of which there are few.
-    coarse = np.array([math.hypot(_MOTOR, _UNIT / max(one.rise, _UNIT) / math.log(2.0)) for _, one, _ in rows])
+    coarse = np.array(
+        [math.hypot(_MOTOR, _SLOPE_TOLERANCE / max(one.rise, _SLOPE_TOLERANCE) / math.log(2.0)) for _, one, _ in rows]
+    )
     # What a ds402 drive tells is relative to its motor's rated current (6075h), which it knows itself.
     shown = np.ones(len(rows)) if file.profile == "ds402" else factors(peaks, coarse)
     for (j, _, _), gear, peak in zip(rows, gears, shown, strict=True):
@@ -195,7 +202,7 @@ def _logs(values: Vector, expected: Sequence[float] | None, tendons: Sequence[in
 
 
 def factors(powers: Vector, errors: Vector | float = _MOTOR) -> Vector:
-    """Return the factors behind measured `powers` of two: whole powers but for what all of them share, and noise.
+    """Return the factors of measured `powers` of two: whole powers, apart from a common factor and noise.
 
     The most probable ones: c is what all share (the neck is not quite the expected one), k the whole powers, and
     `sum((powers - c - k)^2 / errors^2) + (c / neck)^2`, and one for each mistake, is least. One mistake is a k that is
@@ -251,7 +258,7 @@ def _signs(seen: Sequence[Features | None], file: DrivesFile) -> list[Finding]:
     return found
 
 
-def _unmoved(moves: Moves, count: int) -> list[Finding]:
+def _still_motors(moves: Moves, count: int) -> list[Finding]:
     found = []
     for j in range(1, count + 1):
         moved = moves.of(j)
@@ -268,7 +275,7 @@ def _unmoved(moves: Moves, count: int) -> list[Finding]:
 
 
 def _mounting(seen: Sequence[Features | None], file: DrivesFile) -> tuple[Mounting | None, list[Finding]]:
-    """Return the simplest explanation of the measured directions, and what it says."""
+    """Return the simplest mounting that explains the measured directions, and its findings."""
     weights = file.weights
     if not weights or not any(seen):
         return None, []
@@ -279,12 +286,12 @@ def _mounting(seen: Sequence[Features | None], file: DrivesFile) -> tuple[Mounti
     if best.off > FITS:
         text = f"off by {math.degrees(best.off):.0f} deg whatever motors and axes are exchanged"
         return None, [Finding("directions", text, "Are the angles of the robot file those of the tendons?")]
-    told = [_told(one, outputs) for one in found]
+    told = [_mounting_findings(one, outputs) for one in found]
     others = tuple(" and ".join(f"{one.name}: {one.text}" for one in other) for other in told[1:])
     return best, [replace(one, instead=others) for one in told[0]]
 
 
-def _told(mounting: Mounting, outputs: Sequence[str]) -> list[Finding]:
+def _mounting_findings(mounting: Mounting, outputs: Sequence[str]) -> list[Finding]:
     found = []
     moved = [j for j, k in enumerate(mounting.order) if j != k]
     if moved:
@@ -301,7 +308,7 @@ def _told(mounting: Mounting, outputs: Sequence[str]) -> list[Finding]:
     return found
 
 
-def proposed(file: DrivesFile, found: Identified) -> DrivesFile:
+def apply_findings(file: DrivesFile, found: Identified) -> DrivesFile:
     """Return the drives file with all that was found put right."""
     entries = []
     for entry, one, scale in zip(file.drives, found.motors, found.scales, strict=True):

@@ -1,4 +1,4 @@
-"""Jogging: one motor a little, both ways, and whether the neck tilts the way that its tendon says."""
+"""Jogging: move one motor a little, both ways, and compare the tilt with its tendon's direction."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _WAY, _STAND, _MEAN = 1.0, 1.5, 0.75
 # Jogged further or by less than this it is no jog [rad].
 LEAST, MOST = 0.1, 1.5
 # Less than this part of the tilt that is expected is no movement of the neck.
-_MOVED = 0.25
+_LEAST_MOTION_SHARE = 0.25
 # The mean angles must be known to this part of what is seen.
-_NOISE = 0.35
+_NOISE_SHARE = 0.35
 
 
 @dataclass(frozen=True, slots=True)
 class JogResult:
-    """What a jog showed.
+    """The result of a jog.
 
     Attributes:
         motor: from 1 on; node: its drive.
@@ -140,7 +140,7 @@ def jog(
     expected = tuple(way * part for part in ways[motor - 1]) if ways else (math.nan,) * len(outputs)
     found = JogResult(
         motor, session.file.nodes[motor - 1], amplitude, expected, (math.nan,) * len(outputs), math.nan, math.nan,
-        *_stopped(run.ended, motor), run.ended, outputs,
+        *_explain_stop(run.ended, motor), run.ended, outputs,
     )  # fmt: skip
     if run.recording is None or run.rows < len(path):
         return found
@@ -161,7 +161,7 @@ def _ways(session: Session, tendon_angles: tuple[float, ...] | None) -> list[tup
 
 
 def jog_pilot(motor: int, amplitude: float, lowest: float | None = None, motors: int = 3) -> SignalPilot:
-    """Return what moves one of the motors up by `amplitude` [rad], and down as far or to `lowest`."""
+    """Return the pilot that moves one motor up by `amplitude` [rad], and down as far or to `lowest`."""
     return SignalPilot(_rows(_path(amplitude, -amplitude if lowest is None else lowest)[0], motor, motors))
 
 
@@ -171,7 +171,7 @@ def _rows(path: Vector, motor: int, motors: int) -> Matrix:
     return rows
 
 
-def _stopped(ended: RunEnd, motor: int) -> tuple[str, str]:
+def _explain_stop(ended: RunEnd, motor: int) -> tuple[str, str]:
     """Return verdict and advice for a jog that did not get to its end.
 
     A tendon can only pull: a motor whose current says that it is pushed has the wrong sign.
@@ -226,19 +226,19 @@ def _response(angles: Matrix, stands: tuple[slice, ...]) -> tuple[tuple[float, .
 def judge(
     seen: Sequence[float], noise: float, expected: Sequence[float], ways: Sequence[Sequence[float]], motor: int
 ) -> tuple[str, str]:
-    """Return verdict and advice for outputs `seen` (for the way up) where `expected` should be.
+    """Return verdict and advice for measured outputs (on the way up), compared with `expected`.
 
     The nearest of all `ways` (each motor pulling, or letting out) says which one moved, and which way.
     """
     size, wanted = math.hypot(*seen), math.hypot(*expected)
     if not math.isfinite(size):
         return "unclear", "The inclinometer gave no angles."
-    if noise > _NOISE * max(size, wanted):
+    if noise > _NOISE_SHARE * max(size, wanted):
         return "unclear", (
             f"The inclinometer is noisier ({math.degrees(noise):.1f} deg) than what is to be seen "
             f"({math.degrees(wanted):.1f} deg); look at it, or raise --travel."
         )
-    if size < _MOVED * wanted:
+    if size < _LEAST_MOTION_SHARE * wanted:
         return (
             "no movement",
             "Is its tendon attached and tight (`softneck drives commission --only zero`)? Is the inclinometer fixed?",
@@ -264,7 +264,7 @@ def judge(
 
 
 def _gap(seen: Sequence[float], way: Sequence[float], sign: int) -> float:
-    """Return the angle between what is seen and a motor's direction [rad]; a motor that moves nothing is far off."""
+    """Return the angle between the measured and a motor's direction [rad]; pi if nothing moves."""
     size = math.hypot(*seen) * math.hypot(*way)
     along = sum(a * b for a, b in zip(seen, way, strict=True))
     return math.acos(min(1.0, max(-1.0, sign * along / size))) if size > 0.0 else math.pi

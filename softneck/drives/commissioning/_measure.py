@@ -31,7 +31,7 @@ _LOOK, _STILL, _PATIENCE = 0.5, 0.01, 10.0
 # each so many cycles.
 _PROBE, _PROBE_ON, _CAPTURED, _ASK = 0x60B8, 0x17, 0x60BA, 10
 # Nothing is known yet of what these checks compare with.
-_OVERRIDE = ("homed", "identity", "firmware")
+_SKIPPED_CHECKS = ("homed", "identity", "firmware")
 # No watch on what is to be found out; the guards of the moves are narrower.
 _OPEN = {"pushed": 200.0, "tilt": 1.6}
 
@@ -39,7 +39,7 @@ _OPEN = {"pushed": 200.0, "tilt": 1.6}
 def measure(
     session: Session, guards: Guards, *, motors: Sequence[int], report: Callable[[float, str], None] | None = None
 ) -> tuple[Moves, RunEnd]:
-    """Move `motors` (from 1 on) one after the other, and return what was measured; the drives are off then.
+    """Move `motors` (from 1 on) one after the other, switch the drives off, and return the measurements.
 
     What stopped it early is in the moves; those of the motors before are whole.
 
@@ -66,7 +66,7 @@ def measure(
         return _from_here(session.link, file, made, guards, probe)
 
     session = replace(
-        session, file=file, override=(*session.override, *_OVERRIDE), settings=settings,
+        session, file=file, override=(*session.override, *_SKIPPED_CHECKS), settings=settings,
         watches=(guard, *session.watches),
     )  # fmt: skip
     most = guards.time * len(motors) + 60.0
@@ -77,7 +77,7 @@ def measure(
 
 
 def expected_of(file: DrivesFile, guards: Guards, neck: NeckParameters | None = None) -> Expected | None:
-    """Return what the virtual plant of the robot shows with drives as `file` has them; None where there is none.
+    """Return the moves of the robot's virtual plant with drives as in `file`; None without a virtual plant.
 
     Args:
         file: as believed.
@@ -96,7 +96,7 @@ def expected_of(file: DrivesFile, guards: Guards, neck: NeckParameters | None = 
 
 
 def cautious(file: DrivesFile, guards: Guards) -> DrivesFile:
-    """Return `file` with the limits of the moves: little current, slow ramps, no limit at what is still unknown."""
+    """Return `file` with the limits of the moves: low current, slow ramps, no limits on unknown positions."""
     current = file.zero.current if guards.current is None else guards.current
     drives = tuple(replace(entry, current_limit=min(current, entry.current_limit)) for entry in file.drives)
     far = 1.1 * guards.travel + 1.0
@@ -106,24 +106,24 @@ def cautious(file: DrivesFile, guards: Guards) -> DrivesFile:
         limits=replace(file.limits, position=far, speed=2.0, slack_unwind=20.0),
         watch=replace(file.watch, **_OPEN),
         ramps=replace(file.ramps, speed=0.3, settle=0.2, tolerance=0.2),
-        robot=None if file.robot is None else _unlimited(file.robot),
+        robot=None if file.robot is None else _without_limits(file.robot),
     )
 
 
-def _unlimited(robot: Robot) -> Robot:
+def _without_limits(robot: Robot) -> Robot:
     return replace(robot, motors=replace(robot.motors, setpoint_min=None, setpoint_max=None, rate_limit=None))
 
 
 def _from_here(
     link: CanLink | VirtualLink, file: DrivesFile, settings: MasterSettings, guards: Guards, probe: _Probe
 ) -> MasterSettings:
-    """Take where the winches stand as P = 0, and set the drives' own limits around it."""
+    """Set P = 0 at the present winch positions, and the drives' own limits around it."""
     objects = [Objects(link, node) for node in file.nodes]
     here = _still(link, objects, settings.counts_per_radian)
     for one, entry, counts in zip(objects, file.drives, here, strict=True):
         far = round(abs(1.1 * guards.travel * entry.scale.counts_per_radian))
         for subindex, edge in ((1, counts - far), (2, counts + far)):
-            if one.written(0x607D, subindex, edge) != edge:
+            if one.write_checked(0x607D, subindex, edge) != edge:
                 raise CheckFailedError(f"node {entry.node}: 607Dh:{subindex} does not keep {edge}. Nothing was moved.")
         probe.begin(one)
     low = tuple((-1.1 * guards.travel, 1.1 * guards.travel, file.limits.speed) for _ in here)
@@ -162,7 +162,7 @@ class _Probe:
         """Switch the touch probe on, before the first cycle; a drive without one has no index to tell."""
         try:
             objects.write(_PROBE, 0, 0)
-            if objects.written(_PROBE, 0, _PROBE_ON) == _PROBE_ON:
+            if objects.write_checked(_PROBE, 0, _PROBE_ON) == _PROBE_ON:
                 self._able.add(objects.node)
         except SdoError as error:
             if not error.aborted:

@@ -1,4 +1,4 @@
-"""Which motor pulls which tendon, and how the sensor sits: what explains measured directions with fewest mistakes."""
+"""Find the assignment of motors to tendons and the mounting of the sensor that explain the measured directions best."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Mounting:
 
 
 def exchanges(order: Sequence[int]) -> int:
-    """Return the least number of exchanges of two that bring `order` about: its length less its cycles."""
+    """Return the number of transpositions in `order`: its length minus its cycles."""
     seen, cycles = set[int](), 0
     for begin in range(len(order)):
         if begin in seen:
@@ -58,7 +58,7 @@ def exchanges(order: Sequence[int]) -> int:
 
 
 def explain(directions: Matrix, tendons: Matrix) -> list[Mounting]:
-    """Return the explanations with fewest mistakes, the best one first; several cannot be told apart by moves.
+    """Return the explanations with fewest errors, the best one first; moves cannot distinguish them.
 
     Args:
         directions: (motors, outputs) in which each motor moved the outputs as they were measured, NaN where unknown.
@@ -92,19 +92,19 @@ def _orders(directions: Matrix, tendons: Matrix, axes: Axes, known: NDArray[np.b
         return
     from scipy.optimize import linear_sum_assignment
 
-    cost = np.array([[_angle(directions[j], seen(tendons[:, k], axes)) if known[j] else 0.0 for k in range(count)]
-                     for j in range(count)])  # fmt: skip
+    expected = [to_sensor_axes(tendon, axes) for tendon in tendons.T]
+    cost = np.array([[_angle(directions[j], one) if known[j] else 0.0 for one in expected] for j in range(count)])
     yield tuple(range(count))
     yield tuple(int(k) for k in linear_sum_assignment(cost**2)[1])
 
 
-def seen(direction: Vector, axes: Axes) -> Vector:
+def to_sensor_axes(direction: Vector, axes: Axes) -> Vector:
     """Return a true direction of the outputs as a sensor with `axes` tells it."""
     return np.array([sign * direction[number] for number, sign in axes])
 
 
 def _off(directions: Matrix, tendons: Matrix, order: Sequence[int], axes: Axes, known: NDArray[np.bool_]) -> float:
-    angles = [_angle(directions[j], seen(tendons[:, order[j]], axes)) for j in range(len(order)) if known[j]]
+    angles = [_angle(directions[j], to_sensor_axes(tendons[:, order[j]], axes)) for j in range(len(order)) if known[j]]
     return float(np.sqrt(np.mean(np.square(angles)))) if angles else 0.0
 
 

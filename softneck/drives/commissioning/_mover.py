@@ -54,7 +54,7 @@ _DRIFT = math.radians(0.5)
 # The guard of the tilt gives way to this much of noise at the most [rad].
 _NOISE = math.radians(0.7)
 # No farther than this beyond where the search ended, slowly, and back [rad].
-_BEYOND = 1.0
+_OVERTRAVEL_RAD = 1.0
 # Below this part of the tilt at the top a tendon is nearly slack, or hysteresis keeps the neck there; and surely slack
 # this much further out [rad].
 _LOOSE, _SLACK = 0.45, 0.3
@@ -64,7 +64,7 @@ _Until = Callable[[], bool]
 
 
 class Mover:
-    """The pilot of a commissioning: gives the set-points, and keeps what is measured.
+    """The pilot of a commissioning: gives set-points and stores measurements.
 
     Attributes:
         done: moves of each motor that is over.
@@ -119,7 +119,7 @@ class Mover:
     def start(self) -> None:
         """Begin with the first motor."""
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         """Return whether all motors were moved."""
         del index
         return self._over
@@ -195,7 +195,7 @@ class Mover:
             yield from self._go(-way * _INDEX_WAY, self.guards.speed, lambda: self._index_seen)
             yield from self._go(0.0, self.guards.speed)
         yield from self._stand(_STAND)
-        self.done.append(self._moved(outcome, way))
+        self.done.append(self._collect_moves(outcome, way))
         self.motor = 0
 
     def _search(self) -> Generator[Motors, None, tuple[str, int]]:
@@ -218,7 +218,7 @@ class Mover:
         return HANGS, 0
 
     def _contact(self, way: int) -> _Until:
-        """Return what says whether a tendon got taut on the way that begins now: by the tilt, or by the current."""
+        """Return the test for a taut tendon on the move that begins now, by tilt or by current."""
         since, even = self._time, list[float]()
         sign = way * self._signs[self.motor - 1]
         self._tight, self._most = "", math.inf
@@ -243,11 +243,11 @@ class Mover:
         return taut
 
     def _taut(self, way: int) -> Generator[Motors, None, tuple[str, int]]:
-        """Look whether the sensor sees the tendon that got taut; where only the current told it, a little farther."""
+        """Check that the sensor sees the taut tendon; after contact by current alone, move a little farther."""
         yield from self._stand(_STAND)
         if self._tight == "current" and self._size() < self._seen:
             sign, most = way * self._signs[self.motor - 1], self._most
-            end = self._at + way * _BEYOND * self._scale
+            end = self._at + way * _OVERTRAVEL_RAD * self._scale
 
             def enough() -> bool:
                 return self._size() > self._seen or sign * float(np.mean(self._currents)) > most
@@ -258,7 +258,7 @@ class Mover:
 
     def _measure(self, way: int) -> _Steps:
         """Slowly back into the slack, up and down under tension, and wiggle at the top."""
-        self._phase, slow, far = SWEEP, self.guards.slow * self._scale, way * _BEYOND * self._scale
+        self._phase, slow, far = SWEEP, self.guards.slow * self._scale, way * _OVERTRAVEL_RAD * self._scale
         top, begin, pulled = self._at, 0, self._tilt() / self._size()
 
         def away() -> bool:
@@ -315,7 +315,7 @@ class Mover:
 
     @property
     def _seen(self) -> float:
-        """The tilt that is one: from `contact` on, or from what stands out of the noise [rad]."""
+        """The least tilt that counts: `contact`, or the noise level if larger [rad]."""
         return max(self.guards.contact, _OUT_OF_NOISE * self._noise / math.sqrt(_MEAN))
 
     def _tilt(self) -> Vector:
@@ -332,13 +332,13 @@ class Mover:
             yield tuple(self._wanted)
 
     def _go(self, end: float, speed: float, until: _Until = lambda: False) -> _Steps:
-        """Lead the motor to `end` [rad], or until something says that it is far enough."""
+        """Move the motor to `end` [rad], or until a test says that it is far enough."""
         step = speed * self._step
         while abs(end - self._at) > 1e-9 and not until():
             self._put(self._at + min(max(end - self._at, -step), step))
             yield tuple(self._wanted)
 
-    def _moved(self, outcome: str, way: int) -> MotorMoves:
+    def _collect_moves(self, outcome: str, way: int) -> MotorMoves:
         rows = np.array(self._rows)
         return MotorMoves(
             self.motor, self._nodes[self.motor - 1], outcome, way, rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3],

@@ -1,4 +1,4 @@
-"""What the small moves of a commissioning measured, and what they may not exceed."""
+"""Measurements of the small moves of a commissioning, and their limits."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ WIGGLES, PERIOD = 8, 1.0
 # motor, of a sensor that is 0.2 s late too, it is less than a degree also where a gear is half of what was believed.
 _SLOW_TILT, _FREE_TILT = math.radians(0.8), math.radians(1.3)
 # Of one index pulse [counts]: a quarter of a line to either side, and some for the drive's own delay.
-_EDGES = 16
+_INDEX_TOLERANCE_COUNTS = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guards:
-    """What the moves of a commissioning may not exceed, and how far they go.
+    """Limits and lengths of the moves of a commissioning.
 
     Attributes:
         tilt: beyond this, from where the neck stood before, all drives are stopped [rad].
@@ -71,7 +71,7 @@ class Guards:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotorMoves:
-    """What one motor's moves measured.
+    """Measurements of one motor's moves.
 
     Attributes:
         motor: from 1 on; node: of its drive.
@@ -102,7 +102,7 @@ class MotorMoves:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moves:
-    """What all motors' moves measured.
+    """Measurements of all motors' moves.
 
     Attributes:
         motors: each motor's.
@@ -123,4 +123,4 @@ def counts_per_turn(captures: Sequence[int]) -> int:
     The edges of one pulse lie some counts apart, by the way in which it is passed: those are no turn.
     """
     steps = [abs(b - a) for a, b in itertools.pairwise(captures)]
-    return min((step for step in steps if step > _EDGES), default=0)
+    return min((step for step in steps if step > _INDEX_TOLERANCE_COUNTS), default=0)

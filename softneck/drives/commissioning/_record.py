@@ -34,11 +34,11 @@ from ..running._bus_loop import RunEnd, Session, run_session
 from ..running._pilot import SignalLog, SignalPilot
 
 # Between two runs the motors stand at rest for this long [s]: 15 time constants of the neck.
-_PAUSE = 3.0
-_ROUNDING = 1e-9
+_PAUSE_S = 3.0
+_ROUNDING_RAD = 1e-9
 # Signals let tendons out no further than this unless they are asked to: a file that allows hanging tendons more does so
 # because they hang earlier, above rest [rad].
-_SLACK = 3.0
+_SLACK_RAD = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ class ExperimentResult:
 
     @property
     def completed(self) -> bool:
-        """Whether all rows are there and nothing stopped the drives."""
+        """Whether all rows were recorded without a stop."""
         return self.rows == self.planned and self.ended.master.supervisor.fault is None
 
     def require(self) -> None:
@@ -77,7 +77,7 @@ class ExperimentResult:
         self.ended.require()
 
     def table(self) -> dict[str, Any]:
-        """Return what JSON holds of it."""
+        """Return the JSON values."""
         return {"completed": self.completed, "rows": self.rows, "planned_rows": self.planned, **self.ended.table()}
 
 
@@ -105,7 +105,7 @@ def drive_limits(
         # A quarter of what the drives take: with their current limit the motors follow the quickest signals up to
         # there: Eq. 22 leaves the paper's motors 1.5 rad behind for 0.28 s at a third, for 0.04 s at a quarter.
         speed=slowest / 4.0 if speed is None else speed,
-        slack=min(file.limits.slack_unwind, farthest, _SLACK) if slack is None else slack,
+        slack=min(file.limits.slack_unwind, farthest, _SLACK_RAD) if slack is None else slack,
     )
 
 
@@ -131,7 +131,7 @@ def record_signal(
     sample_time = excitations[0].sample_time
     for excitation in excitations:
         _require_playable(excitation, session.file, sample_time)
-    set_points, run = joined(excitations, sample_time)
+    set_points, run = join_runs(excitations, sample_time)
     log = SignalLog(len(run), run=run, session=session)
 
     def tell(_now: float, _in: Sequence[Frame], _out: Sequence[Frame], _tilt: Tilt | None, master: Master) -> None:
@@ -144,11 +144,11 @@ def record_signal(
     return ExperimentResult(recording, int(np.count_nonzero(run)), ended)
 
 
-def joined(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:
+def join_runs(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:
     """Return all set-points (rows, motors) with pauses at rest between, and the number of the run, 0 in pauses."""
     parts, runs = [], []
     motors = np.shape(excitations[0].set_points)[1]
-    pause = round(_PAUSE / sample_time)
+    pause = round(_PAUSE_S / sample_time)
     for number, excitation in enumerate(excitations, start=1):
         if parts:
             parts.append(np.zeros((pause, motors)))
@@ -169,7 +169,7 @@ def _require_playable(excitation: Excitation, file: DrivesFile, sample_time: flo
         raise DataError(f"the set-points of {excitation.name} must be finite.")
     low, high, fastest = np.array(file.ranges).T
     whose = "drives file allows" if file.robot is None else "drives file or the robot allow"
-    if (high + _ROUNDING < P).any() or (low - _ROUNDING > P).any():
+    if (high + _ROUNDING_RAD < P).any() or (low - _ROUNDING_RAD > P).any():
         most = float(P.flat[np.argmax(np.maximum(P - high, low - P))])
         allowed = f"{high[0]:g} rad" if file.robot is None else "less"
         raise SettingsError(
@@ -179,7 +179,7 @@ def _require_playable(excitation: Excitation, file: DrivesFile, sample_time: flo
     # From rest to the first row and from the last one to rest within one sample.
     rest = np.zeros(motors)
     speeds = np.abs(np.diff(np.vstack([rest, P, rest]), axis=0)).max(axis=0) / sample_time
-    if (speeds > fastest * (1.0 + _ROUNDING)).any():
+    if (speeds > fastest * (1.0 + _ROUNDING_RAD)).any():
         j = int(np.argmax(speeds / fastest))
         raise SettingsError(
             f"{excitation.name} asks for {speeds[j]:.3g} rad/s; the {whose} {fastest[j]:g} rad/s. "
@@ -189,7 +189,7 @@ def _require_playable(excitation: Excitation, file: DrivesFile, sample_time: flo
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Experiment:
-    """What `softneck drives record` plays.
+    """An experiment of `softneck drives record`.
 
     Attributes:
         signal: name of it, or a recording whose set-points are played, all of its runs.
@@ -211,8 +211,8 @@ class Experiment:
     robot: Robot | None = None
     ranges: tuple[tuple[float, float, float], ...] = ()
 
-    def prepared(self) -> list[tuple[Excitation, Changes]]:
-        """Return for each run the signal within its limits, and what they changed.
+    def prepare_runs(self) -> list[tuple[Excitation, Changes]]:
+        """Return for each run the signal within its limits, and the changes.
 
         Raises:
             SettingsError: no such signal, or limits that it cannot keep.
@@ -222,7 +222,7 @@ class Experiment:
         return [prepare(self._in_range(one), self.limits, ramp_s=self.ramp) for one in signals]
 
     def _signals(self, number: int) -> list[Excitation]:
-        """Return what is played in round `number`: a signal by name, or the runs of a recording."""
+        """Return the excitations of round `number`: a signal by name, or the runs of a recording."""
         if Path(self.signal).suffix.lower() not in (".csv", ".parquet"):
             return [signal(self.signal, duration=self.duration, seed=self.seed + number, robot=self.robot)]
         recording = read_recording(self.signal)
@@ -241,12 +241,12 @@ class Experiment:
         return replace(excitation, set_points=np.clip(excitation.set_points, low, high))
 
     def pilot(self) -> SignalPilot:
-        """Return what plays all runs with their pauses."""
-        parts = [excitation for excitation, _ in self.prepared()]
-        return SignalPilot(joined(parts, parts[0].sample_time)[0])
+        """Return the pilot that plays all runs with their pauses."""
+        parts = [excitation for excitation, _ in self.prepare_runs()]
+        return SignalPilot(join_runs(parts, parts[0].sample_time)[0])
 
     def facts(self) -> dict[str, Any]:
-        """Return what a log holds of it; the robot and its ranges stand elsewhere there."""
+        """Return the values for a log, without the robot and its ranges."""
         return {key: value for key, value in asdict(self).items() if key not in ("robot", "ranges")}
 
     @classmethod

@@ -22,16 +22,16 @@ from ..running._timing import Operator
 
 _MODE, _VELOCITY, _HOMING, _HERE = 0x6060, 3, 6, 35
 # A winch that holds is slower [rad/s], and moves less between two looks [rad].
-_UNMOVED = 0.01
+_STANDSTILL_RAD = 0.01
 # A winch that turns more slowly has come to a stop [rad/s] if it does for this long, and each has to in this time [s].
 _STILL, _STILL_TIME, _TIME = 0.2, 0.3, 10.0
 # Between two looks at a drive [s].
-_LOOK = 0.02
+_POLL_S = 0.02
 # Speeds of 606Ch and of 6064h differ by less than this part, or the slow loop is not what the drives file says.
 _SLOW_LOOP_TOLERANCE = 0.25
 # What is slower than this tells nothing about the slow loop [rad/s].
 _FAST_ENOUGH = 0.3
-_SETTLE = 1.0
+_SETTLING_S = 1.0
 _ENABLE_TIME = 1.0
 
 Look = Callable[[], Reading | None]
@@ -39,7 +39,7 @@ Look = Callable[[], Reading | None]
 
 @dataclass(frozen=True, slots=True)
 class ZeroResult:
-    """What zeroing found, for each motor.
+    """The result of zeroing, for each motor.
 
     Attributes:
         nodes: of the drives.
@@ -106,7 +106,7 @@ class _Motor:
             self.late_mode = True  # until then its speed, if that is what it has, is zero
 
     def _keep(self, index: int, subindex: int, value: int) -> None:
-        if self.objects.written(index, subindex, value) != value:
+        if self.objects.write_checked(index, subindex, value) != value:
             raise CheckFailedError(f"node {self.entry.node}: {index:04X}h does not keep {value}.")
 
     def enable(self) -> None:
@@ -122,7 +122,7 @@ class _Motor:
                     raise CheckFailedError(
                         f"node {self.entry.node}: does not get to {state.name}; it is in {found.name}.{advice}"
                     )
-                wait(self.link, _LOOK)
+                wait(self.link, _POLL_S)
         if self.late_mode:
             self._keep(_MODE, 0, _VELOCITY)
 
@@ -137,11 +137,11 @@ class _Motor:
             if not error.aborted or self.late_mode:
                 raise
             self.word(0x06)
-            wait(self.link, _LOOK)
+            wait(self.link, _POLL_S)
             self.objects.write(_MODE, 0, _HOMING)
             self.enable()
-            until = self.link.now + _SETTLE  # it may still turn back when the drive begins to hold it
-            while abs(_creep(self.link, self)) > _UNMOVED and self.link.now < until:
+            until = self.link.now + _SETTLING_S  # it may still turn back when the drive begins to hold it
+            while abs(_creep(self.link, self)) > _STANDSTILL_RAD and self.link.now < until:
                 pass
             return self.objects.read(0x6064) - self.held
         return 0
@@ -173,7 +173,7 @@ def zero(link: Link, file: DrivesFile, look: Look, *, guarding: str, operator: O
             motor.enable()
             _tension(guarded, motor, operator)
         # What the later ones pulled may have loosened the first: all pull on with their small current.
-        _rest(guarded, _SETTLE, operator)
+        _rest(guarded, _SETTLING_S, operator)
         outputs = _upright(file, look)
         for motor in motors:
             motor.held = motor.objects.read(0x6064)
@@ -200,13 +200,13 @@ def _tension(link: Link, motor: _Motor, operator: Operator | None) -> None:
     still_since: float | None = None
     before, before_at, ratios = motor.position(), link.now, []
     while True:
-        _rest(link, _LOOK, operator)
+        _rest(link, _POLL_S, operator)
         now, position, speed = link.now, motor.position(), motor.speed()
         moved = (position - before) / max(now - before_at, 1e-6)
         if abs(moved) > _FAST_ENOUGH and abs(speed) > 0.01:
             ratios.append(speed / moved)
         before, before_at = position, now
-        if abs(speed) > _STILL or now - begin < 2.0 * _LOOK:
+        if abs(speed) > _STILL or now - begin < 2.0 * _POLL_S:
             still_since = None
         elif still_since is None:
             still_since = now
@@ -257,7 +257,7 @@ def _set_zero(link: Link, motor: _Motor) -> None:
     begin = link.now
     motor.word(0x1F)
     told = link.now
-    wait(link, _LOOK)
+    wait(link, _POLL_S)
     word = objects.read(0x6041)
     asked = link.now
     counts = objects.read(0x6064) - back
@@ -266,7 +266,7 @@ def _set_zero(link: Link, motor: _Motor) -> None:
     # The zero was taken between `begin` and `told`, the position after `asked`: what a winch, pulled on by its small
     # current, creeps meanwhile, and what one that counts as still turns between two looks.
     ways = [speed * time for speed in speeds for time in (asked - told, passed)]
-    off, slack = counts_to_position(counts - HOMED_MARK, motor.entry.scale), _STILL * _LOOK
+    off, slack = counts_to_position(counts - HOMED_MARK, motor.entry.scale), _STILL * _POLL_S
     attained = word & 0x3000 == 0x1000  # bit 13: an error
     near = min(ways) - slack <= off <= max(ways) + slack
     if not (attained and near and max(map(abs, speeds)) <= _STILL):
@@ -282,7 +282,7 @@ def _mark(motor: _Motor, back: float) -> None:
     """Leave the mark of a zero whose home offset was another one; a drive that counts by it at once is refused."""
     before = motor.position()
     motor.objects.write(0x607C, 0, HOMED_MARK)
-    if abs(motor.position() - before) > max(0.5 * abs(back), _UNMOVED):
+    if abs(motor.position() - before) > max(0.5 * abs(back), _STANDSTILL_RAD):
         raise CheckFailedError(
             f"node {motor.entry.node}: its position follows 607Ch at once, and it takes no mode with power; "
             "it cannot be zeroed."
@@ -292,12 +292,12 @@ def _mark(motor: _Motor, back: float) -> None:
 def _creep(link: Link, motor: _Motor) -> float:
     """Return how fast the winch turns, by its position at two looks [rad/s]: 606Ch steps by a count per sample."""
     first, begin = motor.position(), link.now
-    wait(link, _LOOK)
-    return (motor.position() - first) / max(link.now - begin, _LOOK)
+    wait(link, _POLL_S)
+    return (motor.position() - first) / max(link.now - begin, _POLL_S)
 
 
 def _signs_of_life(file: DrivesFile, guarding: str) -> list[Frame]:
-    """Return what tells the drives that we live: guarding requests, or our heartbeat."""
+    """Return the frames that prove the master alive: guarding requests, or its heartbeat."""
     if guarding == "life":
         return [Frame(0x700 + node, b"\0", remote=True) for node in file.nodes]
     return [Frame(0x700 + MASTER_NODE, b"\x05")]
@@ -319,4 +319,4 @@ def _rest(link: Link, seconds: float, operator: Operator | None) -> None:
     while link.now < until - 1e-9:
         if operator is not None and operator() is not None:
             raise CheckFailedError("stopped by the operator. The drives are off; zero them again.")
-        wait(link, min(_LOOK, until - link.now))
+        wait(link, min(_POLL_S, until - link.now))

@@ -54,17 +54,17 @@ class LoggedPilot:
 
     def start(self) -> None:
         """Start a new run of the pilot."""
-        self._heard("start", self._pilot.start)
+        self._call_or_record("start", self._pilot.start)
 
     def step(self, measured: Measurement) -> Motors | None:
         """Return the set-points of the pilot."""
-        return self._heard("step", lambda: self._pilot.step(measured))
+        return self._call_or_record("step", lambda: self._pilot.step(measured))
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         """Return whether the pilot has finished."""
-        return self._heard("finished", lambda: self._pilot.finished(index))
+        return self._call_or_record("finished", lambda: self._pilot.is_finished(index))
 
-    def _heard(self, what: str, ask: Callable[[], Any]) -> Any:
+    def _call_or_record(self, what: str, ask: Callable[[], Any]) -> Any:
         try:
             answer = ask()
         except Exception as error:

@@ -104,7 +104,7 @@ class _ReplayPilot:
             return self._next("reference")
         return ()
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         del index
         return bool(self._next("finished"))
 

@@ -16,8 +16,8 @@ from softneck.signals import NECK, Recording, known_channels
 from ..master import Event
 
 # Width [s] and number of the bins of a histogram up to 200 ms; longer periods are in the last bin.
-_BIN = 1e-5
-_BINS = 20_000
+_BIN_S = 1e-5
+_BIN_COUNT = 20_000
 
 
 class CycleTimes:
@@ -35,7 +35,7 @@ class CycleTimes:
         self.cycle = cycle
         self.count = self.late = self.missed = 0
         self.longest_period = self.longest_step = 0.0
-        self._bins = [0] * _BINS
+        self._bins = [0] * _BIN_COUNT
         self._last: float | None = None
 
     def take(self, now: float, step: float) -> None:
@@ -47,7 +47,7 @@ class CycleTimes:
             self.late += period > 1.5 * self.cycle
             self.missed += max(0, round(period / self.cycle) - 1)
             self.count += 1
-            self._bins[min(_BINS - 1, max(0, int(period / _BIN)))] += 1
+            self._bins[min(_BIN_COUNT - 1, max(0, int(period / _BIN_S)))] += 1
         self._last = now
 
     def quantile(self, share: float) -> float:
@@ -56,7 +56,7 @@ class CycleTimes:
         for index, number in enumerate(self._bins):
             seen += number
             if number and seen >= wanted:
-                return (index + 1) * _BIN
+                return (index + 1) * _BIN_S
         return 0.0
 
     def __str__(self) -> str:
@@ -106,11 +106,11 @@ def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Re
     return Recording(signals.time, signals.sample_time, channels, robot=robot)
 
 
-_UNHEARD = "The drives cannot be reached; their own guarding stops them within 0.1 s"
+_NO_CONTACT = "The drives cannot be reached; their own guarding stops them within 0.1 s"
 # Event -> text on the power of the drives after it; after other events they are off.
 _POWER = {
-    "bus_off": _UNHEARD,
-    "bus_silent": _UNHEARD,
+    "bus_off": _NO_CONTACT,
+    "bus_silent": _NO_CONTACT,
     "not_off": "If it may still have power, press the hardware stop (Enable input)",
 }
 

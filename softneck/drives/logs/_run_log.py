@@ -24,11 +24,11 @@ RUN_LOG = ".mcap"
 LOG_VERSION = 2
 METADATA = "softneck.run"
 # Period of flushes to the operating system [s]: the data that a killed process may lose, besides one chunk.
-_FLUSH = 0.25
+_FLUSH_S = 0.25
 # Uncompressed bytes in one chunk: a cycle has 400 or more, so that a chunk is filled in less than 1 s at 20 Hz.
-_PIECE = 8192
+_CHUNK_BYTES = 8192
 # Length of the queue before the loop drops cycles: 200 s at 100 Hz.
-_WAITING = 20_000
+_QUEUE_LENGTH = 20_000
 
 
 def _schema(**kinds: Any) -> dict[str, Any]:
@@ -131,13 +131,13 @@ class RunLogger:
         self._frames: list[tuple[float, bool, Frame]] = []
         self._row: Mapping[str, float] | None = None
         self._seen: Event | None = None
-        self._queue: queue.Queue[_Entry | Mapping[str, Any] | None] = queue.Queue(_WAITING)
+        self._queue: queue.Queue[_Entry | Mapping[str, Any] | None] = queue.Queue(_QUEUE_LENGTH)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._stream: BinaryIO = partial(path).open("wb")
         except OSError as error:
             raise OutputFileError(f"{path}: cannot be written: {error.strerror}. Choose another folder.") from error
-        self._writer, self._channels = self._begun()
+        self._writer, self._channels = self._start_writer()
         self._thread = threading.Thread(target=self._write, name="softneck-log", daemon=True)
         self._thread.start()
 
@@ -239,7 +239,7 @@ class RunLogger:
         flushed = time.monotonic()
         while True:
             try:
-                entry = self._queue.get(timeout=_FLUSH)
+                entry = self._queue.get(timeout=_FLUSH_S)
             except queue.Empty:
                 entry = _Entry([])
             if self.problem:
@@ -251,7 +251,7 @@ class RunLogger:
                     self._writer.finish()
                     return
                 self._take(entry)
-                if time.monotonic() - flushed >= _FLUSH:
+                if time.monotonic() - flushed >= _FLUSH_S:
                     self._stream.flush()
                     flushed = time.monotonic()
             except OSError as error:
@@ -259,11 +259,11 @@ class RunLogger:
                 if entry is None:
                     return
 
-    def _begun(self) -> tuple[Any, dict[str, int]]:
+    def _start_writer(self) -> tuple[Any, dict[str, int]]:
         """Start an MCAP file of JSON messages in small compressed chunks; return its writer, and topic -> channel."""
         from mcap.writer import Writer
 
-        writer = Writer(self._stream, chunk_size=_PIECE)
+        writer = Writer(self._stream, chunk_size=_CHUNK_BYTES)
         writer.start(profile="", library=f"softneck {__version__}")
         schemas = {
             name: writer.register_schema(name, "jsonschema", json.dumps(schema).encode())

@@ -7,9 +7,9 @@ import math
 from ._settings import LimitSettings
 
 # Differences below this are rounding [rad].
-_SAME = 1e-9
+_ROUNDING_RAD = 1e-9
 # Share of the tension limit above which the set-point may not pull further.
-_NEAR = 0.8
+_NEAR_LIMIT_SHARE = 0.8
 
 
 class Limiter:
@@ -58,7 +58,7 @@ class Limiter:
         goal = wanted
         if not low <= goal <= high:
             goal, why = min(max(goal, low), high), "position"
-        if tension > _NEAR * limits.tension and goal > self.value:
+        if tension > _NEAR_LIMIT_SHARE * limits.tension and goal > self.value:
             goal, why = self.value, "tension"
         if tension >= limits.slack:
             self._slack_at = None
@@ -76,7 +76,7 @@ class Limiter:
         a = limits.acceleration
         most = min(fastest, a * (math.sqrt(0.25 * T * T + 2.0 * abs(way) / a) - 0.5 * T))
         if abs(speed) > most:
-            if abs(speed) > fastest * (1.0 + _SAME):
+            if abs(speed) > fastest * (1.0 + _ROUNDING_RAD):
                 why = why or "speed"
             speed = math.copysign(most, speed)
         change = a * T
@@ -87,5 +87,5 @@ class Limiter:
             speed = self.speed + math.copysign(change, speed - self.speed)
         self.speed = speed
         self.value = min(max(self.value + T * speed, low), high)
-        self.clamped = why if abs(self.value - wanted) > _SAME else ""
+        self.clamped = why if abs(self.value - wanted) > _ROUNDING_RAD else ""
         return self.value

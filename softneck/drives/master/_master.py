@@ -49,7 +49,7 @@ class Pilot(Protocol):
         """Return the set-points [rad], one for each motor; None if they are not ready in time."""
         ...
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         """Return whether the run ends before sample `index`."""
         ...
 
@@ -60,11 +60,11 @@ def reference_of(pilot: Pilot) -> tuple[float, ...]:
 
 
 # Accumulated clamped time that stops the run [s]; time without clamping subtracts a tenth of itself.
-_PERSISTENT = 0.3
+_MAX_CLAMPED_S = 0.3
 # Time-outs for enabling each drive and for a ramp [s]: half of the fault table's.
 _ENABLE_TIME, _RAMP_TIME = 1.0, 30.0
 # Cycles without a set-point until the run stops (fault table: hold at once, stop at 5).
-_LOST = 5
+_MAX_LOST_CYCLES = 5
 # Time for the drives' stop ramp before their voltage is disabled [s].
 _STOP_TIME = 1.0
 # Time after a stop command after which guarding ends if a drive has not stopped [s].
@@ -105,7 +105,7 @@ class Master:
         self._limiters = tuple(Limiter(settings.limits, settings.bus.cycle, own) for own in ranges)
         scales = (settings.counts_per_radian, settings.newton_per_unit, settings.zeros)
         self._scales = tuple(zip(self.bus.drives, *scales, strict=True))
-        self._clamped = Leaky(_PERSISTENT, settings.bus.cycle)
+        self._clamped = Leaky(_MAX_CLAMPED_S, settings.bus.cycle)
         self.positions: Motors = (0.0,) * count
         self.tensions = self.setpoints = self.wanted = self._from = self.positions
         self.reference: Motors = ()
@@ -141,14 +141,14 @@ class Master:
         now = self._now or 0.0
         if self.supervisor.phase in (Phase.RAMP_IN, Phase.RUNNING):
             self._asked.append(Signal.FINISH)
-            self._told(Event(now, "left", 0, reason))
+            self._record_event(Event(now, "left", 0, reason))
         elif self.supervisor.phase in (Phase.IDLE, Phase.ENABLING):
-            self._told(Event(now, "operator", 0, reason))
+            self._record_event(Event(now, "operator", 0, reason))
 
     def stop(self, reason: str = "") -> None:
         """Request an immediate stop of all drives."""
         self.requests.append(("stop", reason))
-        self._told(Event(self._now or 0.0, "operator", 0, reason))
+        self._record_event(Event(self._now or 0.0, "operator", 0, reason))
 
     def step(self, now: float, frames: Sequence[Frame], tilt: Reading | None = None) -> list[Frame]:
         """Return the frames to send at `now` [s, monotonic].
@@ -217,9 +217,9 @@ class Master:
         supervisor, active = self.supervisor, self.supervisor.phase in ACTIVE
         # Without power only the events of `IDLE_TOO` count.
         for event in supervisor.react(now, events if active else [e for e in events if e.name in IDLE_TOO]):
-            self._told(event, judged=True)
+            self._record_event(event, judged=True)
 
-    def _told(self, event: Event, *, judged: bool = False) -> None:
+    def _record_event(self, event: Event, *, judged: bool = False) -> None:
         if not judged:
             self.supervisor.react(event.time, [event])
         self.counts[event.name] += 1
@@ -323,7 +323,7 @@ class Master:
         try:
             self.pilot.start()
         except Exception as error:
-            self._failed(self._now or 0.0, error)
+            self._controller_failed(self._now or 0.0, error)
 
     def _run(self, now: float, due: bool, fresh: bool, events: list[Event]) -> None:
         cycles = self.settings.sample_cycles
@@ -335,7 +335,7 @@ class Master:
                 return
         if self._missing:
             self._missing += 0 if due else 1
-            name = "setpoint_lost" if self._missing >= _LOST else "setpoint_missing"
+            name = "setpoint_lost" if self._missing >= _MAX_LOST_CYCLES else "setpoint_missing"
             events.append(Event(now, name))
         self._part += 1
         share = min(self._part / cycles, 1.0)
@@ -348,7 +348,7 @@ class Master:
         if tilt is None:
             return
         try:
-            if self.pilot.finished(self._index):
+            if self.pilot.is_finished(self._index):
                 self._change(now, Signal.FINISH)
                 self._arrived_at = _NEVER
                 self._ramp(now, events)
@@ -364,12 +364,12 @@ class Master:
             if not all(map(math.isfinite, wanted)):
                 raise ValueError(f"set-points {', '.join(f'{value:g}' for value in wanted)} are not finite")
         except Exception as error:
-            self._failed(now, error)
+            self._controller_failed(now, error)
             return
         self._missing = 0
         self._from, self.wanted, self.reference = self.wanted, wanted, reference_of(self.pilot)
 
-    def _failed(self, now: float, error: Exception) -> None:
+    def _controller_failed(self, now: float, error: Exception) -> None:
         self._judge(now, [Event(now, "controller_failed", 0, f"{type(error).__name__}: {error}")])
 
     def _limit(self, now: float, wanted: Sequence[float], events: list[Event], *, count: bool) -> None:

@@ -38,7 +38,7 @@ _START_TIME = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Session:
-    """What a pilot is run on.
+    """Drives, link, sensor and log on which a pilot runs.
 
     Attributes:
         file: how drives and master are set up.
@@ -103,7 +103,7 @@ class RunEnd:
         return counts["left"] + counts["operator"] > 0
 
     def table(self) -> dict[str, Any]:
-        """Return what JSON holds of it."""
+        """Return the JSON values."""
         master = self.master
         return {
             "phase": str(master.supervisor.phase),

@@ -1,4 +1,4 @@
-"""What may run on drives: files that `verify` and `simulate` certified, in a loop that does the same again."""
+"""Permission to run on drives: certificates of `verify` and `simulate`, and a repeated simulation that agrees."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SAME = 1e-4
 _REPLAY_TIME = 1.8
 # Rows between two looks at the clock; of the slowest controllers they take 0.2 s.
 _REPLAY_ROWS = 10
-_OVERRIDE = "or let it pass by name with --override certificate."
+_OVERRIDE_WAY = "or let it pass by name with --override certificate."
 
 
 def files_that_act(setup: LoopSetup, controller: Path, drives: Path | None = None) -> list[Path]:
@@ -70,7 +70,7 @@ def require_certified(
     if drives is not None and "drives" not in setup.files:
         raise CheckFailedError(
             f'{loop}: names no drives file; write `drives = "{drives.name}"` into it, so that its certificate covers '
-            f"{drives}, simulate it again, {_OVERRIDE}"
+            f"{drives}, simulate it again, {_OVERRIDE_WAY}"
         )
     verified = _covering("verify", certificates, controller, [controller])
     _require_minimum(verified, robot or NECK)
@@ -96,7 +96,7 @@ def _covering(kind: str, given: Sequence[Path], item: Path, files: Sequence[Path
         command = "verify CONTROLLER MODEL -o FILE" if kind == "verify" else "simulate LOOP.toml --certificate FILE"
         raise CheckFailedError(
             f"{item}: has no certificate of `softneck {kind}`; `softneck {command}` writes one. Give it with "
-            f"--certificate, {_OVERRIDE}"
+            f"--certificate, {_OVERRIDE_WAY}"
         )
     refused: CheckFailedError | None = None
     for path in found:
@@ -114,12 +114,12 @@ def _require_robot(found: Certificate, robot: Robot) -> None:
     if said != robot.hash:
         raise CheckFailedError(
             f"{found.path}: is of the robot with the hash {said[:8]}, the drives move {robot.label()}; certify the "
-            f"controller for that one, {_OVERRIDE}"
+            f"controller for that one, {_OVERRIDE_WAY}"
         )
 
 
 def _require_minimum(found: Certificate, robot: Robot) -> None:
-    """Raise CheckFailedError unless the certificate shows all of `ARMING`, at least as strictly as the defaults ask.
+    """Raise CheckFailedError unless the certificate holds all of `ARMING`, at least as strictly as the defaults.
 
     Of another robot the defaults are those that `verify` stretched to it, by what stands in the certificate.
     """
@@ -138,7 +138,7 @@ def _require_minimum(found: Certificate, robot: Robot) -> None:
             why = f"it asks for {float(rows[0].get('limit') or 0.0):g}, the default is {least.limit:g}"
         else:
             continue
-        raise CheckFailedError(f"{found.path}: does not show `{metric}` ({what}): {why}. Verify again, {_OVERRIDE}")
+        raise CheckFailedError(f"{found.path}: does not show `{metric}` ({what}): {why}. Verify again, {_OVERRIDE_WAY}")
 
 
 def _as_strict(row: dict, bound: str, limit: float) -> bool:
@@ -169,7 +169,7 @@ def require_same_again(loop: Loop, certificate: Certificate) -> float:
             if value is not None and row < len(values) and not abs(values[row] - value) <= SAME:
                 raise CheckFailedError(
                     f"{certificate.path}: the loop does not do again what was certified: `{name}` is {values[row]:.6g} "
-                    f"instead of {value:.6g} rad at t = {again.time[row]:.2f} s. Simulate it again, {_OVERRIDE}"
+                    f"instead of {value:.6g} rad at t = {again.time[row]:.2f} s. Simulate it again, {_OVERRIDE_WAY}"
                 )
     return float(again.time[-1] + again.sample_time)
 

@@ -133,7 +133,7 @@ def run_on_bus(
     report: Callable[[float], None] | None = None,
     **how: Any,
 ) -> DrivesResult:
-    """Run the loop on the drives behind `link`, at the pace of the monotonic clock.
+    """Run the loop on the drives of `link`, at the pace of the monotonic clock.
 
     Args:
         deployed: the loop.

@@ -14,11 +14,11 @@ from typing import Any
 
 from ._timing import Ask
 
-_INTERRUPT = b"\x03"
+_CTRL_C = b"\x03"
 # The terminal is closed, a service is ended: as Ctrl-C. Ctrl-Z would hang the loop that feeds the drives: it stops.
-_LEAVE = ("SIGINT", "SIGHUP", "SIGBREAK")
-_END = ("SIGTERM",)
-_STOP = ("SIGTSTP",)
+_INTERRUPT_SIGNALS = ("SIGINT", "SIGHUP", "SIGBREAK")
+_TERMINATE_SIGNALS = ("SIGTERM",)
+_STOP_SIGNALS = ("SIGTSTP",)
 
 
 class Keyboard:
@@ -33,7 +33,7 @@ class Keyboard:
     """
 
     def __init__(self) -> None:
-        """Listen to nothing yet."""
+        """Create the keyboard; it does not listen yet."""
         self.interrupted = self.terminated = False
         self._asks: list[Ask] = []
         self._read: Callable[[], bytes] = lambda: b""
@@ -52,11 +52,11 @@ class Keyboard:
         self._stack.close()
 
     def __call__(self) -> Ask | None:
-        """Return what was asked for since the last call, a stop before a ramp out."""
+        """Return the request since the last call; a stop precedes a ramp out."""
         for key in self._read():
             if bytes([key]) in (b"\x1b", b" "):
                 self._asks.append(Ask.STOP)
-            elif bytes([key]) == _INTERRUPT:
+            elif bytes([key]) == _CTRL_C:
                 self._interrupt()
         if not self._asks:
             return None
@@ -87,7 +87,7 @@ class Keyboard:
             self.interrupted = True
             self._asks.append(Ask.STOP)
 
-        for names, handler in ((_LEAVE, leave), (_END, end), (_STOP, halt)):
+        for names, handler in ((_INTERRUPT_SIGNALS, leave), (_TERMINATE_SIGNALS, end), (_STOP_SIGNALS, halt)):
             for name in names:
                 number = getattr(signal, name, None)
                 if number is None or signal.getsignal(number) is signal.SIG_IGN:
@@ -134,7 +134,7 @@ def _unix_keys(file: int) -> bytes:
 
 
 def _leave_dead_terminal() -> None:
-    """Send what is still printed nowhere if the terminal is gone: it must not fail and cost what was recorded."""
+    """Discard further output if the terminal is closed: an error would lose the recording."""
     import termios
 
     for file in (1, 2):

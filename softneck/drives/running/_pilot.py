@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 # Nothing is recorded here: the master's log does that.
 _NO_TABLE = np.zeros((0, 0))
-_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
+_NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class LoopPilot:
@@ -70,34 +70,34 @@ class LoopPilot:
             first = wiring.spans["controller"].start
             self._chosen = np.array([first + names.index(name) for name in robot.set_points])
         except ValueError as error:
-            word = _NUMBERS[len(robot.set_points)]
+            word = _NUMBER_WORDS[len(robot.set_points)]
             raise SettingsError(f"the controller does not give {word} motor set-points: {', '.join(names)}.") from error
         # Where the plant would say each output and each rate, by their number in a sample.
         outputs = [*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names)]
         self._tilts = [(i, self._places[f"{name}{end}"]) for i, name in enumerate(outputs) for end in ("_measured", "")
                        if f"{name}{end}" in self._places]  # fmt: skip
         self._rows = round(loop.duration / self.sample_time)
-        self._running = self._begun({})
+        self._running = self._start_rows({})
         self._asked = [self.slot("reference", f"{name}_reference") for name in robot.outputs.names]
 
     def start(self) -> None:
         """Start all parts but the plant."""
         parameters = self._loop.parameters
         others = {name: part for name, part in self._parts.items() if name != "plant"}
-        self._running = self._begun({n: part.start(0.0, parameters.get(n, {})) for n, part in others.items()})
+        self._running = self._start_rows({n: part.start(0.0, parameters.get(n, {})) for n, part in others.items()})
 
-    def _begun(self, starts: Mapping[str, Vector]) -> LoopRows:
+    def _start_rows(self, starts: Mapping[str, Vector]) -> LoopRows:
         # What is no number is the master's to judge: it stops the drives where set-points become so.
         return LoopRows(self._parts, self._wiring, self._cycle, step=self.sample_time, starts=starts, checked=False)
 
     def warm(self) -> None:
-        """Step all parts once with the neck at rest: what compiles or loads at its first call does so before a run."""
+        """Step all parts once at rest, so that compilation and loading happen before a run."""
         self.start()
         rest = sample_of((0.0,) * len(self.robot.outputs.names))
         self.step(Measurement(0, rest, True, (0.0,) * len(self.robot.motors.names)))
 
     def step(self, measured: Measurement) -> Motors | None:
-        """Step observer and controller with what was measured now."""
+        """Step observer and controller with the new measurements."""
         running, index = self._running, measured.index
         self._measure(measured, running.held[self._plant])
         if "reference" not in self._parts:
@@ -108,7 +108,7 @@ class LoopPilot:
         set_points = running.bus[self._chosen]
         return tuple(set_points.tolist())
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         """Return whether the loop's duration is over."""
         return index >= self._rows
 
@@ -117,7 +117,7 @@ class LoopPilot:
         self._loop.close()
 
     def slot(self, part: str, port: str) -> int | None:
-        """Return where a signal lies in `signals`."""
+        """Return the index of a signal in `signals`."""
         for item in self._wiring.named:
             if item.part == part and item.port.name == port:
                 return item.slot
@@ -125,7 +125,7 @@ class LoopPilot:
 
     @property
     def reference(self) -> tuple[float, ...]:
-        """What the outputs were wanted to be at the last step [rad]."""
+        """References of the outputs at the last step [rad]."""
         return tuple(math.nan if slot is None else float(self._running.bus[slot]) for slot in self._asked)
 
     @property
@@ -134,7 +134,7 @@ class LoopPilot:
         return self._running.bus
 
     def _measure(self, measured: Measurement, outputs: Vector) -> None:
-        """Write to the plant's `outputs` what hardware says."""
+        """Write the measurements to the plant's `outputs`."""
         places = self._places
         said = (*measured.tilt.values, *measured.tilt.rates)
         for i, place in self._tilts:
@@ -219,13 +219,13 @@ class SignalPilot:
         self._rows = [tuple(row) for row in np.asarray(set_points, dtype=np.float64).tolist()]
 
     def start(self) -> None:
-        """Nothing is kept between samples."""
+        """Do nothing: there is no state between samples."""
 
     def step(self, measured: Measurement) -> Motors | None:
         """Return the set-points of this sample."""
         return self._rows[measured.index]
 
-    def finished(self, index: int) -> bool:
+    def is_finished(self, index: int) -> bool:
         """Return whether all rows were played."""
         return index >= len(self._rows)
 
@@ -257,7 +257,7 @@ class SignalLog:
         self, now: float, frames_in: Sequence[Frame], frames_out: Sequence[Frame], tilt: Reading | None,
         master: Master,
     ) -> None:  # fmt: skip
-        """Take what this cycle measured and sent."""
+        """Store the measurements and set-points of this cycle."""
         del frames_in, frames_out
         self._motion.take(now, master.positions)
         if master.supervisor.phase is not Phase.RUNNING or master.index >= len(self._table):

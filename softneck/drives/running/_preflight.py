@@ -46,7 +46,7 @@ def require_bus(link: Link) -> None:
 
 
 def scan(link: Link, *, bit_rate: int = 1_000_000) -> list[dict[str, Any]]:
-    """Ask every node number for its device type; return what answers, with identity where it tells.
+    """Read the device type of every node number; return the answers, with identity if available.
 
     Args:
         link: to the bus.
@@ -106,7 +106,7 @@ def devices_at(link: Link, nodes: Sequence[int]) -> dict[int, list[int | None]]:
 
 
 def several_devices(serials: Sequence[int | None]) -> str:
-    """Return what to say of a node number with several devices, "" of one with one."""
+    """Return the message on a node number with several devices; "" for a single device."""
     if len(serials) < 2:
         return ""
     told = ", ".join("not told" if serial is None else str(serial) for serial in serials)
@@ -143,13 +143,13 @@ LISTEN = 1.0
 OVERRIDES = ("certificate", "identity", "firmware", "modes", "homed")
 # Default of 6502h in the manual: no bit for the cyclic mode though the drive has it.
 _NO_CSP_BIT = 0x001F0065
-_MODE = 0x6060
+_MODE_OBJECT = 0x6060
 # Why a drive that has a mode may refuse it (CiA 301, table 22): its state, its state of another kind, or no reason.
 _NOT_NOW = (0x08000022, 0x08000021, 0x08000020, 0x08000000)
 # What such a drive does when it gets power: nothing (0), what bit 4 of the control word asks for (1, 6), the speed that
 # we set to zero (3), what we want (8).
-_HOLDING = (0, 1, 3, 6, 8)
-_LATE = "to be taken in Operation Enabled"
+_HOLDING_MODES = (0, 1, 3, 6, 8)
+_MODE_PENDING = "to be taken in Operation Enabled"
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ class PreflightCheck:
 
 @dataclass(slots=True)
 class Report:
-    """What a check found.
+    """The result of one check.
 
     Attributes:
         overridden: names that are let pass by the user.
@@ -214,7 +214,7 @@ class Report:
 
 
 def foreign_master(frames: Sequence[Frame]) -> str:
-    """Return what in `frames` only a master sends, "" if nothing does."""
+    """Return the frame in `frames` that only a master sends; "" if there is none."""
     for frame in frames:
         if frame.error:
             continue
@@ -240,7 +240,7 @@ def set_points_of_others(frames: Sequence[Frame], nodes: Collection[int]) -> str
 
 
 def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
-    """Return what another master sends while we are silent, "" if there is none."""
+    """Return a frame of another master while this one is silent; "" if there is none."""
     until = link.now + seconds
     while link.now < until:
         frames = link.receive(until - link.now)
@@ -253,7 +253,7 @@ def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
 def preflight(
     link: Link, file: DrivesFile, *, override: Collection[str] = (), homed: bool = False, sensor: Sensor | None = None
 ) -> Report:
-    """Check all drives and write their configuration, each value read back; nothing moves.
+    """Check all drives and write their configuration, each value read back; no motor moves.
 
     Args:
         link: to the bus.
@@ -302,7 +302,7 @@ def preflight(
 
 
 def _tell_robot(file: DrivesFile, rows: Report) -> None:
-    """Say what the robot changes: its limits where they are the tighter ones, what is watched, how full the bus is."""
+    """Add rows on the robot's tighter limits, the supervision, and the bus load."""
     robot = file.moves
     rows.add(0, "robot", robot.label(), True)
     for node, said in zip(file.nodes, limits_said(robot, file.limits), strict=True):
@@ -349,7 +349,7 @@ def _check_drive(objects: Objects, file: DrivesFile, entry: DriveEntry, guarding
         return "auto"
     late = node in rows.late_modes
     for topic, writes in (
-        ("modes", [write for write in mode_writes(file) if not (late and write.at == _MODE)]),
+        ("modes", [write for write in mode_writes(file) if not (late and write.at == _MODE_OBJECT)]),
         ("options", option_writes()),
         ("limits", limit_writes(file, entry)),
         ("guarding", guarding_writes(file, guarding, MASTER_NODE, has)),
@@ -388,29 +388,29 @@ def _check_modes(objects: Objects, node: int, rows: Report) -> None:
     modes = objects.read(0x6502) & 0xFFFFFFFF
     said = bool(modes & 0x80) or modes == _NO_CSP_BIT
     try:
-        taken = "taken" if objects.written(_MODE, 0, CSP) == CSP else "not kept"
+        taken = "taken" if objects.write_checked(_MODE_OBJECT, 0, CSP) == CSP else "not kept"
     except SdoError as error:
         if not error.aborted:
             raise
         taken = _when_enabled(objects) if said and error.code in _NOT_NOW else "refused"
-    if taken.startswith(_LATE):
+    if taken.startswith(_MODE_PENDING):
         rows.late_modes.append(node)
     found = f"6502h is {modes:08X}h, mode 8 is {taken}"
-    holds = said and taken in ("taken", _LATE)
+    holds = said and taken in ("taken", _MODE_PENDING)
     rows.add(node, "modes", found, holds, "The cyclic synchronous position mode is needed.")
 
 
 def _when_enabled(objects: Objects) -> str:
-    """Return what to say of a drive that takes no mode while it is off: until it has it, it must hold its motor."""
+    """Return the message on a drive that takes no mode while it is off: until then it must hold its motor."""
     now = objects.read(0x6061)
-    if now not in _HOLDING:
-        return f"{_LATE}, and until then it would be in mode {now}"
+    if now not in _HOLDING_MODES:
+        return f"{_MODE_PENDING}, and until then it would be in mode {now}"
     objects.write(0x60FF, 0, 0)
-    return _LATE
+    return _MODE_PENDING
 
 
 def _guarding(objects: Objects, wanted: str, rows: Report) -> tuple[str, frozenset[int]]:
-    """Return how the drive is guarded and which of the objects for it the drive has; "" after a row that says why not.
+    """Return the guarding of the drive and its objects; "" after a row with the reason if there is none.
 
     With "auto" by heartbeat where the drive can send and watch one, else by life guarding.
     """
@@ -420,12 +420,12 @@ def _guarding(objects: Objects, wanted: str, rows: Report) -> tuple[str, frozens
     if possible:
         return possible[0], has
     kinds = GUARDED_BY if wanted == "auto" else (wanted,)
-    told = " and ".join(f"no {kind} guarding: it lacks {_listed(lacks[kind])}" for kind in kinds)
+    told = " and ".join(f"no {kind} guarding: it lacks {_object_list(lacks[kind])}" for kind in kinds)
     rows.add(objects.node, "guarding", told, False, "A drive must notice by itself that its master is gone.")
     return "", has
 
 
-def _listed(indices: Sequence[int]) -> str:
+def _object_list(indices: Sequence[int]) -> str:
     return ", ".join(f"{index:04X}h" for index in indices)
 
 
@@ -434,7 +434,7 @@ def _apply(objects: Objects, topic: str, writes: Sequence[Write], rows: Report) 
     for write in writes:
         place = f"{write.at:04X}h:{write.sub}"
         try:
-            found = objects.written(*write)
+            found = objects.write_checked(*write)
         except SdoError as error:
             if not error.aborted:
                 raise

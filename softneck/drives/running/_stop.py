@@ -15,11 +15,11 @@ from ..master._cia402 import OFF, DriveState, state_of
 from ._preflight import require_bus
 
 # Between two looks at a drive [s].
-_LOOK = 0.02
+_POLL_S = 0.02
 
 
 def wait(link: Link, seconds: float) -> None:
-    """Let time pass; what comes meanwhile is not needed."""
+    """Let time pass and discard received frames."""
     until = link.now + seconds
     while link.now < until - 1e-9:
         link.receive(until - link.now)
@@ -59,7 +59,7 @@ def reset(link: Link, file: DrivesFile) -> dict[int, str]:
         try:
             for word in (0x00, 0x80, 0x00):
                 objects.write(0x6040, 0, word)
-                wait(link, _LOOK)
+                wait(link, _POLL_S)
             states[entry.node] = state_of(objects.read(0x6041)).name
         except SdoError:
             states[entry.node] = "no answer"

@@ -1,4 +1,4 @@
-"""What a process does so that its cycles come in time, and what it tells a service manager (sd_notify(3))."""
+"""Real-time settings of the process, and messages to a service manager (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..master import Master
 
 
 class Ask(StrEnum):
-    """What an operator wants of a run."""
+    """Requests of an operator during a run."""
 
     LEAVE = "leave"
     STOP = "stop"
@@ -42,11 +42,11 @@ def steady() -> Iterator[None]:
 
 
 # A sign of life for each quarter of the manager's time-out: two may be lost.
-_SHARE = 0.25
+_WATCHDOG_SHARE = 0.25
 
 
 class Notifier:
-    """Sends datagrams to `NOTIFY_SOCKET`; does nothing where there is none.
+    """Sends datagrams to `NOTIFY_SOCKET`, if there is one.
 
     A hung loop sends nothing: the manager then ends the process, and the drives have stopped by themselves long before.
     """
@@ -63,7 +63,7 @@ class Notifier:
             self._address = "\0" + address[1:] if address[0] == "@" else address
         mine = values.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         text = values.get("WATCHDOG_USEC", "") if mine else ""
-        self._every = _SHARE * int(text) * 1e-6 if text.isdigit() else 0.0
+        self._every = _WATCHDOG_SHARE * int(text) * 1e-6 if text.isdigit() else 0.0
         self._fed_at: float | None = None
         self._phase = ""
 
@@ -74,14 +74,14 @@ class Notifier:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Say that it stops."""
+        """Notify that the service stops."""
         self.tell("STOPPING=1")
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def ready(self) -> None:
-        """Say that the pre-flight holds and the loop begins."""
+        """Notify that the pre-flight holds and the loop begins."""
         self.tell("READY=1")
 
     def cycle(self, now: float, master: Master) -> None:

@@ -21,18 +21,18 @@ from ..simulated import SimulatedNeck, SimulatedSettings
 from ..simulated._springs import SimulatedSprings, SpringSettings
 
 # A run is over at the latest this long after its loop, whatever happens [s].
-_PATIENCE = 120.0
+_TIMEOUT_S = 120.0
 
 # Called after each cycle: (now, frames in, frames out, sample of the inclinometer or None, master).
 Watch = Callable[[float, Sequence[Frame], Sequence[Frame], Reading | None, Master], None]
 # Noise of the stand-in's sensor where the robot gives none [rad]: none at all would look frozen.
-_LITTLE = 1e-5
+_DEFAULT_NOISE_RAD = 1e-5
 # The tilt that tells the gain: the middle of what the neck does [rad of theta_i].
-_PULLED = 3.0
+_GAIN_AMPLITUDE_RAD = 3.0
 
 
 def simulated_neck(file: DrivesFile, parameters: NeckParameters, **how: Any) -> SimulatedNeck:
-    """Return the virtual neck, or a robot built like it, with drives that are set up as `file` says the real ones are.
+    """Return the virtual neck, or a robot built like it, with drives as in `file`.
 
     Args:
         file: of the drives, and what they move.
@@ -46,7 +46,7 @@ def simulated_neck(file: DrivesFile, parameters: NeckParameters, **how: Any) -> 
 
 
 def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
-    """Return drives on what stands for a robot without virtual plant: springs, and outputs by its directions.
+    """Return drives on springs, for a robot without virtual plant; its directions give the outputs.
 
     Gain and lag of the outputs are those that the drives file watches for, motors and winches its own.
 
@@ -70,13 +70,13 @@ def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
         current_limit=tuple(entry.current_limit for entry in file.drives),
         winch_radius=neck.winch_radius,
         pretension_current=file.zero.current,
-        noise_std=(robot.noise_std or 0.0) * to_si(robot.outputs.unit)[0] or _LITTLE,
+        noise_std=(robot.noise_std or 0.0) * to_si(robot.outputs.unit)[0] or _DEFAULT_NOISE_RAD,
     )
     return SimulatedSprings(springs, _settings(file, **how))
 
 
 def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -> SimulatedNeck | SimulatedSprings:
-    """Return what the simulated drives of `file` turn: the virtual plant, or springs where nothing stands for a robot.
+    """Return the plant of the simulated drives of `file`: the virtual plant, or springs.
 
     Args:
         file: of the drives, and what they move.
@@ -88,14 +88,14 @@ def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -
 
 
 def physics_of(robot: Robot, neck: NeckParameters | None = None) -> NeckParameters | None:
-    """Return the physics of what stands for a robot: `neck`, or what the robot names; None where nothing does."""
+    """Return the physics of a robot's virtual plant: `neck`, or the one that it names; None without any."""
     if robot.tendon_angles is None or (neck is None and robot.neck is None):
         return None
     return VirtualNeck.of(robot, neck).parameters
 
 
 def stand_in(file: DrivesFile, neck: NeckParameters | None) -> str:
-    """Return what to say of simulated drives that turn no virtual plant, "" of the others."""
+    """Return the note on simulated drives without virtual plant; "" for others."""
     if physics_of(file.moves, neck) is not None:
         return ""
     gain, pole = file.watch.gain, file.watch.pole
@@ -170,7 +170,7 @@ class VirtualRun:
 
     def run(self, most: float) -> None:
         """Step until the master is done, for at most `most` + 120 s of virtual time."""
-        cycles = round((most + _PATIENCE) / self.link.cycle)
+        cycles = round((most + _TIMEOUT_S) / self.link.cycle)
         for _ in range(cycles):
             if self.master.finished:
                 return
@@ -235,6 +235,6 @@ def _tilt(neck: VirtualNeck) -> float:
     """Return how far the neck tilts when its tendons are moved as Eq. 9 and 10 have it, without payload [rad]."""
     # Along the first output's direction, so that the motors come to as much together.
     meant = np.cos(np.radians(neck.robot.directions.angles_deg))
-    P: Vector = _PULLED / np.dot(meant, meant) * np.cos(tendons_of(neck.robot, neck.parameters))
+    P: Vector = _GAIN_AMPLITUDE_RAD / np.dot(meant, meant) * np.cos(tendons_of(neck.robot, neck.parameters))
     out = settle(neck.block(), P).outputs
     return math.hypot(*(float(angle) for angle in out[: len(neck.robot.outputs.names)]))

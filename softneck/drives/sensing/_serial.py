@@ -23,8 +23,8 @@ from ..master import Frame, Tilt
 
 # Two decimals or more: a number cut within its decimals is invalid.
 _LINE = re.compile(rb"i(\d{1,3}\.\d{2,}),\s?o(\d{1,3}\.\d{2,}|nan)")
-_LONGEST = 64
-_REQUEST = b"i"
+_MAX_LINE_BYTES = 64
+_REQUEST_BYTE = b"i"
 
 
 class SensorError(SoftneckError):
@@ -69,17 +69,17 @@ class TiltLines:
         *lines, rest = (self._rest + data).split(b"\n")
         samples = []
         for line in lines:
-            sample = tilt_of_line(line) if len(line) <= _LONGEST else None
+            sample = tilt_of_line(line) if len(line) <= _MAX_LINE_BYTES else None
             if sample is not None and self._whole:
                 self.good += 1
                 samples.append(sample)
             elif self._whole and line.strip():
                 self.bad += 1
-                self.strange = line[:_LONGEST]
+                self.strange = line[:_MAX_LINE_BYTES]
             self._whole = True
-        if len(rest) > _LONGEST:
+        if len(rest) > _MAX_LINE_BYTES:
             # No line end in so many bytes: binary data, up to the next line end.
-            self.strange = rest[:_LONGEST]
+            self.strange = rest[:_MAX_LINE_BYTES]
             self.bad += 1
             rest, self._whole = b"", False
         self._rest = rest
@@ -174,7 +174,7 @@ class SerialInclinometer:
     def _ask(self) -> None:
         if self._request and not self.problem:
             try:
-                self._port.write(_REQUEST)
+                self._port.write(_REQUEST_BYTE)
             except OSError as error:
                 # A full buffer is not an error: the sensor is late, which the gate detects.
                 if not type(error).__name__.endswith("TimeoutException"):

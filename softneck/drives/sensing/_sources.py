@@ -17,7 +17,7 @@ from softneck.robot import Robot
 from softneck.signals import NECK
 
 from ..bus._link import Link
-from ..bus._sensor_source import SENSORS, SensorSource, axes_of, turned
+from ..bus._sensor_source import SENSORS, SensorSource, axes_of, to_robot_axes
 from ..master import Frame, Tilt
 from ..master._gate import Reading, sample_of
 from ._serial import SensorError, SerialInclinometer
@@ -26,10 +26,10 @@ from ._serial import SensorError, SerialInclinometer
 _SLOPES = {1: struct.Struct("<i"), 2: struct.Struct("<ii")}
 _RESOLUTION = math.radians(0.001)
 # Sent by the sensor if it has no measurement: the most negative number.
-_NOTHING = -(2**31)
+_NO_MEASUREMENT = -(2**31)
 # Time in which any active inclinometer sends a sample [s]: 10 samples at 20 Hz.
 LOOK = 0.5
-_PIECE = 0.02
+_READ_PERIOD_S = 0.02
 
 
 class Sensor(Protocol):
@@ -48,7 +48,7 @@ def look_at(sensor: Sensor, link: Link, timeout: float) -> Reading | None:
     """Return the first sample of `sensor` within `timeout` [s], or None."""
     until = link.now + timeout
     while link.now < until:
-        tilt = sensor.read(link.now, link.receive(_PIECE))
+        tilt = sensor.read(link.now, link.receive(_READ_PERIOD_S))
         if tilt is not None:
             return tilt
     return None
@@ -84,7 +84,7 @@ class CanInclinometer:
                 continue
             if len(frame.data) == self._slopes.size:
                 slopes = self._slopes.unpack(frame.data)
-                self._newest = sample_of([slope * _RESOLUTION for slope in slopes], valid=_NOTHING not in slopes)
+                self._newest = sample_of([slope * _RESOLUTION for slope in slopes], valid=_NO_MEASUREMENT not in slopes)
 
 
 class _Changed:
@@ -114,10 +114,10 @@ def open_sensor(
         SettingsError: a simulated sensor, a factory that cannot be called, or one that does not return a sensor.
         SensorError: no port, no permission, no data, or another protocol.
     """
-    sensor = _opened(kind, node, source, robot)
+    sensor = _open_source(kind, node, source, robot)
     if axes:
         order = axes_of(axes, robot.outputs.names)
-        sensor = _Changed(sensor, lambda sample: turned(sample, order))
+        sensor = _Changed(sensor, lambda sample: to_robot_axes(sample, order))
     try:
         yield sensor
     finally:
@@ -126,7 +126,7 @@ def open_sensor(
             close()
 
 
-def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
+def _open_source(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
     count = len(robot.outputs.names)
     match kind:
         case "can":
@@ -147,9 +147,9 @@ def _opened(kind: str, node: int, source: SensorSource, robot: Robot) -> Any:
             raise SettingsError(f'[sensor] kind is "{kind}"; on a bus it must be one of {", ".join(SENSORS[1:])}.')
 
 
-_METHODS = ("take", "read")
+_SOURCE_METHODS = ("take", "read")
 # A longer call delays bus cycles [s]; the loop stops after five of them.
-_LONG = 0.02
+_MAX_CALL_S = 0.02
 
 
 class PythonInclinometer:
@@ -210,7 +210,7 @@ class PythonInclinometer:
             self._end(f"`{method}` raised {type(error).__name__}: {' '.join(str(error).split())}")
             return None
         took = time.monotonic() - begin
-        if took > _LONG and not self.problem:
+        if took > _MAX_CALL_S and not self.problem:
             self.problem = f"`{method}` took {1e3 * took:.0f} ms; it must not wait."
         return answer
 
@@ -246,7 +246,7 @@ def make_python_sensor(
     except Exception as error:
         text = " ".join(str(error).split())
         raise SensorError(f"inclinometer `{python}`: {type(error).__name__}: {text}. Nothing moved.") from error
-    missing = [method for method in _METHODS if not callable(getattr(sensor, method, None))]
+    missing = [method for method in _SOURCE_METHODS if not callable(getattr(sensor, method, None))]
     if missing:
         raise SettingsError(f"[sensor] python = `{python}` returned a sensor without `{missing[0]}`.")
     return PythonInclinometer(sensor, python, outputs)

@@ -17,7 +17,7 @@ from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
 # Current in internal units: A x 65520 / (2 I_peak).
 _CURRENT_RANGE = 65520.0
 # Speed of the demand below which a stop ramp is over [counts/s].
-_STANDS = 1.0
+_STANDSTILL_SPEED = 1.0
 _FOLLOWING_ERROR, _ENABLE_INPUT, _GUARDING = 0x8611, 0x5441, 0x8130
 # Fault -> bit of 2000h. The bits are not verified on hardware.
 _MOTION_ERRORS = {_GUARDING: 1 << 0, 0x2340: 1 << 1, _FOLLOWING_ERROR: 1 << 3, 0x2310: 1 << 8, 0x4310: 1 << 11,
@@ -141,7 +141,7 @@ class Axis:
     def store(self, key: tuple[int, int], value: int, item: Item) -> int:
         """Store a value that fits `item`; return 0 or an SDO abort code."""
         del item
-        if not self._allowed(key, value):
+        if not self._is_allowed(key, value):
             return WRONG_VALUE
         self.values[key] = value
         setter = self.setters.get(key)
@@ -151,7 +151,7 @@ class Axis:
             self._configure()
         return 0
 
-    def _allowed(self, key: tuple[int, int], value: int) -> bool:
+    def _is_allowed(self, key: tuple[int, int], value: int) -> bool:
         allowed = {
             (0x605A, 0): (0, 1, 2, 5, 6),
             (0x605E, 0): (-1, 0, 2),
@@ -306,7 +306,7 @@ class Axis:
             self._limit_told = at
             if at:
                 self.emergencies.append((_LIMIT_CODES[at], 0))
-        if m[servo.SERVO_MODE] == 0.0 and self._stop_then and abs(m[servo.SERVO_DEMAND_SPEED]) < _STANDS:
+        if m[servo.SERVO_MODE] == 0.0 and self._stop_then and abs(m[servo.SERVO_DEMAND_SPEED]) < _STANDSTILL_SPEED:
             then, self._stop_then = self._stop_then, 0
             self._enter(then)
 

@@ -18,9 +18,9 @@ from ._habits import WireHabits
 from ._node import CanFrame, SimulatedDrive
 from ._profiles import PROFILES
 
-_TICK = 1e-3
+_TICK_S = 1e-3
 # Length of the ring buffer [ticks]: longer than the largest `drive_latency`, 0.1 s.
-_RING = 128
+_RING_TICKS = 128
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -88,8 +88,8 @@ class SimulatedDrives(abc.ABC):
         count = len(settings.nodes)
         self.settings = settings
         self.motion: Matrix = np.zeros((count, servo.SERVO_SIZE))
-        self.ring: Matrix = np.zeros((count, _RING))
-        self.ticks = max(1, round(settings.cycle / _TICK))
+        self.ring: Matrix = np.zeros((count, _RING_TICKS))
+        self.ticks = max(1, round(settings.cycle / _TICK_S))
         self.h = settings.cycle / self.ticks
         lag = latency - 0.5 * settings.hold
         for row in range(count):
@@ -122,7 +122,7 @@ class SimulatedDrives(abc.ABC):
         """Return the true values at the last sample by name: outputs [rad], tensions [N]."""
 
     @abc.abstractmethod
-    def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+    def _measure(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
         """Return values [rad], rates [rad/s] and validity of a new sample of a healthy sensor."""
 
     def block(self, motor: int) -> None:
@@ -131,11 +131,11 @@ class SimulatedDrives(abc.ABC):
 
     def sample(self, now: float) -> Sample:
         """Take one sample of the sensor; to be called each `sample_time`."""
-        values, rates, valid = self._measured()
+        values, rates, valid = self._measure()
         if self.sensor == "freezes":
             self.newest = self._last._replace(time=now)
             return self.newest
-        values, rates, valid = sensed(self.sensor, values, rates, valid=valid)
+        values, rates, valid = sensor_channels(self.sensor, values, rates, valid=valid)
         self.newest = Sample(now, values, rates, valid=valid)
         if not math.isnan(values[0]):
             self._last = self.newest
@@ -184,7 +184,7 @@ def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
     return drive
 
 
-def sensed(
+def sensor_channels(
     kind: str, values: tuple[float, ...], rates: tuple[float, ...], *, valid: bool
 ) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
     """Return values, rates and validity from a sensor that "works", "drops", gives "nan" or "jumps" by 60 deg."""

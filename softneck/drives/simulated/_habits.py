@@ -16,11 +16,11 @@ from ._sdo import WRITE_ONLY, WRONG_STATE, WRONG_VALUE
 
 # The object of the mode, and those that may be write-only: control word, mode, homing method, interpolation period,
 # target speed.
-_MODE = 0x6060
-_NOT_TOLD = frozenset({0x6040, _MODE, 0x6098, 0x60C2, 0x60FF})
+_MODE_OBJECT = 0x6060
+_NOT_TOLD = frozenset({0x6040, _MODE_OBJECT, 0x6098, 0x60C2, 0x60FF})
 # Objects that a run needs, so that no drive may lack them.
-_NEEDED = frozenset({0x1000, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6040, 0x6041, _MODE, 0x6064, 0x607A})
-_MODES = (1, 3, 6, 8)
+_NEEDED = frozenset({0x1000, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6040, 0x6041, _MODE_OBJECT, 0x6064, 0x607A})
+_KNOWN_MODES = (1, 3, 6, 8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,9 +54,9 @@ class WireHabits:
 
     def unwritable(self, index: int, value: int, *, enabled: bool) -> int:
         """Return the SDO abort code for writing a value to an object, or 0 if it is accepted."""
-        if index != _MODE:
+        if index != _MODE_OBJECT:
             return 0
-        if value not in _MODES:
+        if value not in _KNOWN_MODES:
             return WRONG_VALUE
         return WRONG_STATE if self.mode_when == ("off" if enabled else "enabled") else 0
 

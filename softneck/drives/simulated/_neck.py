@@ -46,7 +46,7 @@ class SimulatedNeck(SimulatedDrives):
             sized_name("softneck.drives.simulated._servo_runtime", motors, self._angles)
         )
         self._samples = 0
-        self.newest = self._last = Sample(0.0, *self._shown(), valid=True)
+        self.newest = self._last = Sample(0.0, *self._sensor_outputs(), valid=True)
 
     def set(self, **disturbance: float) -> None:
         """Set payload [kg], push_x, push_y [N], base_tilt_pitch or base_tilt_roll [rad], as far as the neck has them.
@@ -67,16 +67,16 @@ class SimulatedNeck(SimulatedDrives):
         """Advance drives and neck by one bus cycle."""
         self._functions.servo_ticks(self._q, self._x, self.disturbance, self.motion, self.ring, self.ticks, self.h)
 
-    def _shown(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def _sensor_outputs(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the angles of the inclinometer and the rates of its gyro; in `outputs` after the true angles."""
         m = self._angles
         return tuple(self.outputs[m : 2 * m].tolist()), tuple(self.outputs[2 * m : 3 * m].tolist())
 
-    def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+    def _measure(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
         if self._samples:
             self._functions.winch_sense(self._arrays, self._q, self._x, self.disturbance, self.outputs)
         self._samples += 1
-        return *self._shown(), bool(self.outputs[3 * self._angles] > 0.5)
+        return *self._sensor_outputs(), bool(self.outputs[3 * self._angles] > 0.5)
 
     def truth(self) -> Mapping[str, float]:
         """Return the neck's outputs at the last sample by name: true angles, tensions, compression."""

@@ -27,7 +27,7 @@ class CanFrame(NamedTuple):
 
 _PREOPERATIONAL, _OPERATIONAL, _STOPPED = 0x7F, 0x05, 0x04
 _COMMANDS = {0x01: _OPERATIONAL, 0x02: _STOPPED, 0x80: _PREOPERATIONAL}
-_DISABLED = 0x80000000
+_PDO_DISABLED = 0x80000000
 
 
 @dataclass(slots=True)
@@ -136,7 +136,7 @@ class SimulatedDrive:
             if pdo.kind > 240:
                 continue
             pdo.syncs += 1
-            data = self._packed(pdo)
+            data = self._pack(pdo)
             # Type n: with each n-th SYNC; type 0: with the SYNC after a change (CiA 301, 7.5.2.35).
             if pdo.syncs == pdo.kind or (pdo.kind == 0 and data != pdo.sent):
                 pdo.syncs = 0
@@ -151,7 +151,7 @@ class SimulatedDrive:
         for action, value in zip(reversed(pdo.actions), reversed(values), strict=True):
             action(value)
 
-    def _packed(self, pdo: _Pdo) -> bytes:
+    def _pack(self, pdo: _Pdo) -> bytes:
         try:
             return pdo.packed.pack(*[action() for action in pdo.actions])
         except struct.error:
@@ -184,7 +184,7 @@ class SimulatedDrive:
             code, register = axis.emergencies.popleft()
             self._remember(code)
             told = axis.values[(0x1014, 0)]
-            if self.nmt != _STOPPED and not told & _DISABLED:
+            if self.nmt != _STOPPED and not told & _PDO_DISABLED:
                 self._out.append(CanFrame(told & 0x7FF, struct.pack("<HB5x", code, register)))
         if self.nmt == _OPERATIONAL:
             self._events()
@@ -201,7 +201,7 @@ class SimulatedDrive:
     def _events(self) -> None:
         """Send the event-driven PDOs with changed data."""
         for pdo in self._transmit_pdos:
-            if pdo.kind >= 254 and (data := self._packed(pdo)) != pdo.sent:
+            if pdo.kind >= 254 and (data := self._pack(pdo)) != pdo.sent:
                 self._send(pdo, data)
 
     def _watch_times(self) -> None:
@@ -235,7 +235,7 @@ class SimulatedDrive:
         mapping = bool(index & 0x200)
         communication = (index & ~0x200, 1)
         if mapping:
-            if not v[communication] & _DISABLED:
+            if not v[communication] & _PDO_DISABLED:
                 return WRONG_STATE
             if subindex > 0 and v[(index, 0)]:
                 return WRONG_STATE
@@ -253,7 +253,7 @@ class SimulatedDrive:
         for n in range(4):
             for base, mapping in ((0x1400, 0x1600), (0x1800, 0x1A00)):
                 identifier, count = v[(base + n, 1)], v[(mapping + n, 0)]
-                if identifier & _DISABLED or not count:
+                if identifier & _PDO_DISABLED or not count:
                     continue
                 fields = fields_of(items, [v[(mapping + n, i)] for i in range(1, count + 1)])
                 if fields is None:

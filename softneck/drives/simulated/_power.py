@@ -8,7 +8,7 @@ STATES = {0x00: "NOT_READY", 0x40: "DISABLED", 0x21: "READY", 0x23: "SWITCHED_ON
 NOT_READY, SWITCH_ON_DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, REACTION, FAULT = STATES
 
 # Requests of control words: (mask, value, request), first match wins; bit 7 acts by its rising edge.
-_REQUESTS = (
+_REQUEST_TABLE = (
     (0x02, 0x00, "disable voltage"),
     (0x06, 0x02, "quick stop"),
     (0x07, 0x06, "shutdown"),
@@ -37,7 +37,7 @@ _TRANSITIONS = {
 
 def request(word: int) -> str:
     """Return the request in control word `word`; "" for none."""
-    return next((name for mask, value, name in _REQUESTS if word & mask == value), "")
+    return next((name for mask, value, name in _REQUEST_TABLE if word & mask == value), "")
 
 
 def next_state(state: int, word: int) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 from ._drives import SimulatedDrives
 from ._node import CanFrame
 
-_NOTHING = -(2**31)
+_NO_MEASUREMENT = -(2**31)
 _RESOLUTION = math.radians(0.001)
 
 
@@ -76,7 +76,9 @@ def _slopes(neck: SimulatedDrives, now: float, node: int) -> CanFrame:
     sample = neck.sample(now)
     # An inclinometer has one axis or two.
     angles = sample.values[:2]
-    values = [round(angle / _RESOLUTION) if sample.valid and not math.isnan(angle) else _NOTHING for angle in angles]
+    values = [
+        round(angle / _RESOLUTION) if sample.valid and not math.isnan(angle) else _NO_MEASUREMENT for angle in angles
+    ]
     return CanFrame(0x180 + node, struct.pack(f"<{len(values)}i", *values))
 
 

@@ -31,7 +31,7 @@ from ._springs_runtime import SPRING_DRIVE, SPRING_PER_AMPERE, SPRING_REST, SPRI
 # that it may use.
 _MORE, _SPARE = 0.4, 0.8
 # Slack of the winches before `drives commission --only zero` [rad].
-_LOOSE = 1.0
+_SLACK_RAD = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,9 +83,9 @@ class SimulatedSprings(SimulatedDrives):
         self._winches: Matrix = np.zeros((4, count))
         self._winches[3] = 1.0
         if not settings.homed:
-            self._winches[0], self._winches[3] = -_LOOSE, 0.0
+            self._winches[0], self._winches[3] = -_SLACK_RAD, 0.0
             # Encoders start at zero at power-on.
-            self.motion[:, SERVO_ZERO] = self.motion[:, SERVO_SCALE] * _LOOSE
+            self.motion[:, SERVO_ZERO] = self.motion[:, SERVO_SCALE] * _SLACK_RAD
             self.motion[:, SERVO_POSITION] = 0.0
         self._table = np.array([_spring(springs, settings.gear[row], row) for row in range(count)])
         self.outputs: Matrix = np.zeros((2, len(springs.outputs)))
@@ -116,7 +116,7 @@ class SimulatedSprings(SimulatedDrives):
             self.ticks, self.h,
         )  # fmt: skip
 
-    def _measured(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
+    def _measure(self) -> tuple[tuple[float, ...], tuple[float, ...], bool]:
         noise: Vector = self._noise.normal(0.0, self._springs.noise_std, len(self._springs.outputs))
         return tuple((self.outputs[0] + noise).tolist()), tuple(self.outputs[1].tolist()), True
 

@@ -17,18 +17,18 @@ from ._tilt_charts import GyroLevel, TiltCharts, TiltModel, tilt_names
 from ._tracking import LoopRun, fit_tracking, tracking_scores
 
 # Memory of the tilt model [s], and number of its lags, which are denser for recent positions.
-_REACH = 0.5
-_LAGS = 8
+_MEMORY_S = 0.5
+_LAG_COUNT = 8
 # Margin beyond the measured range of positions, loads and speeds, as a share of it.
-_MARGIN = 0.2
-_LEAST = 20.0
+_RANGE_MARGIN = 0.2
+_MIN_LENGTH = 20.0
 # Least total length of runs of a loop [s]: four minutes showed a third of the slow error of a quarter of an hour, and
 # the tracking chart then had a false alarm every eight hours.
 _LEAST_LOOPS = 600.0
 # See `calibrate`; by `benchmarks/supervisor_choice.py`.
 _KNOWN_BIAS = 0.25
 # Quantile of cycles that counts as nearly all.
-_NEARLY = 0.95
+_HIGH_QUANTILE = 0.95
 
 
 def calibrate(
@@ -61,10 +61,10 @@ def calibrate(
     loops = [motion for motion in motions if motion.references is not None]
     motions = [motion for motion in motions if motion.references is None]
     seconds = sum(len(motion.due) for motion in motions) * cycle
-    if seconds < 2.0 * _LEAST:
+    if seconds < 2.0 * _MIN_LENGTH:
         besides = ", beside those of a loop" if loops else ""
         raise DataError(
-            f"{seconds:.3g} s of motion{besides} are too few to compare with; record at least {2.0 * _LEAST:g} s."
+            f"{seconds:.3g} s of motion{besides} are too few to compare with; record at least {2.0 * _MIN_LENGTH:g} s."
         )
     parts = list(motions) if len(motions) > 1 else motions[0].halves()
     known = [(part, features_of(part, cycle)) for part in parts]
@@ -166,14 +166,14 @@ def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles
     )
     step = cycle * sample_cycles
     top = np.max([np.abs(motion.tensions).max(axis=0) for motion in motions], axis=0)
-    reach = np.nanquantile(np.concatenate([f.behind for f in features]), _NEARLY, axis=0)
+    reach = np.nanquantile(np.concatenate([f.behind for f in features]), _HIGH_QUANTILE, axis=0)
     lags = _lags(step)
     # At rest the sign of friction is unknown: a tendon is certainly taut only above this tension.
     least = slack + np.abs(np.array(current)[:, n : n + len(EDGES)]).sum(axis=1)
     load, (least_load, most_load), level, level_spread = level_rows(known, least, top, reach)
     samples = [_Samples.of(motion, f, np.array(current), least) for motion, f in zip(motions, features, strict=True)]
     tilt = _tilt_gains(samples, lags)
-    residuals = [s.values - _predicted(s, tilt, lags, n) for s in samples]
+    residuals = [s.values - _predict(s, tilt, lags, n) for s in samples]
     sure = [np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5 for s in samples]
     stretches = [part for r, good in zip(residuals, sure, strict=True) for part in _stretches(r, good, lags[-1] + 1)]
     white, spread = _tilt_noise(samples, residuals, sure, tilt, lags, n)
@@ -181,14 +181,15 @@ def fit(known: Sequence[tuple[Motion, Features]], *, cycle: float, sample_cycles
     bends = [np.diff(part - part.mean(axis=0), 2, axis=0) for part in stretches]
     low = np.min([motion.positions.min(axis=0) for motion in motions], axis=0)
     high = np.max([motion.positions.max(axis=0) for motion in motions], axis=0)
-    margin = _MARGIN * (high - low)
+    margin = _RANGE_MARGIN * (high - low)
     due = np.concatenate([s.came for s in samples])
+    fastest = np.max([np.nanmax(np.abs(f.moved), axis=0) for f in features], axis=0)
     return Baseline(
         cycle=cycle, sample_cycles=sample_cycles, outputs=m, drive=drive, drive_spread=drive_spread,
-        drive_fastest=row_of((1.0 + _MARGIN) * np.max([np.nanmax(np.abs(f.moved), axis=0) for f in features], axis=0)),
+        drive_fastest=row_of((1.0 + _RANGE_MARGIN) * fastest),
         current=current, current_whitening=current_white, current_spread=current_spread,
         current_top=row_of(top), current_reach=row_of(reach),
-        load=load, load_low=least_load - _MARGIN * (most_load - least_load),
+        load=load, load_low=least_load - _RANGE_MARGIN * (most_load - least_load),
         level=level, level_spread=level_spread, tilt=_table(tilt), lags=lags,
         tilt_whitening=white, tilt_spread=spread, tilt_bias=(0.0,) * m,
         gyro_whitening=gyro[0], gyro_spread=gyro[1], gyro_wander=gyro[2],
@@ -244,11 +245,11 @@ class _Samples:
 
 def _lags(step: float) -> tuple[int, ...]:
     """Return lags up to half a second [samples]: 0, 1, 2, then with growing distances."""
-    last = max(_LAGS, round(_REACH / step))
-    return tuple(sorted({0, 1, 2, *np.unique(np.round(np.geomspace(3, last, _LAGS - 2)).astype(int)).tolist()}))
+    last = max(_LAG_COUNT, round(_MEMORY_S / step))
+    return tuple(sorted({0, 1, 2, *np.unique(np.round(np.geomspace(3, last, _LAG_COUNT - 2)).astype(int)).tolist()}))
 
 
-def _lagged(s: _Samples, lags: tuple[int, ...]) -> Matrix:
+def _lag_matrix(s: _Samples, lags: tuple[int, ...]) -> Matrix:
     last = lags[-1]
     columns = [s.positions[last - lag : len(s.positions) - lag] for lag in lags]
     return np.hstack(columns)
@@ -259,7 +260,7 @@ def _tilt_gains(samples: Sequence[_Samples], lags: tuple[int, ...]) -> Matrix:
     X, y = [], []
     for s in samples:
         good = (np.convolve(~s.taut, np.ones(lags[-1] + 1))[: len(s.taut)] < 0.5)[lags[-1] :]
-        x, v = _lagged(s, lags)[good], s.values[lags[-1] :][good]
+        x, v = _lag_matrix(s, lags)[good], s.values[lags[-1] :][good]
         if len(x) > 1:
             X.append(x - x.mean(axis=0))
             y.append(v - v.mean(axis=0))
@@ -269,7 +270,7 @@ def _tilt_gains(samples: Sequence[_Samples], lags: tuple[int, ...]) -> Matrix:
     return np.linalg.lstsq(np.vstack(X), np.vstack(y), rcond=None)[0].T
 
 
-def _predicted(s: _Samples, tilt: Matrix, lags: tuple[int, ...], motors: int) -> Matrix:
+def _predict(s: _Samples, tilt: Matrix, lags: tuple[int, ...], motors: int) -> Matrix:
     walk = TiltModel(tilt, lags, motors)
     return np.array([walk.step(p).sum(axis=0) for p in s.positions])
 
@@ -291,7 +292,7 @@ def _tilt_noise(
     n: int,
 ) -> tuple[Rows, Rows]:
     white, spread = [], []
-    angles = [_predicted(s, tilt, lags, n) for s in samples]
+    angles = [_predict(s, tilt, lags, n) for s in samples]
     for a in range(tilt.shape[0]):
         parts, changes, ways = [], [], []
         for r, angle, good in zip(residuals, angles, known, strict=True):

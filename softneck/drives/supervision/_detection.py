@@ -170,7 +170,7 @@ class Charts:
 
 
 # A tail is fitted to the tenth of the windows with the largest sums.
-_TAIL = 0.1
+_TAIL_SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,12 +209,12 @@ def thresholds(scores: list[Matrix], budget: Budget, rng: np.random.Generator) -
         DataError: less than ten blocks of motion, or scores that are not finite.
     """
     largest = window_maxima(scores, budget, rng)
-    border = np.quantile(largest, 1.0 - _TAIL, axis=0)
-    excess = np.maximum(largest - border, 0.0).sum(axis=0) / max(_TAIL * len(largest), 1.0)
+    border = np.quantile(largest, 1.0 - _TAIL_SHARE, axis=0)
+    excess = np.maximum(largest - border, 0.0).sum(axis=0) / max(_TAIL_SHARE * len(largest), 1.0)
     # The tail of a likelihood ratio falls as e^-h; the data may only make it heavier.
     scale = np.maximum(excess, 1.0)
     share = budget.rate * budget.window / budget.charts
-    return np.maximum(border + scale * np.log(_TAIL / share), largest.max(axis=0))
+    return np.maximum(border + scale * np.log(_TAIL_SHARE / share), largest.max(axis=0))
 
 
 def window_maxima(scores: list[Matrix], budget: Budget, rng: np.random.Generator) -> Matrix:

@@ -19,14 +19,14 @@ _SET_POINTS = 12
 # Speeds over which Coulomb friction is smoothed [rad/s]; the fit selects among them.
 EDGES = (0.1, 0.5)
 # Cycles between two compared tensions: over one cycle the change is half a count of the drive's current.
-_OVER = 3
+_TENSION_CYCLES = 3
 # Range of lags of the set-points in the model of the current: the distance to them is the requested speed.
-_ASKED = (2, 10)
-_OWN = len(EDGES) + 3 + _ASKED[1] - _ASKED[0]
+_SET_POINT_LAGS = (2, 10)
+_OWN = len(EDGES) + 3 + _SET_POINT_LAGS[1] - _SET_POINT_LAGS[0]
 # Cycles after a jump until it is decided whether the drive moved its winch, which takes about 10 ms.
-_JUDGED = 4
+_DECISION_CYCLES = 4
 # Share of the expected way back in these cycles below which the drive counts as not moving.
-_BACK = 0.5
+_LEAST_RETURN_SHARE = 0.5
 # Hypotheses of a wrong current scale: ratios of two peak currents.
 SCALES = (2.0, 0.5)
 
@@ -73,19 +73,23 @@ class MotorFeatures:
         """Start with an empty memory."""
         self._cycle, self._seen = cycle, 0
         self._functions: Any = load_functions(RUNTIME)
-        self.past = (np.zeros((_SET_POINTS, motors)), np.zeros((5, motors)), np.zeros((_OVER + 1, motors)))
-        self.x = np.zeros((_OVER + 1, motors, motors + _OWN))
+        self.past = (
+            np.zeros((_SET_POINTS, motors)),
+            np.zeros((5, motors)),
+            np.zeros((_TENSION_CYCLES + 1, motors)),
+        )
+        self.x = np.zeros((_TENSION_CYCLES + 1, motors, motors + _OWN))
         self._edges = np.array(EDGES)
 
     @property
     def full(self) -> bool:
         """Whether its memory is filled."""
-        return self._seen > _SET_POINTS + _OVER
+        return self._seen > _SET_POINTS + _TENSION_CYCLES
 
     def step(self, setpoints: Vector, positions: Vector, tensions: Vector) -> None:
         """Add one cycle, with the set-points sent in the cycle before; all (motors,)."""
         now = (setpoints, positions, tensions)
-        self._functions.supervised_features(now, self.past, self.x, self._edges, _ASKED, self._cycle)
+        self._functions.supervised_features(now, self.past, self.x, self._edges, _SET_POINT_LAGS, self._cycle)
         self._seen += 1
 
     @property
@@ -109,12 +113,12 @@ class MotorFeatures:
     @property
     def tension_change(self) -> Vector:
         """Change of the tensions over three cycles [N]."""
-        return self.past[2][0] - self.past[2][_OVER]
+        return self.past[2][0] - self.past[2][_TENSION_CYCLES]
 
     @property
     def current(self) -> Matrix:
         """Regressors of the change of tension (motors, features)."""
-        return self.x[0] - self.x[_OVER]
+        return self.x[0] - self.x[_TENSION_CYCLES]
 
     def taut(self, model: Matrix) -> Vector:
         """Return the tensions without friction and damping by `model` (motors, features) [N]."""
@@ -182,7 +186,7 @@ class MotorCharts:
         if not f.full:
             return None
         if self._jump is not None:
-            return self._judged(self._jumped)
+            return self._classify_jump(self._jumped)
         self._functions.supervised_motors(
             self._model, _RULES, f.past, f.x, self._white, self._rest, self._scales, self._b.cycle, self.scores
         )
@@ -198,14 +202,14 @@ class MotorCharts:
             return None
         name, motor = self._names[found]
         if name == "jump":
-            self._jump, self._jumped = (_JUDGED, float(f.moved[motor]), 0.0, 0.0, 0.0), motor
+            self._jump, self._jumped = (_DECISION_CYCLES, float(f.moved[motor]), 0.0, 0.0, 0.0), motor
             return None
         if name == "current_scale":
             times = SCALES[(found // n - 2) % len(SCALES)]
             return name, motor, f"motor {motor + 1}: its current is about {times:g} times what its motion takes"
         return name, motor, f"motor {motor + 1} at {positions[motor]:.2f} rad, set-point {setpoints[motor]:.2f} rad"
 
-    def _judged(self, motor: int) -> tuple[str, int, str] | None:
+    def _classify_jump(self, motor: int) -> tuple[str, int, str] | None:
         """Decide the cause of a jump: a drive whose encoder slipped moves its winch back, a misread one does not."""
         f, (left, jumped, slipped, misread, went) = self.features, self._jump or (0, 0.0, 0.0, 0.0, 0.0)
         asked = float(self._model[0][motor] @ f.drive[motor])
@@ -219,6 +223,6 @@ class MotorCharts:
         self._jump = (left - 1, jumped, slipped, misread, went)
         if left > 1:
             return None
-        if abs(went - misread) > _BACK * abs(slipped - misread):
+        if abs(went - misread) > _LEAST_RETURN_SHARE * abs(slipped - misread):
             return "encoder_slip", motor, f"{text}, and its drive turns the winch after it"
         return "position_bad", motor, f"{text}, and its drive does not answer to it"

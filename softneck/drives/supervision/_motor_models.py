@@ -111,7 +111,7 @@ def level_rows(
     n = len(slack)
     if n < 2:
         return ((0.0, 0.0),), (0.0, 0.0), (row_of(np.zeros(known[0][1].place.shape[2] + 2)),), (1.0,)
-    good = [_believed(motion, f, slack, top, reach) for motion, f in known]
+    good = [_usable_cycles(motion, f, slack, top, reach) for motion, f in known]
     places = [np.column_stack([motion.positions, np.ones(len(motion.due))])[kept]
               for (motion, _), kept in zip(known, good, strict=True)]  # fmt: skip
     others = [
@@ -120,7 +120,7 @@ def level_rows(
     told = sum(map(len, others)) > 10 * (n + 1)
     load = np.array([_robust(np.concatenate(places), column) if told else np.zeros(n + 1)
                      for column in np.concatenate(others).T])  # fmt: skip
-    carried = [_carried(y - X @ load.T, RULES.carries) for X, y in zip(places, others, strict=True)]
+    carried = [_exponential_mean(y - X @ load.T, RULES.carries) for X, y in zip(places, others, strict=True)]
     rows, spread = [], []
     for i in range(n):
         X = np.concatenate([np.column_stack([f.place[kept, i], loads[:, i], np.ones(len(loads))])
@@ -134,14 +134,14 @@ def level_rows(
     return tuple(row_of(row) for row in load), (float(seen.min()), float(seen.max())), tuple(rows), tuple(spread)
 
 
-def _believed(motion: Motion, f: Features, slack: Vector, top: Vector, reach: Vector) -> Flags:
+def _usable_cycles(motion: Motion, f: Features, slack: Vector, top: Vector, reach: Vector) -> Flags:
     """Return the cycles with taut tendons, motors below their current limits, and small following errors."""
     T = motion.tensions
     good = ((slack <= T) & ((1.0 - RULES.near_top) * top >= T) & (f.behind <= reach)).all(axis=1)
     return np.asarray(good & np.isfinite(f.place).all(axis=(1, 2)))
 
 
-def _carried(off: Matrix, memory: float) -> Matrix:
+def _exponential_mean(off: Matrix, memory: float) -> Matrix:
     """Return the mean over the last cycles, as in the chart."""
     functions, load, counted = load_functions(RUNTIME), np.zeros(off.shape[1]), np.zeros(1)
     rows = np.empty_like(off)

@@ -16,13 +16,13 @@ from ._tracking import TrackingCharts
 # Rate of missing samples that is a fault: at least this, and three times the calibrated rate.
 _RATE_LEAST = 0.2
 # Time from the first chart beyond its threshold until the fault is named [s]: the right chart may take longer.
-_RIPE = 0.1
+_NAMING_DELAY_S = 0.1
 # The same for a chart of a current, which other faults may raise first [s].
 _RIPE_CURRENT = 0.3
 # Time without a valid tilt model until it is reported, and with one until the report may be repeated [s].
-_RESTS = 5.0
+_REPORT_INTERVAL_S = 5.0
 # Lead in log likelihood over the next fault at which it is named at once.
-_LEAD = 20.0
+_LEAD_LOG_LIKELIHOOD = 20.0
 
 
 class Finding(NamedTuple):
@@ -114,7 +114,7 @@ class Plausibility:
     def _count_rest(self) -> None:
         """Report once if the tilt model was invalid for long, and again only after it was valid for as long."""
         self.rests, self._why = "", self.tilt.off or self._why
-        most = round(_RESTS / (self._b.cycle * self._b.sample_cycles))
+        most = round(_REPORT_INTERVAL_S / (self._b.cycle * self._b.sample_cycles))
         self._rested = max(0, self._rested - 1) if self.tilt.valid else min(most, self._rested + 1)
         if self._rested == most and not self._said_so:
             self.rests, self._said_so = self._why, True
@@ -129,13 +129,13 @@ class Plausibility:
         waited = (self._now - self._since) * self._b.cycle + 1e-9
         current = self._current
         alone = found < 0 and current is not None and current.name == "current_scale"
-        if lead < _LEAD and waited < (_RIPE_CURRENT if alone else _RIPE):
+        if lead < _LEAD_LOG_LIKELIHOOD and waited < (_RIPE_CURRENT if alone else _NAMING_DELAY_S):
             return None
         self._since = self._current = None
         if found < 0:
             return current
         name, number, size = self.tilt.names[found]
-        return Finding(name, number if name == "gear_wrong" else -1, self._said(name, number, size))
+        return Finding(name, number if name == "gear_wrong" else -1, self._describe(name, number, size))
 
     def _rate(self, missing: bool) -> bool:
         """Update the CUSUM for a rate of missing samples of three times the calibrated one, or a fifth."""
@@ -145,7 +145,7 @@ class Plausibility:
         self._missing = max(0.0, self._missing + score)
         return self._missing > self._b.missing_threshold
 
-    def _said(self, name: str, number: int, size: float) -> str:
+    def _describe(self, name: str, number: int, size: float) -> str:
         off = np.degrees(self.tilt.residual)
         gap = ", ".join(f"{value:.1f}" for value in off)
         if name == "gear_wrong":

@@ -17,21 +17,21 @@ from ._motor_charts import RUNTIME
 
 # Sizes of the faults to detect: a gear of another stage, a filter with a delay of 0.2 s, 1.5 deg of drift (half of the
 # 3 deg by which a fault may move the neck), a fifth or five times the noise.
-_GEARS = (2.0, 0.5)
-_LATE = 0.2
+_GEAR_RATIOS = (2.0, 0.5)
+_FILTER_DELAY_S = 0.2
 _OFFSET = math.radians(1.5)
-_NOISES = (1.0 / 25.0, 25.0)
+_VARIANCE_RATIOS = (1.0 / 25.0, 25.0)
 # The difference of angles and gyro decays with the first time constant; its rate, the gyro's bias, is averaged over the
 # second [s].
 _FORGET, _BIAS = 6.0, 15.0
 # Time in which a drift must be detected: the bias is estimated from older samples [s].
-_OLD = 4.0
+_DRIFT_TIME_S = 4.0
 # Waiting time until the model is valid, in multiples of its memory.
-_SETTLED = 2
+_SETTLING_MEMORIES = 2
 # Time constant of the evidence for faults [s].
-_LATELY = 0.5
+_EVIDENCE_TIME_S = 0.5
 # Number of samples at rest for the initial offset of tilt and model.
-_REST = 25
+_REST_SAMPLES = 25
 # Faults that change the residual of the model; and those among them that a gyro without motion confirms. A gyro that
 # agrees with the angles does not exclude them: in a frozen unit the gyro is frozen too.
 _OF_MODEL = frozenset(
@@ -42,11 +42,11 @@ _OF_SENSOR = frozenset({"sensor_stuck", "sensor_late", "tilt_unexplained"})
 
 def tilt_names(motors: int, outputs: int, *, gyro: bool) -> list[tuple[str, int, float]]:
     """Return (event, motor or output from 0, size) of each chart; motor -1: all of them."""
-    names: list[tuple[str, int, float]] = [("gear_wrong", i, g) for g in _GEARS for i in (*range(motors), -1)]
+    names: list[tuple[str, int, float]] = [("gear_wrong", i, g) for g in _GEAR_RATIOS for i in (*range(motors), -1)]
     names += [("sensor_stuck", a, 0.0) for a in range(outputs)] + [("sensor_reversed", a, 0.0) for a in range(outputs)]
-    names += [("sensor_swapped", a, 0.0) for a in range(outputs - 1)] + [("sensor_late", -1, _LATE)]
+    names += [("sensor_swapped", a, 0.0) for a in range(outputs - 1)] + [("sensor_late", -1, _FILTER_DELAY_S)]
     names += [("tilt_unexplained", a, sign * _OFFSET) for a in range(outputs) for sign in (1.0, -1.0)]
-    names += [("sensor_noise", a, ratio) for a in range(outputs) for ratio in _NOISES]
+    names += [("sensor_noise", a, ratio) for a in range(outputs) for ratio in _VARIANCE_RATIOS]
     if gyro:
         names += [("sensor_drift", a, sign * _OFFSET) for a in range(outputs) for sign in (1.0, -1.0)]
     return names
@@ -108,7 +108,7 @@ class GyroLevel:
         self._samples += 1
         self._late.append(change)
         # The bias is estimated from the older half of the samples, or from those older than a drift to detect.
-        while len(self._late) > min(self._samples // 2, round(_OLD / self._step)):
+        while len(self._late) > min(self._samples // 2, round(_DRIFT_TIME_S / self._step)):
             self._averaged += 1
             share = max(self._step / _BIAS, 1.0 / self._averaged)
             self._bias = self._bias + share * (self._late.popleft() - self._bias)
@@ -138,7 +138,7 @@ class TiltCharts:
         self._filter = Filter([Whitening(row) for row in b.tilt_whitening], 1 + self._hypotheses)
         self._turned = Filter([Whitening(row) for row in b.gyro_whitening], 1 + 2 * m) if b.gyro_spread else None
         self._functions: Any = load_functions(RUNTIME)
-        self._gears, self._noises = np.array(_GEARS), np.array(_NOISES)
+        self._gears, self._noises = np.array(_GEAR_RATIOS), np.array(_VARIANCE_RATIOS)
         self._raw = np.zeros((1 + self._hypotheses, m))
         # Difference of angles and gyro, and its mean for an offset of each output, to either side.
         self._levels = np.vstack([np.zeros(m), np.kron(np.eye(m), np.array([[_OFFSET], [-_OFFSET]]))])
@@ -152,15 +152,15 @@ class TiltCharts:
         self._low, self._high = np.array(b.reach).T
         self.scores = np.zeros(len(self.names))
         self.charts = Charts(np.array(b.tilt_thresholds) if thresholds is None else thresholds)
-        late = max(1, round(_LATE / self._step))
+        late = max(1, round(_FILTER_DELAY_S / self._step))
         self._angles: deque[Vector] = deque(maxlen=late + 1)
         self._residuals: deque[Vector] = deque(maxlen=3)
-        self._rest: deque[Vector] = deque(maxlen=_REST)
+        self._rest: deque[Vector] = deque(maxlen=_REST_SAMPLES)
         self._began: Matrix | None = None
         self._offset = np.zeros(m)
         self._stuck = np.zeros(m)
         self._explained, self._information = np.zeros(self._hypotheses), np.zeros(self._hypotheses)
-        self._running, self._wait = False, _SETTLED * b.lags[-1]
+        self._running, self._wait = False, _SETTLING_MEMORIES * b.lags[-1]
         self.residual = self.bend = np.zeros(m)
         self.valid, self.off = False, ""
 
@@ -245,7 +245,7 @@ class TiltCharts:
             self.off = "a motor is beyond its range in the experiments: tilt and tracking rest"
         out = bool(self.off)
         # Also for the memory of the model afterwards, and once more to average the new offset.
-        self._wait = _SETTLED * self._b.lags[-1] if out else max(0, self._wait - 1)
+        self._wait = _SETTLING_MEMORIES * self._b.lags[-1] if out else max(0, self._wait - 1)
         before, self.valid = self.valid, self._wait == 0
         if self.valid and not before:
             self._align()
@@ -263,7 +263,7 @@ class TiltCharts:
         good = self.valid and f.settled
         run.supervised_tilt(
             self._spread, self._bias_allowed, squares, (f.coefficients, f.past, self._raw),
-            (self._explained, self._information), math.exp(-self._step / _LATELY), good, self.scores,
+            (self._explained, self._information), math.exp(-self._step / _EVIDENCE_TIME_S), good, self.scores,
         )  # fmt: skip
         run.supervised_noise(self.bend, self._noise, self._noises, good, self.scores[h : h + 2 * m])
         if self._turned is not None:

@@ -26,9 +26,9 @@ _LAGS = tuple(0.04 * 2.0**k for k in range(7))
 # Tracking error to detect: half of the 3 deg by which a fault may move the neck.
 _ASTRAY = math.radians(1.5)
 # Samples without evaluation after the start of a reference or slack tendons: the initial state is not in the model.
-_SETTLE = 150
+_SETTLING_ROWS = 150
 # Least length of a run of a loop [s].
-_LEAST = 20.0
+_LEAST_LENGTH_S = 20.0
 
 
 class _Lags:
@@ -41,7 +41,7 @@ class _Lags:
 
     def step(self, reference: Sequence[float], values: Sequence[float], *, valid: bool) -> bool:
         """Process a sample; return whether the loop has had a reference and taut tendons for long enough."""
-        self._wait = max(0, self._wait - 1) if valid else _SETTLE
+        self._wait = max(0, self._wait - 1) if valid else _SETTLING_ROWS
         if len(reference) != self._outputs or not np.isfinite(reference).all():
             self.seen = 0
             return False
@@ -50,7 +50,7 @@ class _Lags:
             self.x[:] = values
         self.x += self._share * (np.asarray(reference) - self.x)
         self.seen += 1
-        return self.seen > _SETTLE and not self._wait
+        return self.seen > _SETTLING_ROWS and not self._wait
 
 
 class TrackingCharts:
@@ -168,4 +168,4 @@ class LoopRun:
     @property
     def long(self) -> bool:
         """Whether it is long enough to be held out of a fit."""
-        return self.seconds >= _LEAST
+        return self.seconds >= _LEAST_LENGTH_S

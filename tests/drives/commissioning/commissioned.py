@@ -11,7 +11,7 @@ import numpy as np
 
 from softneck.drives import DrivesFile, neck_drives
 from softneck.drives.bus._link import VirtualLink
-from softneck.drives.commissioning._identify import Expected, Identified, identify, proposed
+from softneck.drives.commissioning._identify import Expected, Identified, apply_findings, identify
 from softneck.drives.commissioning._measure import expected_of, measure
 from softneck.drives.commissioning._moves import Guards, Moves
 from softneck.drives.running._bus_loop import Session
@@ -66,7 +66,7 @@ def commissioned(mistakes: Sequence[str], preset: str = "paper", *, seed: int = 
     moves, _ = measure(Session(file=file, link=link, watches=(truth,)), guards, motors=(1, 2, 3))
     assert all(drive.axis.state != 0x27 for drive in link.neck.drives)
     found = identify(moves, file, expected)
-    return Run(planted, moves, found, proposed(file, found), truth)
+    return Run(planted, moves, found, apply_findings(file, found), truth)
 
 
 def agrees(run: Run) -> bool:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from softneck.core import CheckFailedError, SettingsError
 from softneck.drives import default_drives, load_drives
 from softneck.drives.bus._read import drives_table, make_drives
-from softneck.drives.bus._sensor_source import Axes, axes_of, inverse, said_of, turned
+from softneck.drives.bus._sensor_source import Axes, axes_of, inverse, said_of, to_robot_axes
 from softneck.drives.commissioning._features import Features
 from softneck.drives.commissioning._findings import (
     Finding,
@@ -25,10 +25,10 @@ from softneck.drives.commissioning._findings import (
     known_before,
     peak_of,
     require_answers,
-    typed,
+    with_type_currents,
 )
-from softneck.drives.commissioning._identify import Identified, Scale, factors, identify, proposed
-from softneck.drives.commissioning._mounting import Mounting, exchanges, explain, seen
+from softneck.drives.commissioning._identify import Identified, Scale, apply_findings, factors, identify
+from softneck.drives.commissioning._mounting import Mounting, exchanges, explain, to_sensor_axes
 from softneck.drives.commissioning._moves import WIGGLE
 from softneck.drives.master import Tilt
 from softneck.robot import Robot
@@ -54,21 +54,21 @@ axes_strategy = st.permutations(range(3)).flatmap(
 def test_what_explains_the_directions_gives_them_and_has_no_more_mistakes(order: tuple[int, ...], axes: Axes) -> None:
     """The truth itself may need more: a triangle turned over is three motors exchanged, or a sign."""
     truth = Mounting(order, axes, 0.0)
-    measured = np.array([seen(TENDONS[:, order[j]], axes) for j in range(3)])
+    measured = np.array([to_sensor_axes(TENDONS[:, order[j]], axes) for j in range(3)])
     found = explain(measured, TENDONS)
     assert found[0].mistakes <= truth.mistakes
     for one in found:
-        again = np.array([seen(TENDONS[:, one.order[j]], one.axes) for j in range(3)])
+        again = np.array([to_sensor_axes(TENDONS[:, one.order[j]], one.axes) for j in range(3)])
         np.testing.assert_allclose(again, measured, atol=1e-12)
 
 
 def test_only_a_reversed_roll_and_the_exchange_of_two_tendons_cannot_be_told_apart() -> None:
     for axes, order in [(((0, 1.0), (1, -1.0)), (0, 1, 2)), (STRAIGHT, (0, 2, 1))]:
-        found = explain(np.array([seen(TENDONS[:, order[j]], axes) for j in range(3)]), TENDONS)
+        found = explain(np.array([to_sensor_axes(TENDONS[:, order[j]], axes) for j in range(3)]), TENDONS)
         assert {(one.order, one.axes) for one in found} == {((0, 2, 1), STRAIGHT), ((0, 1, 2), ((0, 1.0), (1, -1.0)))}
     for axes, order in [(((1, 1.0), (0, 1.0)), (0, 1, 2)), (((0, -1.0), (1, 1.0)), (0, 1, 2)), (STRAIGHT, (1, 0, 2)),
                         (STRAIGHT, (0, 1, 2))]:  # fmt: skip
-        found = explain(np.array([seen(TENDONS[:, order[j]], axes) for j in range(3)]), TENDONS)
+        found = explain(np.array([to_sensor_axes(TENDONS[:, order[j]], axes) for j in range(3)]), TENDONS)
         assert [(one.order, one.axes) for one in found] == [(order, axes)]
 
 
@@ -136,7 +136,7 @@ def test_a_poor_measurement_says_less() -> None:
 
 @given(axes_strategy)
 def test_axes_back_and_forth_are_the_sample(axes: Axes) -> None:
-    sample = turned(Tilt(0.1, -0.2), ((0, 1.0), (1, 1.0)))
+    sample = to_robot_axes(Tilt(0.1, -0.2), ((0, 1.0), (1, 1.0)))
     names = ("a", "b", "c")
     assert axes_of(said_of(axes, names), names) == axes
     there = tuple(sign * (1.0, 2.0, 3.0)[number] for number, sign in inverse(axes))
@@ -182,7 +182,7 @@ def test_what_was_found_put_right_is_what_was_planted(mistakes: list[str]) -> No
                              new.peak_current / old.peak_current))  # fmt: skip
     axes = inverse(axes_of(right.sensor_axes, names))
     found = Identified((), tuple(motors), tuple(scales), Mounting(order, axes, 0.0), 0.0, 0.0, True)
-    assert proposed(file, found) == right
+    assert apply_findings(file, found) == right
 
 
 def _scale(lines: float, gear: float, peak: float) -> Any:
@@ -248,7 +248,7 @@ def test_serial_numbers_tell_exchanged_nodes() -> None:
 
 def test_a_type_that_is_public_gives_the_peak_current_from_the_first_move_on() -> None:
     found = [drive(1, name="iPOS4808 BX-CAN"), drive(2, name="iPOS3604 MX-CAN"), drive(3)]
-    file, peaks = typed(default_drives(), found)
+    file, peaks = with_type_currents(default_drives(), found)
     assert peaks == {1: 20.0, 2: 10.0}
     assert [entry.scale.peak_current for entry in file.drives] == [20.0, 10.0, 10.0]
     assert peak_of(drive(1, name=None)) is None

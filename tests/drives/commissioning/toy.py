@@ -46,7 +46,7 @@ class Toy:
         for index in range(round(most / STEP)):
             now, before = index * STEP, believed
             tilt = self._tilt(views, push=self.push if now >= push_at else 0.0)
-            if mover.finished(index) or mover.stopped:
+            if mover.is_finished(index) or mover.stopped:
                 break
             positions = tuple(view.counts / COUNTS for view in views)
             asked = mover.step(Measurement(index, Tilt(*tilt), True, positions))

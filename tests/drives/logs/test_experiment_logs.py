@@ -45,7 +45,7 @@ def virtual() -> VirtualLink:
 def recorded(path: Path, *, link: VirtualLink | None = None, operator: Operator | None = None) -> Recording:
     with RunLogger(path, wait=True) as log:
         session = Session(file=FILE, link=link or virtual(), log=log, facts={"record": EXPERIMENT.facts()})
-        done = record_signal([part for part, _ in EXPERIMENT.prepared()], replace(session, operator=operator))
+        done = record_signal([part for part, _ in EXPERIMENT.prepare_runs()], replace(session, operator=operator))
     assert done.recording is not None
     return done.recording
 

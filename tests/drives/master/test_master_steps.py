@@ -143,7 +143,7 @@ def test_set_points_run_straight_between_samples_and_the_last_holds() -> None:
 def test_what_is_counted_is_kept_once_and_the_last_thousand_events() -> None:
     master = new_master()
     for _ in range(3):
-        master._told(Event(0.0, "late_cycle"))
+        master._record_event(Event(0.0, "late_cycle"))
     assert master.counts["late_cycle"] == 3
     assert [event.name for event in master.events] == ["late_cycle"]
     for _ in range(1500):

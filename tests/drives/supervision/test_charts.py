@@ -311,7 +311,7 @@ def test_without_a_gyro_that_knows_its_bias_a_push_is_not_called_a_drift() -> No
 def test_what_is_found_is_said_in_words(name: str, number: int, size: float, said: str) -> None:
     charts = Plausibility(baseline())
     charts.tilt.residual = np.radians([1.0, -2.0])
-    assert charts._said(name, number, size) == said
+    assert charts._describe(name, number, size) == said
 
 
 @pytest.mark.parametrize(("chart", "said"), [(0, "motor 1 at 0.25 rad, set-point 0.50 rad"),

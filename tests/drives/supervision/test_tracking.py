@@ -18,7 +18,13 @@ from softneck.drives.master import Phase
 from softneck.drives.supervision._calibrate import _tracking, calibrate, require_loops
 from softneck.drives.supervision._detection import Budget
 from softneck.drives.supervision._motor_models import Motion
-from softneck.drives.supervision._tracking import _SETTLE, LoopRun, TrackingCharts, fit_tracking, tracking_scores
+from softneck.drives.supervision._tracking import (
+    _SETTLING_ROWS,
+    LoopRun,
+    TrackingCharts,
+    fit_tracking,
+    tracking_scores,
+)
 
 from ..bench import TS, Bench, T
 from ..plausible import Tracker, baseline, experiments, looped, watched
@@ -76,14 +82,16 @@ def test_what_the_loop_is_off_by_itself_counts_for_no_fault() -> None:
 def test_without_a_reference_and_where_tendons_hung_nothing_is_compared() -> None:
     model = fit_tracking([run_of(1), run_of(2)])._replace(thresholds=(10.0,) * 4)
     charts = TrackingCharts(model, 2, TS)
-    for _ in range(_SETTLE + 50):
+    for _ in range(_SETTLING_ROWS + 50):
         assert charts.step((), (0.3, 0.3), valid=True) == -1
         assert not charts.scores.any()
     # As long again after it came, and after tendons hung.
-    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(_SETTLE)] == [-1] * _SETTLE
+    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(_SETTLING_ROWS)] == [-1] * _SETTLING_ROWS
     assert max(charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(50)) >= 0
     charts.step((0.0, 0.0), (0.3, 0.3), valid=False)
-    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(_SETTLE - 1)] == [-1] * (_SETTLE - 1)
+    assert [charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(_SETTLING_ROWS - 1)] == [-1] * (
+        _SETTLING_ROWS - 1
+    )
     assert charts.step((0.0, 0.0), None, valid=True) == -1
     assert max(charts.step((0.0, 0.0), (0.3, 0.3), valid=True) for _ in range(50)) >= 0
 
