@@ -17,7 +17,7 @@ from softneck.identification import Recursion
 from softneck.runtime import load_functions
 
 ROWS = 2_000_000
-UD, STANDARD = "softneck.identification.linear._ud_runtime", "tests.oracles.recursion_runtime"
+STANDARD = "tests.oracles.recursion_runtime"
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +28,8 @@ def record() -> tuple[np.ndarray, np.ndarray]:
 
 
 def ud(Phi: np.ndarray, y: np.ndarray) -> np.ndarray:
-    state = Recursion(parameters=5).initial_state()
-    load_functions(UD).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
-    return state.theta
+    settings = Recursion(parameters=5)
+    return settings.run(settings.initial_state(), Phi, y)[0].theta
 
 
 def guarded(Phi: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ def arx_output(
 ) -> float:
     """Return y(k+1) = -a y(k+1-i) + b u(k+1-delay-j) of one axis; `a` (na,) and `b` (nb,) may be empty.
 
-    The positions stand H samples behind the set-points: with a delay of H more, u is where the motors were.
+    Motor positions are stored H samples after the set-points: a delay of H more reads positions.
     """
     y = 0.0
     for i in range(a.shape[0]):

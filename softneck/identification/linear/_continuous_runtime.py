@@ -1,4 +1,4 @@
-"""A continuous-time system between samples: its input held and late by any time, its errors joined by straight lines.
+"""Simulation of a continuous-time system with a held, delayed input, and of a filter of errors linear between samples.
 
 State (3n,): x of `x' = A x + e u(t - L)`, z of `z' = A z`, w of `w' = A w + e (C x + z_1)`, all in controllable form,
 e the last unit vector: x_j = s^j/A u, w_j = s^j/A yhat.

@@ -1,4 +1,4 @@
-"""Transfer functions over the redefined inputs, in free run their own outputs fed back."""
+"""Transfer functions over the redefined inputs; a simulation feeds their own outputs back."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from softneck.runtime._layout import array
 
 
 class OeArrays(ArxArrays):
-    """Those of Eq. 23, and where u comes from."""
+    """Arrays of Eq. 23, and the source of u."""
 
     source = array("1", "1 takes motor positions for u, 0 set-points")
 
@@ -19,7 +19,7 @@ def step(p: OeArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray, 
     narx_observe(p, parameters, x, inputs)
     ahead = np.empty(p.outputs)
     for axis in range(p.outputs):
-        # Motor positions stand H samples of all behind set-points: a source of 1 reads them as if that much older.
+        # Motor positions are stored H samples after the set-points, so source 1 reads them by a longer delay.
         delay = int(p.delay[axis]) + p.H * int(p.source[0])
         ahead[axis] = arx_output(p, p.redefinition, p.a[axis], p.b[axis], delay, x, axis)
     narx_forward(p, parameters, x, ahead, outputs)

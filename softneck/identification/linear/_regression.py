@@ -87,7 +87,7 @@ def no_base(motors: int = 3, outputs: int = 2) -> dict[str, Matrix]:
 
 
 def check_linear(arrays: Mapping[str, Matrix], sizes: Mapping[str, int], *, least: int = 1) -> None:
-    """Raise FileFormatError for orders (below `least`), dead times or a source outside the histories."""
+    """Raise FileFormatError for orders, dead times or a source outside the histories."""
     if "A" in arrays:
         within(np.array([sizes["n"]]), sizes["outputs"], sizes["outputs"] * sizes["H"], "the order")
         within(arrays["delay"][:1], 0, sizes["H"] - 1, "a dead time")
@@ -107,13 +107,10 @@ _MAX_CONDITION = 1e8
 def arx_rows(
     runs: Sequence[tuple[Matrix, Matrix]], na: int, nb: int, delay: int, *, lag: int | None = None
 ) -> tuple[Matrix, Matrix]:
-    """Return phi(t-1) of Eq. 26 (rows, n) and y(t) (rows, ny) of all runs; a row with a missed sample is left out.
+    """Return phi(t-1) of Eq. 26 (rows, n) and y(t) (rows, ny) of all runs, without rows with a missed sample.
 
-    Args:
-        runs: outputs (time, ny) and inputs (time, nu) of each run; the first output is the modelled one.
-        na, nb: samples of each output and each input.
-        delay: dead time in samples; the newest input is u(t - delay - 1).
-        lag: rows skipped at the start of each run; as many as needed by default.
+    Runs are outputs (time, ny), the modelled one first, and inputs (time, nu); the newest input is u(t - delay - 1).
+    `lag` rows are skipped at the start of each run, by default as many as needed.
     """
     need = max(na, nb + delay)
     first = need if lag is None else max(lag, need)

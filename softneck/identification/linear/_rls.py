@@ -145,21 +145,14 @@ class Recursion:
         )
 
     def step(self, state: RecursionState, phi: ArrayLike, y: float) -> RecursionState:
-        """Update by one row, regressor `phi` (n,) and output `y`; a NaN in either changes nothing."""
+        """Update by one row, regressor `phi` (n,) and output `y`; a NaN in either skips the row."""
         row = np.ascontiguousarray(phi, dtype=np.float64).reshape(1, -1)
         return self.run(state, row, np.array([y], dtype=np.float64))[0]
 
     def run(
         self, state: RecursionState, regressors: Matrix, targets: Vector, *, keep: bool = False
     ) -> tuple[RecursionState, RecursionHistory]:
-        """Update by all rows; return the state and the history, which is empty unless `keep`.
-
-        Args:
-            state: to start from; it is not changed.
-            regressors: (rows, n).
-            targets: (rows,).
-            keep: whether to keep the history.
-        """
+        """Update by regressors (rows, n) and targets (rows,); return the state and, with `keep`, the history."""
         Phi, y = self._rows(regressors, targets)
         after = RecursionState(
             theta=state.theta.copy(), factor=state.factor.copy(), scale=state.scale.copy(), tally=state.tally.copy()
@@ -322,11 +315,7 @@ class Rls:
         y = np.ascontiguousarray(Y[:, 0])
         number = require_excitation(name, Phi)
         recursion = self._recursion(Phi.shape[1])
-        state = recursion.initial_state()
-        if self.forgetting < 1.0 or self.stable:
-            state, _ = recursion.run(state, Phi, y)
-        else:
-            load_functions(_UD_RUNTIME).ud_recursion(Phi, y, state.theta, state.factor, state.scale, 1.0)
+        state, _ = recursion.run(recursion.initial_state(), Phi, y)
         theta = state.theta
         rms = float(np.sqrt(np.mean((y - Phi @ theta) ** 2)))
         free = max(y.size - theta.size, 1)

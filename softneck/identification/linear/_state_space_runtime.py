@@ -2,7 +2,7 @@
 
     x(k+1) = A x(k) + B u(k - delay) + K (y(k) - offset - C x(k)),    y = C x + offset,    C x = the first states
 
-The first states are the outputs less the offset. States stand where other kinds keep their histories of outputs
+The first states are the outputs minus the offset. States take the place of the histories of outputs of other kinds
 (n <= outputs H).
 """
 
@@ -45,13 +45,13 @@ def step(p: StateSpaceArrays, parameters: np.ndarray, x: NarxState, inputs: np.n
     narx_push(x.u, inputs[: p.motors])
     narx_push(x.m, x.motors)
     states = x.y
-    # Zero in free run: then the outputs of now are the first states.
+    # Zero in a simulation, where the present outputs are the first states.
     e = np.empty(p.outputs)
     for axis in range(p.outputs):
         e[axis] = x.angles[axis] - p.offset[axis] - states[axis]
-    # Beside the states, as every row needs all the old ones.
+    # A new array, as every row needs all old states.
     ahead = np.zeros(p.n)
-    # Motor positions stand H samples of all motors behind set-points.
+    # Motor positions are stored H samples after the set-points.
     back = int(p.delay[0]) + p.H * int(p.delay[1])
     for i in range(p.n):
         value = 0.0

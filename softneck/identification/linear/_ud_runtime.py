@@ -12,7 +12,7 @@ def ud_update(
     forgetting: float,
     gain: np.ndarray,
 ) -> float:
-    """Take one row in (Eq. 28-30), in place; return epsilon(t+1), the error before it.
+    """Update by one row (Eq. 28-30), in place; return epsilon(t+1), the error before it.
 
     `factor` (n, n) is U transposed, whose diagonal of ones is not stored; `scale` (n,) is D; `gain` (n,) is scratch.
     """
@@ -45,20 +45,6 @@ def ud_update(
     for i in range(theta.shape[0]):
         theta[i] += gain[i] * (error * inverse)
     return error
-
-
-def ud_recursion(
-    regressors: np.ndarray,
-    targets: np.ndarray,
-    theta: np.ndarray,
-    factor: np.ndarray,
-    scale: np.ndarray,
-    forgetting: float,
-) -> None:
-    """Run through all rows (rows, n), updating `theta`, `factor` and `scale` in place, without any guard."""
-    gain = np.zeros(theta.shape[0])
-    for t in range(regressors.shape[0]):
-        ud_update(factor, scale, theta, regressors[t], targets[t], forgetting, gain)
 
 
 def ud_trace(factor: np.ndarray, scale: np.ndarray) -> float:
@@ -102,11 +88,11 @@ def ud_guarded(
     tally: np.ndarray,
     history: np.ndarray,
 ) -> None:
-    """Run through all rows with guards.
+    """Update by all rows, with guards.
 
-    `guards` = [forgetting, bound on the trace of F (0: none), dead zone, number of a (0: no projection), radius];
-    `tally` (4,) adds up the rows taken in, those with their squared errors after lambda, the dead-zone rows and the
-    projections; `history` (rows or 0, 1 + 2n) takes the error and the parameters and the diagonal of F of each row.
+    `guards` = [forgetting, bound on the trace of F (0: none), dead zone, number of a (0: no projection), radius].
+    `tally` (4,) counts the rows and their squared errors (both forgotten), the dead-zone rows and the projections.
+    `history` (rows or 0, 1 + 2n) takes the error, the parameters and the diagonal of F of each row.
     """
     n = theta.shape[0]
     forgetting, bound, dead_zone, na, radius = guards[0], guards[1], guards[2], int(guards[3]), guards[4]
@@ -118,7 +104,7 @@ def ud_guarded(
         error = targets[t]
         for i in range(n):
             error -= theta[i] * phi[i]
-        # Before anything moves: a row that teaches nothing leaves F alone too.
+        # A row in the dead zone leaves F unchanged too.
         if abs(error) > dead_zone or dead_zone == 0.0:
             before[:] = theta
             ud_update(factor, scale, theta, phi, targets[t], forgetting, gain)
@@ -130,7 +116,7 @@ def ud_guarded(
             tally[1] = forgetting * tally[1] + error * after
             if na > 0 and not is_stable(theta[:na], radius, work):
                 tally[3] += 1.0
-                # theta alone goes back; what F has learnt of the directions stays.
+                # Only theta is projected; F keeps its update.
                 ud_retreat(theta, before, na, radius, work)
             if bound > 0.0:
                 trace = ud_trace(factor, scale)

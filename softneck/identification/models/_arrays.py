@@ -83,11 +83,7 @@ def own_arrays(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
 
 
 def members(arrays: Mapping[str, Matrix]) -> list[tuple[str, dict[str, Matrix]]]:
-    """Return kind and arrays of each member, in order.
-
-    Raises:
-        FileFormatError: members out of order, or of a kind that cannot be a member.
-    """
+    """Return kind and arrays of each member; raise FileFormatError for a wrong order or kind."""
     found: list[tuple[str, dict[str, Matrix]]] = []
     for name, array in arrays.items():
         if "." not in name:
@@ -150,7 +146,7 @@ _MAX_HISTORY_SAMPLES = 60_000
 
 
 def memory_array(seconds: float, sample_time: float) -> Vector:
-    """Return the array `memory`: the samples in so many seconds, limited to what a file may hold."""
+    """Return the array `memory`: the samples in so many seconds, up to the limit of a file."""
     return np.array([float(min(np.ceil(seconds / sample_time), _MAX_HISTORY_SAMPLES))])
 
 
@@ -281,11 +277,7 @@ def _payload_port(least: float, most: float) -> Port:
 
 
 def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the findings with the range of the training's set-points in SI, rest included, and its conditions.
-
-    Args:
-        sources: recordings, and findings of models that are members.
-    """
+    """Return the findings on set-points (SI, rest included) and conditions of recordings and of findings of members."""
     parts = [s.set_points if isinstance(s, Recording) else np.array(_set_point_range(s, 3)) for s in sources]
     rows = np.vstack([np.zeros((1, parts[0].shape[1])), *parts])
     found = {"min": np.nanmin(rows, axis=0).tolist(), "max": np.nanmax(rows, axis=0).tolist()}

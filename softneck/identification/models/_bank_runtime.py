@@ -1,14 +1,13 @@
-"""A drive that stalls under load, and a bank of play operators and low-pass filters behind it.
+"""Drives that stall under load, and a bank of play operators and low-pass filters driven by them.
 
-Drive: `m_j` moves towards its delayed set-point as a first-order lag does, but no further than
-`c + c1 (q_j - mean q) + c2 mean q`, where q is m behind a low-pass: a drive that pulls against its current limit
-gets as far as the tension lets it, and the tension is set by how the neck hangs, which follows m. It never moves
-away from its set-point, so it stays between the set-points it was given.
+Drive: `m_j` moves towards its delayed set-point as a first-order lag, but no further than
+`c + c1 (q_j - mean q) + c2 mean q`, where q is m after a low-pass: a drive at its current limit stalls at a tension,
+which depends on the pose of the neck and so on m. It never moves away from its set-point.
 load = [pole of q, c, c1, c2].
 
-Bank: each redefined input (theta, phi, delta) as it is and behind play operators (Visintin 1994, sec. III.2), and
-each of those through `order` equal low-pass filters: order * c * (1 + widths) signals for c redefined inputs (three of
-a neck), all of them between the least and the largest input ever given.
+Bank: each redefined input (theta, phi, delta) directly and through play operators (Visintin 1994, sec. III.2), each of
+these through `order` equal low-pass filters. The order * c * (1 + widths) signals for c redefined inputs stay between
+the smallest and the largest input.
 """
 
 import numpy as np
@@ -17,18 +16,18 @@ from softneck.runtime._rest_runtime import REST
 
 
 def drive_limit(load: np.ndarray, q: float, mean: float) -> float:
-    """Return how far a motor gets under the load of now: its own q, and the mean of all."""
-    # What one motor pulls beyond the others bends the neck, what all pull presses it together: two slopes of tension.
+    """Return the largest position of a motor under the present load, from its own q and the mean of all."""
+    # Differences between motors bend the neck, their mean compresses it: two slopes of tension.
     return load[1] + load[2] * (q - mean) + load[3] * mean
 
 
 def drive_advance(pole: float, target: float, m: float, limit: float) -> float:
-    """Return the motor's next position: a lag, stopped at the limit but never driven back by it."""
+    """Return the motor's next position by its lag, stopped at the limit but never moved back by it."""
     return min(pole * m + (1.0 - pole) * target, max(limit, m))
 
 
 def load_advance(load: np.ndarray, m: np.ndarray, q: np.ndarray) -> None:
-    """Let q follow m (3,)."""
+    """Update q by the low-pass of m (3,)."""
     for j in range(q.shape[0]):
         q[j] = (load[0] * q[j] + (1.0 - load[0]) * m[j] + REST) - REST
 
@@ -63,7 +62,7 @@ def bank_advance(
 
 
 def monomial(table: np.ndarray, row: int, bank: np.ndarray) -> float:
-    """Return the product of the signals that a row of `table` (n, 3) names; -1 stands for 1."""
+    """Return the product of the signals with the indices in a row of `table` (n, 3); -1 means a factor of 1."""
     value = 1.0
     # Up to three factors: terms of degree three at most.
     for i in range(3):

@@ -84,10 +84,7 @@ class Directions:
 def directions_of(recording: Recording, motors: list[Matrix], robot: Robot | None = None) -> Directions:
     """Return the directions and time constants of a robot; estimate those that its file does not give.
 
-    Args:
-        recording: to estimate from.
-        motors: set-points or positions that drive the outputs, (time, motors) of each run.
-        robot: by default that of the recording.
+    Motors are the set-points or positions (time, motors) of each run of the recording.
 
     Raises:
         DataError: an output follows no motor.
@@ -132,10 +129,7 @@ def _geometric_mean(seconds: ArrayLike) -> float:
 
 
 def bandwidth_of(recording: Recording) -> float | None:
-    """Return the bandwidth of a robot [rad/s]: a neck's 4 (section 3.1), scaled by time constant for others.
-
-    It is None where an output follows no motor.
-    """
+    """Return the bandwidth [rad/s], a neck's 4 (section 3.1) over the time constant; None as of that."""
     seconds = time_constant_of(recording)
     return None if seconds is None else BANDWIDTH * (NECK_SECONDS / seconds)
 
@@ -207,10 +201,7 @@ _MIN_CROSSINGS, _MAX_CROSSINGS = 6.8e-5, 0.68
 def make_test_motions(train: Recording, seconds: float, *, seed: int = 0) -> list[Recording]:
     """Generate motions within the set-points of a recording; their outputs are NaN after the start.
 
-    Args:
-        train: the recording.
-        seconds: of each motion, before it is scaled to the recording's speed.
-        seed: of levels and phases.
+    Each has a length of `seconds` before it is scaled to the recording's speed.
     """
     length = _MIXED_PER_MOTION * seconds
     start, stop = (round(share * length / SAMPLE_TIME) for share in _SINGLE_TENDON_SHARE)

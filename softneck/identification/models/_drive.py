@@ -1,4 +1,4 @@
-"""Drive models, from motor set-point to measured position, and noise models of what a plant model misses.
+"""Drive models, from motor set-point to measured position, and noise models of prediction errors.
 
 A drive is a first-order lag with dead time for each motor. Tendon robots add a common limit: a motor that pulls against
 its current limit stalls (see `_bank_runtime`).
@@ -216,10 +216,8 @@ _MAX_POLE_RADIUS = 0.995
 def fit_noise_model(errors: list[Vector], order: int, *, beyond: float = 1.0) -> Vector:
     """Fit c (order,) of `e(k+1) = sum_i c_i e(k+1-i)` by Yule and Walker (Stoica and Moses 2005, sec. 3.4).
 
-    Args:
-        errors: one sequence a run; NaN where nothing was measured.
-        order: number of past errors.
-        beyond: factor by which errors on new motions are assumed larger, with the same measurement noise.
+    There is one sequence of errors a run, NaN where not measured. On new motions errors are assumed `beyond` times
+    larger, with the same measurement noise.
     """
     r = np.zeros(order + 1)
     counts = np.zeros(order + 1)

@@ -1,7 +1,7 @@
-"""What kinds whose output has no feedback share: an echo of what was measured, and drives that stall under load.
+"""Parts of kinds without output feedback: the noise model (array `echo`), and drives that stall under load.
 
-The histories (see `_histories_runtime`) hold what the outputs were above the kind's own part f, which is never fed
-back: y(k+1) = f(k+1) + sum_i echo_i (y - f)(k+1-i). In free run the echo dies out.
+The histories (see `_histories_runtime`) hold the outputs minus the kind's own part f, which is never fed back:
+y(k+1) = f(k+1) + sum_i echo_i (y - f)(k+1-i). In a simulation the sum decays.
 """
 
 import numpy as np
@@ -11,14 +11,14 @@ from softneck.identification.models._histories_runtime import NarxArrays, NarxSt
 
 
 def echo_rest(p: NarxArrays, x: NarxState, axis: int, f: float) -> None:
-    """Remember what the start is above `f` as if it had been measured for ever."""
+    """Fill the history with the start minus `f`, as if measured at rest."""
     x.added[axis] = f
     for j in range(p.H):
         x.y[j, axis] -= f
 
 
 def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: float) -> float:
-    """Return y(k+1) of one axis, and note `f`; echo (outputs, p)."""
+    """Return y(k+1) of one axis and store `f`; echo (outputs, p)."""
     total = 0.0
     for i in range(echo.shape[1]):
         total += echo[axis, i] * x.y[i, axis]  # y - f of i + 1 samples before, as `narx_observe` left it
@@ -27,7 +27,7 @@ def echo_added(p: NarxArrays, echo: np.ndarray, x: NarxState, axis: int, f: floa
 
 
 def stalling_drives(p: NarxArrays, load: np.ndarray, q: np.ndarray, x: NarxState, outputs: np.ndarray) -> None:
-    """Move the motors of now on from the newest of the histories, no further than their load lets them."""
+    """Advance the motors from the newest of the histories, limited by their load."""
     mean = 0.0
     for j in range(p.motors):
         mean += q[j]

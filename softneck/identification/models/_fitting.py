@@ -119,11 +119,8 @@ def delay_samples(
 def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d: int) -> float:
     """Return the simulation fit [%] of the first output over all runs; -inf where the model is unstable.
 
-    Args:
-        runs: outputs (time, ny) and inputs (time, nu).
-        a: (na,) denominator without its leading one.
-        B: (nu, nb) numerators.
-        d: dead time in samples.
+    Runs are outputs (time, ny) and inputs (time, nu); a (na,) is the denominator without its leading one, B (nu, nb)
+    are the numerators.
     """
     from scipy.signal import lfilter, lfiltic
 

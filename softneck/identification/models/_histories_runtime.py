@@ -1,4 +1,4 @@
-"""What all plants share: histories, the drive model, measured or simulated signals, output noise."""
+"""Parts of all plants: histories, the drive model, measured or simulated signals, output noise."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from softneck.runtime._rest_runtime import REST
 
 
 def narx_outputs(history: np.ndarray) -> int:
-    """Return the number of outputs: the neck's two where none is said."""
+    """Return the number of outputs; two by default."""
     return int(history[1]) if history.shape[0] > 1 else 2
 
 
@@ -29,7 +29,7 @@ class NarxArrays(GroundArrays):
 
 
 class NarxState(StateVector):
-    """Histories, newest first, and what holds now; kinds add what else they remember."""
+    """Histories, newest first, and present values; kinds add further states."""
 
     u = cells("H, motors", "motor set-points [rad]")
     m = cells("H, motors", "motor positions [rad]")
@@ -59,7 +59,7 @@ def narx_rest(p: NarxArrays, parameters: np.ndarray, x: NarxState, outputs: np.n
 
 
 def narx_validity(p: NarxArrays, x: NarxState) -> float:
-    """Return the validity of outputs that follow from where the motors are at t_k; 0 where the model does not know."""
+    """Return the validity of the next outputs from the motors at t_k; 0 for a model without a training region."""
     if p.ground.shape[0] == 0:
         return 0.0
     outside = ground_outside(p, x.m[0], x.slow)
@@ -78,7 +78,7 @@ def narx_push(history: np.ndarray, newest: np.ndarray) -> None:
 
 
 def narx_known(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray) -> None:
-    """Take in where angles and motors are at t_k: as measured, where they are."""
+    """Replace angles and motors at t_k by their measurements where there are any."""
     measured = parameters[p.outputs] > 0.5  # a Boolean parameter as a number
     for axis in range(p.outputs):
         if measured and np.isfinite(inputs[p.motors + axis]):  # NaN: not measured now
@@ -93,17 +93,17 @@ def narx_known(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np.n
 
 
 def narx_observe(p: NarxArrays, parameters: np.ndarray, x: NarxState, inputs: np.ndarray) -> None:
-    """Push what is known at t_k into the histories: set-points, motors and outputs, measured where they are."""
+    """Push set-points, motors and outputs at t_k, measured where possible, into the histories."""
     narx_known(p, parameters, x, inputs)
     narx_push(x.u, inputs[: p.motors])
     narx_push(x.m, x.motors)
-    # What a kind adds is never fed back: its history holds the outputs without it.
+    # The part that a kind adds is never fed back: the history holds the outputs without it.
     base = x.angles - x.added
     narx_push(x.y, base)
 
 
 def narx_forward(p: NarxArrays, parameters: np.ndarray, x: NarxState, ahead: np.ndarray, outputs: np.ndarray) -> None:
-    """Take `ahead` (outputs,), those at t_k+1, as the new outputs, move the motors on, write the outputs."""
+    """Write the outputs at t_k+1, `ahead` (outputs,), and the motors that the drive model gives."""
     for j in range(p.motors):
         d = int(p.drive[j, 1])
         if d > 0:
@@ -114,7 +114,7 @@ def narx_forward(p: NarxArrays, parameters: np.ndarray, x: NarxState, ahead: np.
     for axis in range(p.outputs):
         x.angles[axis] = (ahead[axis] + REST) - REST
         outputs[axis] = x.angles[axis]
-    # What a sensor would add is seen outside and never fed back.
+    # Sensor noise is on the outputs only and never fed back.
     if parameters[p.outputs + 1] > 0.0:
         for axis in range(p.outputs):
             outputs[axis] += parameters[p.outputs + 1] * random_normal(x.random)

@@ -24,11 +24,7 @@ UNITS = ("SI", "robot")
 def transfer_function(
     model: Any, output: str, input: str | None, angle_unit: str = "rad", units: str = "SI"
 ) -> control.TransferFunction:
-    """Return the discrete transfer function from `input` to `output`, with its exact dead time.
-
-    Raises:
-        SettingsError: the kind is not linear, or an unknown input, output or unit.
-    """
+    """Return the discrete transfer function from `input` to `output`, with its exact dead time."""
     name = _checked_input(model, output, input)
     b, a, delay = _function(model, output, name)
     # The numerator b_1 z^(n-1-d)... has no negative power of z for n = max(na, nb + d).
@@ -191,21 +187,17 @@ def axis_functions(model: Any) -> dict[str, tuple[Vector, Vector, int]]:
 
 
 def weights_of(model: Any) -> Matrix:
-    """Return the weights (outputs, motors) of the motors in each output's direction, given or learned.
-
-    Raises:
-        SettingsError: the robot's directions are to be identified, and the model has not learned them.
-    """
+    """Return the weights (outputs, motors) of the motors in each output's direction, given or learned."""
     weights = model.robot.weights()
-    if weights is None:
-        found = model.findings.get("directions")
-        if found is None:
-            raise SettingsError(
-                f"the model of kind `{model.kind}` has not learned the directions of robot {model.robot.label()}, "
-                'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
-            )
-        weights = np.array(found, dtype=np.float64)
-    return weights
+    if weights is not None:
+        return weights
+    found = model.findings.get("directions")
+    if found is None:
+        raise SettingsError(
+            f"the model of kind `{model.kind}` has not learned the directions of robot {model.robot.label()}, "
+            'which are "identified"; identify `oe` or `rls`, or give `directions.matrix`.'
+        )
+    return np.array(found, dtype=np.float64)
 
 
 def redefined_input(robot: Robot, output: str) -> str:
@@ -461,10 +453,7 @@ def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
 def axes_system(a: list[Vector], b: list[Vector], directions: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Join transfer functions over redefined inputs to one system over the motors, with a Kalman gain.
 
-    Args:
-        a: denominators without their leading ones, of each output.
-        b: numerators, b_1 first.
-        directions: (outputs, motors) from motors to redefined inputs.
+    Denominators `a` are without their leading ones; `directions` (outputs, motors) lead to the redefined inputs.
     """
     from scipy.linalg import block_diag
 

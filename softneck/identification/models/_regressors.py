@@ -24,14 +24,10 @@ def lag_table(
     both_outputs: bool = False,
     sizes: tuple[int, int] = (3, 2),
 ) -> Matrix:
-    """Return the regressor table of these lags [samples], with rows (source, channel, lag).
+    """Return the regressor table, with rows (source, channel, lag), of lags of y, u_i and M_i [samples].
 
-    Args:
-        outputs: lags of y; empty for a regressor without feedback.
-        set_points: lags of u_i.
-        motors: lags of M_i.
-        both_outputs: take all outputs at each lag, as form `residual` does from its base.
-        sizes: numbers of motors and outputs.
+    With `both_outputs` it has all outputs at each lag, as form `residual` takes them from its base. `sizes` are the
+    numbers of motors and outputs.
     """
     rows = [[0, 0, lag] for lag in outputs]
     if both_outputs:
@@ -61,13 +57,7 @@ def spread_table(recording: Recording) -> Matrix:
 
 
 def regressor_scale(table: Matrix, scaling: Scaling, base_rest: Vector | float = 0.0) -> tuple[Matrix, Matrix]:
-    """Return rest value in SI and unit of each regressor of each output, both (outputs, n).
-
-    Args:
-        table: rows (source, channel, lag).
-        scaling: of motors and outputs.
-        base_rest: (outputs,) source 3 at rest.
-    """
+    """Return rest value in SI and unit of each regressor of each output (outputs, n); source 3 rests at `base_rest`."""
     outputs, at = len(scaling.output_unit), table[:, 1].astype(int)
     rests, units = np.zeros((outputs, len(table))), np.full((outputs, len(table)), scaling.motor_unit)
     own, base, motors = table[:, 0] == 0, table[:, 0] == 3, np.isin(table[:, 0], (1, 2))

@@ -69,13 +69,7 @@ def tolerance(robot: Robot, recording: Recording) -> Vector:
 
 
 def with_validity_region(model: Model, recording: Recording, *, trust: Trust | None = None) -> Model:
-    """Add the arrays of `validity` to a model, from its simulation of the training recording.
-
-    Args:
-        model: as identified.
-        recording: of its training.
-        trust: by default that of its kind.
-    """
+    """Add the arrays of `validity` to a model, from its simulation of the training recording."""
     bare = replace(model, arrays=without_validity(model.arrays))
     chosen = TRUST.get(model.kind, _LEARNED) if trust is None else trust
     allowed = tolerance(model.robot, recording)
@@ -95,7 +89,7 @@ def with_validity_region(model: Model, recording: Recording, *, trust: Trust | N
 
 
 def limit_validity(model: Model, errors: Matrix) -> Model:
-    """Lower the validity of a model to what `errors` (time, outputs) allow; NaN where not measured."""
+    """Lower the validity of a model to that of `errors` (time, outputs), NaN where not measured."""
     allowed = tolerance_of(model)
     if allowed is None or not has_validity(model):
         return model
@@ -141,15 +135,11 @@ def has_validity(model: Model) -> bool:
 
 
 def find_farthest_motor(block: Block, motors: Matrix) -> tuple[int, bool, float, float]:
-    """Find the motor farthest from its training range.
-
-    Args:
-        block: of a model with a training region.
-        motors: positions (time, motors) up to the instant of interest.
+    """Find the motor farthest from its training range at the end of positions `motors` (time, motors).
 
     Returns:
-        The motor's index, whether its low-passed position counts, that position, and its distance from the training's
-        mean over the region's extent.
+        Its index, whether its low-passed position counts, that position, and its distance from the training's mean
+        over the region's extent.
     """
     ground = block.arrays[layout_of(block.runtime.partition("(")[0], Arrays).place("ground")]
     n = motors.shape[1]
@@ -179,7 +169,7 @@ def _errors_and_motion(model: Model, recording: Recording) -> tuple[Matrix, Matr
 
 
 def low_pass_motors(m: Matrix) -> Matrix:
-    """Return the motors `m` (time, motors) behind the low-pass of the runtime."""
+    """Return the motors `m` (time, motors) after the low-pass of the runtime."""
     from scipy.signal import lfilter
 
     keep = 1.0 - GROUND_RATE

@@ -1,12 +1,12 @@
-"""How far a plant's output can be trusted now: the probability that its error in free run stays within a tolerance.
+"""The output `validity`: the probability that the error of a simulation stays within a tolerance.
 
     outside = max(|D z - o|^2 - 1, 0),    doubt = max over the outputs of v + slope outside + agreement s^2
     validity = 1 / (1 + doubt)
 
-z are the motors and, behind a low-pass of a second of a neck, where they have been held: a neck that knows quick moves
-only has not seen a slow one, though it passes the same positions. o and D (`ground`) say where z was in training, s is
-the spread of members where there are any; v, slope and agreement (`doubt`) are variances over the tolerance squared.
-The probability is that of an error with heavy tails, P(|e| < t) = t^2 / (t^2 + var): far out errors are no Gaussian.
+z are the motors, and the motors after a low-pass of a second of a neck: a training with quick moves only does not cover
+a slow one through the same positions. o and D (`ground`) describe the region of z in training, s is the spread of
+members; v, slope and agreement (`doubt`) are variances over the tolerance squared. The probability is that of an error
+with heavy tails, P(|e| < t) = t^2 / (t^2 + var), as errors far from the training are not Gaussian.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from softneck.runtime._layout import Arrays, array, value
 from softneck.runtime._rest_runtime import REST
 
-# Of the way to the motors in a sample: 50 samples, 1 s of a neck.
+# Low-pass of the motors: a time constant of 50 samples, 1 s of a neck.
 GROUND_RATE = 0.02
 
 
@@ -32,7 +32,7 @@ class GroundArrays(Arrays):
 
 
 def ground_outside(p: GroundArrays, motors: np.ndarray, slow: np.ndarray) -> float:
-    """Move `slow`, where the motors have been held, on towards them, and return `outside`; both (motors,)."""
+    """Update `slow`, the low-passed motors (motors,), and return `outside`."""
     for j in range(p.motors):
         slow[j] = (slow[j] + GROUND_RATE * (motors[j] - slow[j]) + REST) - REST
     squared = 0.0

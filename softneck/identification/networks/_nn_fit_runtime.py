@@ -1,4 +1,4 @@
-"""Free runs of one axis of the NLARX network over prepared regressors, with exact derivatives by all weights.
+"""Simulation of one axis of the NLARX network over prepared regressors, with exact derivatives by all weights.
 
 Row k of `Z` (time, n) is the scaled regressor of y(k); its first columns, past outputs by `lags` (f,), are filled in
 here: `z_j = shift_j + gain_j y(k - lag_j)` of the scaled output y. Weights stand in the order W1, b1, W2, b2, w3, b3,
@@ -84,14 +84,14 @@ def nn_free(
     gain: np.ndarray,
     y: np.ndarray,
 ) -> None:
-    """Fill `y` (time,) with free runs; where `starts` (time, f) is a number the past output is that, a measured one."""
+    """Fill `y` (time,) by simulation; a number in `starts` (time, f) replaces the simulated past output."""
     first = np.empty(h1)
     second = np.empty(h2)
     z = np.empty(Z.shape[1])
     for k in range(Z.shape[0]):
         z[:] = Z[k]
         for j in range(lags.shape[0]):
-            # NaN: the free run goes on from its own output.
+            # NaN: the simulation continues from its own output.
             past = starts[k, j] if np.isfinite(starts[k, j]) else y[k - lags[j]]
             z[j] = shift[j] + gain[j] * past
         y[k] = nn_scalar(w, h1, h2, z, first, second)
@@ -110,7 +110,7 @@ def nn_sensitivities(
     y: np.ndarray,
     J: np.ndarray,
 ) -> None:
-    """As `nn_free`, and row r of `J` (time / thin, weights) is the derivative of y(r thin) along its free run."""
+    """As `nn_free`, with the derivative of y(r thin) along its simulation in row r of `J` (time / thin, weights)."""
     first = np.empty(h1)
     second = np.empty(h2)
     back = np.empty(h1)

@@ -1,10 +1,10 @@
-"""NLARX network with two tanh layers over drives that stall under load (section 6.2; see `_bank_runtime`).
+"""NLARX network with two tanh layers and drives that stall under load (section 6.2; see `_bank_runtime`).
 
     z(k) = (regressor - mean) / scale,    N = w3 tanh(W2 tanh(W1 z + b1) + b2) + b3
     y(k+1) = N + d(k+1),                  d(k+1) = memory (d(k) + gain (y(k) - N(k) - d(k)))
 
-d is what the network misses where outputs are measured; where none are, it dies out. A tanh layer is bounded, so the
-output is, whatever it is fed back.
+d estimates the error of the network from measurements, and decays without them. A tanh layer is bounded, and so is the
+output for any feedback.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ class NnArrays(NarxArrays):
 
 
 class NnState(NarxState):
-    """Histories, and what the network's drives and disturbance remember."""
+    """Histories, and the states of the network's drives and disturbance."""
 
     q = cells("motors", "motor positions behind a low-pass: the load of now [rad]")
     own = cells("outputs", "N: the network's part of the outputs of now [rad]")
@@ -49,7 +49,7 @@ class NnState(NarxState):
 def initialise(p: NnArrays, parameters: np.ndarray, x: NnState, outputs: np.ndarray) -> None:
     """Rest: motors at zero, outputs at their start values for ever."""
     narx_rest(p, parameters, x, outputs)
-    # At the start the network has said what the output is: it misses nothing (d = 0).
+    # At the start the network has no error (d = 0).
     for axis in range(p.outputs):
         x.own[axis] = parameters[axis]
 
@@ -73,12 +73,12 @@ def step(p: NnArrays, parameters: np.ndarray, x: NnState, inputs: np.ndarray, ou
     regressor = np.empty(p.n)
     ahead = np.empty(p.outputs)
     for axis in range(p.outputs):
-        # The newest output in the history is measured, or what was said before: then nothing is missed.
+        # The newest output in the history is measured, or the prediction itself, with no error.
         missed = x.y[0, axis] - x.own[axis] - x.disturbance[axis]
         x.disturbance[axis] = p.correction[axis, 0] * (x.disturbance[axis] + p.correction[axis, 1] * missed)
         narx_regressor(p, p.table, x, axis, regressor)
         x.own[axis] = nn_output(p, axis, regressor)
         ahead[axis] = x.own[axis] + x.disturbance[axis]
     narx_forward(p, parameters, x, ahead, outputs)
-    # The lag of `narx_forward` knows no load: these positions replace its own.
+    # These positions replace those of `narx_forward`, which has no load limit.
     stalling_drives(p, p.load, q, x, outputs)

@@ -82,19 +82,15 @@ def levenberg(
 ) -> Vector:
     """Minimise `|errors(w)|^2 + decay |w|^2` over w by Levenberg and Marquardt; return the last w.
 
-    Args:
-        errors: see `Errors`.
-        start: the first w.
-        iterations: largest number of steps.
-        decay: weight of the squared parameters.
-        on_step: called with w and its cost at the start and after each step; False ends the search.
-
-    Raises:
-        DataError: the first cost is not finite.
+    `on_step` gets w and its cost at the start and after each step; False ends the search.
     """
     w, damping = start, 1e-2
     error, J = errors(w, True)
-    cost = _cost(error, w, decay)
+
+    def penalized(e: Vector, w: Vector) -> float:
+        return float(e @ e + decay * (w @ w))
+
+    cost = penalized(error, w)
     if not np.isfinite(cost):
         raise DataError("the network's first error is not finite; look for wild values in the recording.")
     if not on_step(w, cost):
@@ -106,8 +102,8 @@ def levenberg(
         trial, trial_cost = w, cost
         # A cost that is not finite also shortens the step.
         while not trial_cost < cost and damping < _MAX_DAMPING:
-            trial = w + _solve(A, g, decay + damping)
-            trial_cost = _cost(errors(trial, False)[0], trial, decay)
+            trial = w + _solve_damped(A, g, decay + damping)
+            trial_cost = penalized(errors(trial, False)[0], trial)
             damping *= _SHRINK if trial_cost < cost else _GROW
         if not trial_cost < cost:
             break
@@ -118,17 +114,13 @@ def levenberg(
     return w
 
 
-def _solve(A: Matrix, g: Vector, damping: float) -> Vector:
+def _solve_damped(A: Matrix, g: Vector, damping: float) -> Vector:
     from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
     try:
         return cho_solve(cho_factor(A + damping * np.eye(g.size)), g)
     except LinAlgError:
         return np.zeros_like(g)
-
-
-def _cost(error: Vector, w: Vector, decay: float) -> float:
-    return float(error @ error + decay * (w @ w))
 
 
 FUNCTIONS = "softneck.identification.networks._nn_fit_runtime"
@@ -226,16 +218,9 @@ def axis_data(
     scale: tuple[Matrix, Vector] | None,
     weights: Vector | None = None,
 ) -> tuple[AxisData, Matrix, Vector]:
-    """Return the data of one axis, its input scale (2, n) and output scale (2,).
+    """Return the data of one axis, its input scale (2, n) and output scale (2,); None computes the scale.
 
-    Args:
-        recording: with logged motors, or those of the drive model.
-        motors: (time, motors) simulated [rad].
-        axis: of the outputs.
-        table: rows (source, channel, lag), past outputs first.
-        has_time_constant: whether the robot file gives it.
-        scale: that of other data; None computes it.
-        weights: (time,) of errors; None for equal ones.
+    The recording has motor positions; `motors` (time, motors) are simulated ones, `weights` (time,) those of errors.
     """
     lag = int(table[:, 2].max())
     X, S, y, first, weight = [], [], [], [], []
@@ -309,14 +294,8 @@ def train_axis(
 ) -> Layers:
     """Return the network with the best simulation of the hold-out among all starts and stages.
 
-    Args:
-        data: of the training.
-        best: keeps the best network.
-        hidden: neurons of the two layers.
-        decays: one for each start.
-        iterations: series-parallel steps of the best start; the others get a third.
-        refine: steps over simulation windows.
-        rng: of the starts.
+    Each of `decays` gives one start, with a third of the `iterations` (series-parallel); the best gets them all. Then
+    it takes `refine` steps over simulation windows.
     """
     known = np.isfinite(data.measured).all(axis=1) & np.isfinite(data.target)
     rows = np.flatnonzero(known)[:: data.decimation]
