@@ -14,7 +14,7 @@ from .networks._network import Network as Network
 from .selection._auto import Choice as Choice
 from .selection._auto import choose as choose
 from .set_membership._set_membership import SetMembership as SetMembership
-from .set_membership._set_membership import outside_seen as outside_seen
+from .set_membership._set_membership import is_extrapolating as is_extrapolating
 from .structured._greybox import GreyBox as GreyBox
 from .structured._play import Play as Play
 from .uncertainty._family import Family as Family

@@ -34,7 +34,7 @@ from ..models._fitting import row_hashes
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 from ..models._validity import limit_validity
-from ..structured._greybox import NUMBERS
+from ..structured._greybox import PARAMETERS
 
 # Kind -> the arrays that are moved; entries that are zero are structure and stay.
 _MOVED = {
@@ -71,7 +71,7 @@ class Free:
     def of(cls, model: Model) -> Free:
         """Find them."""
         if model.kind == "greybox":
-            mask = np.arange(model.arrays["neck"].size) < len(NUMBERS)  # its tendons stand behind its numbers
+            mask = np.arange(model.arrays["neck"].size) < len(PARAMETERS)  # its tendons stand behind its numbers
             return cls(model, (("neck", mask),))
         found = [(name, model.arrays[name]) for name in _MOVED[model.kind] if name in model.arrays]
         return cls(model, tuple((name, array != 0.0) for name, array in found))
@@ -80,13 +80,13 @@ class Free:
         """Return where they are."""
         if self.model.kind == "greybox":
             values = self.model.arrays["neck"]
-            return np.array([number.encode(float(value)) for number, value in zip(NUMBERS, values, strict=False)])
+            return np.array([number.encode(float(value)) for number, value in zip(PARAMETERS, values, strict=False)])
         return np.concatenate([self.model.arrays[name][mask] for name, mask in self.places])
 
     def sizes(self) -> Vector:
         """Return by how much each is usefully moved: its size, or that of its neighbours where it is small."""
         if self.model.kind == "greybox":
-            return np.array([number.spread for number in NUMBERS])
+            return np.array([number.spread for number in PARAMETERS])
         parts = [self.model.arrays[name][mask] for name, mask in self.places]
         return np.concatenate([np.maximum(np.abs(part), np.median(np.abs(part))) for part in parts if part.size])
 
@@ -112,8 +112,8 @@ class Free:
         """Return the model with other numbers."""
         if self.model.kind == "greybox":
             numbers = [number.decode(float(np.clip(v, number.encode(number.low), number.encode(number.high))))
-                       for number, v in zip(NUMBERS, x, strict=True)]  # fmt: skip
-            neck = np.concatenate([numbers, self.model.arrays["neck"][len(NUMBERS) :]])
+                       for number, v in zip(PARAMETERS, x, strict=True)]  # fmt: skip
+            neck = np.concatenate([numbers, self.model.arrays["neck"][len(PARAMETERS) :]])
             # Its drives lag by the same number.
             drive = self.model.arrays["drive"].copy()
             drive[:, 0] = np.exp(-neck[0] * self.model.arrays["sensor"][1])

@@ -159,8 +159,8 @@ def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: 
     return epsilon + np.array(widths)
 
 
-def knows_what_it_saw(model: Model) -> bool:
-    """Return whether `outside_seen` can judge by this model."""
+def can_detect_extrapolation(model: Model) -> bool:
+    """Return whether `is_extrapolating` can judge by this model."""
     return usual_finding(model.robot) in model.findings
 
 
@@ -169,7 +169,7 @@ def usual_finding(robot: Robot) -> str:
     return f"{_FINDING}_{robot.outputs.display_unit}"
 
 
-def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
+def is_extrapolating(model: Model, outputs: Matrix) -> np.ndarray:
     """Return (rows, outputs) whether the bounds of each output are wider than the training data's usually are.
 
     Args:
@@ -179,7 +179,7 @@ def outside_seen(model: Model, outputs: Matrix) -> np.ndarray:
     Raises:
         SettingsError: a model without bounds, or one identified before this was learned.
     """
-    if not knows_what_it_saw(model):
+    if not can_detect_extrapolation(model):
         raise SettingsError("only a model of kind nlsm knows what it has seen; identify one (again).")
     first, axes = len(model.robot.outputs.names) + len(model.robot.motors.names), len(model.robot.outputs.names)
     columns = first + 2 * axes + 1  # `validity` is the last

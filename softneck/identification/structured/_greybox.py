@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class Parameter:
     """One number of the neck's equations.
 
     Attributes:
@@ -67,34 +67,34 @@ class Number:
         return float(np.exp(value)) if self.positive else value
 
 
-NUMBERS = (
-    Number("drive_rate", "1/s", 10.0, 1.0, 80.0, 1.0, True, "position loop of the drives"),
-    Number("pretension", "rad", 0.3, 0.01, 5.0, 1.0, True, "stretch of each tendon at rest"),
-    Number("pull_limit", "rad", 0.6, 0.05, 50.0, 1.0, True, "stretch at which a drive stalls"),
-    Number("lever", "rad/rad", 7.0, 0.5, 40.0, 0.5, True, "radius of the tendons over radius of the winch"),
-    Number("gain", "1/(rad s)", 10.0, 0.05, 500.0, 1.0, True, "tension to rate of bending"),
-    Number("stiffness", "1/s", 10.0, 0.05, 500.0, 1.0, True, "of the link against bending"),
-    Number("stiffening", "1/(rad^2 s)", 3.0, 0.0, 300.0, 10.0, False, "cubic term of the stiffness"),
-    Number("asymmetry", "1", 0.0, -0.5, 0.5, 0.1, False, "stiffness is (1 + this) in pitch, (1 - this) in roll"),
-    Number("rest_pitch", "rad", 0.0, -0.3, 0.3, 0.1, False, "bend of the link without tendons"),
-    Number("rest_roll", "rad", 0.0, -0.3, 0.3, 0.1, False, "bend of the link without tendons"),
-    Number("compliance", "1", 3.0, 0.001, 50.0, 1.0, True, "compression per sum of the tensions"),
-    Number("axial_rate", "1/s", 20.0, 0.5, 300.0, 1.0, True, "rate of compression"),
-    Number("friction", "1/s", 0.3, 0.0, 300.0, 30.0, False, "hysteresis against bending"),
-    Number("friction_angle", "rad", 0.05, 0.003, 1.0, 1.0, True, "bend over which the hysteresis builds up"),
-    Number("twist", "rad", 0.0, -0.5, 0.5, 0.1, False, "turn of the tendons against the inclinometer"),
-    Number("sensor_rate", "1/s", 40.0, 2.0, 300.0, 1.0, True, "lag of the inclinometer"),
+PARAMETERS = (
+    Parameter("drive_rate", "1/s", 10.0, 1.0, 80.0, 1.0, True, "position loop of the drives"),
+    Parameter("pretension", "rad", 0.3, 0.01, 5.0, 1.0, True, "stretch of each tendon at rest"),
+    Parameter("pull_limit", "rad", 0.6, 0.05, 50.0, 1.0, True, "stretch at which a drive stalls"),
+    Parameter("lever", "rad/rad", 7.0, 0.5, 40.0, 0.5, True, "radius of the tendons over radius of the winch"),
+    Parameter("gain", "1/(rad s)", 10.0, 0.05, 500.0, 1.0, True, "tension to rate of bending"),
+    Parameter("stiffness", "1/s", 10.0, 0.05, 500.0, 1.0, True, "of the link against bending"),
+    Parameter("stiffening", "1/(rad^2 s)", 3.0, 0.0, 300.0, 10.0, False, "cubic term of the stiffness"),
+    Parameter("asymmetry", "1", 0.0, -0.5, 0.5, 0.1, False, "stiffness is (1 + this) in pitch, (1 - this) in roll"),
+    Parameter("rest_pitch", "rad", 0.0, -0.3, 0.3, 0.1, False, "bend of the link without tendons"),
+    Parameter("rest_roll", "rad", 0.0, -0.3, 0.3, 0.1, False, "bend of the link without tendons"),
+    Parameter("compliance", "1", 3.0, 0.001, 50.0, 1.0, True, "compression per sum of the tensions"),
+    Parameter("axial_rate", "1/s", 20.0, 0.5, 300.0, 1.0, True, "rate of compression"),
+    Parameter("friction", "1/s", 0.3, 0.0, 300.0, 30.0, False, "hysteresis against bending"),
+    Parameter("friction_angle", "rad", 0.05, 0.003, 1.0, 1.0, True, "bend over which the hysteresis builds up"),
+    Parameter("twist", "rad", 0.0, -0.5, 0.5, 0.1, False, "turn of the tendons against the inclinometer"),
+    Parameter("sensor_rate", "1/s", 40.0, 2.0, 300.0, 1.0, True, "lag of the inclinometer"),
 )
 
 
 # What a payload changes, where the recordings have several; of a kilogram as much as the numbers themselves are.
-LOADS = (
-    Number("payload_stiffness", "1/(s kg)", -3.0, -60.0, 60.0, 10.0, False, "what a payload adds to the stiffness"),
-    Number("payload_pretension", "rad/kg", -0.2, -5.0, 5.0, 1.0, False, "what a payload adds to the pretension"),
+PAYLOAD_PARAMETERS = (
+    Parameter("payload_stiffness", "1/(s kg)", -3.0, -60.0, 60.0, 10.0, False, "what a payload adds to the stiffness"),
+    Parameter("payload_pretension", "rad/kg", -0.2, -5.0, 5.0, 1.0, False, "what a payload adds to the pretension"),
 )
 
 # Those that have no meaning where the link bends in one plane.
-ACROSS = ("asymmetry", "rest_roll", "twist")
+OUT_OF_PLANE_PARAMETERS = ("asymmetry", "rest_roll", "twist")
 
 _FUNCTIONS = "softneck.identification.structured._greybox_fit_runtime"
 # An error of a motor counts as much as one of the tilt twenty times smaller: about the ratio of their ranges.
@@ -194,7 +194,7 @@ class _FitProblem:
     payloads: list[float]
     drive: Matrix
     logged: bool
-    numbers: tuple[Number, ...]
+    numbers: tuple[Parameter, ...]
     tendons: Vector
 
     @classmethod
@@ -207,10 +207,10 @@ class _FitProblem:
             (np.ascontiguousarray(run.set_points), drive_start(run), run.motor_positions, run.outputs)
             for run in recording.runs()
         ]
-        across = ACROSS if recording.outputs.shape[1] == 1 else ()
+        across = OUT_OF_PLANE_PARAMETERS if recording.outputs.shape[1] == 1 else ()
         payloads = [payload_of(run) for run in recording.runs()]
-        loads = LOADS if len(set(payloads)) > 1 else ()
-        numbers = (*(number for number in NUMBERS if number.name not in across), *loads)
+        loads = PAYLOAD_PARAMETERS if len(set(payloads)) > 1 else ()
+        numbers = (*(number for number in PARAMETERS if number.name not in across), *loads)
         return cls(Ts, runs, payloads, drive, recording.has_motor_positions, numbers, _tendons(recording.robot))
 
     def delays(self) -> tuple[int, ...]:
@@ -221,11 +221,11 @@ class _FitProblem:
     def decode(self, x: Vector) -> Vector:
         """Return all numbers of what the search moved, then the tendons."""
         found = self._found(x)
-        return np.array([*(found.get(number.name, number.guess) for number in NUMBERS), *self.tendons])
+        return np.array([*(found.get(number.name, number.guess) for number in PARAMETERS), *self.tendons])
 
     def load(self, x: Vector) -> Vector:
         """Return least and most payload [kg], and what they change; nothing where there is but one."""
-        found = [self._found(x)[number.name] for number in LOADS if number in self.numbers]
+        found = [self._found(x)[number.name] for number in PAYLOAD_PARAMETERS if number in self.numbers]
         return np.array([min(self.payloads), max(self.payloads), *found]) if found else np.zeros(0)
 
     def _found(self, x: Vector) -> dict[str, float]:
@@ -380,13 +380,13 @@ def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> Non
     within(arrays["sensor"][:1], 0, 1000, "the sensor's dead time")
     if "payload" in arrays:
         _check_payload(arrays["payload"])
-    numbers, tendons = np.split(arrays["neck"], [len(NUMBERS)])
+    numbers, tendons = np.split(arrays["neck"], [len(PARAMETERS)])
     neck = (sizes["motors"], sizes["outputs"]) == (3, 2) and not tendons.size
     if not neck and tendons.size != 1 + 2 * sizes["motors"]:
         raise FileFormatError(f"its array `neck` has {arrays['neck'].size} numbers, which do not fit its tendons.")
     if np.abs(tendons).max(initial=0.0) > 1.0 or not (tendons[:1] > 0.0).all():
         raise FileFormatError("the directions of its tendons in its array `neck` are not of length 1.")
-    for number, value in zip(NUMBERS, numbers, strict=True):
+    for number, value in zip(PARAMETERS, numbers, strict=True):
         # A thousandth for the rounding of logarithms.
         margin = 1e-3 * max(abs(number.low), abs(number.high))
         if not number.low - min(margin, 0.1 * abs(number.low)) <= value <= number.high + margin:
@@ -397,6 +397,6 @@ def _check_payload(load: Matrix) -> None:
     least, most = load[:2]
     if not 0.0 <= least <= most <= MOST_PAYLOAD:
         raise FileFormatError(f"its payloads from {least:g} to {most:g} kg are not between 0 and {MOST_PAYLOAD:g}.")
-    for number, value in zip(LOADS, load[2:], strict=True):
+    for number, value in zip(PAYLOAD_PARAMETERS, load[2:], strict=True):
         if not number.low <= value <= number.high:
             raise FileFormatError(f"its {number.name} of {value:g} {number.unit} is out of range.")

@@ -22,7 +22,7 @@ from softneck.robot import Robot, Scaling
 from ..models._arrays import BOUNDED, trained_range
 from ..models._model import Model
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
-from ..set_membership._set_membership import knows_what_it_saw, outside_seen
+from ..set_membership._set_membership import can_detect_extrapolation, is_extrapolating
 from ._scored_rows import Rows, ScoredStretch
 
 RESAMPLES = 1000
@@ -276,9 +276,9 @@ def outside_table(model: Model, rows: Rows, free: Matrix) -> dict[str, float] | 
     """
     lower, upper = free_run_bounds(model.kind, free, model.robot)
     there = np.isfinite(rows.measured)
-    if knows_what_it_saw(model) and (there & np.isfinite(lower) & np.isfinite(upper)).any():
+    if can_detect_extrapolation(model) and (there & np.isfinite(lower) & np.isfinite(upper)).any():
         there &= np.isfinite(lower) & np.isfinite(upper)
-        flagged = outside_seen(model, free)
+        flagged = is_extrapolating(model, free)
     else:
         trained = trained_range(model.findings)
         if trained is None or not there.any():

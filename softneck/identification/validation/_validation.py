@@ -79,7 +79,7 @@ class Validation(ReprMixin):
         bounds_remarks: where these bounds are of no use or do not hold what they promise.
         calibrated_bounds: of every kind, from nine or more stretches: see `_bounds`; else why there are none.
         outside_pct: axis -> measured samples [%] outside what the model has seen: of set membership where its bounds
-            are wider than training's usually are (see `outside_seen`), of other kinds where a set-point lies beyond
+            are wider than training's usually are (see `is_extrapolating`), of other kinds where a set-point lies beyond
             those that it was trained on; None where the model does not know.
         validity: least and mean of the model's own in free run, and how well it foretold errors within its tolerance
             (see `judged_validity`); None where the model has none.

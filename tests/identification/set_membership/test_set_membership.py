@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from softneck.core import DataError, SettingsError
-from softneck.identification import PAPER_EQ21, Model, SetMembership, outside_seen
+from softneck.identification import PAPER_EQ21, Model, SetMembership, is_extrapolating
 from softneck.identification.models._regressors import regression
 from softneck.identification.set_membership._regressor import all_pairs_gammas, least_gammas
 from softneck.identification.set_membership._set_membership import noise_level
@@ -241,16 +241,16 @@ def test_the_estimate_lies_in_the_middle_of_its_bounds(models: dict, form: str) 
 def test_a_motion_like_the_data_is_known_and_a_wilder_one_is_not(models: dict, form: str) -> None:
     model, trained = models[form], short_neck()
     # The training data themselves are as near as can be.
-    assert outside_seen(model, model.predict(trained)).mean() < 0.05
+    assert is_extrapolating(model, model.predict(trained)).mean() < 0.05
     wild = trained.with_channels(**{f"motor_setpoint_{j}": 3 * trained.set_points[:, j - 1] for j in (1, 2, 3)})
-    assert outside_seen(model, model.simulate(wild)[25:]).mean() > 0.5
+    assert is_extrapolating(model, model.simulate(wild)[25:]).mean() > 0.5
 
 
 def test_only_set_membership_knows_what_it_has_seen(models: dict) -> None:
     with pytest.raises(SettingsError, match="only a model of kind nlsm"):
-        outside_seen(models["rls"], np.zeros((3, 10)))
+        is_extrapolating(models["rls"], np.zeros((3, 10)))
     with pytest.raises(DataError, match=r"`outputs` must be \(rows, 10\).*got \(3, 5\)"):
-        outside_seen(models["nlsm"], np.zeros((3, 5)))
+        is_extrapolating(models["nlsm"], np.zeros((3, 5)))
 
 
 def test_the_residual_form_is_its_base_and_a_set_over_its_signals(models: dict) -> None:

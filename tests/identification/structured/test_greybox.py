@@ -12,7 +12,7 @@ import statsmodels.api as sm
 
 from softneck.core import load
 from softneck.identification import INFINITE, GreyBox, Model, validate
-from softneck.identification.structured._greybox import INTERRUPTED, NUMBERS, _table
+from softneck.identification.structured._greybox import INTERRUPTED, PARAMETERS, _table
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.runtime import load_functions
@@ -22,8 +22,8 @@ from softneck.signals.recording._channels import MOTOR_POSITIONS
 from ...data import TS, neck_recording
 
 FUNCTIONS = load_functions("softneck.identification.structured._greybox_fit_runtime")
-GUESS = np.array([number.guess for number in NUMBERS])
-NAMES = [number.name for number in NUMBERS]
+GUESS = np.array([number.guess for number in PARAMETERS])
+NAMES = [number.name for number in PARAMETERS]
 DELAY = np.full(3, 3.0)
 
 
@@ -77,9 +77,9 @@ def test_motors_stop_at_the_pull_limit() -> None:
 
 def test_no_numbers_and_no_inputs_move_the_tilt_beyond_its_bound() -> None:
     rng = np.random.default_rng(2)
-    low, high = (np.array([getattr(n, side) for n in NUMBERS]) for side in ("low", "high"))
+    low, high = (np.array([getattr(n, side) for n in PARAMETERS]) for side in ("low", "high"))
     for _ in range(100):
-        numbers = low + rng.random(len(NUMBERS)) ** 3 * (high - low)
+        numbers = low + rng.random(len(PARAMETERS)) ** 3 * (high - low)
         U = np.repeat(rng.uniform(-6, 6, (40, 3)), 5, axis=0)
         M, Y = run(numbers, U)
         assert np.isfinite(M).all()
@@ -121,17 +121,17 @@ def test_the_numbers_behind_its_own_equations_are_found(fitted: Model, truth: np
 class _Line:
     """A problem whose errors are linear in what is searched, so that least squares says all about it."""
 
-    numbers = NUMBERS
+    numbers = PARAMETERS
     directions = SimpleNamespace(stretch=1.0)
 
     def __init__(self) -> None:
         rng = np.random.default_rng(0)
-        self.A = rng.standard_normal((400, len(NUMBERS)))
+        self.A = rng.standard_normal((400, len(PARAMETERS)))
         self.noise = 1e-3 * rng.standard_normal(400)
 
     def errors(self, x: np.ndarray, delay: int) -> np.ndarray:
         del delay
-        return self.A @ (x - np.array([number.encode(number.guess) for number in NUMBERS])) - self.noise
+        return self.A @ (x - np.array([number.encode(number.guess) for number in PARAMETERS])) - self.noise
 
 
 def tendons_of(*degrees: float, axes: int = 2) -> np.ndarray:
@@ -169,14 +169,14 @@ def test_a_robot_of_one_output_bends_in_its_plane_as_one_with_two_tendons_there(
 
 def test_intervals_of_a_linear_problem_are_those_of_ordinary_least_squares() -> None:
     problem = _Line()
-    x = np.array([number.encode(number.guess) for number in NUMBERS])
+    x = np.array([number.encode(number.guess) for number in PARAMETERS])
     # At the solution, with errors that change sign from row to row: every one counts.
     x = x + np.linalg.lstsq(problem.A, problem.noise)[0]
     white = np.tile([[1.0], [-1.0]], (200, 2))
     fit = sm.OLS(problem.noise, problem.A).fit()
     expected = np.asarray(fit.conf_int(0.05)) - np.asarray(fit.params)[:, None]
     # Student's quantile with 400 rows is 0.4 % above the normal one.
-    for row, number, value, half in zip(_table(problem, x, 0, [white]), NUMBERS, x, expected[:, 1], strict=True):  # pyright: ignore[reportArgumentType]
+    for row, number, value, half in zip(_table(problem, x, 0, [white]), PARAMETERS, x, expected[:, 1], strict=True):  # pyright: ignore[reportArgumentType]
         for side, sign in (("low", -1.0), ("high", 1.0)):
             bound = number.decode(value + sign * half)
             if number.low < bound < number.high:

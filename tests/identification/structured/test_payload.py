@@ -10,7 +10,7 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import GreyBox, Model
-from softneck.identification.structured._greybox import NUMBERS
+from softneck.identification.structured._greybox import PARAMETERS
 from softneck.identification.structured._loaded_greybox_runtime import loaded_neck
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, concatenate, signal
@@ -18,7 +18,7 @@ from softneck.signals import Recording, concatenate, signal
 from ...foreign_necks.necks import ForeignNeck
 from ...foreign_necks.necks import record as record_foreign
 
-NAMES = [number.name for number in NUMBERS]
+NAMES = [number.name for number in PARAMETERS]
 
 
 def log(payload: float, rows: int = 1500, seed: int = 1) -> Recording:

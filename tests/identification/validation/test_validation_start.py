@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from softneck.identification import WARM_UP, Model, SetMembership, outside_seen, validate
+from softneck.identification import WARM_UP, Model, SetMembership, is_extrapolating, validate
 from softneck.signals import SET_POINTS, Recording, concatenate
 
 from ...data import neck_recording
@@ -111,7 +111,7 @@ def test_bounds_are_those_of_set_membership_alone(models: dict[str, Model], kind
         assert result.mean_width_deg is not None
         assert result.coverage_pct[name] == pytest.approx(100 * inside.mean(), abs=1e-9)
         assert result.mean_width_deg[name] == pytest.approx(np.degrees((high - low)[WARM_UP:].mean()), rel=1e-12)
-        flagged = outside_seen(model, outputs)[WARM_UP:, axis]
+        flagged = is_extrapolating(model, outputs)[WARM_UP:, axis]
         assert result.outside_pct is not None
         assert result.outside_pct[name] == pytest.approx(100 * flagged.mean(), abs=1e-9)
 
