@@ -28,8 +28,8 @@ from .loops._loop_file import require_trusted as require_trusted
 from .loops._loop_parts import read_toml as read_toml
 from .loops._simulate import describe_excess_range as describe_excess_range
 from .loops._simulate import run_setup as run_setup
-from .studies._run_study import Crew as Crew
-from .studies._run_study import crew as crew
+from .studies._run_study import WorkerPool as WorkerPool
+from .studies._run_study import open_workers as open_workers
 from .studies._run_study import run_study as run_study
 from .studies._store import STUDY_FILE as STUDY_FILE
 from .studies._store import pareto_rows as pareto_rows

@@ -80,7 +80,7 @@ class BlockPart:
         return self._outputs
 
     def close(self) -> None:
-        """Do nothing: a block holds only memory."""
+        """Leave the block as it is: it has only memory."""
 
     @property
     def memory(self) -> tuple[Vector, Vector, Vector]:

@@ -1,4 +1,4 @@
-"""References: what the outputs of a robot and its co-contraction are to be at a time, and parts that return them."""
+"""References of the outputs of a robot and its co-contraction over time, and parts that return them."""
 
 from __future__ import annotations
 
@@ -315,7 +315,7 @@ class AheadReference:
         return self._at(time + self.sample_time)
 
     def close(self) -> None:
-        """Do nothing: there is nothing to release."""
+        """Release no resources: it has none."""
 
     def _at(self, time: float) -> Vector:
         return np.array([*self.reference(time), 1.0, *self.reference(time + self.ahead)[: self._count]])

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Progress, SoftneckError
-from softneck.cosim import Crew
+from softneck.cosim import WorkerPool
 from softneck.verification import Requirement
 
 from ._judge import LEVELS, judge_candidate
@@ -146,7 +146,7 @@ class Search:
 
     task: Task
     spaces: list[Space]
-    crew: Crew
+    crew: WorkerPool
     log: Log
     budget: int
     report: Progress
@@ -324,7 +324,7 @@ class Search:
 
 
 def run_jobs(
-    jobs: Sequence[Job], run: Callable[[Job], Future], crew: Crew, took: Callable[[Job, Judgement], None]
+    jobs: Sequence[Job], run: Callable[[Job], Future], crew: WorkerPool, took: Callable[[Job, Judgement], None]
 ) -> None:
     """Have jobs done, two for each worker at a time, and take each as it ends.
 

@@ -22,7 +22,7 @@ from softneck.core import (
     shown_progress,
     silent,
 )
-from softneck.cosim import crew, pareto_rows
+from softneck.cosim import open_workers, pareto_rows
 from softneck.estimation import KalmanSettings, directions_of, robot_of
 from softneck.identification import payloads
 from softneck.loop import run_loop
@@ -184,7 +184,7 @@ def tune(
     prepare(task)  # a plant that does not fit is said before anything is searched
     log = Log(folder, task.digest, force=force)
     with shown_progress("tune", progress) as tell:
-        with crew(workers, None) as members:
+        with open_workers(workers, None) as members:
             search = Search(task, each, members, log, budget, lambda done, text: tell(0.9 * done, text))
             search.dropped |= dropped
             search.run()

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from softneck.cosim.studies._run_study import Crew, SameProcess
+from softneck.cosim.studies._run_study import SameProcess, WorkerPool
 from softneck.robot import Robot
 from softneck.tuning import _search
 from softneck.tuning._search import Search
@@ -42,7 +42,7 @@ def searched(monkeypatch: pytest.MonkeyPatch, budget: int, tested: bool = True) 
         asked=SimpleNamespace(bounds=BOUNDS), own={"neck": 0}, seed=0, tested=tested,
     )  # fmt: skip
     each = spaces(("pi", "hinf"), rise=0.4, cocontraction=None, robot=Robot.preset())
-    found = Search(task, each, Crew(1, SameProcess()), Log(None, ""), budget, lambda *_: None)
+    found = Search(task, each, WorkerPool(1, SameProcess()), Log(None, ""), budget, lambda *_: None)
     found.run()
     return found
 

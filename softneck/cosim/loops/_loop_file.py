@@ -53,8 +53,6 @@ _LOOP_KEYS = (
 )  # fmt: skip
 # Keys of a loop file that names an SSP archive.
 _SSP_KEYS = ("ssp", "duration_s", "fault", "limits", "angle", "robot")
-# Relative tolerance of sample times: rounding of decimal numbers in files.
-_SAME_SAMPLE_TIME = 1e-6
 
 
 def load_loop(path: str | Path, *, robot: str | None = None) -> LoopSetup:
@@ -238,7 +236,9 @@ def _setup(table: Mapping[str, Any], source: Path, opened: dict[Any, Any] | None
         robot=robot,
         connections=links(table.get("connections", {}), robot),
     )
-    _check_sample_time(loop, table.get("sample_time_s"))
+    fastest = min(part.sample_time for part in loop.parts.values())
+    if "sample_time_s" in table and abs(step - fastest) > 1e-6 * fastest:  # rounding of decimals in files
+        raise SettingsError(f"`sample_time_s` is {step:g}, but the fastest part runs at {fastest:g} s; use that.")
     limits = numbers("[limits]", table.get("limits", {}))
     return LoopSetup(loop=loop, limits=limits, files=dict(opener.files), angle=table.get("angle", "true"))
 
@@ -274,19 +274,13 @@ def normal_table(table: Mapping[str, Any]) -> dict[str, Any]:
         value = made.get(name)
         if value is None or isinstance(value, Mapping):
             continue
+        text, key = str(value), OBJECT
         if isinstance(value, str | Path) and name != "reference":
-            made[name] = {_source_key(name, str(value)): str(value)}
-        else:
-            made[name] = {OBJECT: value}
+            is_neck = text in PRESETS or text.endswith(".toml")
+            own = "file" if name != "plant" else "neck" if is_neck else "model"
+            key, value = "fmu" if text.endswith(".fmu") else own, text
+        made[name] = {key: value}
     return {key: value for key, value in made.items() if value is not None}
-
-
-def _source_key(part: str, text: str) -> str:
-    if text.endswith(".fmu"):
-        return "fmu"
-    if part == "plant":
-        return "neck" if text in PRESETS or text.endswith(".toml") else "model"
-    return "file"
 
 
 def _named_parts(listed: Any) -> dict[str, Mapping[str, Any]]:
@@ -310,14 +304,6 @@ def _faults(listed: Any, robot: Robot) -> tuple[Fault, ...]:
         except SettingsError as error:
             raise SettingsError(f"[[fault]] {place}: {error}") from error
     return tuple(faults)
-
-
-def _check_sample_time(loop: Loop, given: Any) -> None:
-    if given is None:
-        return
-    step = min(part.sample_time for part in loop.parts.values())
-    if abs(number("sample_time_s", given) - step) > _SAME_SAMPLE_TIME * step:
-        raise SettingsError(f"`sample_time_s` is {given:g}, but the fastest part runs at {step:g} s; use that.")
 
 
 def find_python(table: Any) -> Iterator[str]:

@@ -58,13 +58,6 @@ def numbers(where: str, table: Any) -> dict[str, float]:
     return {name: number(f"{where} {name}", value) for name, value in table.items()}
 
 
-def texts(where: str, table: Any) -> dict[str, str]:
-    """Return a table of names."""
-    if not isinstance(table, dict) or not all(isinstance(value, str) for value in table.values()):
-        raise SettingsError(f"{where} must be a table of names; got {table!r}.")
-    return dict(table)
-
-
 def links(table: Any, robot: Robot) -> dict[str, str | Link]:
     """Return [connections]: names, or tables {from = name, factor, offset}, which replace the conversion of units."""
     if not isinstance(table, dict):
@@ -215,8 +208,8 @@ class PartOpener:
             return self._virtual(NeckParameters.from_toml(file))
         settings = sorted((k, repr(v)) for k, v in table.items() if k != "parameters")
         if key == "fmu":
-            return self._cached((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
-        thing = self._cached((role, file), lambda: load(file, role=role))
+            return self._open_cached((name, file, *settings), lambda: _fmu_part(file, f"[{name}]", table, as_role))
+        thing = self._open_cached((role, file), lambda: load(file, role=role))
         self._note_robot(name, thing)
         return BlockPart(thing.block())
 
@@ -253,7 +246,7 @@ class PartOpener:
         if isinstance(robot := getattr(thing, "robot", None), Robot):
             self.robots[name] = robot
 
-    def _cached(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
+    def _open_cached(self, key: tuple[Any, ...], make: Callable[[], Any]) -> Any:
         """Return the result of `make`, from the cache if there is one and the file has not changed."""
         if self._opened is None:
             return make()
@@ -282,7 +275,7 @@ class PartOpener:
         path = self.folder / name
         if not path.is_file():
             raise FileFormatError(f"[{role}]: there is no file {path}.")
-        self.files[role] = (str(path), self._cached(("hash", path), lambda: file_hash(path)))
+        self.files[role] = (str(path), self._open_cached(("hash", path), lambda: file_hash(path)))
         return path
 
 
@@ -319,12 +312,11 @@ def _fmu_part(file: Path, where: str, table: Mapping[str, Any], role: str) -> Pa
     if not isinstance(isolated, bool):
         raise SettingsError(f"{where} isolated must be true or false; got {isolated!r}.")
     step = table.get("sample_time_s")
-    settings: dict[str, Any] = {
-        "role": role,
-        "names": texts(f"{where} names", table.get("names", {})),
-        "units": texts(f"{where} units", table.get("units", {})),
-        "sample_time": None if step is None else number("sample_time_s", step),
-    }
+    settings: dict[str, Any] = {"role": role, "sample_time": None if step is None else number("sample_time_s", step)}
+    for key in ("names", "units"):
+        chosen = settings[key] = table.get(key, {})
+        if not isinstance(chosen, dict) or not all(isinstance(value, str) for value in chosen.values()):
+            raise SettingsError(f"{where} {key} must be a table of names; got {chosen!r}.")
     if not isolated:
         return FmuPart(file, **settings)
     return IsolatedPart(file, **settings, timeout=number("timeout_s", table.get("timeout_s", 10.0)))

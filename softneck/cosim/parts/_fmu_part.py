@@ -21,6 +21,7 @@ from softneck.core import (
     require_positive,
 )
 from softneck.fmu import unpack, unpacked
+from softneck.loop import PART_NAMES
 from softneck.signals import Recording
 
 from ._native import ERROR, FATAL, Bank, CallError, Native
@@ -29,7 +30,6 @@ from ._variables import Description, number_of, read_description
 if TYPE_CHECKING:
     from fmpy.fmi1 import FMICallException
 
-_ROLES = ("plant", "observer", "controller", "reference")
 # The message of pythonfmu's binary for every Python exception; the reason is in the line before.
 _NO_REASON = "Fatal py exception encountered"
 
@@ -83,8 +83,8 @@ class FmuPart:
         self.annotated_robot = self._description.annotation.robot
         self.role = role or self._description.annotation.role
         if not self.role:
-            raise SettingsError(f"{self.path}: give its role in the loop ({', '.join(_ROLES)}).")
-        require_one_of("role", self.role, _ROLES)
+            raise SettingsError(f"{self.path}: give its role in the loop ({', '.join(PART_NAMES)}).")
+        require_one_of("role", self.role, PART_NAMES)
         self.sample_time = _sample_time(self._description, sample_time)
         self.inputs = self._description.ports("input")
         self.outputs = self._description.ports("output")

@@ -11,9 +11,9 @@ from urllib.parse import unquote
 
 from softneck.core import FileFormatError
 
-_NAMESPACE = "http://ssp-standard.org/SSP1/SystemStructure"
 SSD, SSC, SSV, SSM = (
-    f"{{{_NAMESPACE}{name}}}" for name in ("Description", "Common", "ParameterValues", "ParameterMapping")
+    f"{{http://ssp-standard.org/SSP1/SystemStructure{name}}}"
+    for name in ("Description", "Common", "ParameterValues", "ParameterMapping")
 )
 _FMU_TYPE = "application/x-fmu-sharedlibrary"
 # Types that a loop has; those of FMI 3 are also in SSP 2.0.

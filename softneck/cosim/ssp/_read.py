@@ -12,7 +12,7 @@ from typing import Any
 
 from softneck.core import SI_BASES, DataError, FileFormatError, SettingsError, to_si
 from softneck.fmu import unpack, unpacked
-from softneck.loop import USE_MOTOR_POSITIONS
+from softneck.loop import PART_NAMES, USE_MOTOR_POSITIONS
 from softneck.robot import is_set_point
 from softneck.runtime import Port
 
@@ -189,7 +189,8 @@ class _Flattening:
         after = Line(affine.factor, affine.offset)
         if not affine.convert:
             return after
-        (a, unit_a), (b, unit_b) = ((self._unit(place), self._connector(place).unit) for place in (start, end))
+        unit_a, unit_b = self._connector(start).unit, self._connector(end).unit
+        a, b = self._find_unit(unit_a, {}), self._find_unit(unit_b, {})
         return self._unit_line(unit_a, a, unit_b, b, f"`{_join(start)}` to `{_join(end)}`").then(after)
 
     def _unit_line(self, unit_a: str, a: Unit | None, unit_b: str, b: Unit | None, what: str) -> Line:
@@ -222,9 +223,6 @@ class _Flattening:
         elif path in self.systems and name in self.systems[path].connectors:
             return self.systems[path].connectors[name]
         raise self._wrong(f"connects `{_join(place)}`, which is not there")
-
-    def _unit(self, place: Place) -> Unit | None:
-        return self._find_unit(self._connector(place).unit, {})
 
     def _find_unit(self, name: str, own: Mapping[str, Unit]) -> Unit | None:
         for units in (own, self.structure.units):
@@ -290,9 +288,6 @@ def _binding_values(binding: Binding) -> dict[str, tuple[Value, Affine]]:
 
 def _join(place: Place) -> str:
     return ".".join((*place[0], place[1]))
-
-
-_LOOP_ROLES = ("plant", "observer", "controller", "reference")
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,7 +363,11 @@ class _TableBuilder:
             "duration_s": self._duration(),
             "order": self.structure.order or "jacobi",
             "connections": {
-                f"{names[path]}.{name}": _link(f"{names[origin]}.{output}", line)
+                f"{names[path]}.{name}": {
+                    "from": f"{names[origin]}.{output}",
+                    "factor": line.factor,
+                    "offset": line.offset,
+                }
                 for (path, name), ((origin, output), line) in self.flat.links.items()
             },
         }
@@ -379,7 +378,7 @@ class _TableBuilder:
                 "sample_time_s": step,
                 "parameters": self._values(path, component, closed=closed),
             }
-            if names[path] in _LOOP_ROLES and closed:
+            if names[path] in PART_NAMES and closed:
                 table[names[path]] = part
             else:
                 table.setdefault("part", []).append({"name": names[path], "role": "plant", **part})
@@ -387,10 +386,10 @@ class _TableBuilder:
 
     def _names(self) -> tuple[dict[tuple[str, ...], str], bool]:
         """Return path -> name in the loop, and whether the FMUs are a closed loop."""
-        roles: dict[str, list[tuple[str, ...]]] = {role: [] for role in _LOOP_ROLES}
+        roles: dict[str, list[tuple[str, ...]]] = {role: [] for role in PART_NAMES}
         for path, component in self.flat.components.items():
             role = self.descriptions[component.source].annotation.role
-            role = role or (path[-1] if path[-1] in _LOOP_ROLES else "")
+            role = role or (path[-1] if path[-1] in PART_NAMES else "")
             if role:
                 roles[role].append(path)
         closed = all(len(roles[role]) == 1 for role in ("plant", "controller", "reference"))
@@ -399,7 +398,7 @@ class _TableBuilder:
         for path in self.flat.components:
             if path not in names:
                 plain = re.sub(r"\W", "_", "_".join(path), flags=re.ASCII)
-                plain = plain if plain.isidentifier() and plain not in _LOOP_ROLES else f"part_{plain}"
+                plain = plain if plain.isidentifier() and plain not in PART_NAMES else f"part_{plain}"
                 while plain in names.values():
                     plain += "_"
                 names[path] = plain
@@ -412,7 +411,7 @@ class _TableBuilder:
         return bool(names) and all((plant, name) in self.flat.links for name in names)
 
     def _values(self, path: tuple[str, ...], component: Component, *, closed: bool) -> dict[str, float]:
-        """Return the set parameters, and a value for each unconnected input, so that names connect nothing."""
+        """Return the set parameters, and a value for each unconnected input, which prevents a connection by name."""
         description, given = self.descriptions[component.source], self.flat.values[path]
         values = dict(given)
         for port in description.ports("input"):
@@ -426,9 +425,7 @@ class _TableBuilder:
     def _step(self) -> float:
         if self.structure.step is not None:
             return self.structure.step
-        experiments = [item.model.defaultExperiment for item in self.descriptions.values()]
-        steps = [number_of(item.stepSize, 0.0) for item in experiments if item is not None and item.stepSize]
-        if not steps:
+        if not (steps := self._experiment_values("stepSize")):
             raise SettingsError(
                 f"{self.source}: neither the structure nor an FMU has a step size; put `<ssd:Annotations>"
                 '<ssc:Annotation type="softneck"><Master order="jacobi" stepSize="0.01"/></ssc:Annotation>'
@@ -436,15 +433,13 @@ class _TableBuilder:
             )
         return min(steps)
 
+    def _experiment_values(self, key: str) -> list[float]:
+        experiments = [item.model.defaultExperiment for item in self.descriptions.values()]
+        return [number_of(text, 0.0) for item in experiments if (text := getattr(item, key, None))]
+
     def _duration(self) -> float:
         if self.structure.stop is not None:
             return self.structure.stop
-        experiments = [item.model.defaultExperiment for item in self.descriptions.values()]
-        stops = [number_of(item.stopTime, 0.0) for item in experiments if item is not None and item.stopTime]
-        if not stops:
+        if not (stops := self._experiment_values("stopTime")):
             raise SettingsError(f"{self.source}: neither the structure nor an FMU has a stop time.")
         return max(stops)
-
-
-def _link(origin: str, line: Line) -> dict[str, Any]:
-    return {"from": origin, "factor": line.factor, "offset": line.offset}

@@ -1,4 +1,4 @@
-"""Run a study: give runs to workers, collect rows, and write them down, so that a dead worker loses nothing.
+"""Run a study: submit runs to workers, collect and write their rows, and repeat the runs of dead workers.
 
 Workers are this process, local processes of loky, or a Dask cluster; all are executors.
 """
@@ -45,8 +45,8 @@ _CONNECT_S = 10
 
 
 @dataclass(slots=True, eq=False)
-class Crew:
-    """The workers of a study or a search: their number, their pool, and how to start a new pool of a given size."""
+class WorkerPool:
+    """The workers of a study or a search: their number, their executor, and how to start one of a given size."""
 
     size: int
     pool: Executor
@@ -70,7 +70,7 @@ class SameProcess(Executor):
 
 
 @contextlib.contextmanager
-def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
+def open_workers(workers: int | None, dask: str | None) -> Iterator[WorkerPool]:
     """Yield the workers: a cluster, a number of local processes (default: one for each core), or this process for 0.
 
     Raises:
@@ -83,7 +83,7 @@ def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
             there = client.scheduler_info(n_workers=-1)["workers"].values()
             pool = client.get_executor(pure=False)
             try:
-                yield Crew(max(1, sum(int(worker["nthreads"]) for worker in there)), pool)
+                yield WorkerPool(max(1, sum(int(worker["nthreads"]) for worker in there)), pool)
             finally:
                 pool.shutdown(wait=False)
         return
@@ -92,11 +92,11 @@ def crew(workers: int | None, dask: str | None) -> Iterator[Crew]:
     if isinstance(number, bool) or not isinstance(number, int) or number < 0:
         raise SettingsError(f"`workers` must be a whole number of at least 1 (0: this process); got {number!r}.")
     if number == 0:
-        yield Crew(1, SameProcess())
+        yield WorkerPool(1, SameProcess())
         return
     with tempfile.TemporaryDirectory(prefix="softneck-study-", ignore_cleanup_errors=True) as folder:
         start = partial(_processes, folder)
-        found = Crew(number, start(number), start)
+        found = WorkerPool(number, start(number), start)
         try:
             yield found
         except BaseException:
@@ -129,12 +129,12 @@ def _shut_down(pool: Any, *, kill: bool) -> None:
     pool.shutdown(wait=True, kill_workers=kill)
 
 
-def check_sendable(what: Any) -> None:
-    """Raise SettingsError if `what` cannot be sent to another process."""
+def check_sendable(thing: Any) -> None:
+    """Raise SettingsError if an object cannot be sent to another process."""
     import cloudpickle
 
     try:
-        cloudpickle.dumps(what)
+        cloudpickle.dumps(thing)
     except SoftneckError:
         raise
     except Exception as error:  # of the user's objects
@@ -303,7 +303,7 @@ def run_study(
     study.check()
     if workers != 0:
         check_sendable((dict(study.loop), [item.values for item in study.vary.values()]))
-    with crew(workers, study.dask if dask is None and workers is None else dask) as members:
+    with open_workers(workers, study.dask if dask is None and workers is None else dask) as members:
         store = Store(study, folder, force=force)
         try:
             _StudyRun(study, store, members, report).run()
@@ -315,8 +315,8 @@ def run_study(
 class _StudyRun:
     """The runs of a study that are left, that are running, and those whose worker died."""
 
-    def __init__(self, study: Study, store: Store, members: Crew, report: Progress) -> None:
-        self._study, self._store, self._crew, self._report = study, store, members, report
+    def __init__(self, study: Study, store: Store, members: WorkerPool, report: Progress) -> None:
+        self._study, self._store, self._workers, self._report = study, store, members, report
         self._left = deque(run for run in range(len(study.points)) if run not in store.done)
         self._suspects: deque[int] = deque()
         self._deaths: dict[int, int] = {}
@@ -341,23 +341,23 @@ class _StudyRun:
             return
         if self._alone and not self._running and self._left:
             self._alone = False
-            self._crew.renew(alone=False)
+            self._workers.renew(alone=False)
         # Two chunks for each worker: one runs while the other waits.
-        while self._left and not self._alone and len(self._running) < 2 * self._crew.size:
+        while self._left and not self._alone and len(self._running) < 2 * self._workers.size:
             self._submit([self._left.popleft() for _ in range(self._chunk())])
 
     def _chunk(self) -> int:
         """Return the number of runs to submit at once: few while their duration is unknown, and at the end."""
         known = self._ended and self._seconds / self._ended
         wanted = int(_CHUNK_S / max(known, 1e-6)) if known else 1
-        fair = -(-len(self._left) // (4 * self._crew.size))
+        fair = -(-len(self._left) // (4 * self._workers.size))
         return max(1, min(wanted, fair, _MAX_CHUNK_RUNS, len(self._left)))
 
     def _submit(self, runs: list[int]) -> None:
         points = [self._study.points[run] for run in runs]
         chunk = Chunk(self._digest, self._study.loop, self._study.folder, points, self._study.metrics)
         try:
-            self._running[self._crew.pool.submit(run_chunk, chunk)] = runs
+            self._running[self._workers.pool.submit(run_chunk, chunk)] = runs
         except BrokenExecutor:
             # The pool broke in the meantime; its other runs become suspects.
             self._suspects.extend(runs)
@@ -404,7 +404,7 @@ class _StudyRun:
             except Exception:  # went down with the pool
                 self._suspects.extend(runs)
         self._alone = True
-        self._crew.renew(alone=True)
+        self._workers.renew(alone=True)
 
     def _write(self, rows: list[Row]) -> None:
         self._store.add(rows)
