@@ -163,13 +163,13 @@ def validation_chart(
 
 def _range_for(measured: Vector, curves: list[Curve], least: float) -> tuple[float, float] | None:
     """Return y limits for the measured values, at least `least` wide, if a curve leaves them by far; else None."""
-    seen = measured[np.isfinite(measured)]
-    if seen.size == 0:
+    finite = measured[np.isfinite(measured)]
+    if finite.size == 0:
         return None
-    low, high = float(seen.min()), float(seen.max())
-    room = max(high - low, least) or 1.0
+    low, high = float(finite.min()), float(finite.max())
+    span = max(high - low, least) or 1.0
     far = max((float(np.nanmax(np.abs(c.y), initial=0.0)) for c in curves), default=0.0)
-    return (low - 0.5 * room, high + 0.5 * room) if far > max(abs(low), abs(high)) + 2.0 * room else None
+    return (low - 0.5 * span, high + 0.5 * span) if far > max(abs(low), abs(high)) + 2.0 * span else None
 
 
 def loop_chart(
@@ -233,8 +233,8 @@ def _around(curves: list[Curve], values: list[float]) -> tuple[float, float] | N
     """Return y limits that include the curves and `values`; None without values."""
     if not values:
         return None
-    seen = np.concatenate([*(curve.y[np.isfinite(curve.y)] for curve in curves), values])
-    low, high = float(seen.min()), float(seen.max())
+    finite = np.concatenate([*(curve.y[np.isfinite(curve.y)] for curve in curves), values])
+    low, high = float(finite.min()), float(finite.max())
     return low - 0.05 * (high - low), high + 0.05 * (high - low)
 
 

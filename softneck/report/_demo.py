@@ -170,7 +170,6 @@ def _write_results(demo: Demo, tell: Tell) -> None:
     write_page(out / "report.html", html, force=True)
 
 
-Head = list[str]
 Rows = list[list[str]]
 FIT_HEAD = [
     "model on data", "persistence", "one step", "paper, one step", "simulation", "paper, simulation",
@@ -212,7 +211,7 @@ def _paper_cell(pair: tuple[float, float] | None) -> str:
     return "" if pair is None else cell(dict(enumerate(pair)), ".1f")
 
 
-def fmu_rows(packaged: Mapping[str, PackagedFmu]) -> tuple[Head, Rows]:
+def fmu_rows(packaged: Mapping[str, PackagedFmu]) -> tuple[list[str], Rows]:
     """Return one row for each FMU with its difference from the Python model in simulation."""
     rows = [
         [name, item.path.name, str(item.rows), f"{item.difference:.1e}", "holds" if item.equal else "fails"]
@@ -221,7 +220,7 @@ def fmu_rows(packaged: Mapping[str, PackagedFmu]) -> tuple[Head, Rows]:
     return ["model", "FMU", "samples", "largest difference", f"at most {TOLERANCE:g}"], rows
 
 
-def loop_rows(loops: Mapping[str, Result]) -> tuple[Head, Rows]:
+def loop_rows(loops: Mapping[str, Result]) -> tuple[list[str], Rows]:
     """Return one row for each limit of each loop."""
     rows = [
         [

@@ -37,10 +37,9 @@ def study_sections(description: Mapping[str, Any], runs: pd.DataFrame) -> list[S
     vary = description["study"]["vary"]
     sections: list[Section] = []
     if not all(failed):
-        sections += [_spread(runs, vary, objectives), _ranking(runs, list(vary), objectives)]
-        sections += [_trade(runs, vary, objectives)]
-        inputs = _numbers(runs, vary)
-        if inputs:
+        sections = [_spread(runs, vary, objectives), _ranking(runs, list(vary), objectives)]
+        sections.append(_trade(runs, vary, objectives))
+        if inputs := _numbers(runs, vary):
             sections.append(_influence(runs, inputs, objectives[0]))
     if any(failed):
         sections.append(_failures(runs))

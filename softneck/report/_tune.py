@@ -123,10 +123,10 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}
     if taut and "least_cocontraction" not in found.best.settings:
         table["reference"]["cocontraction"] = task.said_cocontraction
-    asked = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
+    limits = {b.metric.partition(".")[2]: b.limit for b in task.asked.bounds
              if b.metric.startswith("sim.") and b.bound != "min" and not b.metric.endswith("slack_s")}  # fmt: skip
     known = ("rise_s", "steady_rms_") + (("overshoot_pct", "settling_s") if task.asked.shows_settling() else ())
-    table["limits"] = {f"{first}.{key}": limit for key, limit in asked.items() if key.startswith(known)}
+    table["limits"] = {f"{first}.{key}": limit for key, limit in limits.items() if key.startswith(known)}
     words = "" if found.observed else (
         "\n# Without observer.npz: with it a requirement on the steps fails, or none was designed."
     )  # fmt: skip
@@ -173,10 +173,10 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
     rows = []
     for verdict in found.verification.verdicts:
         item, value, holds = verdict.requirement, verdict.value, verdict.holds
-        seen = found.best.metrics.get(item.metric)
-        if value is not None and seen is not None and item.metric.startswith("sim.") and seen > value:
+        tuned = found.best.metrics.get(item.metric)
+        if value is not None and tuned is not None and item.metric.startswith("sim.") and tuned > value:
             # Loops of tuning alone: with noise, or with another dead time.
-            value, holds = seen, bool(holds) and item.holds(seen)
+            value, holds = tuned, bool(holds) and item.holds(tuned)
         rows.append((item, value, holds, verdict.note))
     for item in found.task.asked.bounds:
         if item.metric.startswith("track."):
@@ -191,11 +191,11 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
 
 def tune_notes(found: Tuned) -> list[str]:
     """Return the notes on requirements, each once with its metrics, and the assumptions of the design."""
-    told: dict[str, list[str]] = {}
+    metrics_of: dict[str, list[str]] = {}
     for row in requirement_rows(found):
         if row[5]:
-            told.setdefault(row[5], []).append(row[0])
-    reasons = [f"{', '.join(metrics)}: {note}." for note, metrics in told.items()]
+            metrics_of.setdefault(row[5], []).append(row[0])
+    reasons = [f"{', '.join(metrics)}: {note}." for note, metrics in metrics_of.items()]
     limits = getattr(found.controller, "limits", None)
     motors = [] if limits is None else limits.lines(found.controller.sample_time)
     return reasons + [line.strip() for line in (*motors, *assumed_lines(found.assumed))]
@@ -211,8 +211,8 @@ def failing_requirement(found: Tuned) -> str:
         return f"{metrics} of {found.best.kind} cannot be computed: {unknown[0].note}."
     if found.binding is None:
         # Unlike `verify`, tuning has loops with noise, smaller steps and a circle.
-        asked = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
-        looped = ", ".join(metric for metric in asked if metric.startswith(("sim.", "track.")))
+        limits = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)
+        looped = ", ".join(metric for metric in limits if metric.startswith(("sim.", "track.")))
         return f"The budget of {found.evaluations} ended before all loops were simulated: {looped} are not computed."
     if found.nearest is None:
         return f"{found.binding} fails, by the largest factor."

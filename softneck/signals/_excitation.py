@@ -80,7 +80,7 @@ class PullDirections:
         motors, outputs = len(robot.motors.names), len(robot.outputs.names)
         angles = np.radians(robot.directions.angles_deg or np.arange(motors) * 360.0 / motors)
         weights = robot.weights()
-        if weights is None:  # nobody knows yet: waves that run around, one for each output
+        if weights is None:  # unknown directions: waves around the axis, one for each output
             weights = np.cos(
                 np.outer(np.arange(outputs) // 2 + 1, angles) - np.pi / 2 * (np.arange(outputs) % 2)[:, None]
             )

@@ -242,7 +242,7 @@ LOG = ["t,a,b,c,p,r", *[f"{k / 50},{k},{k % 3},{k % 5},{k / 100},{-k / 100}" for
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (changed(LOG, 9, 0, "0.16"), "`time` stands still at row 9: 0.16 s stands there twice (1 such row(s))"),
+        (changed(LOG, 9, 0, "0.16"), "`time` stands still at row 9: 0.16 s occurs twice (1 such row(s))"),
         (changed(LOG, 9, 0, "0.1"), "`time` runs backwards or stands still at row 9 (0.16 to 0.1 s)"),
         (changed(LOG, 9, 0, "soon"), "column `t` holds `soon` at row 9"),
         (changed(LOG, 9, 0, "inf"), "`time` is not finite at row 9"),

@@ -112,8 +112,8 @@ BAD: dict[str, tuple[Edit, str]] = {
     "no unit": (lambda s: changed(s, -1, 5, "roll"), r"column `roll` names no unit; write `roll \[deg\]`"),
     "unit that is none": (lambda s: changed(s, -1, 5, "roll [grad]"), "unknown unit `grad`"),
     "unit of another quantity": (lambda s: changed(s, -1, 5, "roll [mm]"), "column `roll` cannot be in `mm`"),
-    "twice": (lambda s: changed(s, -1, 5, "pitch [rad]"), "channel `pitch` stands in two columns"),
-    "twice the same": (lambda s: changed(s, -1, 5, "pitch [deg]"), "channel `pitch` stands in two columns"),
+    "twice": (lambda s: changed(s, -1, 5, "pitch [rad]"), "channel `pitch` is in two columns"),
+    "twice the same": (lambda s: changed(s, -1, 5, "pitch [deg]"), "channel `pitch` is in two columns"),
     "text": (lambda s: changed(s, 9, 1, "abc"), "column `motor_setpoint_1` holds `abc` at row 9"),
     "NaN": (lambda s: changed(s, 9, 1, "NaN"), "column `motor_setpoint_1` holds `NaN` at row 9"),
     "NaN in a sensor": (

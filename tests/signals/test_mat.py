@@ -119,7 +119,7 @@ def test_a_link_to_another_file_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "raw").write_bytes(TABLE.tobytes())
     with h5py.File(tmp_path / "a.mat", "w") as file:
         file.create_dataset("log", TABLE.shape, "f8", external=[(str(tmp_path / "raw"), 0, h5py.h5f.UNLIMITED)])
-    with pytest.raises(DataError, match="variable `log` lies in another file"):
+    with pytest.raises(DataError, match="variable `log` is in another file"):
         load(tmp_path, "a.mat", layout_text(False, '[file]\nvariable = "log"'))
 
 
@@ -205,7 +205,7 @@ def test_version_4_and_two_variables_of_one_name_are_refused(tmp_path: Path) -> 
     savemat(tmp_path / "a.mat", {"log": TABLE})
     whole = (tmp_path / "a.mat").read_bytes()
     (tmp_path / "a.mat").write_bytes(whole + whole[128:])
-    with pytest.raises(FileFormatError, match="the variable `log` stands there twice"):
+    with pytest.raises(FileFormatError, match="the variable `log` occurs twice"):
         mat_arrays(tmp_path / "a.mat")
 
 

@@ -138,7 +138,7 @@ def test_duplicated_time_stamps_are_an_error_or_one_row_by_the_layouts_word(tmp_
         done = imported(tmp_path, twice, layout, p=pitch)
         assert done.recording.outputs[7, 0] == expected
         assert len(done.recording) == 40
-        assert done.notes == ("1 row(s) left out: their time stamp stands twice, the first time at row 8",)
+        assert done.notes == ("1 row(s) left out: their time stamp occurs twice, the first time at row 8",)
 
 
 def test_the_layouts_sample_time_counts_rows_and_says_so(tmp_path: Path) -> None:

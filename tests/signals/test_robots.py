@@ -89,7 +89,7 @@ def test_a_file_of_one_robot_is_not_read_as_another_s(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="of robot `finger`"):
         read_recording(path)
     path.write_text(path.read_text().replace("# robot {", "# robot {{"))
-    with pytest.raises(DataError, match="does not say whose recording it is"):
+    with pytest.raises(DataError, match="does not name its robot"):
         read_recording(path)
 
 

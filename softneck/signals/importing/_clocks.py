@@ -129,14 +129,14 @@ def merge_clocks(samples: Samples, outputs: Sequence[str]) -> tuple[Samples, str
     Set-points and flags hold their last value; other channels are interpolated linearly, but not across long gaps. Rows
     before the first set-point are dropped.
     """
-    told = {name: np.isfinite(values) for name, values in samples.channels.items()}
-    silent = [name for name, there in told.items() if not there.any()]
-    if silent:
-        raise DataError(f"`{silent[0]}` holds no number in any row.")
-    base = min((name for name in outputs if name in told), key=lambda name: int(told[name].sum()), default=None)
+    present = {name: np.isfinite(values) for name, values in samples.channels.items()}
+    empty = [name for name, there in present.items() if not there.any()]
+    if empty:
+        raise DataError(f"`{empty[0]}` holds no number in any row.")
+    base = min((name for name in outputs if name in present), key=lambda name: int(present[name].sum()), default=None)
     if base is None:
         raise DataError(f"`merge` needs the columns of {', '.join(outputs)}.")
-    keep = told[base].copy()
+    keep = present[base].copy()
     found: dict[str, Vector] = {}
     for name, values in samples.channels.items():
         found[name] = np.full(values.size, np.nan)
@@ -159,15 +159,15 @@ def last_values(values: Vector) -> Vector:
 
 def _between(time: Vector, values: Vector) -> Vector:
     """Interpolate values linearly at all times, except across long gaps."""
-    seen = np.isfinite(values)
-    if seen.sum() < 2:
+    present = np.isfinite(values)
+    if present.sum() < 2:
         return values
-    t, x = time[seen], values[seen]
+    t, x = time[present], values[present]
     step = np.diff(t)
     usual = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
     after = np.clip(np.searchsorted(t, time), 1, t.size - 1)
     far = (t[after] - t[after - 1] > _MAX_MESSAGE_GAP * usual) | (time < t[0]) | (time > t[-1])
-    return np.where(seen, values, np.where(far, np.nan, np.interp(time, t, x)))
+    return np.where(present, values, np.where(far, np.nan, np.interp(time, t, x)))
 
 
 def fill_gaps(samples: Samples, robot: Robot, *, always: bool = False) -> tuple[Samples, tuple[str, ...]]:
@@ -220,8 +220,8 @@ def integrate_rates(samples: Samples, sources: Mapping[str, Source]) -> tuple[Sa
         channels[name] = np.zeros(samples.time.size)
         for rows in samples.runs():
             t, v = samples.time[rows], samples.channels[name][rows]
-            seen = np.isfinite(v)
-            v = np.interp(t, t[seen], v[seen]) if seen.any() else np.zeros(v.size)
+            present = np.isfinite(v)
+            v = np.interp(t, t[present], v[present]) if present.any() else np.zeros(v.size)
             channels[name][rows] = np.concatenate([[0.0], np.cumsum(np.diff(t) * (v[1:] + v[:-1]) / 2.0)])
     note = f"{', '.join(names)}: integrated from rates, from 0 at the start of each run; drift remains"
     return Samples(samples.time, samples.run, channels), (note,)

@@ -148,14 +148,14 @@ def read_title(title: str) -> Title:
     text, unit = _without_unit(title.strip())
     words = words_of(text)
     numbers = [int(word) for word in words if word.isdigit() and len(word) < 4]
-    said = [word for word in words if not word.isdigit()]
-    if unit is None and len(said) > 1 and said[-1] in _UNITS and len(said[-1]) > 1:
-        unit = _UNITS[said.pop()]
+    names = [word for word in words if not word.isdigit()]
+    if unit is None and len(names) > 1 and names[-1] in _UNITS and len(names[-1]) > 1:
+        unit = _UNITS[names.pop()]
     motor = numbers[-1] if numbers else None
-    role, why, rank = _role(said, motor)
-    if role == "time" and unit is None and said and said[-1] in _UNITS and said[-1] != "m":
-        unit = _UNITS[said[-1]]
-    return Title(role, " ".join(said), motor, unit, why, rank)
+    role, why, rank = _role(names, motor)
+    if role == "time" and unit is None and names and names[-1] in _UNITS and names[-1] != "m":
+        unit = _UNITS[names[-1]]
+    return Title(role, " ".join(names), motor, unit, why, rank)
 
 
 def _without_unit(title: str) -> tuple[str, str | None]:
@@ -168,9 +168,9 @@ def _without_unit(title: str) -> tuple[str, str | None]:
 def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:
     """Return (role, why, rank) of a title's words."""
     known = set(words)
-    for said, why in _NOT_SENSED:
-        if known & said:
-            return "ignored", f"'{' '.join(sorted(known & said))}' is {why}", 0
+    for names, why in _NOT_SENSED:
+        if known & names:
+            return "ignored", f"'{' '.join(sorted(known & names))}' is {why}", 0
     if words[:1] == ["unnamed"]:
         return "ignored", COUNTS_ROWS, 0
     # The title `tilt.pitch` of a topic means pitch.

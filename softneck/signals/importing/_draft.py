@@ -24,10 +24,10 @@ def take_moving_rows(columns: Mapping[Column, Vector]) -> dict[Column, Vector]:
     found: dict[Column, Vector] = {}
     for name, values in columns.items():
         head = values[:_MAX_ROWS]
-        seen = np.isfinite(head)
+        present = np.isfinite(head)
         # Sums of fourth powers of numbers beyond 1e60 would overflow.
-        if seen.any() and np.ptp(head[seen]) > 0 and np.abs(head[seen]).max() < 1e60:
-            found[name] = np.where(seen, head, head[seen].mean())
+        if present.any() and np.ptp(head[present]) > 0 and np.abs(head[present]).max() < 1e60:
+            found[name] = np.where(present, head, head[present].mean())
     return found
 
 
@@ -91,8 +91,8 @@ class Draft:
     def free(self) -> list[Column]:
         """Return moving columns that are not in use and may be motors or outputs by their names."""
         used = self.used_columns()
-        said = {name for name, title in self.titles.items() if title.role not in ("unknown", "position", "set-point")}
-        return [name for name in self.moving if name not in used and name not in said and name not in self.passed_over]
+        named = {name for name, title in self.titles.items() if title.role not in ("unknown", "position", "set-point")}
+        return [name for name in self.moving if name not in used and name not in named and name not in self.passed_over]
 
     def order(self) -> None:
         """Sort the picks into the column order of a recording."""
@@ -138,6 +138,6 @@ class Draft:
         return run
 
 
-def say(column: Column) -> str:
+def column_label(column: Column) -> str:
     """Return a column as the lines of a guess name it."""
     return f"column {column!r}"

@@ -14,7 +14,7 @@ from softneck.robot import Robot
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, NECK, OUTPUTS, SET_POINTS, redefine
 from ..recording._resampling import jitter
 from ._clocks import SampleTime, estimate_sample_time
-from ._draft import Draft, say
+from ._draft import Draft, column_label
 from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, use_positions_as_inputs
 from ._guess_shapes import by_shapes, max_correlation
 from ._guess_units import Unit, nominal_step, units
@@ -80,7 +80,7 @@ def _column_doubts(draft: Draft) -> list[Doubt]:
         sure = min((draft.picks[name].confidence for name in names), default=1.0)
         if sure < SURE:
             columns = dict.fromkeys(term.column for name in names for term in draft.picks[name].terms)
-            doubts.append(Doubt(about, names, ", ".join(map(say, columns)), sure, draft.picks[names[0]].why))
+            doubts.append(Doubt(about, names, ", ".join(map(column_label, columns)), sure, draft.picks[names[0]].why))
     return doubts
 
 
@@ -256,13 +256,13 @@ def _layout(draft: Draft, found: dict[str, Unit], robot: Robot) -> Layout:
         return Source(terms, unit.name, pick.sign, pick.integrate)
 
     tilt = "inclination" in draft.picks and "orientation" in draft.picks
-    asked = [term.column for name in SET_POINTS if name in draft.picks for term in draft.picks[name].terms]
+    set_point_columns = [term.column for name in SET_POINTS if name in draft.picks for term in draft.picks[name].terms]
     absent = {name for name in draft.picks if any(name.startswith(axis) for axis in OUTPUTS)
               and not name.startswith(robot.outputs.names)}  # fmt: skip
     return replace(
         draft.sniffed.form,
         # A measurement may be missed, a set-point may not: an empty cell means that it holds.
-        merge=draft.sniffed.form.merge and any(draft.sniffed.lacks(column) for column in asked),
+        merge=draft.sniffed.form.merge and any(draft.sniffed.lacks(column) for column in set_point_columns),
         channels={name: source(name) for name in draft.picks if name not in _NO_CHANNELS and name not in absent},
         inclination=source("inclination") if tilt else None,
         orientation=source("orientation") if tilt else None,
@@ -338,7 +338,7 @@ def _mark_line(line: str, sure: float) -> str:
 
 def _line(draft: Draft, found: dict[str, Unit], name: str) -> str:
     pick = draft.picks[name]
-    columns = " and ".join(say(term.column) for term in pick.terms)
+    columns = " and ".join(column_label(term.column) for term in pick.terms)
     unit = f" [{found[name].name}]" if name in found else ""
     reason = f"{pick.why}; {found[name].why}" if name in found else pick.why
     return _mark_line(f"{name} from {columns}{unit}: because {reason}", _sure(draft, found, name))
@@ -375,7 +375,7 @@ def _check_signs(draft: Draft) -> tuple[list[str], list[Doubt]]:
 
 
 def _left_out(draft: Draft) -> list[str]:
-    lines = [f"ignored: {say(column)}: because it holds words" for column in draft.sniffed.words]
+    lines = [f"ignored: {column_label(column)}: because it holds words" for column in draft.sniffed.words]
     q = draft.quaternion
     used = draft.used_columns() | (set() if q is None else {q.w, q.x, q.y, q.z})
     for column in draft.sniffed.columns:
@@ -394,7 +394,7 @@ def _left_out(draft: Draft) -> list[str]:
             reason = f"{title.why}, but a set of three motors or a better name was not found with it"
         else:
             reason = f"it is not recognised from its {'name or ' if title else ''}data"
-        lines.append(f"ignored: {say(column)}: because {reason}")
+        lines.append(f"ignored: {column_label(column)}: because {reason}")
     return lines
 
 

@@ -14,7 +14,7 @@ from softneck.robot import Robot
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, parse_column, redefine
 from ._clocks import axis_rotations, velocity_period
 from ._column_titles import plain
-from ._draft import Draft, Pick, say
+from ._draft import Draft, Pick, column_label
 from ._guess_shapes import max_correlation
 from ._layout import Column, Quaternion, Term
 
@@ -79,19 +79,19 @@ def use_positions_as_inputs(draft: Draft) -> None:
     if any(name in draft.picks for name in SET_POINTS):
         return
     if draft.has(MOTOR_POSITIONS):
-        for asked, there in zip(SET_POINTS, MOTOR_POSITIONS, strict=True):
+        for set_point, there in zip(SET_POINTS, MOTOR_POSITIONS, strict=True):
             pick = draft.picks[there]
             why = f"no set-points were logged, so the positions are the inputs ({pick.why}), without the drives' lag"
-            draft.picks[asked] = replace(pick, why=why, confidence=min(_STAND_IN, pick.confidence))
+            draft.picks[set_point] = replace(pick, why=why, confidence=min(_STAND_IN, pick.confidence))
             # Without a time column the positions and velocities determine the sample time.
             if "time" in draft.picks:
                 del draft.picks[there]
     elif draft.has(MOTOR_VELOCITIES):
-        for asked, speed in zip(SET_POINTS, MOTOR_VELOCITIES, strict=True):
+        for set_point, speed in zip(SET_POINTS, MOTOR_VELOCITIES, strict=True):
             pick = draft.picks[speed]
             why = f"no set-points or positions were logged, so the velocities, summed up, are the inputs ({pick.why})"
             sure = min(_STAND_IN, pick.confidence)
-            draft.picks[asked] = replace(pick, why=why, confidence=sure, integrate=True)
+            draft.picks[set_point] = replace(pick, why=why, confidence=sure, integrate=True)
 
 
 def one_axis(draft: Draft, candidates: list[Column], neck: Robot) -> Robot:
@@ -163,7 +163,7 @@ def _time_and_run(draft: Draft, by_role: dict[str, list[tuple[int, Column]]]) ->
         if column in draft.used_columns():
             continue
         if "time" in draft.picks:
-            draft.passed_over[column] = f"{say(draft.picks['time'].terms[0].column)} names time more clearly"
+            draft.passed_over[column] = f"{column_label(draft.picks['time'].terms[0].column)} names time more clearly"
         elif rising > 0.5:
             why = draft.titles[column].why if column in draft.titles else "it holds dates"
             draft.pick("time", column, f"{why}, and it rises from row to row")
@@ -219,7 +219,7 @@ def _set_points(draft: Draft, own: set[Column]) -> None:
     for family, score in zip(families, scores, strict=True):
         for column in family if family is not families[best] else ():
             draft.passed_over[column] = (
-                f"the positions follow {say(families[best][0])} and its like more closely than it"
+                f"the positions follow {column_label(families[best][0])} and its like more closely than it"
             )
             if score > 0.999 * scores[best]:
                 draft.passed_over[column] += ", by little: check"
@@ -292,4 +292,8 @@ def _not_taken(draft: Draft, role: str) -> str:
     if role == "yaw":
         return "yaw is not a channel of a recording; where your second axis is yaw, write it as `roll` with its sign"
     taken = role if role in draft.picks else "pitch"
-    return f"{say(draft.picks[taken].terms[0].column)} was taken" if taken in draft.picks else "its pair is not there"
+    return (
+        f"{column_label(draft.picks[taken].terms[0].column)} was taken"
+        if taken in draft.picks
+        else "the other angle of its pair is missing"
+    )

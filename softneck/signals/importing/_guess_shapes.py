@@ -73,10 +73,10 @@ def find_rates(columns: Columns, run: np.ndarray) -> tuple[Triple, Triple, float
     for most_still in (0, 1):
         best, found = _MIN_RATE_CORRELATION, None
         for position, velocity in itertools.product(triples(columns), repeat=2):
-            stands = find_still(columns, position)
-            if set(position) & set(velocity) or len(stands) != most_still or stands != find_still(columns, velocity):
+            at_rest = find_still(columns, position)
+            if set(position) & set(velocity) or len(at_rest) != most_still or at_rest != find_still(columns, velocity):
                 continue
-            worst = min(agree[pair] for k, pair in enumerate(zip(position, velocity, strict=True)) if k not in stands)
+            worst = min(agree[pair] for k, pair in enumerate(zip(position, velocity, strict=True)) if k not in at_rest)
             if worst > best:
                 best, found = worst, (position, velocity, worst)
         if found is not None:
@@ -106,11 +106,11 @@ def max_correlation(x: Vector, y: Vector, longest: int) -> tuple[float, int]:
 
 def find_followed(columns: Columns, positions: Sequence[Column], free: Sequence[Column]) -> tuple[Triple, float] | None:
     """Return three neighbours of `free` that the positions follow, and the smallest correlation."""
-    best, found, stands = _MIN_FOLLOW_CORRELATION, None, find_still(columns, positions)
+    best, found, at_rest = _MIN_FOLLOW_CORRELATION, None, find_still(columns, positions)
     for triple in triples({name: columns[name] for name in free}):
         worst = min(
             max_correlation(columns[s], columns[p], _DRIVE_LAG)[0]
-            for k, (s, p) in enumerate(zip(triple, positions, strict=True)) if k not in stands
+            for k, (s, p) in enumerate(zip(triple, positions, strict=True)) if k not in at_rest
         )  # fmt: skip
         if worst > best:
             best, found = worst, (triple, worst)
@@ -307,8 +307,8 @@ def _set_points(draft: Draft) -> None:
         for channel, column in zip(SET_POINTS, found[0], strict=True):
             draft.pick(channel, column, why, confidence=_confidence(found[1]))
         return
-    stands = find_still(draft.moving, positions)
-    moved = [j for j in range(3) if j not in stands]
+    at_rest = find_still(draft.moving, positions)
+    moved = [j for j in range(3) if j not in at_rest]
     pair, factors, R2 = find_sums(draft.moving, [positions[j] for j in moved], free[:12])
     if R2 < _MIN_SUM_R2:
         return  # `use_positions_as_inputs` makes the positions the inputs
@@ -318,7 +318,7 @@ def _set_points(draft: Draft) -> None:
         terms = tuple(Term(name, float(f"{factors[i, k]:.4g}")) for i, name in enumerate(pair) if counts[i])
         why = f"the position follows this sum (R2 {R2:.3f} or more); its factors were fitted to the data"
         draft.picks[SET_POINTS[j]] = Pick(terms, why, draft.picks[MOTOR_POSITIONS[j]].unit, confidence=_confidence(R2))
-    for j in stands:
+    for j in at_rest:
         why = "its position is constant while the others move, so its set-point is unknown: its position is used"
         draft.pick(SET_POINTS[j], positions[j], why, confidence=0.7)
 

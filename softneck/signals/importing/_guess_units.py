@@ -190,9 +190,9 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
     summed = {group for group, names in groups.items() if draft.picks[names[0]].integrate}
     titled: dict[str, str] = {}
     for group, names in groups.items():
-        said = {found[name].name.removesuffix("/s") for name in names if name in found} & {"rad", "deg"}
-        if len(said) == 1:
-            titled[group] = said.pop()
+        named = {found[name].name.removesuffix("/s") for name in names if name in found} & {"rad", "deg"}
+        if len(named) == 1:
+            titled[group] = named.pop()
     turned = "orientation" in draft.picks and "tilt" not in titled and largest(draft, "orientation") > 2.1 * np.pi
     verdicts = judge(reaches, {**titled, "tilt": "deg"} if turned else titled)
     for group, verdict in verdicts.items():
@@ -216,12 +216,12 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
 
 def _asked_in_another_unit(draft: Draft, found: dict[str, Unit]) -> tuple[str, ...]:
     """Return the references whose magnitude differs so much from the angles that their unit must differ too."""
-    asked = [name for name in _REFERENCE_CHANNELS if name in draft.picks]
+    references = [name for name in _REFERENCE_CHANNELS if name in draft.picks]
     angles = [name for name in (*OUTPUTS, "inclination") if name in draft.picks]
-    if any(name in found for name in (*asked, *angles)):
+    if any(name in found for name in (*references, *angles)):
         return ()
-    reaches = [max((largest(draft, name) for name in names), default=0.0) for names in (asked, angles)]
-    return tuple(asked) if max(reaches) > _TWO_UNITS_RATIO * min(reaches) > 0.0 else ()
+    reaches = [max((largest(draft, name) for name in names), default=0.0) for names in (references, angles)]
+    return tuple(references) if max(reaches) > _TWO_UNITS_RATIO * min(reaches) > 0.0 else ()
 
 
 def _references(draft: Draft, found: dict[str, Unit]) -> None:
@@ -245,10 +245,10 @@ def _counts(draft: Draft, found: dict[str, Unit]) -> float | None:
     if not draft.has(MOTOR_POSITIONS) or not draft.has(SET_POINTS) or MOTOR_POSITIONS[0] in found:
         return None
     x, u = (np.column_stack([draft.values(name) for name in names]) for names in (MOTOR_POSITIONS, SET_POINTS))
-    seen = np.isfinite(x).all(axis=1) & np.isfinite(u).all(axis=1)
-    if not seen.any():
+    present = np.isfinite(x).all(axis=1) & np.isfinite(u).all(axis=1)
+    if not present.any():
         return None
-    x, u = x[seen] - x[seen].mean(axis=0), u[seen] - u[seen].mean(axis=0)
+    x, u = x[present] - x[present].mean(axis=0), u[present] - u[present].mean(axis=0)
     size = np.sqrt((x**2).sum() * (u**2).sum())
     if size <= 0.0 or (x * u).sum() < _MIN_FOLLOW_CORRELATION * size:
         return None
@@ -309,7 +309,9 @@ def _velocities(draft: Draft, found: dict[str, Unit]) -> None:
         return
     if not draft.has(MOTOR_POSITIONS):
         if SET_POINTS[0] in draft.picks and draft.picks[SET_POINTS[0]].integrate:
-            found.update({name: found[asked] for name, asked in zip(MOTOR_VELOCITIES, SET_POINTS, strict=True)})
+            found.update(
+                {name: found[references] for name, references in zip(MOTOR_VELOCITIES, SET_POINTS, strict=True)}
+            )
         return
     factors = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "rpm": np.pi / 30.0}
     angle = np.pi / 180.0 if found[MOTOR_POSITIONS[0]][0] == "deg" else 1.0

@@ -245,8 +245,8 @@ def _source(entry: Any, quantity: str, where: str) -> Source:
         raise SettingsError(f"{where} names no unit.")
     integrate = _flag(entry, "integrate", default=False)
     if to_si(entry["unit"])[1] != (f"{quantity}/s" if integrate else quantity):
-        what = f"; a rate in {quantity}/s is integrated to {quantity}" if integrate else f"; its SI unit is {quantity}"
-        raise SettingsError(f"{where} cannot be in `{entry['unit']}`{what}.")
+        hint = f"; a rate in {quantity}/s is integrated to {quantity}" if integrate else f"; its SI unit is {quantity}"
+        raise SettingsError(f"{where} cannot be in `{entry['unit']}`{hint}.")
     parsed = tuple(Term(term["column"], _factor(term.get("factor", 1.0), where)) for term in terms)
     if entry.get("sign", 1) not in (1, -1) or isinstance(entry.get("sign"), bool):
         raise SettingsError(f"{where}: sign must be 1 or -1; got {entry['sign']!r}. Scale it by `factor`.")
@@ -342,8 +342,8 @@ def layout_toml(layout: Layout, *, remarks: Mapping[str, str] | None = None, ope
 
 def _file(layout: Layout, why: Mapping[str, str]) -> list[str]:
     plain = Layout(channels={})
-    said = {key: getattr(layout, key) for key in FILE_KEYS if getattr(layout, key) != getattr(plain, key)}
-    lines = [f"{key} = {_text(value)}" for key, value in said.items()]
+    changed = {key: getattr(layout, key) for key in FILE_KEYS if getattr(layout, key) != getattr(plain, key)}
+    lines = [f"{key} = {_text(value)}" for key, value in changed.items()]
     return ["[file]", *_comment(why.get("file")), *lines] if lines else []
 
 
@@ -369,10 +369,11 @@ def _inline(source: Source) -> str:
 
 
 def _entries(source: Source) -> list[str]:
-    unit, first = f"unit = {_text(source.unit)}", source.terms[0]
+    unit = f"unit = {_text(source.unit)}"
     if len(source.terms) == 1:
-        entries = [f"column = {_text(first.column)}", unit]
-        entries += [f"factor = {first.factor!r}"] if first.factor != 1.0 else []
+        (term,) = source.terms
+        entries = [f"column = {_text(term.column)}", unit]
+        entries += [f"factor = {term.factor!r}"] if term.factor != 1.0 else []
     else:
         terms = ", ".join(f"{{ column = {_text(t.column)}, factor = {t.factor!r} }}" for t in source.terms)
         entries = [unit, f"terms = [{terms}]"]
@@ -417,5 +418,5 @@ def doubts_in(path: str | Path) -> tuple[str, ...]:
         for sure, why in _NOT_SURE.findall(" ".join(marked)) if key else ():
             found.setdefault(f"({sure} sure): {why}" if sure else why, []).extend([key[1]] if sure and key else [])
         marked = [] if key else marked
-    said = [" ".join([", ".join(keys), why]).strip() for why, keys in found.items()]
-    return tuple(sorted(said, key=lambda one: not one.startswith(f"{ONE_AXIS}: ")))
+    changed = [" ".join([", ".join(keys), why]).strip() for why, keys in found.items()]
+    return tuple(sorted(changed, key=lambda one: not one.startswith(f"{ONE_AXIS}: ")))

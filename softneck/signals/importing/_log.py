@@ -291,7 +291,7 @@ def _column(frame: pd.DataFrame, name: Column, channel: str) -> pd.Series:
     """Return a column by its name, or by its index."""
     places = [place for place, title in enumerate(frame.columns) if title == name]
     if len(places) > 1:
-        raise DataError(f"column `{name}` for `{channel}` stands {len(places)} times in the file; use its index.")
+        raise DataError(f"column `{name}` for `{channel}` occurs {len(places)} times in the file; use its index.")
     if not places and isinstance(name, int) and 0 <= name < frame.shape[1]:
         places = [name]
     if not places:

@@ -174,7 +174,7 @@ def _arrays(source: Path, fewest: int) -> tuple[pd.DataFrame, Layout, tuple[str,
         line = f"file: {len(beside.columns)} columns of {len(beside)} numbers, vectors and matrices by their names"
         return beside, Layout(channels={}), (line,)
     if not matrices:
-        return table_of(source, arrays, None), Layout(channels={}), ()  # which says what is missing
+        return table_of(source, arrays, None), Layout(channels={}), ()  # which raises the error
     name = max(matrices, key=lambda key: matrices[key].size)
     line = f"file: the matrix '{name}', because it is the largest one ({' x '.join(map(str, matrices[name].shape))})"
     return table_of(source, arrays, name), Layout(channels={}, variable=name, header=False), (line,)

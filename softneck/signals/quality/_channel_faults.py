@@ -240,9 +240,9 @@ def _find_clipping(
             continue
         for start, stop in flats[z[flats[:, 0]] == top]:
             fast = max(_speed(y, start, -1), _speed(y, stop - 1, 1)) > slope
-            seen = inputs[start : max(stop - _DEAD_SAMPLES, start + CLIPPED_SAMPLES)]
+            part = inputs[start : max(stop - _DEAD_SAMPLES, start + CLIPPED_SAMPLES)]
             enough = min(_MIN_MOTION_PER_SAMPLE * (stop - start), _MIN_MOTION_AT_TOP)
-            if chance or (fast and _relative_motion(seen, std) > enough):
+            if chance or (fast and _relative_motion(part, std) > enough):
                 found.append(_segment(recording, start, stop))
     # A single short flat top is chance.
     chosen = tuple(sorted(found, key=lambda segment: segment.start))

@@ -153,40 +153,42 @@ _LAGS = (0, *(2**k for k in range(9)))
 
 def poor_excitation(recording: Recording) -> tuple[str, ...]:
     """Return the weaknesses of a recording as training data, as sentences."""
-    said = []
+    problems = []
     if len(recording) < _FEW_ROWS:
         seconds = len(recording) * recording.sample_time
-        said.append(f"{len(recording)} rows ({seconds:.3g} s) are few to train on: record {_FEW_ROWS} or more.")
+        problems.append(f"{len(recording)} rows ({seconds:.3g} s) are few to train on: record {_FEW_ROWS} or more.")
     spans, least = np.ptp(recording.set_points, axis=0), _least_motion(recording)
     still = [name for name, span in zip(recording.robot.set_points, spans, strict=True) if span < least]
     if still:
-        said.append(f"{', '.join(still)} never moves: its effect cannot be learned. Move every motor.")
+        problems.append(f"{', '.join(still)} never moves: its effect cannot be learned. Move every motor.")
     changes = sum(int((np.diff(run.set_points, axis=0) != 0.0).any(axis=1).sum()) for run in recording.runs())
     if spans.max() >= least and changes < _FEW_CHANGES:
-        said.append(f"the set-points change in {changes} rows only: a model between them is a guess. Record `mixed`.")
+        problems.append(
+            f"the set-points change in {changes} rows only: a model between them is a guess. Record `mixed`."
+        )
     outputs = recording.robot.outputs.names
     if independent_motions(recording) < min(len(outputs), len(spans)):
-        said.append(
+        problems.append(
             f"the motors move along {independent_motions(recording)} direction(s) for {len(outputs)} outputs: their "
             "separate effects cannot be learned. Move all of them independently, as `eq22` and `mixed` do."
         )
     if len(recording) < _FEW_ROWS or changes < _FEW_CHANGES:
-        return tuple(said)  # too short to tell whether an output follows its motors
-    said += [
+        return tuple(problems)  # too short to tell whether an output follows its motors
+    problems += [
         f"`{name}` does not follow the motors (they explain {100.0 * max(share, 0.0):.0f} % of its variance): no model "
         "of set-points will predict it. Look for drift, a wrong column, or an output that nothing moves."
         for name, share in zip(outputs, explained_variance(recording), strict=True)
         if share < _MIN_EXPLAINED_SHARE
     ]
-    return tuple(said)
+    return tuple(problems)
 
 
 def why_at_rest(held_out: Recording, whole: Recording) -> str | None:
     """Return why `held_out`, a part of `whole`, cannot judge a model; None if it can."""
-    for name, judged, seen in zip(whole.robot.outputs.names, held_out.outputs.T, whole.outputs.T, strict=True):
+    for name, judged, full in zip(whole.robot.outputs.names, held_out.outputs.T, whole.outputs.T, strict=True):
         there = np.isfinite(judged)
-        if there.any() and np.nanstd(judged) < _MIN_RELATIVE_MOTION * np.nanstd(seen):
-            part = 100.0 * float(np.nanstd(judged) / np.nanstd(seen))
+        if there.any() and np.nanstd(judged) < _MIN_RELATIVE_MOTION * np.nanstd(full):
+            part = 100.0 * float(np.nanstd(judged) / np.nanstd(full))
             return f"the rows held out stand still: {name} moves by {part:.1f} % of what it does in all rows"
     return None
 

@@ -51,8 +51,8 @@ class Finding:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON values."""
-        said = asdict(self)
-        return {**said, "time_s": said.pop("time")}
+        values = asdict(self)
+        return {**values, "time_s": values.pop("time")}
 
     def __str__(self) -> str:
         about = f"{self.channel}: " if self.channel else ""
@@ -81,8 +81,14 @@ class Quality(ReprMixin):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """Return all findings, warnings first."""
-        return findings(self)
+        """Return all findings, warnings first; a topic without a fault gives one "ok"."""
+        found = [finding for channel in self.channels.values() for finding in _channel(channel, self)]
+        found += [*_excitation(self), *_directions(self), *_ranges(self), *_correlation(self)]
+        topics = {finding.topic for finding in found if finding.severity != "ok"}
+        moved, bandwidth = ", ".join(self.spectrum.inputs), self.spectrum.bandwidth
+        clean = _CLEAN | {"excitation": f"{moved} move up to the bandwidth of {bandwidth:.3g} rad/s."}
+        found += [Finding("ok", topic, "", text) for topic, text in clean.items() if topic not in topics]
+        return tuple(sorted(found, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
     @property
     def severity(self) -> str:
@@ -91,10 +97,10 @@ class Quality(ReprMixin):
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON values of `softneck info --json` under `quality`."""
-        said = self.findings
+        found = self.findings
         return {
             "severity": self.severity,
-            "findings": [finding.as_dict() for finding in said],
+            "findings": [finding.as_dict() for finding in found],
             "channels": {name: channel.as_dict() for name, channel in self.channels.items()},
             "bandwidth_rad_s": self.spectrum.bandwidth,
             "excitation": self.spectrum.as_dict(),
@@ -162,17 +168,6 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
         directions=independent_motions(recording),
         correlation=correlation(recording),
     )
-
-
-def findings(quality: Quality) -> tuple[Finding, ...]:
-    """Return all findings, warnings first; a topic without a fault gives one "ok"."""
-    said = [finding for channel in quality.channels.values() for finding in _channel(channel, quality)]
-    said += [*_excitation(quality), *_directions(quality), *_ranges(quality), *_correlation(quality)]
-    topics = {finding.topic for finding in said if finding.severity != "ok"}
-    moved, bandwidth = ", ".join(quality.spectrum.inputs), quality.spectrum.bandwidth
-    clean = _CLEAN | {"excitation": f"{moved} move up to the bandwidth of {bandwidth:.3g} rad/s."}
-    said += [Finding("ok", topic, "", text) for topic, text in clean.items() if topic not in topics]
-    return tuple(sorted(said, key=lambda finding: -SEVERITIES.index(finding.severity)))
 
 
 _CLEAN = {

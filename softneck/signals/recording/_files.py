@@ -160,12 +160,12 @@ def read_recording(path: str | Path, *, robot: str | Path | Robot | None = None)
     suffix = recording_suffix(source)
     if source.is_file():
         require_size(source)
-    said = robot_in_file(source, suffix)
+    stored = robot_in_file(source, suffix)
     columns: Mapping[str, pd.Series | Vector] | None = read_plain_csv(source) if suffix == ".csv" else None
     if columns is None:
-        columns = _columns(read_table(source, suffix, TextForm(skip=0 if said is None else 1)))
+        columns = _columns(read_table(source, suffix, TextForm(skip=0 if stored is None else 1)))
     try:
-        return _from_columns(columns, _resolve_robot(source, said, robot))
+        return _from_columns(columns, _resolve_robot(source, stored, robot))
     except SoftneckError as error:
         raise DataError(f"{source}: {error}") from error
 
@@ -219,13 +219,13 @@ def from_frame(frame: object, robot: Robot | str | Path | None = None) -> Record
         raise DataError(f"the columns do not make a table ({error}).") from error
     if table.index.name == column_name("time"):
         table = table.reset_index()
-    said = table.attrs.get("robot")
-    return _from_columns(_columns(table), find_robot(Robot.from_dict(said) if robot is None and said else robot))
+    stored = table.attrs.get("robot")
+    return _from_columns(_columns(table), find_robot(Robot.from_dict(stored) if robot is None and stored else robot))
 
 
 def robot_in_file(source: Path, suffix: str) -> Robot | None:
     """Return the robot that a file names, or None."""
-    said: object = None
+    stored: object = None
     try:
         if suffix == ".parquet" and source.is_file():
             from pyarrow import ArrowException
@@ -235,22 +235,22 @@ def robot_in_file(source: Path, suffix: str) -> Robot | None:
                 attributes = (read_schema(source).metadata or {}).get(b"PANDAS_ATTRS", b"{}")
             except (ValueError, OSError, ArrowException):
                 return None  # the reader of the table reports the damage
-            said = json.loads(attributes).get("robot")
+            stored = json.loads(attributes).get("robot")
         elif suffix == ".csv" and source.is_file():
             with source.open(encoding="utf-8", errors="replace") as file:
                 line = file.readline(MOST_TOML)
-            said = json.loads(line.removeprefix(ROBOT_LINE)) if line.startswith(ROBOT_LINE) else None
-        return None if said is None else Robot.from_dict(said)  # pyright: ignore[reportArgumentType]
+            stored = json.loads(line.removeprefix(ROBOT_LINE)) if line.startswith(ROBOT_LINE) else None
+        return None if stored is None else Robot.from_dict(stored)  # pyright: ignore[reportArgumentType]
     except (ValueError, AttributeError, TypeError, RecursionError) as error:
-        raise DataError(f"{source}: does not say whose recording it is ({error}).") from error
+        raise DataError(f"{source}: does not name its robot ({error}).") from error
 
 
-def _resolve_robot(source: Path, said: Robot | None, given: str | Path | Robot | None) -> Robot:
+def _resolve_robot(source: Path, stored: Robot | None, given: str | Path | Robot | None) -> Robot:
     """Return the given robot, else that of `robot.toml`, else the one the file names, else the neck."""
-    found = find_robot(given, beside=source) if given is not None or robot_file_of(source) is not None else said
+    found = find_robot(given, beside=source) if given is not None or robot_file_of(source) is not None else stored
     found = Robot.preset("neck") if found is None else found
-    if said is not None and said.hash != found.hash:
-        raise DataError(f"is a recording of robot {said.label()}, not of {found.label()}.")
+    if stored is not None and stored.hash != found.hash:
+        raise DataError(f"is a recording of robot {stored.label()}, not of {found.label()}.")
     return found
 
 
@@ -328,7 +328,7 @@ def _from_columns(columns: Mapping[str, pd.Series | Vector], robot: Robot) -> Re
         # pandas renames the second of two equal titles to `pitch [deg].1`.
         name, factor = parse_column(re.sub(r"\]\.\d+$", "]", title), robot)
         if name in channels:
-            raise DataError(f"channel `{name}` stands in two columns; drop one.")
+            raise DataError(f"channel `{name}` is in two columns; drop one.")
         channels[name] = factor * numbers(cells, name, missing=may_miss(name, robot))
     if "time" not in channels:
         raise DataError("there is no column `time [s]`.")
@@ -371,8 +371,8 @@ def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: 
             bad[bad] = [str(cell).strip().lower() != "nan" for cell in column[bad]]
     if bad.any():
         row = int(np.argmax(bad))
-        said = " ".join(str(column.iloc[row]).split())[:60]  # a cell in quotes may hold lines
-        cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{said}`"
+        text = " ".join(str(column.iloc[row]).split())[:60]  # a cell in quotes may hold lines
+        cell = "an empty cell" if pd.isna(column.iloc[row]) else f"`{text}`"
         raise _number_error(name, cell, row, missing=missing)
     return values
 

@@ -50,15 +50,15 @@ def without_duplicates(samples: Samples, rule: str | None) -> tuple[Samples, tup
     row = int(np.argmax(same)) + 1
     if rule is None:
         raise DataError(
-            f"`time` stands still at row {row}: {samples.time[row]:g} s stands there twice ({same.sum()} such row(s)); "
+            f"`time` stands still at row {row}: {samples.time[row]:g} s occurs twice ({same.sum()} such row(s)); "
             'fix the log, or write `duplicates = "first"` (or "last") into [time] of the layout to keep one of each.'
         )
     keep = np.append(True, ~same) if rule == "first" else np.append(~same, True)
-    note = f"{same.sum()} row(s) left out: their time stamp stands twice, the first time at row {row}"
+    note = f"{same.sum()} row(s) left out: their time stamp occurs twice, the first time at row {row}"
     return samples.rows(keep), (note,)
 
 
-def find_gaps(samples: Samples, hole: float = _LENGTH_JUMP) -> tuple[np.ndarray, float]:
+def find_gaps(samples: Samples, jump: float = _LENGTH_JUMP) -> tuple[np.ndarray, float]:
     """Return (time - 1,) whether rows are missing after each row, and the shortest gap [s].
 
     A late stamp is followed by a short step, so each step is judged together with its shorter neighbour. A clock that
@@ -73,11 +73,11 @@ def find_gaps(samples: Samples, hole: float = _LENGTH_JUMP) -> tuple[np.ndarray,
     shorter = np.minimum(beside[:-2], beside[2:])
     length = (step + np.where(np.isfinite(shorter), shorter, usual)) / usual - 1.0
     long = np.sort(length[inside & (length > 1.0)])
-    behind = long[1:][long[1:] > hole * long[:-1]] if long.size else long
-    behind = behind[behind > _GAP_STEPS]
+    gap_lengths = long[1:][long[1:] > jump * long[:-1]] if long.size else long
+    gap_lengths = gap_lengths[gap_lengths > _GAP_STEPS]
     if long.size and long[0] > _GAP_STEPS:  # all long steps are gaps
-        behind = long
-    bound = min(float(behind[0]) if behind.size else np.inf, _PAUSE_STEPS)
+        gap_lengths = long
+    bound = min(float(gap_lengths[0]) if gap_lengths.size else np.inf, _PAUSE_STEPS)
     return inside & (length >= bound), bound * usual
 
 
@@ -175,8 +175,8 @@ def low_pass(values: Vector, ratio: float) -> Vector:
     at it. Both ends are continued by point reflection, which keeps straight lines straight. Missed samples are bridged
     for the filter and stay missed.
     """
-    seen = np.isfinite(values)
-    if values.size < 3 or seen.sum() < 2:
+    present = np.isfinite(values)
+    if values.size < 3 or present.sum() < 2:
         return values
     stop = np.pi / ratio
     width = (1.0 - _PASSBAND) * stop
@@ -184,10 +184,10 @@ def low_pass(values: Vector, ratio: float) -> Vector:
     half = min(int(np.ceil((_ATTENUATION_DB - 7.95) / (2.285 * width) / 2.0)), values.size - 1)
     k = np.arange(-half, half + 1)
     weights = np.sinc((stop - width / 2.0) / np.pi * k) * np.kaiser(2 * half + 1, 0.1102 * (_ATTENUATION_DB - 8.7))
-    whole = np.interp(np.arange(values.size), np.flatnonzero(seen), values[seen])
+    whole = np.interp(np.arange(values.size), np.flatnonzero(present), values[present])
     ends = 2.0 * whole[0] - whole[half:0:-1], 2.0 * whole[-1] - whole[-2 : -half - 2 : -1]
     filtered = np.convolve(np.concatenate([ends[0], whole, ends[1]]), weights / weights.sum(), mode="valid")
-    return np.where(seen, filtered, np.nan)
+    return np.where(present, filtered, np.nan)
 
 
 def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:
@@ -221,15 +221,15 @@ def _interpolate(t: Vector, x: Vector, grid: Vector, before: np.ndarray, after: 
     """Interpolate x (time,) at `grid` (instants,) between its samples `before` and `after`."""
     from scipy.interpolate import PchipInterpolator
 
-    seen = np.isfinite(x)
-    missed = ~(seen[before] & seen[after])
+    present = np.isfinite(x)
+    missed = ~(present[before] & present[after])
     values = x[before]
     # Fewer than two points cannot be interpolated.
-    if seen.sum() > 1:
+    if present.sum() > 1:
         try:
-            values = PchipInterpolator(t[seen], x[seen])(grid)
+            values = PchipInterpolator(t[present], x[present])(grid)
         except ValueError as error:  # damaged numbers have slopes that are not finite
-            largest = float(np.abs(x[seen]).max())
+            largest = float(np.abs(x[present]).max())
             raise DataError(
                 f"a channel reaches {largest:.3g} within {np.ptp(t):.3g} s and cannot be resampled; is the log damaged?"
             ) from error

@@ -163,7 +163,7 @@ def _by_name(arrays: Iterator[tuple[str, np.ndarray]], left: int) -> dict[str, n
         if left < 0:
             raise ValueError("its variables unpack to more than a log of its size holds")
         if name in found:
-            raise ValueError(f"the variable `{name}` stands there twice")
+            raise ValueError(f"the variable `{name}` occurs twice")
         found[name] = array
     return found
 
@@ -181,23 +181,23 @@ def _hdf5(source: Path) -> Iterator[tuple[str, np.ndarray]]:
         yield from _members(file, "", 0, set())
 
 
-def _members(group: Any, prefix: str, depth: int, seen: set[int]) -> Iterator[tuple[str, np.ndarray]]:
+def _members(group: Any, prefix: str, depth: int, visited: set[int]) -> Iterator[tuple[str, np.ndarray]]:
     import h5py
 
     for name in group:
         # Soft and external links lead elsewhere, the latter to other files; MATLAB writes neither.
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
-        yield from _item(group[name], f"{prefix}{name}", depth, seen)
+        yield from _item(group[name], f"{prefix}{name}", depth, visited)
 
 
-def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the arrays in a group or dataset; skip `seen` addresses, since references may form cycles."""
+def _item(item: Any, name: str, depth: int, visited: set[int]) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the arrays in a group or dataset; skip `visited` addresses, since references may form cycles."""
     import h5py
 
     if isinstance(item, h5py.Group):
         if depth < _MAX_DEPTH:
-            yield from _members(item, f"{name}.", depth + 1, seen)
+            yield from _members(item, f"{name}.", depth + 1, visited)
     elif isinstance(item, h5py.Dataset) and item.dtype.kind == "O" and item.size is not None and depth < _MAX_DEPTH:
         # Elements of cells and fields of arrays of structures are references.
         references = np.asarray(item[()]) if item.size <= _MAX_ELEMENTS else np.array([])
@@ -205,12 +205,12 @@ def _item(item: Any, name: str, depth: int, seen: set[int]) -> Iterator[tuple[st
             if isinstance(reference, h5py.Reference) and reference:
                 target = item.file[reference]
                 address = h5py.h5o.get_info(target.id).addr  # pyright: ignore[reportAttributeAccessIssue]
-                if address not in seen:
-                    seen.add(address)
-                    yield from _item(target, f"{name}{{{place + 1}}}", depth + 1, seen)
+                if address not in visited:
+                    visited.add(address)
+                    yield from _item(target, f"{name}{{{place + 1}}}", depth + 1, visited)
     elif isinstance(item, h5py.Dataset) and _is_numbers(item):
         if item.external or item.is_virtual:
-            raise DataError(f"variable `{name}` lies in another file; softneck reads what is in this one.")
+            raise DataError(f"variable `{name}` is in another file; softneck reads what is in this one.")
         if item.size is not None and 8 * item.size > largest_unpacked(8 * item.file.id.get_filesize()):
             raise DataError(f"variable `{name}` declares {item.size} numbers; that is not a log.")
         # MATLAB stores columns first: the file holds the transpose.

@@ -70,13 +70,13 @@ def _is_true(piece: Chunk) -> bool:
     from lz4.frame import LZ4FrameDecompressor
     from zstandard import CONTENTSIZE_UNKNOWN, get_frame_parameters
 
-    says = piece.uncompressed_size
+    declared = piece.uncompressed_size
     try:
         if piece.compression == "lz4":
-            return len(LZ4FrameDecompressor().decompress(piece.data, max_length=says + 1)) <= says
+            return len(LZ4FrameDecompressor().decompress(piece.data, max_length=declared + 1)) <= declared
         # Without a size in the frame, zstd stops at the chunk's declared size.
-        holds = get_frame_parameters(piece.data).content_size if piece.compression == "zstd" else says
-        return holds in (says, CONTENTSIZE_UNKNOWN)
+        holds = get_frame_parameters(piece.data).content_size if piece.compression == "zstd" else declared
+        return holds in (declared, CONTENTSIZE_UNKNOWN)
     except Exception:  # the reader reports the damage
         return True
 

@@ -70,10 +70,10 @@ def format_of(source: Path) -> str:
     for mark, name in _FORMAT_MARKS:
         if head.startswith(mark):
             return name
-    for mark, what, instead in _OTHER_FORMATS:
+    for mark, what, remedy in _OTHER_FORMATS:
         # A text may begin with the letters of a mark, but holds no zeros.
         if head.startswith(mark) and (b"\0" in head[:512] or not mark.isalpha()):
-            raise FileFormatError(f"{source}: is {what}, not a log; {instead}.")
+            raise FileFormatError(f"{source}: is {what}, not a log; {remedy}.")
     return {".mat": "mat", ".parquet": "parquet"}.get(source.suffix.lower(), "text")
 
 
