@@ -201,8 +201,9 @@ def loop_chart(
     if "tension_1" in signals:
         pulls = [
             Curve(time, signals[f"tension_{j}"], f"tendon {j}", ALL_MOTOR_COLOURS[j - 1])
-            for j in range(1, len(robot.motors.names) + 1) if f"tension_{j}" in signals
-        ]  # fmt: skip
+            for j in range(1, len(robot.motors.names) + 1)
+            if f"tension_{j}" in signals
+        ]
         panels.append(Panel(pulls, "tension [N]"))
     return Chart(title, panels, caption=caption)
 

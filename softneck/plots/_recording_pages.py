@@ -67,10 +67,8 @@ def _doubts_section(
         for one in doubts
     ]
     if not doubts:
-        findings.append(("ok", "nothing that was guessed is less than 90 % sure."))
-    method = (
-        "Left: the columns as logged, over their rows. Right: the recording's channels over time, in the same colours."
-    )
+        findings.append(("ok", "every guess is at least 90 % sure."))
+    method = "Left: columns as logged, by row. Right: channels of the recording over time, in the same colours."
     return Section("Doubts", findings=findings, charts=charts, method=[method] if charts else [])
 
 

@@ -290,11 +290,12 @@ def _verdict(found: Reproduction) -> str:
     least = {
         model: min(
             -np.inf if fit is None else fit
-            for (name, _), pair in found.judged.items() if name == model
+            for (name, _), pair in found.judged.items()
+            if name == model
             for fit in pair.free.fits[INFINITE].values()
         )
         for model in found.models
-    }  # fmt: skip
+    }
     best = max(least, key=lambda name: least[name])
     worst = ", ".join(
         f"{name} {'diverges' if np.isneginf(fit) else f'{fit:.1f} %'}" for name, fit in least.items() if name != best

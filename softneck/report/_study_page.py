@@ -168,9 +168,7 @@ def _groups(vary: Mapping[str, Any]) -> list[str]:
 
 
 def _numbers(runs: pd.DataFrame, vary: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    import pandas as pd
-
-    numeric = [key for key, item in vary.items() if item["kind"] != "seed" and pd.api.types.is_numeric_dtype(runs[key])]
+    numeric = [key for key, item in vary.items() if item["kind"] != "seed" and runs[key].dtype.kind in "biufc"]
     return {key: runs[key].to_numpy(float) for key in numeric}
 
 

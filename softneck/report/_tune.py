@@ -118,7 +118,7 @@ def _write_loop(found: Tuned, folder: Path, steps: Mapping[str, Path | str]) -> 
         **({"observer": {"file": OBSERVER}} if found.observed else {}),
         "controller": {"file": BEST},
         "reference": {"kind": "step", f"{first}_{unit}": float(neck["size_deg"]), "at_s": at},
-    }  # fmt: skip
+    }
     if any(plant.payload and plant.name == name for plant in found.own):
         table["plant"]["parameters"] = {"payload": float(max(neck["payloads_kg"]))}
     if taut and "least_cocontraction" not in found.best.settings:

@@ -57,7 +57,7 @@ def test_in_a_terminal_a_doubt_is_asked(call: Call, tmp_path: Path, monkeypatch:
     assert said.code == 0, said.err
     assert asked == ["unit of motor set-points"]
     assert np.abs(read_recording("r.csv").set_points).max() == pytest.approx(np.radians(12.0))
-    assert "as was answered" in (tmp_path / "r.layout.toml").read_text()
+    assert "as you answered" in (tmp_path / "r.layout.toml").read_text()
     again = call("import", "log.csv", "--layout", "r.layout.toml", "-o", "again.csv")
     assert (again.code, (tmp_path / "again.csv").read_bytes()) == (0, (tmp_path / "r.csv").read_bytes())
     # All taken: as without a terminal.

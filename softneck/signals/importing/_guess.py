@@ -172,14 +172,14 @@ class Guess(ReprMixin):
             SettingsError: `choice` is none of the doubt's choices.
         """
         layout = self.layout if choice is None else settle_doubt(self.layout, doubt, choice)
-        said = f"{doubt.about}: {choice or doubt.taken}, as was answered"
+        said = f"{doubt.about}: {choice or doubt.taken}, as you answered"
         remarks = {**self._remarks, **dict.fromkeys(doubt.channels, said)}
         return self._rewrite(layout, remarks, self.missing, tuple(one for one in self.doubts if one is not doubt))
 
     def with_sample_time(self, sample_time: float) -> Guess:
         """Return the guess of a log without a clock with its sample time [s]."""
         missing = tuple(line for line in self.missing if not line.startswith(_NO_CLOCK))
-        remarks = {**self._remarks, "sample_time": "as was answered"}
+        remarks = {**self._remarks, "sample_time": "as you answered"}
         return self._rewrite(replace(self.layout, sample_time=sample_time), remarks, missing, self.doubts)
 
     def _rewrite(
@@ -226,7 +226,7 @@ def _guess(path: Path, neck: Robot) -> Guess:
     other_doubts = list(sign_doubts)
     if robot is not neck:  # a log of one angle, although a neck has two
         axis, other = robot.outputs.names[0], "roll" if robot.outputs.names[0] == "pitch" else "pitch"
-        why = f"no column is {other} or answers the motors like it, so the robot has one output; log {other} too if it"
+        why = f"no column is {other} or follows the motors like it, so the robot has one output; log {other} too if it"
         other_doubts.append(Doubt(ONE_AXIS, (axis,), f"{axis} only", 0.8, f"{why} tilts"))
     doubts = sorted([*doubts_of(draft, found), *clock_doubts, *other_doubts], key=lambda doubt: doubt.confidence)
     remarks = {name: _why(draft, found, name) for name in draft.picks}

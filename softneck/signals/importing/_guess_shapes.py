@@ -66,10 +66,7 @@ def find_rates(columns: Columns, run: np.ndarray) -> tuple[Triple, Triple, float
 
     One of the three may be at rest if no other triple fits.
     """
-    agree = {
-        (x, v): velocity_period(columns[x], columns[v], run)[1]
-        for x, v in itertools.permutations(columns, 2)
-    }  # fmt: skip
+    agree = {(x, v): velocity_period(columns[x], columns[v], run)[1] for x, v in itertools.permutations(columns, 2)}
     for most_still in (0, 1):
         best, found = _MIN_RATE_CORRELATION, None
         for position, velocity in itertools.product(triples(columns), repeat=2):
@@ -110,8 +107,9 @@ def find_followed(columns: Columns, positions: Sequence[Column], free: Sequence[
     for triple in triples({name: columns[name] for name in free}):
         worst = min(
             max_correlation(columns[s], columns[p], _DRIVE_LAG)[0]
-            for k, (s, p) in enumerate(zip(triple, positions, strict=True)) if k not in at_rest
-        )  # fmt: skip
+            for k, (s, p) in enumerate(zip(triple, positions, strict=True))
+            if k not in at_rest
+        )
         if worst > best:
             best, found = worst, (triple, worst)
     return found
@@ -256,12 +254,12 @@ def by_shapes(draft: Draft) -> None:
         return
     for axis, (column, r) in find_outputs(draft.moving, motors, draft.free()[:_MAX_COLUMNS]).items():
         if axis not in draft.picks:
-            _answer(draft, axis, column, r)
+            _pick_output(draft, axis, column, r)
 
 
-def _answer(draft: Draft, axis: str, column: str | int, r: float) -> None:
+def _pick_output(draft: Draft, axis: str, column: str | int, r: float) -> None:
     inverted = "; inverted, so that it rises with it" if r < 0 else ""
-    why = f"it answers {_AXIS[axis]} of the motors with correlation {r:.2f}; none that moves as far does so more"
+    why = f"it follows {_AXIS[axis]} of the motors (correlation {r:.2f}), best of the columns with as large a motion"
     draft.pick(axis, column, why + inverted, sign=-1.0 if r < 0 else 1.0, confidence=_confidence(r))
 
 
@@ -340,7 +338,7 @@ def _motors_without_rates(draft: Draft) -> None:
         if min(correlation(draft.moving[a], draft.moving[b]) for a, b in zip(first, other, strict=True))
         > _MIN_FOLLOW_CORRELATION
     ]
-    why = "it is one of three neighbours to which two other columns answer best"
+    why = "it is one of three neighbours to which two other columns respond best"
     if alike:
         other = alike[0]
         first, other = (first, other) if is_leading(draft.moving, first, other) else (other, first)
@@ -350,4 +348,4 @@ def _motors_without_rates(draft: Draft) -> None:
         draft.pick(channel, column, why, confidence=0.7)
     for axis, (column, r) in axes.items():
         if axis not in draft.picks:
-            _answer(draft, axis, column, r)
+            _pick_output(draft, axis, column, r)

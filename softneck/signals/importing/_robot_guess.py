@@ -126,9 +126,10 @@ def robot_of_columns(
     if robot is None:
         robot = Robot.preset() if _of_neck(table, motors, outputs) else _propose_robot(path, table, motors, outputs)[0]
     for count, needed, what in (
-        (len(motors), len(robot.motors.names), "motor"), (len(outputs), len(robot.outputs.names), "output"),
+        (len(motors), len(robot.motors.names), "motor"),
+        (len(outputs), len(robot.outputs.names), "output"),
         (len(positions), len(robot.motors.names) if positions else 0, "position"),
-    ):  # fmt: skip
+    ):
         if count != needed:
             raise DataError(f"{path}: robot {robot.label()} needs {needed} --{what}; {count} were given.")
     layout = _layout(table, robot, motors, outputs, (time, run))
