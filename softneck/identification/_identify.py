@@ -228,19 +228,14 @@ def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: in
 
 def _split_for_choice(parts: Sequence[Recording], train: float) -> tuple[Recording, Recording, bool]:
     """Return the training recording, the hold-out, and whether the hold-out is another experiment."""
-    if len(parts) > 1 and not _is_other_payload(parts[-1], parts[:-1]):
+    known = [payload_of(run) for part in parts[:-1] for run in part.runs()]
+    if known and all(min(known) <= payload_of(run) <= max(known) for run in parts[-1].runs()):
         return concatenate(parts[:-1]), parts[-1], True
     if not 0.0 < train < 1.0:
         raise SettingsError(f"`train`: `auto` has to hold rows out; give a part below 1, got {train:g}.")
     # Hold out the end of each run: a model cannot predict with a payload that it was not trained on.
     head, tail = concatenate(parts).split(train)
     return head, tail, False
-
-
-def _is_other_payload(one: Recording, others: Sequence[Recording]) -> bool:
-    """Return whether a recording has a payload outside the range of the others."""
-    known = [payload_of(run) for part in others for run in part.runs()]
-    return any(not min(known) <= payload_of(run) <= max(known) for run in one.runs())
 
 
 def with_fit(model: Model, held_out: Validation | None) -> Model:

@@ -297,13 +297,19 @@ class OutputError:
         if self.intervals:
             each = [settings._intervals(Ts, *one) for one in zip(inputs, found, delays, strict=True)]
             intervals = {"intervals": dict(zip(names, each, strict=True)), "caution": _INTERVALS_CAUTION}
+        text = "its slowest pole is at the bound of a third of the longest run, a drift; lower `nf` or record longer."
+        warnings = [
+            f"{name}: {text}"
+            for name, bound, fit in zip(names, map(largest_radius, inputs), found, strict=True)
+            if pole_radius(fit.f) > bound - 1e-3 * (1.0 - bound)
+        ]
         findings = {
             **functions,
             "delay_criterion": "output_error",
             "delay_curve": curves,
             "parameter_std": [np.sqrt(np.diag(fit.covariance)).tolist() for fit in found],
             "least_squares_beside": beside,
-            **_warnings(names, inputs, found),
+            **({"warnings": warnings} if warnings else {}),
             **intervals,
         }
         progress(1.0, "done")
@@ -321,7 +327,7 @@ class OutputError:
         a, b = [fit.f for fit in found], [fit.b for fit in found]
         source = int(self.source == "positions")
         if self.nf == 1 and not scaled.has_offset:
-            arrays = axis_arrays(scaled, drive, np.array(a), np.array(b), delays)
+            arrays = axis_arrays(scaled.directions.redefinition, drive, np.array(a), np.array(b), delays)
             return {**arrays, "source": np.array([float(source)])}, {}
         common = min(delays)
         late = [np.concatenate([np.zeros(d - common), part]) for d, part in zip(delays, b, strict=True)]
@@ -435,14 +441,3 @@ def _least_squares_findings(
         "static_gain": float(theta[na:].sum() / (1.0 + theta[:na].sum())),
         "free_run_fit": fit if np.isfinite(fit) else None,
     }
-
-
-def _warnings(
-    names: tuple[str, ...], runs: list[list[tuple[Vector, Vector]]], found: list[OutputErrorFit]
-) -> dict[str, list[str]]:
-    warnings = [
-        f"{name}: its slowest pole is at the bound of a third of the longest run, a drift; lower `nf` or record longer."
-        for name, axis, fit in zip(names, runs, found, strict=True)
-        if pole_radius(fit.f) > largest_radius(axis) - 1e-3 * (1.0 - largest_radius(axis))
-    ]
-    return {"warnings": warnings} if warnings else {}

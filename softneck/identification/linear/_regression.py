@@ -57,14 +57,14 @@ def linear_in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Ma
 
 
 def axis_arrays(
-    scaled: ScaledData, drive: DriveModel, a: Matrix, b: Matrix, delays: Sequence[int]
+    redefinition: Matrix, drive: DriveModel, a: Matrix, b: Matrix, delays: Sequence[int]
 ) -> dict[str, Matrix]:
     """Return the runtime's arrays of transfer functions over redefined inputs; a (outputs, na), b (outputs, nb)."""
     history = max(a.shape[1], max(delays) + b.shape[1], drive.delay.max())
     return {
         "history": history_array(int(history), len(a)),
         "drive": drive.array,
-        "redefinition": scaled.directions.redefinition,
+        "redefinition": redefinition,
         "a": a,
         "b": b,
         "delay": np.array(delays, dtype=np.float64),

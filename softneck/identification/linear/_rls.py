@@ -25,7 +25,7 @@ from softneck.core import (
 from softneck.runtime import load_functions
 from softneck.signals import TENDON_ANGLES, Recording, redefinition_matrix
 
-from ..models._drive import fit_drive
+from ..models._drive import DriveModel, fit_drive
 from ..models._fitting import ScaledData, delay_samples, free_run_fit, training_recording
 from ..models._linear_systems import lss_arrays, varx_system
 from ..models._model import WARM_UP, Model
@@ -287,7 +287,7 @@ class Rls:
                 for theta, weights in zip(thetas, directions.weights, strict=True)
             ]
             return motor_arrays(replace(self, structure="miso"), spread, delays, drive.array), found
-        return axis_arrays(scaled, drive, a, b, delays), found
+        return axis_arrays(directions.redefinition, drive, a, b, delays), found
 
     def _search(
         self, sample_time: float, runs: list[tuple[Matrix, Matrix]], name: str
@@ -454,19 +454,12 @@ class OnlineRls:
     def model(self, state: OnlineState) -> Model:
         """Return the present model, as `Rls.fit` does; its drives follow their set-points."""
         thetas = [recursion.theta for recursion in state.recursions]
-        drive = np.zeros((3, 2))
-        s = self.settings
+        drive, s, delays = DriveModel(np.zeros(3), np.zeros(3)), self.settings, [self.delay, self.delay]
         if s.structure == "siso":
-            arrays = {
-                "history": np.array([float(max(s.na, self.delay + s.nb))]),
-                "drive": drive,
-                "redefinition": redefinition_matrix(TENDON_ANGLES),
-                "a": np.array([theta[: s.na] for theta in thetas]),
-                "b": np.array([theta[s.na :] for theta in thetas]),
-                "delay": np.full(2, float(self.delay)),
-            }
+            a, b = np.split(np.array(thetas), [s.na], axis=1)
+            arrays = axis_arrays(redefinition_matrix(TENDON_ANGLES), drive, a, b, delays)
         else:
-            arrays = motor_arrays(s, thetas, [self.delay, self.delay], drive)
+            arrays = motor_arrays(s, thetas, delays, drive.array)
         stds = [recursion.parameter_std.tolist() for recursion in state.recursions]
         return Model(
             kind="rls",

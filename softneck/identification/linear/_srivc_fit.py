@@ -132,24 +132,19 @@ class SrivcFitOptions:
         """Halve the step until the cost falls; return the fit and its next step, or None."""
         size = 1.0
         for _ in range(12):
-            model = self._add_step(fit.model, size * moves[0], slowest)
-            if model is not None:
+            step, n = size * moves[0], self.order
+            a, b = fit.model.a + step[:n], fit.model.b + step[n : n + fit.model.b.size]
+            poles = np.roots(np.concatenate([[1.0], a]))
+            if poles.real.max() <= -slowest and np.abs(poles).max() <= self.fastest:
+                L = fit.model.delay
+                L = float(np.clip(L + step[-1], 0.0, self.max_delay)) if self.free_delay else L
+                model = Continuous(a=a, b=b, delay=L)
                 starts = [s + size * move for s, move in zip(fit.starts, moves[1], strict=True)]
                 new = self._step(runs, model, starts)
                 if new[0].cost < fit.cost:
                     return new
             size *= 0.5
         return None
-
-    def _add_step(self, model: Continuous, step: Vector, slowest: float) -> Continuous | None:
-        """Add a step of (a, b, L) to a model; None where a pole leaves its bounds."""
-        n = self.order
-        a, b = model.a + step[:n], model.b + step[n : n + model.b.size]
-        poles = np.roots(np.concatenate([[1.0], a]))
-        if poles.real.max() > -slowest or np.abs(poles).max() > self.fastest:
-            return None
-        delay = float(np.clip(model.delay + step[-1], 0.0, self.max_delay)) if self.free_delay else model.delay
-        return Continuous(a=a, b=b, delay=delay)
 
     def _step(
         self, runs: Runs, model: Continuous, starts: Sequence[Vector]

@@ -189,17 +189,13 @@ def _check_numbers(kind: str, arrays: Mapping[str, Matrix], runtime: str) -> Non
     sizes = layout_of(runtime, Arrays).lengths(arrays)
     if "drive" in arrays:
         within(arrays["drive"][:, 1], 0, sizes["H"], "a drive's delay")
-    _check_validity(arrays, sizes)
-    if KINDS[kind].check:
-        resolve(KINDS[kind].check)(arrays, sizes)
-
-
-def _check_validity(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:
     ground, doubt, n = arrays["ground"], arrays["doubt"], 2 * sizes["motors"]
     if ground.shape not in ((0, 1 + n), (n, 1 + n)):
         raise FileFormatError(f"its array `ground` has shape {ground.shape}; ({n}, {1 + n}) is needed, or no rows.")
     if len(doubt) != sizes["outputs"] or (doubt < 0.0).any() or (ground.size and not (doubt[:, 0] > 0.0).all()):
         raise FileFormatError("its array `doubt` must hold three variances of each output, the first positive.")
+    if KINDS[kind].check:
+        resolve(KINDS[kind].check)(arrays, sizes)
 
 
 def check_table(table: Matrix, sizes: Mapping[str, int]) -> None:
@@ -242,38 +238,29 @@ def _motor_port(robot: Robot, name: str, description: str, *, missing: bool = Fa
 
 def parameter_ports(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Port, ...]:
     """Return the parameters: start values, `use_measurement`, noise, and the payload where the model depends on it."""
-    known = payloads(arrays)
-    names, largest = robot.outputs.names, 0.5 if to_si(robot.outputs.unit)[1] == "rad" else None
-    return (
-        *(_output_port(robot, f"{name}_start", f"{name.capitalize()} at the start") for name in names),
-        Port(
-            name="use_measurement",
-            description="false: free run (paper, Fig. 3b); true: from measured angles and motors (Fig. 3a)",
-            boolean=True,
-            minimum=0.0,
-            maximum=1.0,
-        ),
-        Port(
-            name="noise_std",
-            unit=to_si(robot.outputs.unit)[1],
-            description=f"Standard deviation of the noise on {' and '.join(names)}",
-            minimum=0.0,
-            maximum=largest,
-        ),
+    known, names, unit = payloads(arrays), robot.outputs.names, to_si(robot.outputs.unit)[1]
+    measured = "false: free run (paper, Fig. 3b); true: from measured angles and motors (Fig. 3a)"
+    noise = f"Standard deviation of the noise on {' and '.join(names)}"
+    ports = [_output_port(robot, f"{name}_start", f"{name.capitalize()} at the start") for name in names]
+    ports += [
+        Port(name="use_measurement", description=measured, boolean=True, minimum=0.0, maximum=1.0),
+        Port(name="noise_std", unit=unit, description=noise, minimum=0.0, maximum=0.5 if unit == "rad" else None),
         Port(name="noise_seed", description="Seed of that noise", minimum=0.0, maximum=2147483647.0, integer=True),
-        *(() if known is None else (_payload_port(*known),)),
-    )
+    ]
+    if known is not None:
+        text = "What hangs on the platform; the recordings had {:g} to {:g} kg, beyond which validity is 0".format(
+            *known
+        )
+        ports.append(
+            Port(name="payload", unit="kg", description=text, start=known[0], minimum=0.0, maximum=MOST_PAYLOAD)
+        )
+    return tuple(ports)
 
 
 def payloads(arrays: Mapping[str, np.ndarray]) -> tuple[float, float] | None:
     """Return the smallest and largest payload [kg] of a model's recordings; None for a single payload."""
     found = [array for name, array in arrays.items() if name.rpartition(".")[2] == "payload"]
     return (float(found[0][0]), float(found[0][1])) if found else None
-
-
-def _payload_port(least: float, most: float) -> Port:
-    text = f"What hangs on the platform; the recordings had {least:g} to {most:g} kg, beyond which validity is 0"
-    return Port(name="payload", unit="kg", description=text, start=least, minimum=0.0, maximum=MOST_PAYLOAD)
 
 
 def trained_set_points(*sources: Recording | Mapping[str, Any]) -> dict[str, Any]:
@@ -297,20 +284,16 @@ def input_ports(findings: Mapping[str, Any], robot: Robot) -> tuple[Port, ...]:
     pulls = f" ({robot.motors.unit} in the robot's files)"
     if robot.tendon_angles is not None:
         pulls = "; positive: the winch pulls"
-    return (
-        *(
-            replace(_motor_port(robot, name, f"Set-point of motor {j}{pulls}"), minimum=float(a), maximum=float(b))
-            for j, (name, a, b) in enumerate(zip(robot.set_points, low, high, strict=True), start=1)
-        ),
-        *(
-            _output_port(robot, f"{name}_measured", f"Measured {name}; for use_measurement", missing=True)
-            for name in robot.outputs.names
-        ),
-        *(
-            _motor_port(robot, name, f"Measured position of motor {j}; for use_measurement", missing=True)
-            for j, name in enumerate(robot.measured_positions, start=1)
-        ),
-    )
+    ports = [
+        replace(_motor_port(robot, name, f"Set-point of motor {j}{pulls}"), minimum=float(a), maximum=float(b))
+        for j, (name, a, b) in enumerate(zip(robot.set_points, low, high, strict=True), start=1)
+    ]
+    for name in robot.outputs.names:
+        ports.append(_output_port(robot, f"{name}_measured", f"Measured {name}; for use_measurement", missing=True))
+    for j, name in enumerate(robot.measured_positions, start=1):
+        text = f"Measured position of motor {j}; for use_measurement"
+        ports.append(_motor_port(robot, name, text, missing=True))
+    return tuple(ports)
 
 
 def _set_point_range(findings: Mapping[str, Any], motors: int) -> tuple[list[float], list[float]]:
@@ -324,29 +307,16 @@ BOUNDED = ("nlsm",)
 
 def output_ports(kind: str, robot: Robot) -> tuple[Port, ...]:
     """Return the outputs of a kind: outputs, motors, the bounds of set membership, and `validity` last."""
-    names = robot.outputs.names
-    tendons = robot.tendon_angles is not None
-    bounds = tuple(
-        _output_port(robot, f"{name}_{side}", f"{side.capitalize()} bound of {name} by set membership (Eq. 19, 20)")
-        for name in names
-        for side in ("lower", "upper")
-    )
-    return (
-        *(
-            _output_port(
-                robot, name, f"{name.capitalize()} of the platform" if tendons else f"Output `{name}` of {robot.name}"
-            )
-            for name in names
-        ),
-        *(
-            _motor_port(robot, name, f"Position of motor {j} by the drive model")
-            for j, name in enumerate(robot.motor_positions, start=1)
-        ),
-        *(bounds if kind in BOUNDED else ()),
-        Port(
-            name="validity",
-            description="Predicted probability that the error stays within the model's tolerance; 0: not known",
-            minimum=0.0,
-            maximum=1.0,
-        ),
-    )
+    names, tendons = robot.outputs.names, robot.tendon_angles is not None
+    texts = [
+        f"{name.capitalize()} of the platform" if tendons else f"Output `{name}` of {robot.name}" for name in names
+    ]
+    ports = [_output_port(robot, name, text) for name, text in zip(names, texts, strict=True)]
+    for j, name in enumerate(robot.motor_positions, start=1):
+        ports.append(_motor_port(robot, name, f"Position of motor {j} by the drive model"))
+    for name in names if kind in BOUNDED else ():
+        for side in ("lower", "upper"):
+            text = f"{side.capitalize()} bound of {name} by set membership (Eq. 19, 20)"
+            ports.append(_output_port(robot, f"{name}_{side}", text))
+    text = "Predicted probability that the error stays within the model's tolerance; 0: not known"
+    return (*ports, Port(name="validity", description=text, minimum=0.0, maximum=1.0))

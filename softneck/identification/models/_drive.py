@@ -54,9 +54,12 @@ def fit_drive(recording: Recording) -> DriveModel:
 def _fit_motor(recording: Recording, motor: int) -> tuple[float, int]:
     """Return pole and delay [samples] with the smallest simulation error."""
     runs = [(run.set_points[:, motor], run.motor_positions[:, motor]) for run in recording.runs()]
+    # The first measured position, or the first set-point where none was measured.
+    firsts = [float(m[np.argmax(np.isfinite(m))] if np.isfinite(m).any() else u[0]) for u, m in runs]
 
     def squared_error(a: float, d: int) -> float:
-        return sum(float(np.nansum((_simulate(u, _first(m, u), a, d) - m) ** 2)) for u, m in runs)
+        errors = [_simulate(u, m0, a, d) - m for (u, m), m0 in zip(runs, firsts, strict=True)]
+        return sum(float(np.nansum(e**2)) for e in errors)
 
     candidates = [(_fit_pole(runs, d), d) for d in range(1, _MAX_DELAY_SAMPLES + 1)]
     return min(candidates, key=lambda fit: squared_error(*fit))
@@ -74,12 +77,6 @@ def _fit_pole(runs: list[tuple[Vector, Vector]], d: int) -> float:
         above += float(ahead[there] @ now[there])
         below += float(now[there] @ now[there])
     return float(np.clip(above / below, 0.0, 0.999)) if below > 0 else 0.0
-
-
-def _first(m: Vector, u: Vector) -> float:
-    """Return the first measured position; the first set-point where none was measured."""
-    there = np.isfinite(m)
-    return float(m[np.argmax(there)]) if there.any() else float(u[0])
 
 
 def _simulate(u: Vector, start: float, a: float, d: int) -> Vector:

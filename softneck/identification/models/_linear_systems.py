@@ -266,11 +266,8 @@ _REST_TOLERANCE = 1e-12
 class Jacobian(NamedTuple):
     """Derivatives of one step: `dx(k+1) = A dx(k) + B du(k)`, `dy(k+1) = C dx(k) + D du(k)`.
 
-    Attributes:
-        A: (n, n), in the order of the state's `values`.
-        B: (n, motors), from the motors' set-points.
-        C: (n_out, n), to the outputs of the step, in the order of the block's.
-        D: (n_out, motors).
+    States x are in the order of the state's `values`, inputs u are the set-points (motors,), and outputs y (n_out,)
+    are in the order of the block's.
     """
 
     A: Matrix

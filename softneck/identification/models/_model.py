@@ -380,7 +380,16 @@ class Model(ReprMixin):
             robot=Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck"),
         )
         check_arrays(model.kind, model.arrays)
-        _check_header(model)
+        if not 0.0 < model.sample_time < _MAX_SAMPLE_TIME_CONSTANTS * (model.robot.time_constant_s or np.inf):
+            raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for {model.robot.name}.")
+        if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
+            raise FileFormatError("its settings and findings must be tables.")
+        try:
+            input_ports(model.findings, model.robot)
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError("its range of set-points must be a minimum and a maximum for each motor.") from error
+        if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
+            raise FileFormatError("its training rows are not hashes.")
         return model
 
     @property
@@ -400,19 +409,6 @@ class Model(ReprMixin):
             )
         if len(recording) < 2:
             raise DataError(f"a run needs at least 2 rows; got {len(recording)}.")
-
-
-def _check_header(model: Model) -> None:
-    if not 0.0 < model.sample_time < _MAX_SAMPLE_TIME_CONSTANTS * (model.robot.time_constant_s or np.inf):
-        raise FileFormatError(f"a sample time of {model.sample_time} s is implausible for {model.robot.name}.")
-    if not isinstance(model.settings, dict) or not isinstance(model.findings, dict):
-        raise FileFormatError("its settings and findings must be tables.")
-    try:
-        input_ports(model.findings, model.robot)
-    except (KeyError, TypeError, ValueError) as error:
-        raise FileFormatError("its range of set-points must be a minimum and a maximum for each motor.") from error
-    if model.training_rows.dtype != np.uint64 or model.training_rows.ndim != 1:
-        raise FileFormatError("its training rows are not hashes.")
 
 
 def load_model(path: str | Path) -> Model:

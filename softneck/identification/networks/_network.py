@@ -50,12 +50,9 @@ INTERRUPTED = "training was interrupted; this is the best network until then"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """Training and hold-out data of all networks of one fit.
+    """Training and hold-out (`judge`) data of all networks of one fit.
 
     Attributes:
-        train, judge: the training recording and the hold-out.
-        drive: simulates the motors.
-        table: the regressor.
         hints: test motions with the outputs of the linear model; None for none.
         prior: weight of their errors.
         has_time_constant: whether the robot file gives it.

@@ -190,23 +190,25 @@ class AxisData:
 
     def one_step_errors(self, layers: Layers) -> list[Vector]:
         """Return the scaled one-step errors of each run; NaN where a sample was missed."""
+        return np.split(self.target - self._predict(layers), np.flatnonzero(self.first)[1:])
+
+    def _predict(self, layers: Layers) -> Vector:
+        """Return the one-step predictions (time,); NaN where a regressor was missed."""
         known = np.isfinite(self.measured).all(axis=1)
-        errors = np.full(known.size, np.nan)
-        errors[known] = self.target[known] - layers.output(self.measured[known])
-        return np.split(errors, np.flatnonzero(self.first)[1:])
+        one = np.full(known.size, np.nan)
+        one[known] = layers.output(self.measured[known])
+        return one
 
     def fits(self, layers: Layers) -> tuple[float, float]:
         """Return the fits [%] of one step and of the simulation, without the first rows of each run."""
         since = self._since
         y = np.where(since >= _UNSCORED_ROWS, self.target, np.nan)
-        known = np.isfinite(self.measured).all(axis=1)
-        one = np.full(y.size, np.nan)
-        one[known] = layers.output(self.measured[known])
+        one = self._predict(layers)
         starts = self._past(since < _UNSCORED_ROWS - 1 + self.lags[:, None])
         free = np.empty(y.size)
         sizes = (layers.vector(), layers.b1.size, layers.b2.size)
         load_functions(FUNCTIONS).nn_free(*sizes, self.simulated, self.lags, starts, self.shift, self.gain, free)
-        return nrmse_fit(np.where(known, y, np.nan), np.nan_to_num(one)), nrmse_fit(y, free)
+        return nrmse_fit(np.where(np.isfinite(one), y, np.nan), np.nan_to_num(one)), nrmse_fit(y, free)
 
 
 def axis_data(
