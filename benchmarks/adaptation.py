@@ -102,7 +102,7 @@ def choose(necks: list[str], kinds: list[str]) -> None:
 def line(head: str, model: Model, oracle: Model | None, shown: list[tuple[Recording, list[Recording]]]) -> None:
     """Print one row of a table: of each window what it is judged on."""
     begun = time.process_time()
-    adapted = [model.adapted(window) for window, _ in shown]
+    adapted = [model.adapt(window) for window, _ in shown]
     took = (time.process_time() - begun) / len(shown)
     kept = [new.findings["adaptation"]["why"] for new in adapted if not new.findings["adaptation"]["adapted"]]
     before = [(model, run) for _, runs in shown for run in runs]

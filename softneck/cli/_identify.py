@@ -157,7 +157,7 @@ def adapt(
         raise SettingsError(f"{model}: is of kind {old.kind}, not {kind}; a refitted model keeps its kind.")
     window = float(apply_settings(_Adaptation, settings).window)
     require_positive("window", window, "s")
-    new = old.adapted(signals.open_recording(recordings, robot), window=window)
+    new = old.adapt(signals.open_recording(recordings, robot), window=window)
     new.save(path, force=replace)
     said = new.findings["adaptation"]
     if as_json:

@@ -37,7 +37,7 @@ def test_the_model_that_is_written_is_that_of_python(call: Call, folder: Path) -
     told = json.loads(said.out)
     assert told["adapted"]
     assert told["fit_after"][0] >= told["fit_before"][0]
-    expected = load_model(folder / "oe.npz").adapted(read_recording(folder / "today.csv"))
+    expected = load_model(folder / "oe.npz").adapt(read_recording(folder / "today.csv"))
     for name, array in load_model("new.npz").arrays.items():
         np.testing.assert_array_equal(array, expected.arrays[name])
 

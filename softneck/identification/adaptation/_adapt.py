@@ -378,8 +378,8 @@ def _scaled(seconds: float, model: Model) -> float:
     return seconds * ((time_constant_of(model) or NECK_SECONDS) / NECK_SECONDS)
 
 
-def adapted(model: Model, recording: Recording, window: float | None) -> Model:
-    """Return `model.adapted(recording, window=window)`."""
+def adapt_model(model: Model, recording: Recording, window: float | None) -> Model:
+    """Return `model.adapt(recording, window=window)`."""
     return Adaptation(window=window).of(model, recording)
 
 

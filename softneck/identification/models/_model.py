@@ -259,7 +259,7 @@ class Model(ReprMixin):
     def _label(self, recording: Recording, parts: Sequence[Matrix]) -> Labelled:
         return Labelled(np.concatenate(parts), recording.time, {port.name: port.unit for port in self.block().outputs})
 
-    def adapted(self, recording: Recording, *, window: float | None = None) -> Model:
+    def adapt(self, recording: Recording, *, window: float | None = None) -> Model:
         """Refit the model to the latest data, regularized towards its present parameters.
 
         Every third block of ten time constants is held out. Where an output is worse there, this model is kept.
@@ -272,7 +272,7 @@ class Model(ReprMixin):
             SettingsError: a kind that cannot adapt.
         """
         # Resolved by name, as `adaptation` imports this module.
-        return resolve("softneck.identification.adaptation._adapt:adapted")(self, recording, window)
+        return resolve("softneck.identification.adaptation._adapt:adapt_model")(self, recording, window)
 
     def tf(
         self,

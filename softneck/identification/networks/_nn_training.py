@@ -87,10 +87,10 @@ def levenberg(
     w, damping = start, 1e-2
     error, J = errors(w, True)
 
-    def penalized(e: Vector, w: Vector) -> float:
+    def total_cost(e: Vector, w: Vector) -> float:
         return float(e @ e + decay * (w @ w))
 
-    cost = penalized(error, w)
+    cost = total_cost(error, w)
     if not np.isfinite(cost):
         raise DataError("the network's first error is not finite; look for wild values in the recording.")
     if not on_step(w, cost):
@@ -103,7 +103,7 @@ def levenberg(
         # A cost that is not finite also shortens the step.
         while not trial_cost < cost and damping < _MAX_DAMPING:
             trial = w + _solve_damped(A, g, decay + damping)
-            trial_cost = penalized(errors(trial, False)[0], trial)
+            trial_cost = total_cost(errors(trial, False)[0], trial)
             damping *= _SHRINK if trial_cost < cost else _GROW
         if not trial_cost < cost:
             break

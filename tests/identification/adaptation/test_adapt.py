@@ -77,7 +77,7 @@ def same_arrays(one: Model, other: Model) -> bool:
 def test_an_adapted_model_follows_the_neck_it_saw_and_is_better_on_a_run_it_did_not(
     old: Trained, window: Recording, kind: str, tmp_path
 ) -> None:
-    new = old[kind].adapted(window)
+    new = old[kind].adapt(window)
     said = new.findings["adaptation"]
     assert said["adapted"]
     assert all(after >= before for before, after in zip(said["fit_before"], said["fit_after"], strict=True))
@@ -90,9 +90,9 @@ def test_an_adapted_model_follows_the_neck_it_saw_and_is_better_on_a_run_it_did_
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_thirty_seconds_take_less_than_two_of_processor_time(old: Trained, window: Recording, kind: str) -> None:
-    old[kind].adapted(window)  # compiles
+    old[kind].adapt(window)  # compiles
     begun = time.process_time()
-    old[kind].adapted(window)
+    old[kind].adapt(window)
     assert time.process_time() - begun < 2.0
 
 
@@ -103,7 +103,7 @@ def test_a_neck_that_stands_still_changes_nothing_but_what_is_said(old: Trained,
     still = held.with_channels(
         **dict.fromkeys(held.robot.set_points, U), pitch=np.full(len(held), 0.2), roll=np.full(len(held), 0.1)
     )
-    new = old[kind].adapted(still)
+    new = old[kind].adapt(still)
     assert same_arrays(new, old[kind])
     assert new.training_rows.tobytes() == old[kind].training_rows.tobytes()
     assert "hardly moves" in new.findings["adaptation"]["why"]
@@ -120,7 +120,7 @@ def test_where_nothing_is_better_on_the_rows_held_out_the_old_model_is_kept(old:
         blocks = np.arange(len(run)) // 100
         values[blocks % 3 != 2] *= 1.2
         perfect = perfect.with_channels(**{name: values})
-    new = exact.adapted(perfect)
+    new = exact.adapt(perfect)
     assert same_arrays(new, exact)
     assert new.findings["adaptation"]["why"] == "no adapted model is better on the rows held out"
 
@@ -131,7 +131,7 @@ def test_one_output_does_not_pay_for_another(old: Trained) -> None:
     told = old["oe"].simulate(run)
     known = np.arange(len(run)) // 100 % 3 != 2
     seen = run.with_channels(pitch=1.2 * told[:, 0], roll=np.where(known, 1.02, 1.0) * told[:, 1])
-    new = old["oe"].adapted(seen)
+    new = old["oe"].adapt(seen)
     assert new.findings["adaptation"]["why"] == "no adapted model is better on the rows held out"
     assert same_arrays(new, old["oe"])
 
@@ -142,7 +142,7 @@ def test_missing_stretches_are_not_learnt_from(old: Trained, window: Recording) 
         values[300:450] = np.nan
         values[:10] = np.nan
     spoilt = window.with_channels(**holes)
-    new = old["play"].adapted(spoilt)
+    new = old["play"].adapt(spoilt)
     assert new.findings["adaptation"]["adapted"]
     assert all(np.isfinite(array).all() for array in new.arrays.values())
     # What stood in the holes does not matter: only what was measured is looked at.
@@ -155,7 +155,7 @@ def test_a_window_without_a_run_measured_keeps_the_model_and_says_so(
 ) -> None:
     nothing = np.full(len(window), np.nan)
     unseen = window if seconds else window.with_channels(pitch=nothing, roll=nothing)
-    new = old["oe"].adapted(unseen, window=seconds or 30.0)
+    new = old["oe"].adapt(unseen, window=seconds or 30.0)
     assert same_arrays(new, old["oe"])
     assert "no run of the window goes on for more than 0.52 s" in new.findings["adaptation"]["why"]
 
@@ -163,7 +163,7 @@ def test_a_window_without_a_run_measured_keeps_the_model_and_says_so(
 def test_an_output_that_is_not_measured_cannot_be_judged(old: Trained, window: Recording) -> None:
     pitch = window.channels["pitch"].copy()
     pitch[30:] = np.nan
-    new = old["oe"].adapted(window.with_channels(pitch=pitch))
+    new = old["oe"].adapt(window.with_channels(pitch=pitch))
     assert same_arrays(new, old["oe"])
     assert "an output was measured in too few" in new.findings["adaptation"]["why"]
 
@@ -172,8 +172,8 @@ def test_only_the_latest_seconds_count(old: Trained, window: Recording) -> None:
     early = {name: window.channels[name].copy() for name in ("pitch", "roll")}
     for values in early.values():
         values[:500] = 0.4
-    changed = old["play"].adapted(window.with_channels(**early), window=20.0)
-    assert same_arrays(changed, old["play"].adapted(window, window=20.0))
+    changed = old["play"].adapt(window.with_channels(**early), window=20.0)
+    assert same_arrays(changed, old["play"].adapt(window, window=20.0))
 
 
 @pytest.mark.slow
@@ -182,7 +182,7 @@ def test_payload_and_a_biased_sensor_at_once(old: Trained, window: Recording) ->
     judged = loaded("rotation", 1.0, 8)
     judged = judged.with_channels(pitch=judged.channels["pitch"] + np.radians(2.0))
     for kind in ("play", "greybox"):
-        new = old[kind].adapted(both)
+        new = old[kind].adapt(both)
         assert new.findings["adaptation"]["adapted"]
         assert fits(new, judged)[0] > fits(old[kind], judged)[0] + 1.0
 
@@ -228,19 +228,19 @@ def test_a_weak_prior_ends_where_the_estimator_does(window: Recording, old: Trai
 
 
 def test_an_adapted_model_knows_its_rows_and_doubts_itself_no_less(old: Trained, window: Recording) -> None:
-    new = old["play"].adapted(window)
+    new = old["play"].adapt(window)
     assert new.training_rows.size == old["play"].training_rows.size + len(window)
     assert (new.arrays["doubt"][:, 0] >= old["play"].arrays["doubt"][:, 0]).all()
 
 
 def test_a_kind_that_cannot_adapt_says_so(empty: Recording, window: Recording) -> None:
     with pytest.raises(SettingsError, match="kind `rls` cannot adapt; oe, play, nn, greybox can"):
-        Rls().fit(empty).adapted(window)
+        Rls().fit(empty).adapt(window)
 
 
 def test_another_sample_time_is_refused(old: Trained, window: Recording) -> None:
     slow = Recording(2.0 * window.time, 2.0 * window.sample_time, window.channels)
     with pytest.raises(DataError, match="resample"):
-        old["oe"].adapted(slow)
+        old["oe"].adapt(slow)
     with pytest.raises(SettingsError, match="window"):
-        old["oe"].adapted(window, window=0.0)
+        old["oe"].adapt(window, window=0.0)
