@@ -212,12 +212,7 @@ def _best_kind(
 
 
 def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: int, progress: Progress) -> Choice:
-    """Compare all kinds by `auto`; the last of several recordings, called `name`, is held out as a whole.
-
-    Raises:
-        SettingsError: nothing would be held out.
-        DataError: the robot stands still in the rows held out, or no kind could be identified.
-    """
+    """Compare all kinds by `auto`; the last of several recordings, called `name`, is held out as a whole."""
     head, tail, other = _split_for_choice(parts, train)
     check_training(head)
     still = why_at_rest(tail, concatenate(parts))

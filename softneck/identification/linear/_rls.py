@@ -86,13 +86,7 @@ class RecursionState(ReprMixin):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RecursionHistory:
-    """Errors and parameters of a recursion over time.
-
-    Attributes:
-        error: (rows,) epsilon(t+1) of Eq. 30, before the update.
-        theta: (rows, n) parameters after it.
-        covariance: (rows, n) diagonal of F after it.
-    """
+    """Error (rows,) of Eq. 30 before each update, and parameters and diagonal of F (rows, n) after it."""
 
     error: Vector
     theta: Matrix
@@ -153,7 +147,15 @@ class Recursion:
         self, state: RecursionState, regressors: Matrix, targets: Vector, *, keep: bool = False
     ) -> tuple[RecursionState, RecursionHistory]:
         """Update by regressors (rows, n) and targets (rows,); return the state and, with `keep`, the history."""
-        Phi, y = self._rows(regressors, targets)
+        Phi = np.ascontiguousarray(regressors, dtype=np.float64)
+        y = np.ascontiguousarray(targets, dtype=np.float64)
+        if Phi.ndim != 2 or Phi.shape[1] != self.parameters or y.shape != (len(Phi),):
+            raise DataError(
+                f"`regressors` must be (rows, {self.parameters}) and `targets` (rows,); got {Phi.shape} and {y.shape}."
+            )
+        there = np.isfinite(Phi).all(axis=1) & np.isfinite(y)
+        if not there.all():
+            Phi, y = np.ascontiguousarray(Phi[there]), y[there]
         after = RecursionState(
             theta=state.theta.copy(), factor=state.factor.copy(), scale=state.scale.copy(), tally=state.tally.copy()
         )
@@ -166,16 +168,6 @@ class Recursion:
         if not np.isfinite(after.theta).all():
             raise DataError("the recursion is no longer finite; scale the regressors to the order of one.")
         return after, RecursionHistory(error=history[:, 0], theta=history[:, 1 : 1 + n], covariance=history[:, 1 + n :])
-
-    def _rows(self, regressors: Matrix, targets: Vector) -> tuple[Matrix, Vector]:
-        Phi = np.ascontiguousarray(regressors, dtype=np.float64)
-        y = np.ascontiguousarray(targets, dtype=np.float64)
-        if Phi.ndim != 2 or Phi.shape[1] != self.parameters or y.shape != (len(Phi),):
-            raise DataError(
-                f"`regressors` must be (rows, {self.parameters}) and `targets` (rows,); got {Phi.shape} and {y.shape}."
-            )
-        there = np.isfinite(Phi).all(axis=1) & np.isfinite(y)
-        return (Phi, y) if there.all() else (np.ascontiguousarray(Phi[there]), y[there])
 
 
 def require_forgetting(value: float) -> None:

@@ -205,7 +205,8 @@ def payload_of(run: Recording) -> float:
     return low
 
 
-Convert = Callable[[Mapping[str, Matrix], Scaling], dict[str, Matrix]]
+NamedArrays = Mapping[str, Matrix]
+Convert = Callable[[NamedArrays, Scaling], dict[str, Matrix]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,9 +291,14 @@ class ScaledData:
         return scale_recording(recording, self.scaling)
 
     def model(
-        self, kind: str, settings: DataclassInstance, in_si: Convert, *, arrays: Mapping[str, Matrix],
+        self,
+        kind: str,
+        settings: DataclassInstance,
+        in_si: Convert,
+        *,
+        arrays: NamedArrays,
         findings: Mapping[str, Any],
-    ) -> Model:  # fmt: skip
+    ) -> Model:
         """Build the model in SI from scaled `arrays`, which `in_si` converts, and `findings` in SI."""
         findings = {**findings, **self.findings()}
         arrays = arrays if self.scaling.is_identity else in_si(arrays, self.scaling)

@@ -101,11 +101,7 @@ def shown_system(
 def continuous_function(
     model: Any, output: str, input: str | None, angle_unit: str, pade: int, units: str
 ) -> control.TransferFunction:
-    """Return the continuous-time transfer function that a zero-order hold discretizes to the model's.
-
-    Raises:
-        SettingsError: a pole at zero or on the negative real axis, which no sampled continuous system has.
-    """
+    """Return the continuous-time transfer function that a zero-order hold discretizes to the model's."""
     import control
     from scipy.linalg import logm
 

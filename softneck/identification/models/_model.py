@@ -362,10 +362,8 @@ class Model(ReprMixin):
         write_archive(path, header, {**self.arrays, "training_rows": self.training_rows}, force=force)
 
     def _header(self) -> dict[str, Any]:
-        return {
-            "kind": self.kind, "sample_time": self.sample_time, "arrays": list(self.arrays),
-            "settings": dict(self.settings), "findings": dict(self.findings), **self.robot.in_header(),
-        }  # fmt: skip
+        header = {"kind": self.kind, "sample_time": self.sample_time, "arrays": list(self.arrays)}
+        return {**header, "settings": dict(self.settings), "findings": dict(self.findings), **self.robot.in_header()}
 
     @classmethod
     def from_archive(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Model:
