@@ -23,14 +23,17 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from softneck.core import FileFormatError, Matrix, SettingsError
 
+_PARSE_LOCK = threading.Lock()
 _OPERATORS: dict[type, Callable[[int, int], int]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.FloorDiv: operator.floordiv,
 }  # fmt: skip
@@ -201,7 +204,14 @@ def evaluate(text: str, known: Mapping[str, int]) -> int:
             return _OPERATORS[type(node.op)](term(node.left), term(node.right))
         raise SettingsError(f"the length `{text}` of a layout may only use {', '.join(known) or 'numbers'}.")
 
-    return term(ast.parse(text, mode="eval").body)
+    return term(_parse_length(text))
+
+
+@cache
+def _parse_length(text: str) -> ast.expr:
+    # Python 3.11 raises SystemError where two threads parse at once, as those of set membership do.
+    with _PARSE_LOCK:
+        return ast.parse(text, mode="eval").body
 
 
 def _found(symbol: Symbol, source: Matrix) -> int:

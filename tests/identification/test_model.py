@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
-from softneck.identification import WARM_UP, Model, load_model
+from softneck.identification import WARM_UP, Model, embed_model, embedded_model, load_model
 from softneck.signals import Recording, concatenate
 
 from ..data import TS, neck_recording
@@ -177,8 +177,7 @@ def test_noise_has_its_size_and_leaves_the_state_alone(models: dict[str, Model])
 @pytest.mark.parametrize(
     "seen", [{"min": [0.0] * 3}, {"min": [0.0] * 2, "max": [1.0] * 2}, [0.0], {"min": 0, "max": 1}]
 )
-def test_a_file_with_half_a_range_of_set_points_is_refused(seen: object) -> None:
-    from softneck.identification.models._model import _check_header
-
+def test_a_file_with_half_a_range_of_set_points_is_refused(models: dict[str, Model], seen: object) -> None:
+    header, arrays = embed_model(models["rls"])
     with pytest.raises(FileFormatError, match="a minimum and a maximum for each motor"):
-        _check_header(Model(kind="rls", sample_time=0.02, arrays={}, findings={"set_points_rad": seen}))
+        embedded_model({**header, "findings": {"set_points_rad": seen}}, arrays)
