@@ -37,8 +37,8 @@ def _lines(thing: Any) -> list[str]:
     """Return at most three lines on `thing`: the first of its `summary()`, or its fields."""
     title = type(thing).__name__
     if hasattr(thing, "summary"):
-        said = [_plain(line) for line in f"{title}: {thing.summary()}".splitlines() if line.strip()]
-        return [line if len(line) <= _COLUMNS else line[: _COLUMNS - 3] + "..." for line in said[:_LINES]]
+        lines = [_plain(line) for line in f"{title}: {thing.summary()}".splitlines() if line.strip()]
+        return [line if len(line) <= _COLUMNS else line[: _COLUMNS - 3] + "..." for line in lines[:_LINES]]
     fields = ", ".join(f"{f.name}={_short(getattr(thing, f.name))}" for f in dataclasses.fields(thing) if f.repr)
     return textwrap.wrap(f"{title}({fields})", _COLUMNS, max_lines=_LINES, placeholder=" ...", subsequent_indent="  ")
 

@@ -57,14 +57,14 @@ KINDS: dict[str, Kind] = {
              "NLARX neural network, two hidden layers of 25 (section 6.2)",
              f"{_IDENT}.networks._network:check_nn"),
         Kind("play", "model", "softneck.identification:Play", _MODEL, f"{_IDENT}.structured._play_runtime",
-             "play operators and low-pass filters, ridge on their polynomial; no feedback, strong in free run",
+             "play operators and low-pass filters with a ridge polynomial; no feedback, accurate in simulation",
              f"{_IDENT}.structured._play:check_play"),
         Kind("greybox", "model", "softneck.identification:GreyBox", _MODEL, f"{_IDENT}.structured._greybox_runtime",
-             "equations of a tendon-driven neck, their numbers fitted by the error of its free run",
+             "equations of a tendon-driven neck, with parameters fitted by the simulation error",
              f"{_IDENT}.structured._greybox:check_greybox"),
         Kind("guarded", "model", f"{_IDENT}.uncertainty._guarded:Guarded", _MODEL,
              f"{_IDENT}.uncertainty._guarded_runtime",
-             "several of one learned kind, fading to a base where they part or leave what was seen",
+             "several models of one learned kind, faded to a base model where they disagree or extrapolate",
              f"{_IDENT}.uncertainty._guarded:check_guarded"),
         Kind("family", "family", "softneck.identification:FamilySettings", "softneck.identification:Family", "",
              "uncertain linear plant: nominal, box, samples and a weight over them"),
@@ -73,13 +73,13 @@ KINDS: dict[str, Kind] = {
              "Kalman filter over an identified linear model with a disturbance state"),
         Kind("nonlinear", "observer", "softneck.estimation:KalmanSettings", "softneck.estimation:NonlinearObserver",
              "softneck.estimation._nonlinear_runtime",
-             "filter over an identified nonlinear model with a disturbance that walks as far as the model moves"),
+             "filter over an identified nonlinear model with a random-walk disturbance scaled by the model's motion"),
         Kind("pi", "controller", "softneck.design:PiSettings", "softneck.design:LinearController",
              f"{_DESIGN}.linear._linear_controller_runtime",
              "PI with reference filter, anti-windup and tendon allocation"),
         Kind("adaptive", "controller", "softneck.design:AdaptiveSettings", "softneck.design:VaryingController",
              f"{_DESIGN}.varying._adaptive_runtime",
-             "recursive least squares as the neck moves, gains redesigned in every sample, with safeguards"),
+             "recursive least squares during the run, gains redesigned in every sample, with safeguards"),
         Kind("hinf", "controller", "softneck.design:HinfSettings", "softneck.design:LinearController",
              f"{_DESIGN}.linear._linear_controller_runtime",
              "H-infinity mixed sensitivity on the exact-delay plant, verified on every sample"),
@@ -105,7 +105,7 @@ KINDS: dict[str, Kind] = {
 }  # fmt: skip
 
 
-#: Kinds that went, and what takes their place; docs/theory/tried.md says why each went.
+#: Removed kinds and their replacements; docs/theory/tried.md has the reasons.
 REMOVED: dict[str, str] = {
     "online_nlsm": "nlsm",
     "change": "nonlinear",
@@ -124,7 +124,7 @@ REMOVED: dict[str, str] = {
 _LAST_VERSION = "0.2.0"  # reads files of the kinds above
 
 
-#: Settings that the robot's file says since softneck 0.3, and where.
+#: Settings that moved to the robot's file in softneck 0.3 -> their keys there.
 _OF_ROBOT = {
     "position_limit": "[motors] setpoint_min and setpoint_max",
     "slew_limit": "[motors] rate_limit",
@@ -135,7 +135,7 @@ _OF_ROBOT = {
 
 
 def removed_kind(name: str) -> str:
-    """Return a sentence on a kind that went; empty if `name` is none."""
+    """Return a sentence on a removed kind; empty if `name` is none."""
     if name not in REMOVED:
         return ""
     return (
@@ -171,7 +171,7 @@ def make_settings(settings_class: type, values: Mapping[str, Any]) -> Any:
     unknown = sorted(set(values) - fields)
     if unknown and unknown[0] in _OF_ROBOT:
         raise SettingsError(
-            f"`{unknown[0]}` is the robot's: robot.toml says it, `{_OF_ROBOT[unknown[0]]}`; name the file by --robot "
+            f"`{unknown[0]}` is the robot's: set `{_OF_ROBOT[unknown[0]]}` in robot.toml, and name the file by --robot "
             "(`robot=` in Python)."
         )
     if unknown:

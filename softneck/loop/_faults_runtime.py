@@ -21,7 +21,7 @@ FAULT_SLOW = 4
 def faults_act(k: int, place: int, faults: tuple, bus: np.ndarray) -> None:
     """Copy the signals that the faults of one place change, and apply these faults at row `k`.
 
-    faults: detours (from and to of both places), codes, slots, greatest steps, (rows, slots) what to add, memory.
+    faults: detours (from and to of both places), codes, slots, largest steps, (rows, slots) values to add, memory.
     """
     detours, codes = faults[0], faults[1]
     origins, targets = detours[2 * place], detours[2 * place + 1]

@@ -296,12 +296,12 @@ class AheadReference:
         require_positive("sample_time", sample_time, "s")
         self.reference, self.ahead, self.sample_time = reference, ahead, sample_time
         self.inputs: tuple[Port, ...] = ()
-        whose = Robot.preset() if robot is None else robot
-        unit, self._count = to_si(whose.outputs.unit)[1], len(whose.outputs.names)
+        own = Robot.preset() if robot is None else robot
+        unit, self._count = to_si(own.outputs.unit)[1], len(own.outputs.names)
         self.outputs: tuple[Port, ...] = (
-            *reference_ports(whose),
+            *reference_ports(own),
             *(Port(name=f"{name}_reference_ahead", unit=unit, description=f"wanted {name}, `ahead` from now")
-              for name in whose.outputs.names),
+              for name in own.outputs.names),
         )  # fmt: skip
 
     def start(self, time: float, parameters: Mapping[str, float]) -> Vector:

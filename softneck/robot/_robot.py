@@ -253,7 +253,7 @@ class Robot(ReprMixin):
         """
         own = self.weights() if weights is None else weights
         if own is None:
-            raise SettingsError(f"the directions of {self.label()} are to be identified; a model of it knows them.")
+            raise SettingsError(f"the directions of {self.label()} are to be identified; use a model of it.")
         return redefinition_of(own, self.outputs.names)
 
     def in_header(self) -> dict[str, Any]:

@@ -51,7 +51,7 @@ def test_it_designs_every_kind(kind: str, models: list[str], call: Call) -> None
         (("mpc", "m0.npz", "--observer", "m0.npz"), "m0.npz: is a model (rls), not an observer"),
         (
             ("lqg", "m0.npz", "--set", "sample_time=0.01"),
-            "`sample_time` is the robot's: robot.toml says it, `sample_time_s`",
+            "`sample_time` is the robot's: set `sample_time_s` in robot.toml",
         ),
         (("pi", "m0.npz", "--set", "position_limit=5"), "`[motors] setpoint_min and setpoint_max`"),
         (("hinf", "m0.npz", "--set", "speed=3"), "unknown setting `speed`"),

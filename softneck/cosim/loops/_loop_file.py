@@ -163,8 +163,8 @@ def reference_of(path: str | Path, *, robot: str | None = None) -> ReferenceBloc
     table = read_toml(source)
     try:
         opener = PartOpener(source.parent)
-        whose = opener.robot(table.get("robot") if robot is None else robot, source)
-        reference = opener.reference(table["reference"], robot=whose)
+        own = opener.robot(table.get("robot") if robot is None else robot, source)
+        reference = opener.reference(table["reference"], robot=own)
         if isinstance(reference, AheadReference):
             reference = reference.reference
         if hasattr(reference, "advance"):
@@ -172,7 +172,7 @@ def reference_of(path: str | Path, *, robot: str | None = None) -> ReferenceBloc
         step, duration = (
             number(key, table.get(key, usual)) for key, usual in (("sample_time_s", 0.02), ("duration_s", 0))
         )
-        return ReferenceBlock(reference, sample_time=step, duration=duration or None, robot=whose)  # pyright: ignore[reportArgumentType]
+        return ReferenceBlock(reference, sample_time=step, duration=duration or None, robot=own)  # pyright: ignore[reportArgumentType]
     except SoftneckError as error:
         raise type(error)(f"{source}: {error}") from error
 

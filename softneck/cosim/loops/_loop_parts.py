@@ -228,10 +228,10 @@ class PartOpener:
         """Return a part whose motor ports have the names of `robot`, not numbers or names of its own robot."""
         names = {port.name: robot.own(port.name) for port in (*part.inputs, *part.outputs)}
         if name in self.robots:
-            whose = self.robots[name]
+            own = self.robots[name]
             for what in ("set_points", "motor_positions", "measured_positions"):
-                names |= dict(zip(getattr(whose, what), getattr(robot, what), strict=True))
-        names = {other: own for other, own in names.items() if other != own}
+                names |= dict(zip(getattr(own, what), getattr(robot, what), strict=True))
+        names = {old: new for old, new in names.items() if old != new}
         if names and type(part) is BlockPart:
             block = part.block
             ports = {"inputs": _with_names(block.inputs, names), "outputs": _with_names(block.outputs, names)}
@@ -296,14 +296,14 @@ def _with_names(ports: tuple[Port, ...], names: Mapping[str, str]) -> tuple[Port
     return tuple(replace(port, name=names.get(port.name, port.name)) for port in ports)
 
 
-def _part_of(name: str, made: Any, said: str = " is") -> Part:
+def _part_of(name: str, made: Any, verb: str = " is") -> Part:
     """Return a part from a part, a block, an object with `block()`, or a controller of the user."""
     made = own_controller(made) if name == "controller" else made
     made = made.block() if hasattr(made, "block") and not hasattr(made, "advance") else made
     if isinstance(made, Block):
         return BlockPart(made)
     if not all(hasattr(made, item) for item in ("inputs", "outputs", "sample_time", "start", "advance", "close")):
-        raise SettingsError(f"[{name}]{said} a {type(made).__name__}, not a Block or a Part.")
+        raise SettingsError(f"[{name}]{verb} a {type(made).__name__}, not a Block or a Part.")
     return made
 
 

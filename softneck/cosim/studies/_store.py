@@ -142,8 +142,8 @@ def read_runs(folder: str | Path) -> pd.DataFrame:
     """
     import pandas as pd
 
-    said = read_study_description(Path(folder))["study"]
-    varied = said.get("vary") if isinstance(said, dict) else None
+    study = read_study_description(Path(folder))["study"]
+    varied = study.get("vary") if isinstance(study, dict) else None
     kinds = {}
     for key, item in varied.items() if isinstance(varied, dict) else ():
         labels = item.get("labels") if isinstance(item, dict) else None
