@@ -1,6 +1,6 @@
 """Tuning: search kinds and settings for the controller that meets the requirements.
 
-Requirements, the space of settings, judging by levels, search, results; nothing here reads or writes but its own log.
+It holds requirements, the search space, judging by levels, the search and its results; it writes its own log only.
 May import `verification` and below.
 """
 

@@ -1,4 +1,4 @@
-"""One candidate, judged so far as its rank deserves: linear checks, loops, margins by experiment."""
+"""Judge one candidate: linear checks, loops over simulation models, margins by experiment."""
 
 from __future__ import annotations
 
@@ -43,23 +43,23 @@ from softneck.verification import (
 from ._requirements import TuneRequirements, can_follow_circle
 from ._task import Judgement, Task, has_observer
 
-# The circle is led in over so long [s], then goes round so often, of which the last turn is judged.
+# Time to reach the circle [s], and turns, of which the last is judged.
 _LEAD_IN_S, _TURN_COUNT = 2.0, 2.0
-# A reference is known so much earlier at most [s].
+# Longest preview of a reference [s].
 _MAX_PREVIEW_S = 0.8
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One loop.
+    """One loop over a simulation model.
 
     Attributes:
         plant: number of the plant.
         payload: [kg].
         orientation: of the step [rad].
-        part: of the step's size.
+        part: share of the step's size.
         noise: whether the sensor is noisy.
-        late: whether the plant is later than it says.
+        late: whether the plant has more delay than modelled.
         circle: a circle instead of the step.
     """
 
@@ -73,14 +73,14 @@ class Case:
 
 
 def cases(own: Sequence[SimulationModel], asked: TuneRequirements, robot: Robot) -> tuple[Case, ...]:
-    """Return all loops."""
+    """Return all loops of a search."""
     table, small = asked.certificate.sim, asked.track["small_part"]
     payloads = sorted({float(kg) for kg in table["payloads_kg"]})
     angles = [math.radians(a) for a in table["orientations_deg"]] if len(robot.outputs.names) > 1 else [0.0]
     found = []
     for number, plant in enumerate(own):
         for kg in plant.payloads(payloads):
-            # Those of `verify` have no noise, which crosses 90 % sooner than the angle does.
+            # Loops of `verify` have no noise, with which the rise looks shorter.
             found += [Case(number, kg, angle, noise=noisy) for angle in angles for noisy in (False, True)]
             found += [Case(number, kg, angle, part=small, noise=True) for angle in (angles[0], angles[-1])]
             found.append(Case(number, kg, angles[0], noise=True, late=True))
@@ -92,12 +92,12 @@ def cases(own: Sequence[SimulationModel], asked: TuneRequirements, robot: Robot)
 def run_case(
     case: Case, plant: SimulationModel, block: Block, order: str, task: Task, observer: Block | None = None
 ) -> tuple[dict[str, float], Vector | None]:
-    """Return the metrics of a loop by the names of requirements; of a circle its distance for each lead, as shown."""
+    """Return the metrics of a loop, or of a circle the distance for each lead, in the display unit."""
     loop = loop_of(case, plant, block, order, task, observer)
     if case.circle:
         return {}, _distances(loop, task)
     asked = task.asked.certificate
-    # What is asked of a robot is seen by its sensor: a quiet output overshoots less.
+    # A robot is judged by its sensor, whose noise adds to the overshoot.
     values, result = judge_loop(
         loop, compiled=True, angle="measured" if task.asked.shows_settling(case.part) else "true"
     )
@@ -107,7 +107,7 @@ def run_case(
     if case.noise and case.part < 1.0:
         found[f"track.{name_of('variation_rad_s')}"] = math.inf if result is None else variation(result)
     if case.part < 1.0:
-        # A small step of a neck with friction is judged by where it goes, not by percent of little.
+        # With friction, percentages of a small step mean little.
         found = {name: value for name, value in found.items() if not name.endswith(("overshoot_pct", "settling_s"))}
     return found, None
 
@@ -145,13 +145,13 @@ def loop_of(
 
 
 def _seed(case: Case, task: Task) -> int:
-    """Return that of the noise: another for each plant and direction, the same for every candidate."""
+    """Return the seed of the noise: one for each plant and direction, the same for every candidate."""
     return task.seed + 1000 * case.plant + round(math.degrees(case.orientation))
 
 
 @dataclass(frozen=True, slots=True)
 class _Together:
-    """A reference with a co-contraction that is there from the start."""
+    """A reference with a constant co-contraction."""
 
     reference: Reference
     cocontraction: float
@@ -161,13 +161,13 @@ class _Together:
 
 
 def variation(result: LoopResult) -> float:
-    """Return by how much all set-points move in a second, in the unit of the motors."""
+    """Return the total variation of all set-points per second, in the unit of the motors."""
     P = np.column_stack([result[name] for name in result.robot.set_points]) / to_si(result.robot.motors.unit)[0]
     return float(np.abs(np.diff(P, axis=0)).sum() / result.time[-1])
 
 
 def _distances(loop: Loop, task: Task) -> Vector:
-    """Return the rms distance of the last turn to where the circle was 0, 1, ... samples ago (leads,), as shown."""
+    """Return the rms distance (leads,) of the last turn to the circle 0, 1, ... samples ago, in the display unit."""
     scale = task.asked.certificate.scale
     leads = round(scale.time * _MAX_PREVIEW_S / loop.controller.sample_time)
     try:
@@ -183,9 +183,9 @@ def _distances(loop: Loop, task: Task) -> Vector:
     return scale.shown(np.array([math.sqrt(float((part**2).sum(axis=0).mean())) for part in each]))
 
 
-#: From quick to slow; each includes what those before it found.
+#: Levels of judging, from quick to slow.
 LEVELS = ("linear", "all", "margins")
-# Plants of the boxes on which linear checks are made: nominal, corners, samples; a certificate takes hundreds.
+# Linear plants of a linear check (nominal, corners, samples); a certificate has hundreds.
 _PLANT_COUNT = 48
 # The worse of two values of a metric is the smaller one of these.
 LARGE = LARGE
@@ -193,15 +193,15 @@ LARGE = LARGE
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ready:
-    """What a worker makes once of a task.
+    """Objects that a worker prepares once per task.
 
     Attributes:
         plants: linear ones, without the delay that a loop's order adds.
-        frequency: on which they are judged [rad/s].
+        frequency: grid of the margins [rad/s].
         weights: of the motors in each axis's input.
-        uncertain: what linear designs make of the task's plant, made once.
+        uncertain: plant of the linear designs.
         own: simulation models.
-        all: the loops.
+        all: loops of the level `all`.
         kept: designs by kind and settings.
     """
 
@@ -215,7 +215,7 @@ class Ready:
 
 
 def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: str) -> Judgement:
-    """Return the metrics of the level alone; an error of ours about the candidate is its result."""
+    """Return the metrics of one level, or the error of the candidate."""
     try:
         ready = prepare(task)
         controller = design_candidate(task, ready, kind, settings)
@@ -231,7 +231,7 @@ def judge_candidate(task: Task, kind: str, settings: Mapping[str, Any], level: s
 
 
 def prepare(task: Task) -> Ready:
-    """Return what is made once of a task, in this process."""
+    """Return the prepared objects of a task; each process prepares them once."""
     kept = _cache(task.digest)
     if "ready" not in kept:
         certificate = task.asked.certificate
@@ -253,7 +253,7 @@ def _cache(digest: str) -> dict[str, Ready]:
 
 
 def design_candidate(task: Task, ready: Ready, kind: str, settings: Mapping[str, Any]) -> Any:
-    """Return the controller, or the one that this process has designed before."""
+    """Return the controller of a candidate; each process designs it once."""
     key = json.dumps([kind, dict(settings)], sort_keys=True)
     if key not in ready.kept:
         made = make_settings(resolve(KINDS[kind].settings), settings)
@@ -264,10 +264,7 @@ def design_candidate(task: Task, ready: Ready, kind: str, settings: Mapping[str,
 
 
 def _plant_for(task: Task, ready: Ready, kind: str, made: Any) -> Any:
-    """Return what a kind designs on: all linear plants, or the one that it begins from.
-
-    Of several nonlinear models the first that knows payloads.
-    """
+    """Return the plant that a kind is designed on; `nmpc` prefers a nonlinear model with payloads."""
     if isinstance(made, AxisSettings):
         return ready.uncertain
     if kind == "nmpc":
@@ -275,16 +272,16 @@ def _plant_for(task: Task, ready: Ready, kind: str, made: Any) -> Any:
         return models[0] if models else task.plant
     if kind == "adaptive":
         return next(iter(task.linear.values()))
-    return task.plant  # more of a family is read than its plants
+    return task.plant  # these settings read more of a family than its plants
 
 
 def make_observer(task: Task, kind: str) -> Block | None:
-    """Return the observer that loops of a kind have; None for most kinds."""
+    """Return the observer in the loops of a kind; None for most kinds."""
     return task.observer.block() if task.observer is not None and has_observer(kind) else None
 
 
 def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float]:
-    """Return margins over the boxes and over what the recordings show, and steps on the plants of the boxes."""
+    """Return margins over the boxes and over the recordings, and steps on the plants of the boxes."""
     asked = task.asked.certificate
     judged_one: ControllerUnderTest = controller_under_test(controller, order=None, observer=False)
     plants = ready.plants.later(judged_one.extra)
@@ -298,7 +295,7 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
             if last in (*LARGE, *SMALL) and axis != "mimo":
                 keep_worse(found, f"axes.{last}", value)
         for item in data_margins(task.linear, law, plants.axes, judged_one.extra, steep):
-            # Nothing is certified of a loop that may cross where nobody recorded.
+            # A loop that may cross outside the recorded band has no certified margin.
             values = item.margins or {**dict.fromkeys(LARGE, 0.0), "sensitivity": math.inf}
             for last, value in values.items():
                 for group in (item.axis, "axes", *(("mimo",) if last == "disk_margin" else ())):
@@ -311,7 +308,7 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
 
 
 def keep_worse(found: dict[str, float], name: str, value: float) -> None:
-    """Note a value of a metric where it is worse than what is there."""
+    """Store a value of a metric where it is worse than the stored one."""
     pick = min if name.rpartition(".")[2] in LARGE else max
     found[name] = pick(found[name], value) if name in found else value
 
@@ -319,7 +316,7 @@ def keep_worse(found: dict[str, float], name: str, value: float) -> None:
 def loop_metrics(
     task: Task, ready: Ready, block: Block, order: str, chosen: Sequence[Case], observer: Block | None = None
 ) -> dict[str, float]:
-    """Return the worst of all loops."""
+    """Return the worst metrics over all loops."""
     found: dict[str, float] = {}
     shifts: list[Vector] = []
     for case in chosen:
@@ -329,7 +326,7 @@ def loop_metrics(
         if distances is not None:
             shifts.append(distances)
     if shifts:
-        # One lead for all plants: the one whose worst distance is least.
+        # One lead for all plants: the one with the smallest worst distance.
         most = np.max(shifts, axis=0)
         best = int(np.argmin(most))
         Ts = block.sample_time

@@ -35,10 +35,10 @@ from softneck.verification import (
 )
 
 _RISE_METRIC = "sim.rise_s"
-# Standard deviations of noise: of some hundred samples one may be so far off.
+# Largest deviation among some hundred samples of noise, in standard deviations.
 _NOISE_SIGMAS = 4.0
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
-# Least, largest and unit of the numbers of [track].
+# Minimum, maximum and unit of the numbers of [track].
 _TRACK_NUMBERS = {
     "small_part": (0.05, 1.0, ""), "noise_deg": (0.0, 10.0, "deg"), "delay_ms": (0.0, 1e9, "ms"),
     "circle_deg": (0.1, 40.0, "deg"), "circle_rad_s": (0.01, 20.0, "rad/s"),
@@ -47,15 +47,15 @@ _TRACK_NUMBERS = {
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class TuneRequirements:
-    """What is asked.
+    """Requirements of a search.
 
     Attributes:
-        certificate: what `verify` is asked to hold.
-        track: the loops that are judged besides.
-        bounds: all requirements, those of `certificate` first; the reserve is taken off.
+        certificate: requirements of `verify`.
+        track: settings of the additional loops.
+        bounds: all requirements, those of `certificate` first, less the safety margins.
         reserve: metric -> safety margin of its limit, for the difference between a robot and its models.
-        stated: metrics and keys of [track] that somebody asks something of; the others are as the defaults have them.
-        table: of a requirements file that asks `tune` and `verify` for the same: limits as asked, the reserve beside.
+        stated: metrics and keys of [track] that the user states.
+        table: a requirements file that gives `tune` and `verify` the same requirements.
     """
 
     certificate: Requirements
@@ -66,22 +66,22 @@ class TuneRequirements:
     stated: frozenset[str] = frozenset()
 
     def robot_limit(self, metric: str) -> float | None:
-        """Return the largest value that is allowed of a metric of the robot itself: its limit with the reserve."""
+        """Return the largest allowed value of a metric on the robot: the limit plus the safety margin."""
         limit = self.limit(metric)
         return None if limit is None else round_12_digits(limit + self.reserve.get(metric, 0.0))
 
     def limit(self, metric: str) -> float | None:
-        """Return the largest value that is allowed of a metric on the plants; None where nothing bounds it."""
+        """Return the largest allowed value of a metric on the plants; None without an upper bound."""
         limits = [item.limit for item in self.bounds if item.metric == metric and item.bound != "min"]
         return min(limits, default=None)
 
     def shows_settling(self, part: float = 1.0) -> bool:
-        """Return whether the sensor shows if a part of the step has settled: its noise alone stays in that band."""
+        """Return whether the sensor noise stays within the settling band of a share of the step."""
         size = part * float(self.certificate.sim["size_deg"])
         return _NOISE_SIGMAS * self.track["noise_deg"] <= SETTLING_BAND * size
 
     def lines(self) -> list[str]:
-        """Return each requirement as a line for people."""
+        """Return each requirement as a line of text."""
         words = {"min": ">=", "max": "<=", "below": "<"}
         lines = []
         for item in self.bounds:
@@ -95,13 +95,13 @@ def read_tune_requirements(
     path: str | Path | None = None, *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
     rise: float | None = None,
 ) -> TuneRequirements:  # fmt: skip
-    """Return the defaults, with what the file at `path` says instead.
+    """Return the requirements of a file, with defaults for the rest.
 
     Args:
         path: a requirements file, also one for `verify`.
-        robot: whose controller is asked for; None: a neck's.
-        scale: by which the defaults are the robot's; None: by what the robot alone tells.
-        stepping: whether there are simulation models; else `sim.*` of the defaults is asked of the linear plants.
+        robot: of the controller; None: the neck.
+        scale: of the defaults; None: from the robot alone.
+        stepping: whether there are simulation models; else default `sim.*` limits apply to the linear plants.
         rise: the default [s]; None: that of the paper's neck, by the robot's time constant.
 
     Raises:
@@ -115,17 +115,14 @@ def make_tune_requirements(
     table: Mapping[str, Any], *, robot: Robot | None = None, scale: Scale | None = None, stepping: bool = True,
     rise: float | None = None,
 ) -> TuneRequirements:  # fmt: skip
-    """Return the defaults with what a table like a requirements file says instead."""
+    """Return the requirements of a table like a requirements file, with defaults for the rest."""
     scale = scale or Scale.of(robot or Robot.preset())
     whose = scale.robot
     table = expand_metrics(table, whose, stepping=stepping, track=True)
     defaults = tomllib.loads(default_text())
-    limits = defaults["require"]
+    usual = {name: scale.table(values) for name, values in defaults.items() if name != "version"}
     if not can_follow_circle(whose):
-        limits = {metric: limit for metric, limit in limits.items() if not metric.startswith("track.")}
-    usual = {
-        name: scale.table(limits if name == "require" else defaults[name]) for name in defaults if name != "version"
-    }
+        usual["require"] = {name: limit for name, limit in usual["require"].items() if not name.startswith("track.")}
     if rise is not None:
         usual["require"][_RISE_METRIC] = {"max": rise}
     if not stepping:
@@ -140,7 +137,7 @@ def make_tune_requirements(
     tracked = {metric: entry for metric, entry in require.items() if metric.startswith("track.")}
     extra = bounds_of(tracked, metric_names(whose, track=True), tracked)
     if wrong := [item.metric for item in extra if item.bound != "max" or item.limit <= 0.0]:
-        raise SettingsError(f"`{wrong[0]}` must say {{ max = NUMBER }} of a positive number, or false.")
+        raise SettingsError(f"`{wrong[0]}` must be {{ max = NUMBER }} with a positive number, or false.")
     certificate = make_requirements(merged, scale=scale)
     return TuneRequirements(
         certificate=certificate, track=track, bounds=(*certificate.bounds, *extra), reserve=reserve,
@@ -157,37 +154,32 @@ def default_text() -> str:
 
 
 def can_follow_circle(robot: Robot) -> bool:
-    """Return whether a robot can follow a circle: of two angles."""
+    """Return whether a robot can follow a circle: it has two angles."""
     return len(robot.outputs.names) == 2 and to_si(robot.outputs.unit)[1] == "rad"
 
 
 def relax_limits(asked: TuneRequirements, limits: Mapping[str, float]) -> TuneRequirements:
-    """Return the requirements with other upper limits of some metrics on the plants; safety margins stay."""
-    require = {
-        metric: {"max": round_12_digits(limit + asked.reserve.get(metric, 0.0))} for metric, limit in limits.items()
-    }
-    table = {**asked.table, "require": {**asked.table.get("require", {}), **require}}
-    if "sim.settling_s" in limits:  # a file states seconds of the robot: so must the duration it is compared with
+    """Return the requirements with new upper limits of some metrics on the plants and the same safety margins."""
+    wider = {name: round_12_digits(limit + asked.reserve.get(name, 0.0)) for name, limit in limits.items()}
+    require = {**asked.table.get("require", {}), **{name: {"max": limit} for name, limit in wider.items()}}
+    table = {**asked.table, "require": require}
+    if "sim.settling_s" in limits:  # a file states the robot's seconds, so the compared duration must too
         table["sim"] = {"duration_s": asked.certificate.sim["duration_s"], **table.get("sim", {})}
     bounds = tuple(replace(b, limit=limits[b.metric]) if b.metric in limits else b for b in asked.bounds)
-    own = {key: value for key, value in table.items() if key != "version"}
-    certificate = replace(
-        asked.certificate,
-        own=own | {"version": VERSION},
-        bounds=tuple(b for b in bounds if not b.metric.startswith("track.")),
-    )
+    kept = tuple(b for b in bounds if not b.metric.startswith("track."))
+    certificate = replace(asked.certificate, own=table | {"version": VERSION}, bounds=kept)
     return replace(asked, certificate=certificate, bounds=bounds, table=table)
 
 
 def _for_linear(usual: dict[str, Any]) -> dict[str, Any]:
     """Return the defaults without simulation models: their requirements apply to the linear plants."""
     require = {re.sub(r"^sim\.", "step.", name): limit for name, limit in usual["require"].items()}
-    # Presets are foreign plants, which decide nothing and take half a minute.
+    # Loops over a built-in plant decide nothing and take half a minute.
     return {**usual, "reserve": {}, "sim": {**usual["sim"], "necks": 0}, "require": require}
 
 
 def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[str, float]:
-    """Return the table [track] by the neck's names of its keys, which files up to 0.2 have of every robot."""
+    """Return the table [track] under the neck's names of its keys, which files up to 0.2 use for every robot."""
     inside = {key: key for key in defaults} | {scale.name_of(key): key for key in defaults}
     found = dict(zip(defaults, scale.table(defaults).values(), strict=True))
     for key, value in given.items():
@@ -198,21 +190,14 @@ def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[st
     return found
 
 
-# What has settled has risen before.
+# A settled output has risen, so a settling limit bounds the rise.
 _RISE_METRICS = ("sim.rise_s", "step.rise_s", "sim.settling_s", "step.settling_s")
-
-
-#: The least rise that is asked where nothing limits it, in time constants: what is quicker, models tell less of.
+#: Default rise time, in time constants, where the motors allow a shorter one: models are less accurate there.
 USUAL_RISE = 2.0
 
 
 def check_feasibility(asked: TuneRequirements, plant: Any) -> None:
-    """Raise SettingsError for a requirement that no controller of the nominal plant can keep.
-
-    Args:
-        asked: the requirements.
-        plant: whatever `uncertain_plant` takes.
-    """
+    """Raise SettingsError for a requirement that no controller of the nominal plant can meet."""
     uncertain = uncertain_plant(plant)
     limits = LoopSettings().limits(uncertain.robot)
     _refuse_quiet(asked)
@@ -227,7 +212,7 @@ def check_feasibility(asked: TuneRequirements, plant: Any) -> None:
 
 
 def fastest_rise(plant: Any) -> float:
-    """Return the least `rise_s` [s] that designs on a plant take; 0 where the motors do not reach their test step."""
+    """Return the shortest `rise_s` [s] that designs on a plant accept; 0 if the motors cannot reach the test step."""
     uncertain = uncertain_plant(plant)
     limits = LoopSettings().limits(uncertain.robot)
     found = [
@@ -238,7 +223,7 @@ def fastest_rise(plant: Any) -> float:
 
 
 def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
-    """Return the default rise time [s], of the slowest axis; None where no step is reached."""
+    """Return the default rise time [s] of the slowest axis; None if no step can be reached."""
     uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
     limits, size = LoopSettings().limits(uncertain.robot), asked.certificate.si(asked.certificate.sim["size_deg"])
     time, found = asked.certificate.scale.time, []
@@ -248,40 +233,40 @@ def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
         latest = max((plant.delay + 1) * plant.sample_time for plant in (axis.nominal, *axis.samples))
         least = least_rise(axis.nominal, test, size)
         found.append(required_rise(least / time, latest / time) if math.isfinite(least) else math.inf)
-    # Who asks for an earlier settling asks for a rise before it.
+    # A shorter required settling time bounds the rise.
     most = round_12_digits(time * max(*found, USUAL_RISE * TIME_CONSTANT))
     return min(most, asked.robot_limit("sim.settling_s") or math.inf) if most < math.inf else None
 
 
 def _refuse_order(asked: TuneRequirements) -> None:
-    """Refuse a step that may rise later than it has to have settled; of defaults of `verify` nobody asked both."""
+    """Refuse a stated settling time below a stated rise time."""
     said = {item.metric for item in asked.bounds if item.asked}
     for group in ("sim", "step"):
         names = f"{group}.settling_s", f"{group}.rise_s"
         settling, rise = (asked.robot_limit(name) for name in names)
         if settling is not None and rise is not None and settling < rise and said.issuperset(names):
             raise SettingsError(
-                f"`{names[0]}` <= {settling:g} s and `{names[1]}` <= {rise:g} s contradict each other: what has "
-                f"settled has risen; ask for a rise of at most {settling:g} s as well, or for a later settling."
+                f"`{names[0]}` <= {settling:g} s and `{names[1]}` <= {rise:g} s contradict each other: a "
+                f"settled step has risen; require a rise of at most {settling:g} s as well, or a later settling."
             )
 
 
 def _refuse_quiet(asked: TuneRequirements) -> None:
-    """Refuse a steady state that is quieter than the sensor: white noise is in what it tells, whatever is done."""
+    """Refuse a steady-state error below the sensor noise, which every measurement contains."""
     name_of, noise = asked.certificate.scale.name_of, asked.track["noise_deg"]
     metric = f"sim.{name_of('steady_rms_deg')}"
     limit = min((b.limit for b in asked.bounds if b.metric == metric and b.bound != "min" and b.asked), default=noise)
     if limit < noise:
         raise SettingsError(
-            f"`{metric}` <= {limit:g} cannot be: the noise of the sensor alone is {noise:g} (`[track] "
-            f"{name_of('noise_deg')}`); allow more, or state the noise of yours."
+            f"`{metric}` <= {limit:g} cannot be: the sensor noise alone is {noise:g} (`[track] "
+            f"{name_of('noise_deg')}`); allow more, or state the noise of your sensor."
         )
 
 
 def _refuse_rise(
     asked: TuneRequirements, uncertain: UncertainPlant, limits: ControllerLimits, name: str, plant: AxisPlant
 ) -> None:
-    """Refuse a rise that slew and range cannot give, however the motors are led."""
+    """Refuse a rise that is too fast for slew and range of the motors."""
     test = axis_test(plant, limits, uncertain.redefinition[1])
     for metric in _RISE_METRICS:
         limit = asked.robot_limit(metric)
@@ -302,12 +287,12 @@ def _refuse_rise(
 
 
 def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
-    """Refuse a circle beyond a bandwidth of 1/delay: slower ones a filter leads, but for overshoot."""
+    """Refuse a circle beyond a bandwidth of 1/delay: a reference filter can only compensate slower ones."""
     scale = asked.certificate.scale
     metric = f"track.{scale.name_of('circle_rms_deg')}"
     limit = asked.robot_limit(metric)
     dead, turn = (plant.delay + 1) * plant.sample_time, asked.track["circle_rad_s"]
-    # Who stands still in the middle is as far behind as the circle is large.
+    # An output at rest in the middle has the radius as its error.
     if limit is None or not can_follow_circle(scale.robot) or limit >= asked.track["circle_deg"] or turn * dead < 1.0:
         return
     raise SettingsError(
@@ -320,9 +305,9 @@ def _refuse_circle(asked: TuneRequirements, name: str, plant: AxisPlant) -> None
 def _refuse_turn(
     asked: TuneRequirements, uncertain: UncertainPlant, limits: ControllerLimits, name: str, plant: AxisPlant
 ) -> None:
-    """Refuse a circle whose first harmonic slew and range of the motors cannot give.
+    """Refuse a circle beyond slew and range of the motors.
 
-    No input within them has more of it than the square wave of the range, or the triangle of the slew.
+    The largest first harmonic is that of the square wave of the range, or of the triangle wave of the slew.
     """
     scale = asked.certificate.scale
     if not can_follow_circle(scale.robot):
@@ -331,7 +316,7 @@ def _refuse_turn(
     share = float(np.abs(uncertain.redefinition[1][:, uncertain.names.index(name)]).max())
     most = 4.0 / math.pi * min(limits.position_limit, limits.slew_limit / turn) / share
     reached = float(scale.shown(most * np.abs(plant.response(np.array([turn])))[0]))
-    # Of one output alone; a sine has its amplitude over the root of two.
+    # The rms error of one output; the rms of a sine is its amplitude over the root of two.
     least = (size - reached) / math.sqrt(2.0)
     for metric in ("track.circle_rms_deg", "track.ahead_rms_deg"):
         limit = asked.robot_limit(metric)
@@ -353,7 +338,7 @@ def _refuse_sensitivity(asked: TuneRequirements, name: str) -> None:
 
 
 def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
-    """Refuse a load rejected sooner than the dead time lets anybody act on it."""
+    """Refuse a load error below that of the dead time, before any feedback acts."""
     certificate = asked.certificate
     metric = f"step.{certificate.scale.name_of('load_rms_deg')}"
     limit = asked.robot_limit(metric)
@@ -361,7 +346,7 @@ def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
         return
     rows = round(float(certificate.step["duration_s"]) / plant.sample_time)
     load = certificate.step_test(0).load
-    # Felt a dead time late, and answered one more later: until then it acts alone.
+    # The load is measured a dead time later, and feedback acts another one later.
     alone = np.zeros(rows)
     felt = load * _step_response(plant, plant.delay + 2)
     alone[plant.delay : plant.delay + felt.size] = felt[: max(rows - plant.delay, 0)]

@@ -1,12 +1,10 @@
-"""Successive halving over kinds and settings: generations of candidates, judged further the better they are.
+"""Search over kinds and settings by successive halving and CMA-ES.
 
-Each kind begins as fast as its margins allow: its bound on Ms is led there by halves. All kinds are judged by loops
-there; after that and after each round a third of them is left (successive halving: Jamieson and Talwalkar 2016,
-AISTATS). Each kind has its own CMA-ES over the cube of its settings (Hansen and Ostermeier 2001, Evolutionary
-Computation 9:159), which knows ranks alone, so that candidates of different levels are told to it as they are. What
-holds so far goes on to the next level, and of a round's candidates at least half. At the end the best is refined: by
-neighbours to all sides, nearer where none of these is better. All is asked for in rounds and told in order: the number
-of workers changes nothing.
+Each kind starts with the largest bound on Ms that its margins allow, found by bisection, and is judged there by loops.
+After the start and each round the better third of the kinds continues (successive halving: Jamieson and Talwalkar
+2016, AISTATS). Each kind has its own CMA-ES over its unit cube (Hansen and Ostermeier 2001, Evolutionary Computation
+9:159). It uses ranks alone, so candidates of different levels can be mixed. At least half of the candidates continue
+to the next level. Finally, neighbours of the best are searched. The number of workers does not change the result.
 """
 
 from __future__ import annotations
@@ -27,38 +25,37 @@ from ._judge import LEVELS, judge_candidate
 from ._space import COSTLY, Space
 from ._task import Job, Judgement, Log, Task
 
-# Candidates of a kind in each round: CMA-ES' own 4 + 3 ln n for two to four settings, and even.
+# 4 + 3 ln n, the default of CMA-ES, for two to four settings, made even.
 _POPULATION_SIZE = 6
-#: The first step of the search, as a part of each range.
+#: Initial step of CMA-ES, as a share of each range.
 STEP = 0.15
-# By so much the bound on Ms is moved first, as a part of its range, and so often by half as much.
+# First step of the bound on Ms, as a share of its range, and number of steps, each half the last.
 _START_STEP, _START_STEPS = 0.24, 3
-# The last part of the budget is for the neighbours of the best, so far away first and last.
+# Share of the budget for neighbours of the best, and their first and last distance.
 _REFINED_SHARE, _FIRST_DISTANCE, _LAST_DISTANCE = 0.3, 0.08, 0.005
-# Kinds that are never left out, and candidates whose margins are found by experiment at the end.
+# Kinds that always continue, and final candidates with margins by experiment.
 _MIN_KINDS, _FINAL_COUNT = 2, 3
-# One kind of so many goes on to the next round.
+# One kind in three continues to the next round.
 _HALVING_RATE = 3
-# What breaks ties: all ratios together weigh this part of the largest one.
+# Weight of the mean ratio beside the largest one, which breaks ties.
 _TIE_WEIGHT = 0.02
-# No requirement adds more, however far it is beyond its limit: what is not certified, not known or never reached is as
-# bad in whatever way that is told, and does not outweigh all the rest.
+# Largest penalty of one requirement, so that an unknown or unreachable one does not outweigh the rest.
 _MAX_PENALTY = 4.0
 _MARGIN_METRICS = ("axes.gain_margin", "axes.delay_margin_ms")
-# Of what only a controller with a linear form has all.
+# Groups that need a linear form of the controller.
 _LINEAR_GROUPS = ("axes.", "mimo.", "robust.")
 
 
 @dataclass(slots=True, eq=False)
 class Candidate:
-    """One kind with its settings, and all that is known of it.
+    """One kind with its settings and its metrics.
 
     Attributes:
         kind: of controller.
         settings: of its design.
-        x: where that is in the cube of its space.
-        level: the last one it was judged at; "" for none.
-        metrics: of all levels, the worse where two say something.
+        x: its point in the cube.
+        level: of its last judgement, or "".
+        metrics: of all levels.
         error: why it has none.
     """
 
@@ -70,22 +67,22 @@ class Candidate:
     error: str = ""
 
     def update(self, level: str, judgement: Judgement) -> None:
-        """Add what came of a level."""
+        """Add the judgement of a level."""
         self.error = judgement.error or self.error
         if judgement.error:
             return
         self.level = level
-        # Of margins linear methods and experiments each know a part: the least counts.
+        # The smaller of the margins by linear methods and by experiment counts.
         self.metrics |= {
             name: min(value, self.metrics.get(name, math.inf)) if name in _MARGIN_METRICS else value
             for name, value in judgement.metrics.items()
         }
 
     def ratios(self, bounds: Sequence[Requirement], *, tested: bool) -> dict[str, float]:
-        """Return requirement -> value over limit (limit over value of a least one); 1 is the limit itself.
+        """Return metric -> value over limit (for lower bounds limit over value).
 
-        Of a controller without linear form margins are not certified: beside recordings, and where they are asked for,
-        they are broken (`verify` says so), else at their limit, better than which nobody has seen them.
+        Margins of a controller without linear form are not certified: beside recordings, or if stated, they fail as in
+        `verify`; otherwise they count as at their limit at best.
         """
         found: dict[str, float] = {}
         blind = bool(self.metrics) and "axes.sensitivity" not in self.metrics
@@ -99,10 +96,10 @@ class Candidate:
         return found
 
     def cost(self, bounds: Sequence[Requirement], *, tested: bool) -> float:
-        """Return how far requirements are beyond their limits; at most 1 where all known ones hold.
+        """Return the cost, at most 1 where all known requirements hold.
 
-        Where all hold, the largest ratio; else 1 and what is beyond 1 of each, x/(1 + x/4), added up: few are broken
-        rather than all a little, as with any exact penalty (Nocedal and Wright 2006, sec. 17.2).
+        It is the largest ratio where all hold, else 1 plus the sum of x/(1 + x/4) over the excesses x beyond 1: an
+        exact penalty (Nocedal and Wright 2006, sec. 17.2).
         """
         found = list(self.ratios(bounds, tested=tested).values())
         if self.error or not found:
@@ -112,7 +109,7 @@ class Candidate:
         return (1.0 + beyond if beyond > 0.0 else (1.0 - _TIE_WEIGHT) * max(found)) + rest
 
     def holds(self, bounds: Sequence[Requirement], *, tested: bool) -> bool:
-        """Whether every requirement that is known is kept."""
+        """Return whether every known requirement holds."""
         found = self.ratios(bounds, tested=tested)
         return not self.error and bool(found) and max(found.values()) <= 1.0
 
@@ -122,7 +119,7 @@ def _saturate(beyond: float) -> float:
 
 
 def ratio(item: Requirement, value: float) -> float:
-    """Return value over limit, or limit over value of a least one; above 1 it does not hold."""
+    """Return value over limit (for a lower bound limit over value); above 1 it fails."""
     if item.bound == "min":
         return item.limit / value if value > 0.0 else math.inf
     if item.limit <= 0.0:
@@ -132,16 +129,16 @@ def ratio(item: Requirement, value: float) -> float:
 
 @dataclass(slots=True, eq=False)
 class Search:
-    """A search at work.
+    """A running search.
 
     Attributes:
         task: what is tuned.
         spaces: of the kinds.
         crew: workers.
-        log: what has been judged.
+        log: of judgements.
         budget: of judgements.
-        report: called with the part done and the best so far.
-        finals: so many of the best have their margins found by experiment at the end.
+        report: called with progress and the best so far.
+        finals: number of final candidates with margins by experiment.
     """
 
     task: Task
@@ -158,9 +155,9 @@ class Search:
     def run(self) -> None:
         """Search until the budget is spent."""
         optimisers = {space.kind: _optimiser(space, self.task.seed, i) for i, space in enumerate(self.spaces)}
-        # Only what steps has margins by experiment.
+        # Margins by experiment need simulation models.
         levels = LEVELS[:-1] if self.task.own else LEVELS[:1]
-        # A small budget is for the starts first.
+        # A small budget goes to the starts first.
         finals = min(self.finals, max(0, self.budget - len(levels) * len(self.spaces))) if self.task.own else 0
         alive, before = self._judge_starts(levels, finals, optimisers), -1
         while self._remaining(finals + round(_REFINED_SHARE * self.budget)) > 0 and alive and before < len(self.spent):
@@ -172,29 +169,28 @@ class Search:
             alive = self._drop_kinds(alive)
         self._refine(levels, finals)
         if finals:
-            # Of those that loops have judged: what was judged further comes first.
             self._judge([item for item in self.sort_candidates() if item.level == levels[-1]][:finals], "margins", 0)
 
     def sort_candidates(self) -> list[Candidate]:
-        """Return all candidates that have metrics, the best first."""
+        """Return all candidates with metrics, the best first."""
         return sorted((item for item in self.candidates.values() if item.level), key=self._rank)
 
     def cost(self, item: Candidate) -> float:
-        """Return what the search minimises."""
+        """Return the cost of a candidate."""
         return item.cost(self.task.asked.bounds, tested=self.task.tested)
 
     def _candidates_of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]
 
     def _rank(self, item: Candidate) -> tuple[int, float]:
-        """Return the rank: what was judged further first, then the cost: of one level all have the same metrics."""
+        """Return the sort key: the level, later ones first, then the cost."""
         return -LEVELS.index(item.level) if item.level else 1, self.cost(item)
 
     def _remaining(self, reserved: int) -> int:
         return self.budget - reserved - len(self.spent)
 
     def _judge_starts(self, levels: Sequence[str], finals: int, optimisers: dict[str, Any]) -> list[Space]:
-        """Judge each kind where it begins; return those left, with their optimisers there."""
+        """Judge each kind at its start; return the remaining kinds and move their optimisers there."""
         starts = {space.kind: self._candidate(space, space.start) for space in self.spaces}
         self._judge(list(starts.values()), levels[0], finals)
         starts = self._move_starts(starts, finals + (len(levels) - 1) * len(starts))
@@ -207,10 +203,10 @@ class Search:
         return self._drop_kinds([space for space in self.spaces if space.kind not in self.dropped])
 
     def _move_starts(self, starts: dict[str, Candidate], reserved: int) -> dict[str, Candidate]:
-        """Return the starts with their bound on Ms as large as the margins allow, by halves."""
+        """Return the starts with the largest bound on Ms that the margins allow, by bisection."""
         at, best, step = dict(starts), dict(starts), _START_STEP
         spaces = {space.kind: space for space in self.spaces}
-        # A controller without linear form shows no margin to go by.
+        # A controller without linear form has no margins to follow.
         led = {
             kind: space.trade_off for kind, space in spaces.items()
             if space.trade_off is not None and (starts[kind].error or "axes.sensitivity" in starts[kind].metrics)
@@ -218,7 +214,7 @@ class Search:
         for _ in range(_START_STEPS):
             for kind, k in led.items():
                 x = at[kind].x.copy()
-                # What could not be designed is given more room.
+                # A failed design gets a larger bound.
                 x[k] += step if at[kind].error or self._is_robust(at[kind]) else -step
                 at[kind] = self._candidate(spaces[kind], np.clip(x, 0.0, 1.0))
             self._judge([at[kind] for kind in led], LEVELS[0], reserved)
@@ -229,27 +225,27 @@ class Search:
         return best
 
     def _is_robust(self, item: Candidate) -> bool:
-        """Return whether the margins that are known hold."""
+        """Return whether all known margins hold."""
         found = item.ratios(self.task.asked.bounds, tested=self.task.tested)
         return all(value <= 1.0 for name, value in found.items() if name.startswith(_LINEAR_GROUPS))
 
     def _start_rank(self, item: Candidate, k: int) -> tuple[bool, bool, float]:
-        """Return the rank of a start: designed, robust, and of robust ones the boldest, else the most careful."""
+        """Return the sort key of a start: designed, robust, then the largest bound if robust, else the smallest."""
         robust = self._is_robust(item)
         return not item.level, not robust, -float(item.x[k]) if robust else float(item.x[k])
 
     def _judge_levels(self, items: Sequence[Candidate], levels: Sequence[str], finals: int) -> None:
-        """Judge candidates level by level, the better ones further."""
+        """Judge candidates level by level; the better ones continue."""
         left = list(items)
         for level in levels:
             self._judge(left, level, finals)
             left = self._select(left, level)
 
     def _refine(self, levels: Sequence[str], finals: int) -> None:
-        """Judge the neighbours of the best until the budget is spent, or none near it is better.
+        """Judge neighbours of the best until the budget is spent or none is better.
 
-        To both sides along directions that are drawn anew: where two limits meet, one setting alone betters nothing
-        (Gratton et al. 2015, SIAM J. Optim. 25:1515).
+        They lie on both sides along random orthogonal directions: where two limits meet, changing one setting alone
+        improves nothing (Gratton et al. 2015, SIAM J. Optim. 25:1515).
         """
         away, rng = _FIRST_DISTANCE, np.random.default_rng(self.task.seed)
         spaces = {space.kind: space for space in self.spaces}
@@ -264,10 +260,7 @@ class Search:
                 away /= 2.0
 
     def _drop_kinds(self, alive: list[Space]) -> list[Space]:
-        """Return the better third of the kinds, in their order: of more than two a costly one only if it is the best.
-
-        What a search is given is a number of judgements, whatever each of them costs.
-        """
+        """Return the better third of the kinds; of more than two a costly one only if it is the best."""
         keep = max(_MIN_KINDS, math.ceil(len(alive) / _HALVING_RATE))
         best = sorted(alive, key=lambda space: min(self._rank(item) for item in self._candidates_of(space.kind)))
         if len(alive) > _MIN_KINDS:
@@ -275,25 +268,25 @@ class Search:
         return [space for space in alive if space in best[:keep]]
 
     def _sample(self, space: Space, optimiser: Any) -> list[Candidate]:
-        """Return a generation."""
+        """Return a generation of candidates."""
         return [self._candidate(space, optimiser.ask()) for _ in range(_POPULATION_SIZE)]
 
     def _candidate(self, space: Space, x: np.ndarray) -> Candidate:
-        """Return the candidate at a point of the cube; the same one for the same settings."""
+        """Return the candidate at a point of the cube; equal settings give one candidate."""
         settings = space.settings(x)
         job = Job.of(space.kind, settings, "")
         return self.candidates.setdefault((job.kind, job.settings), Candidate(space.kind, settings, np.array(x)))
 
     def _select(self, items: list[Candidate], level: str) -> list[Candidate]:
-        """Return those judged at a level that hold so far, as none of them is better there, and at least half."""
+        """Return the candidates of a level that hold so far, and at least the better half."""
         good = sorted((item for item in items if item.level == level and not item.error),
                       key=lambda item: max(1.0, self.cost(item)))  # fmt: skip
-        # Equal candidates are one.
+        # Remove duplicates.
         good = list({id(item): item for item in good}.values())
         return good[: max(math.ceil(len(good) / 2), sum(self.cost(item) <= 1.0 for item in good))]
 
     def _judge(self, items: Sequence[Candidate], level: str, reserved: int) -> None:
-        """Judge candidates at a level, as many as the budget allows; those in the log are read from it."""
+        """Judge candidates at a level within the budget; logged judgements are reused."""
         wanted: dict[Job, Candidate] = {}
         for item in items:
             job = Job.of(item.kind, item.settings, level)
@@ -302,10 +295,10 @@ class Search:
             if self._remaining(reserved) - len(wanted) <= 0:
                 break
             wanted[job] = item
-        run_jobs([job for job in wanted if job not in self.log], self._submit, self.crew, self._store)
+        run_jobs([job for job in wanted if job not in self.log.found], self._submit, self.crew, self._store)
         for job, item in wanted.items():
             self.spent.add(job)
-            item.update(level, self.log[job])
+            item.update(level, self.log.found[job])
         self._report_progress()
 
     def _submit(self, job: Job) -> Future:
@@ -313,7 +306,7 @@ class Search:
         return self.crew.pool.submit(judge_candidate, self.task, job.kind, item.settings, job.level)
 
     def _store(self, job: Job, judgement: Judgement) -> None:
-        self.log.add(job, judgement)
+        self.log.found[job] = judgement
         self.log.write()
         self._report_progress(len(self.spent) + 1)
 
@@ -326,13 +319,12 @@ class Search:
 def run_jobs(
     jobs: Sequence[Job], run: Callable[[Job], Future], crew: WorkerPool, took: Callable[[Job, Judgement], None]
 ) -> None:
-    """Have jobs done, two for each worker at a time, and take each as it ends.
+    """Run jobs, two per worker at a time, and store each result when it arrives.
 
     Raises:
         SoftneckError: a worker died.
     """
-    left, out = list(jobs)[::-1], {}
-    found: dict[Job, Judgement] = {}
+    left, out = list(jobs)[::-1], dict[Future, Job]()
     try:
         while left or out:
             while left and len(out) < 2 * crew.size:
@@ -340,26 +332,21 @@ def run_jobs(
                 out[run(job)] = job
             done, _ = wait(out, return_when=FIRST_COMPLETED)
             for future in done:
-                job = out.pop(future)
-                found[job] = future.result()
-                took(job, found[job])
+                took(out.pop(future), future.result())
     except BrokenExecutor as error:
         raise SoftneckError(
-            "a worker process died (out of memory, or a plant that crashed); what is done is kept, run it again."
+            "a worker process died (out of memory, or a plant that crashed); run the same command again to continue."
         ) from error
 
 
 def in_words(item: Candidate, cost: float) -> str:
-    """Return a candidate in a few words."""
-    names = {"sim.rise_s": "rise {:.2f} s", "step.rise_s": "rise {:.2f} s", "sim.overshoot_pct": "overshoot {:.1f} %",
-             "step.overshoot_pct": "overshoot {:.1f} %", "axes.gain_margin": "gain margin {:.2g}"}  # fmt: skip
-    told: dict[str, str] = {}
-    for name, text in names.items():
-        if name in item.metrics and math.isfinite(item.metrics[name]):
-            told.setdefault(text, text.format(item.metrics[name]))
-    return ", ".join(
-        [f"best {item.kind}", *told.values(), "all hold" if cost <= 1.0 else f"{cost - 1.0:.2f} beyond limits"]
-    )
+    """Return a short text about a candidate."""
+    words = [f"best {item.kind}"]
+    for name, text in (("rise_s", "rise {:.2f} s"), ("overshoot_pct", "overshoot {:.1f} %"),
+                       ("gain_margin", "gain margin {:.2g}")):  # fmt: skip
+        values = [item.metrics.get(f"{group}.{name}", math.inf) for group in ("sim", "step", "axes")]
+        words += [text.format(value) for value in values if math.isfinite(value)][:1]
+    return ", ".join([*words, "all hold" if cost <= 1.0 else f"{cost - 1.0:.2f} beyond limits"])
 
 
 def _optimiser(space: Space, seed: int, number: int, mean: np.ndarray | None = None) -> Any:
@@ -373,6 +360,6 @@ def _optimiser(space: Space, seed: int, number: int, mean: np.ndarray | None = N
 
 
 def _tell(optimiser: Any, generation: Sequence[Candidate], key: Callable[[Candidate], Any]) -> None:
-    """Tell the ranks: CMA-ES knows no more than which is better."""
+    """Pass the ranks to CMA-ES."""
     order = sorted(range(len(generation)), key=lambda i: key(generation[i]))
     optimiser.tell([(generation[i].x, float(rank)) for rank, i in enumerate(order)])

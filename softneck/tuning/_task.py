@@ -31,23 +31,23 @@ from ._requirements import TuneRequirements
 
 
 def has_observer(kind: str) -> bool:
-    """Return whether loops of a kind have an observer: designed for it."""
+    """Return whether a kind is designed for an observer in its loop."""
     return hasattr(resolve(KINDS[kind].settings), "over")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Task:
-    """All that a worker must know to judge a candidate.
+    """Data that a worker needs to judge a candidate.
 
     Attributes:
-        digest: of all that follows; workers keep what they have made ready by it.
-        linear: by name, models and families.
-        own: by name, simulation models.
+        digest: of the fields below; workers cache by it.
+        linear: name -> linear model or family.
+        own: name -> simulation model.
         asked: the requirements.
-        robot: whose controller is tuned.
-        cocontraction: at which the loops are held [SI unit of the motors]; None: by the controller's own rule.
+        robot: of the controller.
+        cocontraction: in the loops [SI unit of the motors]; None: by the controller's own rule.
         seed: of the noise.
-        observer: of the loops of kinds that have one (`mpc`, `nmpc`); None: these have none either.
+        observer: in the loops of `mpc` and `nmpc`; None for none.
     """
 
     digest: str
@@ -61,7 +61,7 @@ class Task:
 
     @property
     def said_cocontraction(self) -> float | None:
-        """As settings and loop files say it: in the unit of the robot's motors."""
+        """Co-contraction in the unit of the robot's motors, as in settings and loop files."""
         factor = to_si(self.robot.motors.unit)[0]
         return None if self.cocontraction is None else float(f"{self.cocontraction / factor:.4g}")
 
@@ -77,18 +77,18 @@ class Task:
 
     @property
     def plant(self) -> Any:
-        """What controllers are designed on: the first of several linear sources is the nominal plant."""
+        """Linear plants of the design; the first of several is the nominal plant."""
         sources = list(self.linear.values())
         return sources[0] if len(sources) == 1 else sources
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What came of a candidate at one level.
+    """Result of a candidate at one level.
 
     Attributes:
         metrics: name -> value; inf where a level is never reached.
-        error: why there is none; "" where there is.
+        error: why there are no metrics, or "".
     """
 
     metrics: Mapping[str, float]
@@ -120,30 +120,29 @@ class Job:
 
 
 class Log:
-    """All judgements so far, in the order in which they were asked for.
+    """Judgements of a search, in the order of the requests.
 
     Attributes:
         folder: of the search; None: nothing is written.
+        found: job -> judgement.
     """
 
     def __init__(self, folder: Path | None, digest: str, *, force: bool = False) -> None:
-        """Begin, or go on with what is there of the same search.
+        """Start a log, or continue that of the same search.
 
         Raises:
             OutputFileError: the folder holds another search and `force` is not given.
         """
         self.folder, self._digest = folder, digest
-        self._found: dict[Job, Judgement] = {}
-        path = None if folder is None else folder / FILE
-        there = path is not None and path.is_file()
-        if path is None or not there:
+        self.found: dict[Job, Judgement] = {}
+        if folder is None or not (folder / FILE).is_file():
             return
-        content = _read(path)
+        content = _read(folder / FILE)
         if content.get("digest") == digest:
             for row in content["evaluations"]:
                 if row["error"]:
-                    continue  # it is tried again: a later softneck may be able to
-                self._found[Job(row["kind"], row["settings"], row["level"])] = Judgement(
+                    continue  # try it again: a later softneck may succeed
+                self.found[Job(row["kind"], row["settings"], row["level"])] = Judgement(
                     {name: math.inf if value is None else float(value) for name, value in row["metrics"].items()}
                 )
         elif not force:
@@ -152,31 +151,14 @@ class Log:
                 "--force replaces it."
             )
 
-    def __len__(self) -> int:
-        return len(self._found)
-
-    def __contains__(self, job: Job) -> bool:
-        return job in self._found
-
-    def __getitem__(self, job: Job) -> Judgement:
-        return self._found[job]
-
-    def items(self) -> Iterator[tuple[Job, Judgement]]:
-        """Return all jobs with what came of them."""
-        return iter(self._found.items())
-
-    def add(self, job: Job, judgement: Judgement) -> None:
-        """Note what came of a job."""
-        self._found[job] = judgement
-
     def write(self) -> None:
-        """Write all of it; a reader sees the file before or the file after."""
+        """Replace the file as a whole."""
         if self.folder is None:
             return
         rows = [
             {"kind": job.kind, "settings": job.settings, "level": job.level, "error": item.error,
              "metrics": {name: value if math.isfinite(value) else None for name, value in item.metrics.items()}}
-            for job, item in self._found.items()
+            for job, item in self.found.items()
         ]  # fmt: skip
         text = json.dumps({"format": _LOG_FORMAT, "digest": self._digest, "evaluations": rows}, indent=1)
         with atomic_write(self.folder / FILE, force=True) as temporary:
@@ -194,12 +176,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, str]] | None) -> str:
-    """Return the digest of a task: of its files where all plants come from some, else of what the plants are.
+    """Return the digest of a task, from its files, or from its plants where `files` is None.
 
-    Args:
-        task: plants, requirements, robot and seed.
-        kinds: that are searched.
-        files: role -> (path, SHA-256) of what was read; None where plants were made in Python.
+    `files` is role -> (path, SHA-256).
     """
     asked = task.asked
     told = {
@@ -216,14 +195,14 @@ def digest_of(task: Task, kinds: Sequence[str], files: Mapping[str, tuple[str, s
 
 
 def _observer(task: Task, kinds: Sequence[str]) -> str:
-    """Return the digest of the observer; "" where no kind has one."""
+    """Return the digest of the observer, or "" where no kind has one."""
     if task.observer is None or not any(map(has_observer, kinds)):
         return ""
     return hashlib.sha256(b"".join(_of_block(task.observer.block()))).hexdigest()
 
 
 def _plants(task: Task) -> Iterator[bytes]:
-    """Yield what makes the plants: numbers, and never how an object happens to be laid out."""
+    """Yield the numbers of the plants, independent of how objects store them."""
     for axis in uncertain_plant(task.plant).axes.values():
         for plant in axis.samples:
             yield np.concatenate([plant.numerator, plant.denominator, [plant.delay, plant.sample_time]]).tobytes()
@@ -236,7 +215,7 @@ def _plants(task: Task) -> Iterator[bytes]:
         elif hasattr(thing, "arrays"):
             yield from _of_block(thing)
         else:
-            yield cloudpickle.dumps(thing)  # a function of the user's: its bytes are compared, never read
+            yield cloudpickle.dumps(thing)  # a user's function: its bytes are compared, never loaded
 
 
 def _of_block(block: Any) -> Iterator[bytes]:

@@ -1,4 +1,4 @@
-"""From requirements to a controller: the search, the certificate of its best, and what else belongs to it."""
+"""Tune a controller to requirements: the search, the certificate of its best, and the result."""
 
 from __future__ import annotations
 
@@ -60,37 +60,34 @@ from ._search import Candidate, Search, ratio
 from ._space import KINDS_SEARCHED, UNCERTIFIED, spaces
 from ._task import Log, Task, digest_of
 
-#: Judgements of candidates that a search makes where nobody says otherwise.
+#: Default number of judgements of candidates.
 BUDGET = 160
-# Fewer do not judge each of the kinds by a loop.
-_LEAST_BUDGET = 1
-# So many of the best are held against `verify`, until one holds.
+# Number of the best candidates that are verified until one holds.
 _MAX_VERIFICATIONS = 2
-# Why a kind is left out where nobody names it.
 _UNCERTIFIED_REASON = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
-# Motors that are held closer to zero than this, of a neck [rad], have no rule for their co-contraction.
+# Smaller co-contractions, of a neck, set no rule.
 _MIN_COCONTRACTION_RAD = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Tuned:
-    """What came of a search.
+    """Result of a search.
 
     Attributes:
-        best: the candidate with the least cost, or the first whose certificate holds.
-        controller: designed as it says.
-        assumed: what of the paper's neck, and not of these plants or of their robot, its design takes.
-        observer: for the loop; None where none can be built on the nominal plant.
-        observed: whether the steps keep their requirements with it.
-        verification: of `verify` with the same requirements.
-        holds: whether all requirements are kept, those of the certificate and those of [track].
-        candidates: all that were judged by all loops, the best first.
-        front: those of them that none beats in every objective.
+        best: the first of the best candidates whose certificate holds, else the one with the least cost.
+        controller: of `best`.
+        assumed: values of the paper's neck that its design uses.
+        observer: for the loop; None if none can be built on the nominal plant.
+        observed: whether the steps meet their requirements with it.
+        verification: result of `verify` with the same requirements.
+        holds: whether all requirements hold, those of the certificate and those of [track].
+        candidates: those judged by all loops, the best first.
+        front: Pareto-optimal candidates.
         objectives: the metrics of the front.
-        binding: the requirement that stands in the way; None where nothing does.
-        nearest: the value to which that alone would have to be loosened; None where that would not do.
-        loosened: metric -> the default that the best does not keep; the requirements of `task` have what it keeps.
-        evaluations: judgements that were asked for.
+        binding: the active requirement, which prevents a solution; None where all hold.
+        nearest: the limit of it alone at which all would hold; None if there is none.
+        loosened: metric -> default that the best does not meet; `task` has the limit that it meets.
+        evaluations: number of judgements.
         dropped: kind -> why it was not searched.
         task: what was tuned.
         own: simulation models.
@@ -130,26 +127,24 @@ def tune(
     files: Mapping[str, tuple[str, str]] | None = None,
     progress: Progress | None = None,
 ) -> Tuned:
-    """Return the best controller of some kinds for plants, by what is required of it.
+    """Return the best controller of some kinds for plants and requirements.
 
     The same plants, requirements, kinds, budget and seed give the same result, whatever the number of workers.
 
     Args:
-        plants: families and linear models, of which at least one, the first the nominal plant; and simulation models
-            (nonlinear models, neck parameters, FMUs, functions that return a part), which loops are closed over: one,
-            a list, or name -> one, each itself or its file.
-        requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`.
-        kinds: of controllers, also as "pi,mpc"; `KINDS_SEARCHED` if none is named, beside recordings without
-            `UNCERTIFIED`.
-        budget: judgements of candidates.
-        observer: of the loop, if the requirements hold with it; else a Kalman filter over the nominal
-            plant.
+        plants: families and linear models (at least one; the first is the nominal plant) and simulation models
+            (nonlinear models, neck parameters, FMUs, functions that return a part): one, a list, or name -> one,
+            objects or files.
+        requirements: beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`.
+        kinds: of controllers, also as "pi,mpc"; default `KINDS_SEARCHED`, beside recordings without `UNCERTIFIED`.
+        budget: number of judgements of candidates.
+        observer: of the loop; default a Kalman filter over the nominal plant.
         seed: of the search and of the noise in its loops.
-        workers: local processes, as many as cores if not given; 0 for this process.
-        folder: where judgements are kept as they come; the same call goes on with what is there.
-        force: replace another search that `folder` holds.
-        files: role -> (path, SHA-256) of what was read, for the certificate.
-        progress: called with the part done and the best so far; a bar in a terminal if not given.
+        workers: processes; default one per core, 0 for this process.
+        folder: of the log; the same call continues its search.
+        force: replace another search in `folder`.
+        files: role -> (path, SHA-256) of the files read, for the certificate.
+        progress: called with progress and the best so far; default a bar in a terminal.
 
     Raises:
         SettingsError: no linear plant, an unknown kind, or requirements that contradict each other or the motors.
@@ -164,7 +159,7 @@ def tune(
         >>> softneck.tune(model, {"overshoot_pct": 20}, kinds="pi", budget=12, workers=0).best.kind
         'pi'
     """
-    require_whole("budget", budget, _LEAST_BUDGET, 1_000_000)
+    require_whole("budget", budget, 1, 1_000_000)
     require_whole("seed", seed, 0, 2**31 - 2)
     kinds = tuple(kinds.split(",") if isinstance(kinds, str) else kinds)
     folder = None if folder is None else Path(folder)
@@ -181,7 +176,7 @@ def tune(
     )  # fmt: skip
     task = replace(task, observer=_observer(task) if observer is None else observer)
     task = replace(task, digest=digest_of(task, chosen, files))
-    prepare(task)  # a plant that does not fit is said before anything is searched
+    prepare(task)  # report a plant that does not fit before the search
     log = Log(folder, task.digest, force=force)
     with shown_progress("tune", progress) as tell:
         with open_workers(workers, None) as members:
@@ -192,14 +187,12 @@ def tune(
 
 
 def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, seed: int) -> Task:
-    """Return what is tuned, for which plants must be one robot's."""
+    """Return the task; all plants must be of one robot."""
     plants = named_plants(plants)
     own = {name: thing for name, thing in plants.items() if is_simulation_model(thing)}
     linear = {name: thing for name, thing in plants.items() if name not in own}
     if not linear:
-        raise SettingsError(
-            "no linear plant to design on: give a FAMILY (`softneck family`), or a linear MODEL, as well."
-        )
+        raise SettingsError("no linear plant to design on: add a FAMILY (`softneck family`) or a linear MODEL.")
     first = next(iter(linear))
     robot = robot_of(linear[first])
     for name, thing in plants.items():
@@ -207,45 +200,35 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
             require_same_robot(robot_of(thing), robot, f"{first} and {name}")
     own = {name: with_robot(thing, robot) for name, thing in own.items()}
     if own and not loops_start(robot):
+        name = next(iter(own))
         raise SettingsError(
-            f"loops over {next(iter(own))} would begin at zero, where {robot.label()} cannot be; give linear plants "
-            "alone."
+            f"loops over {name} start at zero, outside the range of {robot.label()}; give linear plants only."
         )
     asked = _read_requirements(requirements, robot, list(linear.values()), stepping=bool(own))
     return Task(
-        digest="",
-        linear=linear,
-        own=own,
-        asked=asked,
-        robot=robot,
+        digest="", linear=linear, own=own, asked=asked, robot=robot, seed=seed,
         cocontraction=_recorded_cocontraction(linear, robot),
-        seed=seed,
-    )
+    )  # fmt: skip
 
 
 def loops_start(robot: Robot) -> bool:
-    """Return whether loops over a robot can start: they start at zero, which its outputs' range must contain."""
+    """Return whether the range of the outputs contains zero, where loops start."""
     ends = zip(robot.outputs.min or (), robot.outputs.max or (), strict=True)
     return all(low <= 0.0 <= high for low, high in ends)
 
 
-def _read_requirements(
-    requirements: TuneRequirements | Mapping[str, Any] | str | Path | None, robot: Robot, linear: list[Any], *,
-    stepping: bool,
-) -> TuneRequirements:  # fmt: skip
-    """Return what is asked, the default rise as the robot's slew, range and dead time have it."""
+def _read_requirements(requirements: Any, robot: Robot, linear: list[Any], *, stepping: bool) -> TuneRequirements:
+    """Return the requirements, with a default rise from the robot's slew, range and dead time."""
     if isinstance(requirements, TuneRequirements):
         return requirements
     scale = Scale.of(robot, sources_of({str(k): thing for k, thing in enumerate(linear)}))
-    if isinstance(requirements, Mapping):
-        read = partial(make_tune_requirements, requirements, scale=scale, stepping=stepping)
-    else:
-        read = partial(read_tune_requirements, requirements, scale=scale, stepping=stepping)
+    make = make_tune_requirements if isinstance(requirements, Mapping) else read_tune_requirements
+    read = partial(make, requirements, scale=scale, stepping=stepping)
     return read(rise=default_rise(linear, read()))
 
 
 def _recorded_cocontraction(linear: Mapping[str, Any], robot: Robot) -> float | None:
-    """Return the co-contraction [SI] around which families were recorded, where there is one: of the heaviest load."""
+    """Return the co-contraction [SI] of the recordings with the heaviest load, or None."""
     made = [part for thing in linear.values()
             for part in getattr(thing, "findings", {}).get("tested", {}).get("conditions", [])]  # fmt: skip
     if not made or not robot.redefinition(directions_of(next(iter(linear.values()))))[1][:, -1].any():
@@ -257,37 +240,36 @@ def _recorded_cocontraction(linear: Mapping[str, Any], robot: Robot) -> float | 
 
 
 def _target_rise(task: Task) -> float:
-    """Return the longest rise that is allowed [s], or what is usual for the plant."""
-    limits = [task.asked.limit(metric) for metric in ("sim.rise_s", "step.rise_s")]
-    known = [limit for limit in limits if limit is not None]
-    if known:
-        return min(known)
+    """Return the longest allowed rise [s], or a default for the plant."""
+    limits = [limit for name in ("sim.rise_s", "step.rise_s") if (limit := task.asked.limit(name)) is not None]
+    if limits:
+        return min(limits)
     source = sources_of(task.linear, task.asked.certificate)[0]
     return USUAL_RISE / min(float(box.nominal[1]) for box in source.axes)
 
 
 def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
-    """Return the result of a search: its best verified, and what it means for the requirements."""
+    """Verify the best candidate and return the result of a search."""
     task, ranked = search.task, search.sort_candidates()
     eyes = task.observer
     if not ranked:
         why = "; ".join(f"{kind}: {text}" for kind, text in search.dropped.items())
         if any(space.kind not in search.dropped for space in search.spaces):
-            raise CheckFailedError(f"the budget ended before any candidate could be judged ({why}); give a larger one.")
-        raise SettingsError(f"no candidate could be judged ({why}).")
-    looped_ones = [item for item in ranked if _level(item) >= 1]
-    compared = looped_ones or ranked
+            raise CheckFailedError(f"the budget ended before any candidate was judged ({why}); increase it.")
+        raise SettingsError(f"no candidate controller could be designed ({why}).")
+    compared = [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
     best, verification, controller = _verify_best(search, compared, files, progress)
     bounds = task.asked.bounds
     names = objectives(compared)
-    # Loops of tuning have noise, and plants that are later than they say: `verify` has neither.
+    # Loops of tuning have noise and additional delay, those of `verify` do not.
     looped = [b for b in bounds if b.metric.startswith(("sim.", "track."))]
-    closed = not looped or not task.own or _level(best) >= 1
-    holds = verification.holds and closed and (not looped or not task.own or best.holds(looped, tested=False))
+    unlooped = not looped or not task.own
+    closed = unlooped or LEVELS.index(best.level) >= 1
+    holds = verification.holds and closed and (unlooped or best.holds(looped, tested=False))
     stuck, nearest = (None, None) if holds else active_requirement(compared, bounds, tested=task.tested)
     known = [verdict for verdict in verification.failed if verdict.value is not None]
     if not holds and stuck is None and known:
-        # The search saw nothing broken; the certificate of the whole box does.
+        # The certificate covers more plants than the search.
         stuck = known[0].requirement.metric
         nearest = known[0].value if len(verification.failed) == 1 else None
     found = Tuned(
@@ -304,9 +286,9 @@ def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, pr
 
 
 def _relax(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: Progress) -> Tuned:
-    """Return the result with the defaults of speed and precision as the best keeps them, if it keeps all the rest.
+    """Return the result with defaults of speed and precision relaxed to those of the best, if all others hold.
 
-    What somebody asks stands, and so do the margins of stability; the loosened set is verified anew.
+    Stated requirements and stability margins are not relaxed; the new requirements are verified again.
     """
     task, kept = found.task, relaxations(found.best, found.verification.failed, found.task.asked)
     if not kept:
@@ -316,20 +298,13 @@ def _relax(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: 
     verification = _verify_candidate(replace(task, asked=asked), found.controller, found.best.kind, files)
     if not verification.holds:
         return found
-    return replace(
-        found, task=replace(task, asked=asked), verification=verification, holds=True,
-        loosened=kept,
-    )  # fmt: skip
-
-
-def _level(item: Candidate) -> int:
-    return LEVELS.index(item.level)
+    return replace(found, task=replace(task, asked=asked), verification=verification, holds=True, loosened=kept)
 
 
 def _verify_best(
     search: Search, compared: Sequence[Candidate], files: Mapping[str, tuple[str, str]] | None, progress: Progress
 ) -> tuple[Candidate, Verification, Any]:
-    """Return the first of the best whose certificate holds, else the best, each with what `verify` says."""
+    """Return the first of the best whose certificate holds, else the best, with its verification."""
     task, found = search.task, []
     ready = prepare(task)
     promising = [item for item in compared if search.cost(item) <= 1.0][:_MAX_VERIFICATIONS] or compared[:1]
@@ -352,7 +327,7 @@ def _verify_candidate(
 
 
 def _observer(task: Task) -> Any:
-    """Return the filter over a model of several payloads, which tells them, else over the nominal plant, or None."""
+    """Return the Kalman filter over a model with payloads, else over the nominal plant, or None."""
     several = [model for model in task.models if payloads(model.arrays) is not None]
     for model in (*several, next(iter(task.linear.values()))):
         try:
@@ -362,24 +337,22 @@ def _observer(task: Task) -> Any:
     return None
 
 
-# What is traded, the first of each that was found; of the least ones the reciprocal counts.
+# Objectives of the Pareto front: the first metric of each group that was computed.
 _OBJECTIVE_METRICS = (
     ("sim.rise_s", "step.rise_s"), ("sim.overshoot_pct", "step.overshoot_pct"), ("step.load_rms_",),
     ("sim.steady_rms_", "step.steady_rms_"), ("track.circle_rms_",), ("track.variation_",),
     ("axes.sensitivity",), ("axes.gain_margin",),
 )  # fmt: skip
-# Whoever breaks any limit by more is nothing that somebody would trade for: half and double are what is asked, a little
-# loosened, and beyond it is another requirement ("disk_margin 0.0151 costs sensitivity 66.7").
+# Largest factor by which a default limit is relaxed; beyond it, it would be another requirement.
 _MAX_RELAXATION = 2.0
-# Of these a default is a wish about speed and precision: what the best reaches is told instead. Margins of stability,
-# slack tendons and what a load may do are never loosened.
+# Defaults of speed and precision, which may be relaxed. Stability margins, slack tendons and load errors never are.
 _RELAXABLE_METRICS = ("sim.rise_s", "sim.settling_s", "sim.overshoot_pct", "sim.steady_rms_", "step.rise_s",
              "step.settling_s", "step.overshoot_pct", "step.steady_rms_", "track.")  # fmt: skip
 _RELAXATION_MARGIN = 1.05
 
 
 def objectives(items: Sequence[Candidate]) -> list[str]:
-    """Return the metrics that are traded, of those that all candidates of the last level have."""
+    """Return the objectives that all candidates have."""
     names = set.intersection(*(set(item.metrics) for item in items)) if items else set()
     found = []
     for group in _OBJECTIVE_METRICS:
@@ -390,8 +363,9 @@ def objectives(items: Sequence[Candidate]) -> list[str]:
 
 
 def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
-    """Return the candidates that none beats in one objective without losing in another, by the first objective."""
-    table = np.array([[_signed(name, item.metrics[name]) for name in names] for item in items])
+    """Return the Pareto-optimal candidates, sorted by the first objective."""
+    signs = {name: -1.0 if name.rpartition(".")[2] in LARGE else 1.0 for name in names}
+    table = np.array([[signs[name] * item.metrics[name] for name in names] for item in items])
     if not table.size:
         return []
     finite = np.isfinite(table).all(axis=1)
@@ -403,12 +377,10 @@ def front(items: Sequence[Candidate], names: Sequence[str]) -> list[Candidate]:
 def active_requirement(
     items: Sequence[Candidate], bounds: Sequence[Requirement], *, tested: bool
 ) -> tuple[str | None, float | None]:
-    """Return the requirement that stands in the way, None where a candidate keeps all that were computed of it.
+    """Return the active requirement and the limit of it alone at which a candidate would meet all.
 
-    And the value to which it alone would have to be loosened; None where that does not do.
-
-    It is the one that must be loosened least, alone, for some candidate to keep the rest; where none does, the one
-    that the best candidate breaks most. What was not computed is broken all the same, but nothing is known to bind.
+    It is the requirement with the smallest such change. Where one change is not enough, it is the one that the best
+    candidate exceeds most, with None as the limit. Both are None where all computed requirements hold.
     """
     factors: dict[str, float] = {}
     for item in items:
@@ -431,12 +403,12 @@ def active_requirement(
 
 @dataclass(frozen=True, slots=True)
 class Loosened:
-    """A default that no candidate keeps beside the rest.
+    """A default that no candidate meets beside the rest.
 
     Attributes:
-        default: what it asks.
-        reached: by the best candidate.
-        limit: what is certified instead.
+        default: its limit.
+        reached: value of the best candidate.
+        limit: certified instead.
     """
 
     default: float
@@ -444,19 +416,18 @@ class Loosened:
     limit: float
 
     def in_words(self, metric: str) -> str:
-        """Return it as a clause for people: `sim.rise_s: 0.44, by default 0.40 is required`."""
+        """Return a text such as `sim.rise_s: 0.44, by default 0.40 is required`."""
         return f"{metric}: {self.reached:.3g}, by default {self.default:.3g} is required (certified: {self.limit:g})"
 
 
 def relaxations(item: Candidate, failed: Sequence[Verdict], asked: TuneRequirements) -> dict[str, Loosened]:
-    """Return metric -> the default that the candidate does not keep, where it keeps all the rest.
+    """Return metric -> default that the candidate does not meet, if all others hold.
 
-    Nothing where anything else fails: a margin of stability, what somebody asked for, what was not computed, or what is
-    missed by more than a factor of two.
+    Empty if a margin or a stated requirement fails, was not computed, or is missed by more than a factor of 2.
     """
     broken = {verdict.requirement: verdict.value for verdict in failed}
     looped = [bound for bound in asked.bounds if bound.metric.startswith(("sim.", "track."))]
-    for bound in looped:  # in loops with noise, which `verify` does not close
+    for bound in looped:  # `verify` has no loops with noise
         seen = item.metrics.get(bound.metric)
         if seen is not None and not bound.holds(seen):
             broken[bound] = max(seen, broken.get(bound) or 0.0)
@@ -471,21 +442,17 @@ def relaxations(item: Candidate, failed: Sequence[Verdict], asked: TuneRequireme
 
 
 def _round_up(value: float) -> float:
-    """Return a limit that a value keeps with some room, in two digits: the next loop has other noise."""
+    """Return a limit in two digits, 5 % above a value, as other loops have other noise."""
     if not 0.0 < value < math.inf:
         return math.inf
     step = 10.0 ** (math.floor(math.log10(_RELAXATION_MARGIN * value)) - 1)
     return round_12_digits(math.ceil(_RELAXATION_MARGIN * value / step - 1e-9) * step)
 
 
-def _signed(name: str, value: float) -> float:
-    return -value if name.rpartition(".")[2] in LARGE else value
-
-
 def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
-    """Return time (n,) [s], output and reference (n,) of the first output, in its display unit: the heaviest payload.
+    """Return time [s], output and reference (n,) of a step of the first output, in its display unit.
 
-    Without a simulation model, on the nominal linear one.
+    The plant is the last simulation model with the heaviest payload, or the nominal linear plant.
     """
     ready = prepare(task)
     controller = design_candidate(task, ready, item.kind, item.settings)
@@ -507,7 +474,7 @@ def step_response(task: Task, item: Candidate) -> tuple[Vector, Vector, Vector]:
 
 
 def holds_with_observer(task: Task, item: Candidate, observer: Any, bounds: tuple[Requirement, ...]) -> bool:
-    """Return whether the plain steps keep their requirements with an observer in the loop."""
+    """Return whether the full-size steps meet their requirements with an observer in the loop."""
     ready = prepare(task)
     controller = design_candidate(task, ready, item.kind, item.settings)
     block, eyes = controller.block(), observer.block()

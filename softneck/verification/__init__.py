@@ -1,6 +1,6 @@
 """Verification: a controller on every plant of its family, requirement by requirement.
 
-Writes a certificate, or the worst case of what does not hold.
+It gives a certificate, and a loop file of the worst case of each requirement.
 May import `cosim`, `design` and below.
 """
 

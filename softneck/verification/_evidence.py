@@ -1,4 +1,4 @@
-"""All that is computed for a verification, metric by metric, with the plant behind every value."""
+"""Compute all metrics of a verification, with the plant of every value."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ Describe = Callable[[int], dict[str, Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Values:
-    """The values of one metric over what was tried.
+    """Values of one metric over all plants.
 
     Attributes:
         values: (n,).
-        describe: row -> what stands in the certificate about that plant.
+        describe: row -> facts on that plant for the certificate.
     """
 
     values: Vector
@@ -49,15 +49,15 @@ class Values:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearEvidence:
-    """What linear methods say about one linear form.
+    """Results of the linear methods for one linear form.
 
     Attributes:
         name: of the frozen point, "" for a linear controller.
         law: the form.
-        plants: tried, with the delay that the order adds: those of the boxes, then the worst that the search found.
+        plants: with the delay that the order adds: those of the boxes, then the worst of the search.
         margins: name -> (n,).
-        found: by the search; None where it was switched off.
-        structured: by neck.
+        found: result of the search; None if switched off.
+        structured: bounds of each source.
     """
 
     name: str
@@ -70,19 +70,19 @@ class LinearEvidence:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Evidence(ReprMixin):
-    """All that was computed.
+    """All results of a verification.
 
     Attributes:
         plants: of the boxes, with the delay that the order adds.
         frequency: (m,) [rad/s].
         linear: one for each linear form.
-        steps: of all plants and the worst that the searches found; `stepped` are those plants.
-        necks: loops over the virtual neck.
+        steps: of `stepped`: all plants and the worst of the searches.
+        necks: simulated loops.
         metrics: name -> values.
         not_computed: metric or check -> why.
-        foreign: whether `necks` are not the user's own plants.
-        tested: what the data support, of each axis of each family that was tested against them.
-        crossings: margins by experiment on the user's own plants.
+        foreign: whether `necks` use a built-in plant.
+        tested: margins that the data support, of each axis of each tested family.
+        crossings: margins by experiment on the user's simulation models.
     """
 
     plants: Plants
@@ -99,28 +99,11 @@ class Evidence(ReprMixin):
 
 
 def gather(
-    controller: ControllerUnderTest,
-    necks: Sequence[PlantSource],
-    asked: Requirements,
-    *,
-    observer: Block | None,
-    progress: Progress,
-    families: Mapping[str, Any] | None = None,
-    own: Sequence[SimulationModel] = (),
-) -> Evidence:
-    """Compute all evidence; what the requirements do not need is computed too, where it is cheap.
-
-    Args:
-        controller: that is judged.
-        necks: sources of linear plants.
-        asked: the requirements.
-        observer: of loops over simulation models.
-        progress: called now and then.
-        families: by name, those whose weight over the data is asked.
-        own: the user's simulation models.
-    """
-    sources = list(necks)
-    seed = int(asked.sampling["seed"])
+    controller: ControllerUnderTest, necks: Sequence[PlantSource], asked: Requirements, *, observer: Block | None,
+    progress: Progress, families: Mapping[str, Any], own: Sequence[SimulationModel],
+) -> Evidence:  # fmt: skip
+    """Compute all evidence, including cheap metrics without a requirement; `own` are the user's simulation models."""
+    sources, seed = list(necks), int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
     plants = base.later(controller.extra)
     w = frequency_grid(base.sample_time, asked.scale.time)
@@ -130,34 +113,25 @@ def gather(
         linear.append(_linear(name, law, plants, sources, controller.extra, w, asked))
     progress(0.5, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
-    steps = run_steps(
-        stepped, controller.block, asked.step_test(seed), robot=controller.robot, weights=sources[0].weights
-    )
+    test, weights = asked.step_test(seed), sources[0].weights
+    steps = run_steps(stepped, controller.block, test, robot=controller.robot, weights=weights)
     why = why_no_virtual_plant(controller.robot, asked)
     runs = run_loops(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
     ) if own or not why else []  # fmt: skip
     loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
-    # What nobody requires of an axis alone need not be found of it.
+    # Margins of single axes are only computed if required.
     alone = {f"{axis}.{name}" for axis in plants.axes for name in ("gain_margin", "delay_margin_ms")}
     overall = all(item.metric not in alone for item in asked.bounds)
     late = lambda done, text: progress(0.8 + 0.2 * done, text)  # noqa: E731
     found = crossings(loops, overall=overall, progress=late) if loops else []
     steep = float(asked.uncertainty["rolloff_db_per_decade"])
-    laws, kept = controller.laws.values(), families or {}
-    tested = [item for law in laws for item in data_margins(kept, law, plants.axes, controller.extra, steep)]
-    evidence = Evidence(
-        plants,
-        w,
-        linear,
-        steps,
-        stepped,
-        runs,
-        foreign=_uses_built_in_plant(asked, own),
-        tested=tested,
-        crossings=found,
-    )
+    laws = controller.laws.values()
+    tested = [item for law in laws for item in data_margins(families, law, plants.axes, controller.extra, steep)]
+    # A built-in plant does not count unless the user gives its file.
+    foreign = not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
+    evidence = Evidence(plants, w, linear, steps, stepped, runs, foreign=foreign, tested=tested, crossings=found)
     evidence.not_computed.update({"sim": why} if why and not own else missing_payloads(own, asked))
     _fill_metrics(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
@@ -165,13 +139,7 @@ def gather(
 
 
 def _linear(
-    name: str,
-    law: LinearLaw,
-    plants: Plants,
-    necks: list[PlantSource],
-    extra: int,
-    w: Vector,
-    asked: Requirements,
+    name: str, law: LinearLaw, plants: Plants, necks: list[PlantSource], extra: int, w: Vector, asked: Requirements
 ) -> LinearEvidence:
     seed, generations = int(asked.sampling["seed"]), int(asked.sampling["search_generations"])
     found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
@@ -181,16 +149,11 @@ def _linear(
     return LinearEvidence(name, law, tried, table, found, parts)
 
 
-def _uses_built_in_plant(asked: Requirements, own: Sequence[SimulationModel]) -> bool:
-    """Return whether the loops use a built-in plant that does not count; a file of the user counts."""
-    return not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
-
-
 def _add_data_margins(evidence: Evidence) -> None:
     """Add the margins that the data support, and those by experiment."""
     for item in evidence.tested:
         for name, value in item.margins.items():
-            about = _tested_describer(item, name)  # both channels at once stand no more than one alone
+            about = _tested_describer(item, name)  # the joint margin is at most that of one channel
             for group in (item.axis, "axes", *(("mimo",) if name == "disk_margin" else ())):
                 _add(evidence, f"{group}.{name}", Values(np.array([value]), about))
         _add(evidence, "robust.mu", Values(np.array([item.mu]), _tested_describer(item, "mu")))
@@ -201,9 +164,8 @@ def _add_data_margins(evidence: Evidence) -> None:
     for name, (values, behind) in crossing_values(evidence.crossings).items():
         _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
     if not evidence.crossings:
-        evidence.not_computed["margins by experiment"] = (
-            "no simulation model was given (a nonlinear MODEL, a NECK, an FMU)"
-        )
+        why = "no simulation model was given (a nonlinear MODEL, a NECK, an FMU)"
+        evidence.not_computed["margins by experiment"] = why
 
 
 def _tested_describer(item: AxisMargins, name: str) -> Describe:
@@ -215,7 +177,7 @@ def _tested_describer(item: AxisMargins, name: str) -> Describe:
 
 
 def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Requirements, observer: bool) -> None:
-    """Fill metrics and what was not computed."""
+    """Fill `metrics` and `not_computed`."""
     metrics, absent = evidence.metrics, evidence.not_computed
     for part in evidence.linear:
         _add_linear_margins(evidence, part)
@@ -223,17 +185,15 @@ def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Re
         for name in ("stability", "axes", "mimo", "robust"):
             absent[name] = controller.why
     elif observer:
-        absent["observer in the linear checks"] = (
-            "margins are of controller and plant alone; the observer is in the simulated loops"
-        )
+        why = "margins are of controller and plant alone; the observer is in the simulated loops"
+        absent["observer in the linear checks"] = why
     if any(port.name == "payload" for port in controller.block.inputs):
         absent["steps of other payloads"] = NO_PAYLOAD_IN_STEPS
     if not asked.sampling["search_generations"]:
         absent["stability.searched_radius"] = "the search is switched off (search_generations = 0)"
     if any(part.name for part in evidence.linear):
-        absent["stability between frozen points"] = (
-            "linear checks hold at frozen points; motion between them is simulated"
-        )
+        why = "linear checks hold at frozen points; motion between them is simulated"
+        absent["stability between frozen points"] = why
     _add_data_margins(evidence)
     for name, values in evidence.steps.metrics.items():
         metrics[f"step.{asked.scale.name_of(name)}"] = Values(values, _step_describer(evidence, name))
@@ -245,15 +205,14 @@ def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Re
         metrics[f"sim.{asked.scale.name_of(name)}"] = Values(values, describe)
     if np.isnan(metrics["sim.slack_s"].values).any():
         del metrics["sim.slack_s"]
-        absent["sim.slack_s"] = "a plant tells no tensions; give a NECK, a file or a preset by its name"
+        absent["sim.slack_s"] = "a plant has no tension outputs; give a NECK, a file or a preset by its name"
         return
-    # What a heavier payload leaves of the pretension is no matter of the controller's.
+    # A heavier payload takes the pretension, whatever the controller does.
     light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.sim["taut_up_to_kg"]]
+    slack = metrics.pop("sim.slack_s").values[light]
     if light:
-        values = metrics["sim.slack_s"].values[light]
-        metrics["sim.slack_s"] = Values(values, lambda row: describe(light[row]))
+        metrics["sim.slack_s"] = Values(slack, lambda row: describe(light[row]))
     else:
-        del metrics["sim.slack_s"]
         absent["sim.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
 
 
@@ -265,26 +224,22 @@ def _add_linear_margins(evidence: Evidence, part: LinearEvidence) -> None:
     _add(evidence, "stability.radius", Values(radius[:count], describe))
     if part.found is not None:
         _add(evidence, "stability.searched_radius", Values(radius[count:], lambda row: describe(count + row)))
-        # The largest radius met on the way counts, though the plant named is the worst at the end.
+        # The largest radius of the whole search counts, although the named plant is the final worst one.
         met = np.array([part.found.radius])
         worst = count + int(np.argmax(radius[count:]))
         _add(evidence, "stability.searched_radius", Values(met, lambda _: describe(worst)))
     for name, values in table.items():
         _add(evidence, name, Values(values, _with_axis(describe, name, part.plants.axes)))
     axes = part.plants.axes
-    smaller = {name.partition(".")[2] for name in table if name.startswith(f"{axes[0]}.")}
-    for name in smaller:
-        for axis in axes:
-            found = f"{axis}.{name}"
+    for name in {name.partition(".")[2] for name in table if name.startswith(f"{axes[0]}.")}:
+        for found in (f"{axis}.{name}" for axis in axes):
             _add(evidence, f"axes.{name}", Values(part.margins[found], _with_axis(describe, found, axes)))
-    for rows in part.structured:
-        for row in rows:
-            about = _structured_describer(row, part.name)
-            _add(evidence, "robust.mu", Values(np.array([row.mu]), about))
+    for row in (row for rows in part.structured for row in rows):
+        _add(evidence, "robust.mu", Values(np.array([row.mu]), _structured_describer(row, part.name)))
 
 
 def _add(evidence: Evidence, name: str, more: Values) -> None:
-    """Put more values behind those that a metric has already."""
+    """Append values to those of a metric."""
     before = evidence.metrics.get(name)
     if before is None:
         evidence.metrics[name] = more
@@ -349,7 +304,7 @@ def _neck_describer(evidence: Evidence, controller: ControllerUnderTest, asked: 
 
 
 def worst_row(values: Mapping[str, Values], metric: str, bound: str) -> int:
-    """Return the row of the worst value of a metric: NaN first, else the least for "min", the largest for others."""
+    """Return the row of the worst value of a metric: NaN first, then the smallest for "min", else the largest."""
     found = values[metric].values
     missing = np.flatnonzero(np.isnan(found))
     if missing.size:

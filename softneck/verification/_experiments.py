@@ -1,11 +1,10 @@
-"""Margins by experiment: the loop over a plant is made louder or later until it oscillates, axis by axis and jointly.
+"""Margins by experiment: raise gain or delay of a simulated loop until it oscillates, per axis and jointly.
 
-Gain and delay act on the error between what is measured and the reference. The loop is led to a posture, kicked, and
-listened to: what is still as large in the last window as in the one before, and above what the loop does at gain 1, is
-sustained. Only the first crossing is bisected: stability need not be monotone in the gain.
+Gain and delay act on the control error. The loop moves to a posture and gets a step of its reference. An oscillation
+is sustained if it is as large in the last window as in the one before, and larger than at gain 1. Only the first
+crossing is bisected, as stability need not be monotone in the gain.
 
-Times and sizes are a neck's; of another robot they are stretched by its time and by how far its outputs go, and its
-postures lie around the middle of its outputs.
+Times and sizes are those of the neck, scaled to the robot; postures lie around the middle of its outputs.
 """
 
 from __future__ import annotations
@@ -30,39 +29,38 @@ from ._steps import middle_motors, middle_of
 _LOOP_GAIN_RUNTIME = "softneck.verification._louder_runtime"
 _NECK = Robot.preset()
 _BUFFER_SAMPLES = 34
-# The experiment [s]: led there, at rest, kicked; a moment that does not count, and two windows.
+# The experiment [s]: time to reach the posture, time of the step, a transient, and each of two windows.
 _LEAD_IN_S, _REST_S, _TRANSIENT_S, _WINDOW_S = 1.0, 3.0, 2.0, 4.0
-# Kicks [rad], small before large, and postures (pitch, roll) [rad]: within what every neck can lean under a payload.
+# Steps and postures (pitch, roll), within reach of every neck with a payload.
 _SMALL_RAD, _LARGE_RAD = math.radians(1.0), math.radians(8.0)
 _LEAN_RAD = math.radians(5.0)
 _POSTURES = ((0.0, 0.0), (_LEAN_RAD, 0.0), (0.0, -_LEAN_RAD))
 _ALL_AXES = "both"
-# A neck's sample time [s], of which the delays that are scanned are so many.
+# Unit of the scanned delays.
 _NECK_SAMPLE_TIME_S = 0.02
-# Sustained: the last window has this part of the one before, so what decays by less counts as if it did not, or is
-# above what the kick itself swings without damping: the loop has fed it, though slow parts of a plant may still let it
-# shrink; above this part of the kick, and this many times what the loop does at gain 1.
+# Sustained: at least this ratio of the last window to the one before, or a swing above that of an undamped step;
+# and above this share of the step, and this multiple of the motion at gain 1.
 _SUSTAINED_RATIO, _AUDIBLE_SHARE, _ABOVE_FLOOR = 0.97, 0.1, 2.0
-# Made quieter, a loop that friction holds comes late, and each axis then moves the other: less than the kick.
+# With a lower gain friction delays the axes and they move each other by less than the step.
 _AUDIBLE_SHARE_DOWN = 1.0
-# At gain 1 a loop may hunt by friction; by more than this [rad] peak to peak it oscillates.
+# Largest limit cycle by friction at gain 1, peak to peak.
 _HUNTING_RAD = math.radians(1.0)
-# Parts of the kick: a loop that moves less does not answer it; hunting by more is told.
+# Shares of the step: smallest response of a loop, and smallest limit cycle that is reported.
 _RESPONSE_SHARE, _REPORTED_SHARE = 1e-3, 0.01
-# What is scanned: factors on the gain, up and down, and samples of delay; and to which part a crossing is bisected.
+# Scanned factors on the gain and samples of delay, and the relative tolerance of the bisection.
 _GAINS = tuple(2.0 ** (k / 4.0) for k in range(1, 17))
 _COARSE_GAINS = tuple(2.0 ** (k / 2.0) for k in range(1, 9))
 _DELAY_SAMPLES = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 _BISECTION_TOLERANCE = 0.005
-# Peak to peak, in parts of the kick: linear loops at their border swing by two, and by a little more if they overshoot.
+# Peak to peak over the step: a linear loop at its stability limit swings by two, and more with overshoot.
 _MAX_SWING = 3.0
-# Of which scans one that has crossed says where all end: a gain margin is up or down, whichever is nearer.
+# Scans whose end a crossing bounds: a gain margin is the smaller of both directions.
 _BOUNDED_SCANS = {"gain_up": ("gain_up", "gain_down"), "delay": ("delay",)}
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LoopUnderTest:
-    """What is closed around a plant.
+    """A loop for margins by experiment.
 
     Attributes:
         name: of the plant.
@@ -70,10 +68,10 @@ class LoopUnderTest:
         controller, observer: blocks.
         order: of the loop.
         constants: `plant_inputs` or `plant_parameters` of its `Loop`, such as a payload.
-        compiled: as one function where all parts are blocks; that takes some ten seconds once, and each run a tenth.
-        axes: that are raised.
-        robot: whose loop it is.
-        time, size: by how much the robot is slower than the neck, and an output in SI for each rad of the neck.
+        compiled: as one function if all parts are blocks: ten seconds once, then a tenth of the time per run.
+        axes: whose gain or delay is raised.
+        robot: of the loop.
+        time, size: time scale of the robot, and output in SI per rad of the neck.
         noise: of the sensor over the neck's, in the unit of `size`.
     """
 
@@ -92,27 +90,22 @@ class LoopUnderTest:
 
     @property
     def kicks(self) -> tuple[float, ...]:
-        """Small before large; what noise hides, no model has learned."""
+        """Steps of the reference, small before large, above the sensor noise."""
         large = self.size * _LARGE_RAD
         return tuple(dict.fromkeys((min(max(self.size, self.noise) * _SMALL_RAD, large), large)))
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The outputs' names."""
+        """Names of the outputs."""
         return self.robot.outputs.names
 
     @property
-    def middle(self) -> Vector:
-        """Around which outputs postures lie."""
-        return middle_of(self.robot)
-
-    @property
     def samples(self) -> int:
-        """By how many samples a delay that is scanned is longer than a neck's."""
+        """Samples per unit of the scanned delays."""
         return max(1, round(self.time * _NECK_SAMPLE_TIME_S / self.controller.sample_time))
 
     def postures(self) -> tuple[tuple[float, ...], ...]:
-        """Return where it is kicked, for a neck in rad: nowhere, and leaning to either side."""
+        """Return the postures, in rad of the neck: upright, and leaning to either side."""
         m = len(self.outputs)
         if m == len(_POSTURES[0]):
             return _POSTURES
@@ -122,17 +115,17 @@ class LoopUnderTest:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """The first crossing of one scan.
+    """The first crossing of one scan; [rad] is the SI unit of the outputs.
 
     Attributes:
         plant: its name.
-        axes: "pitch", "roll" or "both", which of another robot are all.
+        axes: name of an axis, or "both" for all.
         what: "gain_up", "gain_down" or "delay".
-        amplitude: of the kick [rad], of another robot in SI.
-        posture: (pitch, roll) [rad], of another robot what its outputs are beside their middle.
-        value: the factor on the gain (above 1 in both ways), or the delay [s]; inf where none was found.
-        hunts: peak to peak at gain 1 [rad], where the loop does not come to rest.
-        robot: whose outputs these are.
+        amplitude: of the step [rad].
+        posture: outputs [rad] relative to their middle.
+        value: factor on the gain (above 1 in both directions) or delay [s]; inf where none was found.
+        hunts: limit cycle at gain 1, peak to peak [rad].
+        robot: of the outputs.
     """
 
     plant: str
@@ -148,24 +141,22 @@ class Crossing:
 def crossings(
     loops: Sequence[LoopUnderTest], *, coarse: bool = False, overall: bool = False, progress: Progress = silent
 ) -> list[Crossing]:
-    """Return the crossings of every loop: each axis and both, up, down and later, small and large, leaning and not.
+    """Return the crossings of every loop over axes, gain and delay, step size and posture.
 
-    A scan ends where an earlier one of the same plant, axes and kind has crossed: only the least is looked for, and
-    later ones say inf there.
+    A scan ends at the crossing of an earlier one of the same plant, axes and kind, and then gives inf.
 
     Args:
         loops: over each plant.
-        coarse: one posture, both axes at once, coarse gains, nothing bisected: the last value without oscillation.
-        overall: only the least gain margin and the least delay margin of all loops are looked for, in half the runs:
-            what the last loop stands of both axes at once, the harder test, ends the scans of all others, which take
-            every other step.
+        coarse: one posture, both axes at once, coarse gains, no bisection: the last value without oscillation.
+        overall: find only the smallest gain and delay margin of all loops, in half the runs: the last loop with both
+            axes at once, the hardest test, bounds the scans of all others, which take every other step.
         progress: called now and then.
     """
     kinds = ("gain_up", "gain_down", "delay")
     groups = [
         (loop, axes, what) for loop in loops for axes in (loop.axes[-1:] if coarse else loop.axes) for what in kinds
     ]
-    # The first compiles the loop; several threads would do that several times.
+    # The first run compiles the loop, once instead of in every thread.
     leaders = groups[:1]
     if overall:
         leaders = [
@@ -192,17 +183,17 @@ def crossings(
 
 
 def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: float = math.inf) -> list[Crossing]:
-    """Return the crossings of one kind; scans end at `least`, or where an earlier one has crossed."""
+    """Return the crossings of one kind; scans end at `least` or at an earlier crossing."""
     found: list[Crossing] = []
     sparse = math.isfinite(least)
-    # Leaning changes how loud a plant is, and not which loops need their gain to be stable.
+    # A posture changes the gain of a plant, not whether a loop is conditionally stable.
     postures = loop.postures()[:1] if coarse or what == "gain_down" else loop.postures()
     for lean, amplitude in product(postures, loop.kicks):
         posture = tuple(loop.size * angle for angle in lean)
         case = _Case(loop, axes, what, amplitude, posture)
         none = 1.0 if what != "delay" else 0.0
         if least <= none:
-            break  # there is no less to look for
+            break  # no smaller value exists
         floor, value = case.floor(), none
         if floor <= loop.size * _HUNTING_RAD:
             value = _first_crossing(case, floor, least, coarse, sparse)
@@ -213,7 +204,7 @@ def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: 
 
 
 def _first_crossing(case: _Case, floor: float, least: float, coarse: bool, sparse: bool = False) -> float:
-    """Return the least value scanned at which the loop oscillates, bisected; inf where none below `least` does."""
+    """Return the smallest scanned value with an oscillation, bisected; inf if there is none below `least`."""
     calm = 0.0 if case.what == "delay" else 1.0
     for scanned in _scan_values(case, coarse, sparse):
         value = min(scanned, least)
@@ -230,12 +221,12 @@ def _scan_values(case: _Case, coarse: bool, sparse: bool) -> Iterator[float]:
         unit = case.loop.samples * case.sample_time
         yield from (samples * unit for samples in (_DELAY_SAMPLES[1::2] if sparse else _DELAY_SAMPLES))
     else:
-        # Down to a quarter: what is stable by itself stands that, and what is not fails sooner.
+        # Down to a quarter: a loop with an unstable plant fails before, others never.
         yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse or sparse else _GAINS
 
 
 def _bisect(case: _Case, calm: float, loud: float, floor: float) -> float:
-    """Return the largest value found without oscillation between a calm one and a loud one."""
+    """Return the largest value without oscillation between a calm and an oscillating one."""
     if case.what == "delay":
         while loud - calm > max(_BISECTION_TOLERANCE * loud, 0.02 * case.sample_time):
             middle = 0.5 * (calm + loud)
@@ -249,7 +240,7 @@ def _bisect(case: _Case, calm: float, loud: float, floor: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Case:
-    """One scan: which axes, what is raised, how hard the loop is kicked, and where."""
+    """One scan: axes, raised quantity, step and posture."""
 
     loop: LoopUnderTest
     axes: str
@@ -259,15 +250,15 @@ class _Case:
 
     @property
     def sample_time(self) -> float:
-        """[s]."""
+        """Sample time [s]."""
         return self.loop.controller.sample_time
 
     def floor(self) -> float:
-        """Return what the loop does at gain 1 and without delay, peak to peak at the end [rad]; inf: nothing."""
+        """Return the final motion at gain 1, peak to peak [rad]; inf if the loop does not respond."""
         return self._windows(1.0, 0.0)[1]
 
     def oscillates(self, value: float, floor: float) -> bool:
-        """Return whether the loop goes on moving at a gain, its reciprocal, or a delay [s]."""
+        """Return whether the oscillation is sustained at a gain, its reciprocal, or a delay [s]."""
         gain = {"gain_up": value, "gain_down": 1.0 / value, "delay": 1.0}[self.what]
         before, last = self._windows(gain, value / self.sample_time if self.what == "delay" else 0.0)
         sustained = last >= _SUSTAINED_RATIO * before or last >= _MAX_SWING * self.amplitude
@@ -275,7 +266,7 @@ class _Case:
         return sustained and last > max(heard, _ABOVE_FLOOR * floor)
 
     def _windows(self, gain: float, delay: float) -> tuple[float, float]:
-        """Return the largest motion to and fro [rad] in the last window but one and in the last."""
+        """Return the largest oscillation [rad] in the last two windows."""
         try:
             result = self._run(gain, delay)
         except DataError:  # numbers overflowed
@@ -284,7 +275,7 @@ class _Case:
         angles = np.stack([result[name] for name in self.loop.outputs])
         kicked = angles[:, result.time >= self.loop.time * _REST_S]
         if (gain, delay) == (1.0, 0.0) and np.ptp(kicked, axis=1).max() <= _RESPONSE_SHARE * self.amplitude:
-            return 0.0, math.inf  # motors that stand at their ends, for one: nothing can be said of this loop
+            return 0.0, math.inf  # no response, such as with motors at their limits: no margin can be found
         parts = angles[:, -2 * rows : -rows], angles[:, -rows:]
         before, last = (max(_oscillation(angle, _MAX_SWING * self.amplitude) for angle in part) for part in parts)
         return before, last
@@ -295,9 +286,9 @@ class _Case:
         parameters = {f"gain_{axis}": gain if on else 1.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
         parameters |= {f"delay_{axis}": delay if on else 0.0 for axis, on in zip(loop.outputs, chosen, strict=True)}
         block, connections = scale_loop_gain(loop.controller, loop.observer, loop.outputs, loop.samples)
-        # Towards upright: no neck is led further than its posture.
+        # Step towards upright, so that no neck leaves its reach.
         kick = np.array([-self.amplitude if p > 0.0 else self.amplitude for p in self.posture]) * chosen
-        posture = tuple(float(a + b) for a, b in zip(loop.middle, self.posture, strict=True))
+        posture = tuple(float(a + b) for a, b in zip(middle_of(loop.robot), self.posture, strict=True))
         middle = float(middle_motors(loop.robot, loop.controller).mean())
         return run_loop(
             Loop(
@@ -307,7 +298,7 @@ class _Case:
                 duration=loop.time * (_REST_S + _TRANSIENT_S + 2.0 * _WINDOW_S), order=loop.order,
                 **loop.constants, other_parameters={"louder": parameters},
                 others={"louder": BlockPart(block)}, connections=connections,
-                # A rate has no reference: it is wanted to be zero.
+                # The reference of a rate is zero.
                 other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},
             ),
             compiled=loop.compiled,
@@ -315,9 +306,9 @@ class _Case:
 
 
 def _oscillation(angle: Vector, away: float) -> float:
-    """Return how far an angle (time,) goes to and fro; peak to peak where that is `away`.
+    """Return the oscillation of an angle (time,): the smaller of largest rise and fall, as creep is none.
 
-    A quiet loop may creep, or stick and come late: what goes one way is no oscillation, unless it runs away.
+    A motion of at least `away` counts in full.
     """
     far = float(np.ptp(angle))
     rise = float((angle - np.minimum.accumulate(angle)).max())
@@ -327,7 +318,7 @@ def _oscillation(angle: Vector, away: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Kicked:
-    """A posture that is reached smoothly, and a step away from it."""
+    """A smooth motion to a posture, then a step."""
 
     posture: tuple[float, ...]
     kick: tuple[float, ...]
@@ -345,13 +336,9 @@ class _Kicked:
 def scale_loop_gain(
     controller: Block, observer: Block | None, outputs: tuple[str, ...] = _NECK.outputs.names, samples: int = 1
 ) -> tuple[Block, dict[str, str]]:
-    """Return what makes a loop louder or later, and its connections: it stands behind the sensor.
+    """Return a block after the sensor that scales the loop gain or adds delay, and its connections.
 
-    Args:
-        controller: sees the observer's angles, or without one those of the sensor.
-        observer: sees the sensor.
-        outputs: that are measured.
-        samples: by how much longer its delays are than a neck's.
+    `samples` is the number of samples per unit of delay.
     """
     reader, role = (controller, "controller") if observer is None else (observer, "observer")
     kept = (_BUFFER_SAMPLES - 2) * samples + 2
@@ -359,11 +346,8 @@ def scale_loop_gain(
     seen = {name: name if observer is None else f"{name}_measured" for name in names}
     ports = {port.name: port for port in reader.inputs}
     read = [name for name in names if seen[name] in ports]
-    missing = [ports[seen[name]].missing for name in read]
-    inputs = [
-        Port(name=f"{name}_measured", unit=ports[seen[name]].unit, missing=gone)
-        for name, gone in zip(read, missing, strict=True)
-    ]
+    used = [ports[seen[name]] for name in read]
+    inputs = [Port(name=f"{name}_measured", unit=p.unit, missing=p.missing) for name, p in zip(read, used, strict=True)]
     references = [
         Port(name=f"{name}_reference", unit=ports[seen[name]].unit) if name in outputs else Port(name=f"{name}_wanted")
         for name in read
@@ -379,17 +363,17 @@ def scale_loop_gain(
         ),
     )  # fmt: skip
     connections = {f"{role}.{seen[name]}": f"louder.{name}_measured_seen" for name in read}
-    # Nobody knows the kick before it comes.
-    connections |= {
-        f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
-        for port in controller.inputs
-        if port.name.endswith("_reference_ahead")
-    }
-    return block, connections
+    return block, connections | connections_without_preview(controller)
+
+
+def connections_without_preview(controller: Block) -> dict[str, str]:
+    """Return connections by which a predictive controller sees the present reference as the future one."""
+    names = [port.name for port in controller.inputs if port.name.endswith("_reference_ahead")]
+    return {f"controller.{name}": f"reference.{name.removesuffix('_ahead')}" for name in names}
 
 
 def crossing_facts(item: Crossing) -> dict[str, Any]:
-    """Return a crossing as JSON values."""
+    """Return the facts on a crossing as JSON values."""
     unit, factor = error_unit(item.robot)
     per = math.radians(1.0) if factor is None else factor
     return {
@@ -400,7 +384,7 @@ def crossing_facts(item: Crossing) -> dict[str, Any]:
 
 
 def crossing_values(found: Sequence[Crossing]) -> dict[str, tuple[Vector, list[Crossing]]]:
-    """Return metric -> values and the crossings behind them: gain margins, and delay margins [ms]."""
+    """Return gain and delay margins [ms]: metric -> values and their crossings."""
     table: dict[str, tuple[Vector, list[Crossing]]] = {}
     for name, kinds, factor in (("gain_margin", ("gain_up", "gain_down"), 1.0), ("delay_margin_ms", ("delay",), 1e3)):
         names = found[0].robot.outputs.names if found else ()

@@ -19,13 +19,12 @@ from softneck.runtime import Block
 
 from ._plants import Plants, mixing_matrix
 
-# Margins that are better large, and better small; of each axis, and of all together.
+# Margins of each axis: those that are better large, and those that are better small.
 LARGE = ("disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
 SMALL = ("sensitivity", "complementary", "control_sensitivity")
-MIMO = "mimo_disk_margin"
-#: Of a neck [rad/s].
-LOWEST = 0.02
-# Plants whose responses are held in memory at once.
+# Lowest frequency of the neck's grid [rad/s].
+_LOWEST_FREQUENCY = 0.02
+# Plants whose responses are in memory at once.
 _CHUNK_SIZE = 64
 # The cosine of pi, up to 1e-6 rad.
 _COS_PI = -1.0 + 5e-13
@@ -33,7 +32,7 @@ _COS_PI = -1.0 + 5e-13
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearLaw:
-    """The feedback part of a controller, `u = Ky(z) y`, and its way from the reference.
+    """State space of a linear controller, `u = Kr(z) r + Ky(z) y`.
 
     Attributes:
         A: (n, n).
@@ -53,7 +52,7 @@ class LinearLaw:
 
     @classmethod
     def of(cls, system: Any, robot: Robot | None = None) -> LinearLaw:
-        """Return it of a system from a robot's references and outputs to their inputs, such as theta_i and phi_i.
+        """Return the law of a system from references and outputs to the redefined inputs, such as theta_i and phi_i.
 
         Raises:
             SettingsError: other channels or not discrete.
@@ -84,13 +83,9 @@ class LinearLaw:
         """Return Ky (m, axes, axes) at `frequency` [rad/s]."""
         return self._response(frequency, self.By, self.Dy)
 
-    def forward(self, frequency: Vector) -> np.ndarray:
-        """Return the way from the reference (m, axes, axes)."""
-        return self._response(frequency, self.Br, self.Dr)
-
     @property
     def coupled(self) -> bool:
-        """Whether one axis' angle moves another's input."""
+        """Whether the output of one axis changes the input of another."""
         Ky = np.abs(self.feedback(np.geomspace(0.002, math.pi, 20) / self.sample_time))
         # 1e-9: rounding of an allocation that is diagonal.
         others = Ky[:, ~np.eye(Ky.shape[1], dtype=bool)].sum(axis=1)
@@ -106,11 +101,8 @@ class LinearLaw:
 
 
 def frequency_grid(sample_time: float, time: float = 1.0, points: int = 360) -> Vector:
-    """Return the frequencies [rad/s] on which loops are judged, up to the Nyquist frequency.
-
-    From 0.02 rad/s of a neck, of a robot that is `time` as slow from less.
-    """
-    return np.geomspace(LOWEST / time, math.pi / sample_time, points)
+    """Return the frequencies [rad/s] of all margins, up to Nyquist; `time` is the robot's time scale."""
+    return np.geomspace(_LOWEST_FREQUENCY / time, math.pi / sample_time, points)
 
 
 def radii(plants: Plants, law: LinearLaw) -> Vector:
@@ -126,7 +118,7 @@ def radii(plants: Plants, law: LinearLaw) -> Vector:
 
 
 def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return A (n, N, N), B (n, N, axes), C (n, axes, N): observable form of each axis behind a line of its delay."""
+    """Return A (n, N, N), B (n, N, axes), C (n, axes, N): observable form of each axis after its delay line."""
     n, m, q = len(plants), len(plants.axes), plants.numerator.shape[2] - 1
     D = int(plants.delay.max(initial=0))
     size = q + D
@@ -140,7 +132,7 @@ def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]
         source = X[:, i]
         b = plants.numerator[:, i, 1:]
         delay = plants.delay[:, i]
-        # The input comes from the end of the delay line, or straight from the controller where there is none.
+        # The input is the end of the delay line, or the controller's output without delay.
         late = rows[delay > 0]
         A[late[:, None], at + np.arange(q)[None, :], (at + q + delay[late] - 1)[:, None]] += b[late]
         now = rows[delay == 0]
@@ -160,7 +152,7 @@ def loops(plants: Plants, law: LinearLaw, w: Vector) -> tuple[np.ndarray, np.nda
 
 
 def inverse(M: np.ndarray) -> np.ndarray:
-    """Return the inverses of small matrices (..., axes, axes); those of 2 x 2 are written out."""
+    """Return the inverses of small matrices (..., axes, axes), in closed form for 2 x 2."""
     if M.shape[-1] != 2:
         return np.linalg.inv(M)
     a, b, c, d = M[..., 0, 0], M[..., 0, 1], M[..., 1, 0], M[..., 1, 1]
@@ -209,10 +201,9 @@ def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
 
 
 def _scalars(M: np.ndarray) -> np.ndarray:
-    """Return the structured singular value (...) of M (..., m, m) for m complex scalars: exact up to two of them.
+    """Return the structured singular value (...) of M (..., m, m) for m complex scalars, exact for m = 2.
 
-    Of more the spectral radius of |M|, which no diagonal scaling makes less safe (Safonov 1982): a margin that is true
-    or too small.
+    For other m it is the spectral radius of |M|, an upper bound (Safonov 1982), so margins are exact or too small.
     """
     if M.shape[-1] == 2:
         return two_scalars(M)
@@ -222,7 +213,7 @@ def _scalars(M: np.ndarray) -> np.ndarray:
 def classical_margins(L: np.ndarray, w: Vector) -> dict[str, Vector]:
     """Return gain, phase [deg] and delay margins [ms] of scalar loops (n, m), by straight lines between frequencies.
 
-    The gain margin is the factor, up or down, whichever is nearer; so is the phase.
+    Gain and phase margins are the smaller of both directions.
     """
     n = L.shape[0]
     x = np.log(w)
@@ -235,7 +226,7 @@ def classical_margins(L: np.ndarray, w: Vector) -> dict[str, Vector]:
         border = 2.0 * math.pi * max(turns[i, k], turns[i, k + 1]) - math.pi
         part = (border - phase[i, k]) / (phase[i, k + 1] - phase[i, k])
         gain[i] = min(gain[i], abs(size[i, k] + part * (size[i, k + 1] - size[i, k])))
-    # At the Nyquist frequency a loop is real: where it is negative it has come to such a multiple, and passes none.
+    # A loop is real at Nyquist: where it is negative, its phase reaches such a multiple without passing it.
     ends = np.cos(phase[:, -1]) < _COS_PI
     gain[ends] = np.minimum(gain[ends], np.abs(size[ends, -1]))
     least, delay = np.full(n, math.inf), np.full(n, math.inf)
@@ -251,15 +242,15 @@ def classical_margins(L: np.ndarray, w: Vector) -> dict[str, Vector]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControllerUnderTest:
-    """A controller as verification sees it.
+    """A controller with its linear forms.
 
     Attributes:
-        block: what runs.
-        robot: whose it is.
-        laws: name -> linear form: one named "" of a linear controller, one for each frozen point of another.
+        block: its runtime.
+        robot: of the controller.
+        laws: name -> linear form: "" for a linear controller, else one for each frozen point.
         order: of the loop.
         extra: samples that the order adds to the plant's delay.
-        why: why there is no linear form; "" where there is one.
+        why: why there is no linear form, or "".
     """
 
     block: Block
@@ -271,15 +262,10 @@ class ControllerUnderTest:
 
 
 def controller_under_test(controller: Any, *, order: str | None, observer: bool) -> ControllerUnderTest:
-    """Return what of `controller` can be judged.
+    """Return a controller with its linear forms; `order` None is that of its design.
 
-    A linear controller has `ss()` (or `to_lti()`), from references and outputs to the redefined inputs; one that is
-    linear at each point of operation has `ss_at(point)` and `points()`, name -> point.
-
-    Args:
-        controller: anything with `block()`.
-        order: of the loop; None for the one that it was designed for.
-        observer: whether the loop has one.
+    A linear controller has `ss()` or `to_lti()`, from references and outputs to the redefined inputs. One that is
+    linear at each operating point has `ss_at(point)` and `points()`, name -> point.
 
     Raises:
         SettingsError: no controller, or a linear form with other channels.
@@ -318,23 +304,25 @@ def _laws(controller: Any) -> tuple[dict[str, LinearLaw], str]:
 
 
 _POINT_COUNT, _POINTS_ABOVE = 2000, 400
-# What is certified on the data; the others of an axis are of the box and its samples alone.
-TESTED = ("sensitivity", "complementary", "disk_margin", "gain_margin", "phase_margin_deg", "delay_margin_ms")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisMargins:
-    """What the data support about one axis of one family.
+    """Margins of one axis that hold for every response within the weight of the recordings, in their band.
+
+    At each frequency the loop is any point of the disk `L = L0 (1 + W D)`, `|D| <= 1`; margins are those of its worst
+    point, in closed form. Above the band the response is unknown: the gain margin keeps the crossover in the band, and
+    a loop that crosses above has no margin. With a stated roll-off the size is known there and the phase is not.
 
     Attributes:
         source: name of the family.
-        axis: of the controller's channels.
+        axis: its name.
         band: [rad/s].
-        crossover: the highest at which the loop of some response crosses 1 [rad/s]; inf where it is above the band.
-        margins: name -> value; empty where the crossover is above the band.
-        mu: the largest `|W T|`; below 1 all responses within the weight are stable.
-        at: name -> frequency at which that is found [rad/s].
-        unheard: recordings of the family that move the axis and show no response of it.
+        crossover: highest crossover of any response [rad/s]; inf above the band.
+        margins: name -> value; empty if the crossover is above the band.
+        mu: largest `|W T|`; below 1 all responses within the weight are stable.
+        at: name -> frequency of that value [rad/s].
+        unheard: recordings that move the axis without a response.
     """
 
     source: str
@@ -347,12 +335,11 @@ class AxisMargins:
     unheard: tuple[str, ...] = ()
 
     def why(self) -> str:
-        """Return why nothing is certified, with what to do; "" where something is."""
+        """Return why there are no margins and what to record, or ""."""
         if self.unheard:
             return (
-                f"not supported by the data: {self.unheard[0]} moves {self.axis} and shows no response of it, so "
-                f"{self.source} knows nothing of what it holds (slack tendons, friction?); record that where it "
-                "answers, or leave it out of the family"
+                f"not supported by the data: {self.axis} does not respond in {self.unheard[0]} of {self.source} (slack "
+                "tendons, friction?); record it at an operating point where it responds, or leave it out of the family"
             )
         if math.isfinite(self.crossover):
             return ""
@@ -366,22 +353,12 @@ class AxisMargins:
 def axis_margins(
     measured: AxisMeasured, law: LinearLaw, axis: int, *, source: str, name: str, extra: int, rolloff: float = -1.0
 ) -> AxisMargins:
-    """Return the margins of one axis that hold for every response within the weight.
-
-    Args:
-        measured: what the recordings of a family show.
-        law: the controller's linear form.
-        axis: number of it.
-        source: name of the family.
-        name: of the axis.
-        extra: samples of delay that the loop's order adds.
-        rolloff: by which the loudest response at the band's end falls above it [dB/decade]; below 0 nobody knows.
-    """
+    """Return the margins of one axis; `rolloff` of the plant above the band in dB/decade, negative: unknown."""
     Ts = law.sample_time
     w = np.geomspace(*measured.band, _POINT_COUNT)
     G0 = response_of(measured.model, w, Ts) * np.exp(-1j * w * Ts * extra)
     L = -law.feedback(w)[:, axis, axis] * G0
-    # Half the way to the next frequency on top: no point of the curve lies between two disks.
+    # Add half the distance to the next frequency, so that the disks cover the whole curve.
     way = 0.5 * np.abs(np.diff(L)) / np.minimum(np.abs(L[1:]), np.abs(L[:-1]))
     W = measured.weight_at(w) + np.maximum(np.append(way, 0.0), np.append(0.0, way))
     loud = (1.0 + W) * np.abs(L)
@@ -392,7 +369,7 @@ def axis_margins(
         crossover = math.inf
     mu = W * np.abs(L / (1.0 + L))
     values = _disk_margins(L, W, w)
-    # The gain at which the loudest loop would cross where nothing is known.
+    # A larger gain would cross above the band, where nothing is known.
     values["gain_margin"] = np.minimum(values["gain_margin"], 1.0 / max(loud[-1], above_band, 1e-12))
     peaks = ("sensitivity", "complementary")
     places = {key: int(np.argmax(item) if key in peaks else np.argmin(item)) for key, item in values.items()}
@@ -403,7 +380,7 @@ def axis_margins(
         margins["complementary"] = max(margins["complementary"], above_band / (1.0 - above_band))
         margins["disk_margin"] = min(margins["disk_margin"], 2.0 * (1.0 - above_band) / (1.0 + above_band))
     if mu.max() >= 1.0:
-        # The disk may hold the point -1: none of its margins is above none at all.
+        # The disk may contain -1: there is no margin.
         margins |= dict.fromkeys(peaks, math.inf)
         margins |= {"disk_margin": 0.0, "gain_margin": 1.0, "phase_margin_deg": 0.0, "delay_margin_ms": 0.0}
     return AxisMargins(
@@ -446,15 +423,14 @@ def _disk_margins(L: np.ndarray, W: Vector, w: Vector) -> dict[str, Vector]:
 
 
 def _largest_ratio(L: np.ndarray, r: Vector, a: float, b: float) -> Vector:
-    """Return the largest `|(a + b l)/(1 + l)|` over the disk `|l - L| <= r` that does not hold -1: b + (a - b)/(1 + l)
-    is a disk again."""
+    """Return the largest `|(a + b l)/(1 + l)|` over a disk `|l - L| <= r` without -1: its image is a disk."""
     c, square = 1.0 + L, np.abs(1.0 + L) ** 2 - r**2
     centre, radius = np.conj(c) / square, r / square
     return np.abs(b + (a - b) * centre) + abs(a - b) * radius
 
 
 def _gain_ratio(L: np.ndarray, W: Vector) -> Vector:
-    """Return the least factor, up or down, that brings a point of the disk onto -1: `1 + 2 k Re L + k^2 q = 0`."""
+    """Return the smallest factor, up or down, that moves the disk onto -1: `1 + 2 k Re L + k^2 q = 0`."""
     q, along = np.abs(L) ** 2 * (1.0 - W**2), np.real(L)
     root = np.sqrt(np.maximum(along**2 - q, 0.0))
     real = along**2 >= q
@@ -468,7 +444,7 @@ def _gain_ratio(L: np.ndarray, W: Vector) -> Vector:
 def data_margins(
     families: Mapping[str, Any], law: LinearLaw, axes: tuple[str, ...], extra: int, rolloff: float
 ) -> list[AxisMargins]:
-    """Return what the data support about every axis of every family that was tested against them."""
+    """Return the margins over the data of every axis of every tested family."""
     return [
         replace(
             axis_margins(measured, law, axes.index(axis), source=name, name=axis, extra=extra, rolloff=rolloff),

@@ -1,4 +1,4 @@
-"""Some axes with cross gains, each a transfer function behind its delay, motors where they were told to be."""
+"""Linear axes with delays and cross gains as a plant; motors follow their set-points at once."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class LinearPlantArrays(Arrays):
 
 
 class LinearPlantState(StateVector):
-    """What each axis remembers."""
+    """State of each axis."""
 
     random = cells("6", "generator of the measurement noise")
     x = cells("axes, q", "observable form of each axis, its angle first [rad]; the last entry stays zero")

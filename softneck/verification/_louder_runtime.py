@@ -1,4 +1,4 @@
-"""Loop gain and delay, put between sensor and controller: what is measured is the reference and g times the error.
+"""Loop gain and delay between sensor and controller: the output is the reference plus g times the error.
 
 At rest on the reference nothing changes, so the loop keeps its operating point whatever its gain.
 """
@@ -17,13 +17,13 @@ class LouderArrays(Arrays):
 
 
 class LouderState(StateVector):
-    """What was measured before."""
+    """Past errors of each channel."""
 
     error = cells("n, kept", "measured less reference, newest first")
 
 
 def initialise(p: LouderArrays, parameters: np.ndarray, x: LouderState, outputs: np.ndarray) -> None:
-    """Nothing was measured before."""
+    """Start with zero errors."""
     x[:] = 0.0
     outputs[:] = 0.0
 

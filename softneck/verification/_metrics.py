@@ -19,23 +19,23 @@ from ._linear import LARGE, SMALL
 from ._plants import PlantSource
 from ._steps import METRICS
 
-# Of the defaults [deg].
+# Sensor noise of the defaults.
 _NOISE_DEG = 0.05
-# Angles of every robot, whatever the unit of its outputs is.
+# Angles of every robot, independent of the unit of its outputs.
 _ANGLE_KEYS = ("orientations_deg", "phase_margin_deg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scale:
-    """What the neck's numbers are multiplied by to be a robot's; of the neck all are one.
+    """Factors from the neck's limits to those of a robot; all are 1 for the neck.
 
     Attributes:
-        robot: whose requirements they are.
-        time: of seconds.
-        size: of degrees, in the unit that outputs are shown in.
+        robot: of the requirements.
+        time: factor of seconds.
+        size: of degrees, in the display unit of the outputs.
         load: of radians at the plant's input, in the unit of the motors.
-        noise: of degrees of the sensor's noise, as `size`.
-        known: whether robot and plants told all of it; else what a user states is not held against it.
+        noise: of degrees of sensor noise, as `size`.
+        known: whether robot and plants give all factors; else stated values are not checked against them.
     """
 
     robot: Robot = field(default_factory=Robot.preset)
@@ -50,7 +50,7 @@ class Scale:
         """Return the scale from the robot file, else from its ranges and plants.
 
         Raises:
-            SettingsError: plants of a robot that does not say where its set-points end.
+            SettingsError: plants of a robot without limits of its set-points.
         """
         slowest = [1.0 / float(box.nominal[1]) for source in sources for box in source.axes]
         scaling = Scaling.of(robot, time_constant=max([*slowest, *(s.sample_time for s in sources)], default=None))
@@ -77,11 +77,11 @@ class Scale:
 
     @property
     def gain(self) -> float:
-        """One of a gain in scaled quantities, in SI."""
+        """SI value of a unit gain in scaled quantities."""
         return self.si(self.size) / math.radians(1.0) / (to_si(self.robot.motors.unit)[0] * self.load)
 
     def factor(self, name: str) -> float:
-        """Return what a number of the neck is multiplied by: of a key or metric such as `size_deg`, `settling_s`."""
+        """Return the factor of a key or metric such as `size_deg` or `settling_s`."""
         if name == "load_rad":
             return self.load
         if name == "noise_deg":
@@ -89,12 +89,12 @@ class Scale:
         if name == "circle_rad_s":
             return 1.0 / self.time
         if name.endswith("_deg") and name not in _ANGLE_KEYS:
-            # A steady output is no quieter than its sensor.
+            # A steady-state error is at least the sensor noise.
             return max(self.size, self.noise) if name == "steady_rms_deg" else self.size
         return self.time if name.endswith(("_s", "_ms")) else 1.0
 
     def name_of(self, name: str) -> str:
-        """Return a neck's key or metric as the robot's: `load_rms_mm` for `load_rms_deg`, `max_bar` for `max_rad`."""
+        """Return the robot's name of a key or metric: `load_rms_mm` for `load_rms_deg`, `max_bar` for `max_rad`."""
         if name.rpartition(".")[2] in _ANGLE_KEYS:
             return name
         motor = self.robot.motors.unit.replace("/", "_")
@@ -102,18 +102,18 @@ class Scale:
         return re.sub(r"_rad$", f"_{motor}", own.replace("variation_rad_s", f"variation_{motor}_s"))
 
     def table(self, defaults: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a table of defaults as the robot's: keys in its units, numbers by its range and its time constant."""
+        """Return a table of defaults scaled to the robot, with keys in its units."""
         return {
             self.name_of(key): _times(self.factor(key.rpartition(".")[2]), value) for key, value in defaults.items()
         }
 
     def si(self, value: float) -> float:
-        """Return an output as people see it, such as in deg, in SI."""
+        """Convert an output from its display unit, such as deg, to SI."""
         factor = error_unit(self.robot)[1]
         return math.radians(value) if factor is None else factor * value
 
     def shown(self, values: Any) -> Any:
-        """Return outputs in SI as people see them."""
+        """Convert outputs from SI to their display unit."""
         factor = error_unit(self.robot)[1]
         return np.degrees(values) if factor is None else values / factor
 
@@ -124,7 +124,7 @@ def _unit_factor(robot: Robot) -> float:
 
 
 def _times(factor: float, value: Any) -> Any:
-    """Return numbers times a factor, also in tables; lists, texts and switches as they are."""
+    """Scale numbers, also in tables; lists, texts and booleans stay."""
     if isinstance(value, Mapping):
         return {key: _times(factor, item) for key, item in value.items()}
     plain = isinstance(value, bool) or not isinstance(value, int | float) or factor == 1.0
@@ -132,11 +132,11 @@ def _times(factor: float, value: Any) -> Any:
 
 
 def round_12_digits(value: float) -> float:
-    """Return it to 12 digits: without what conversions of units round."""
+    """Round to 12 digits, which removes rounding errors of unit conversions."""
     return float(f"{value:.12g}")
 
 
-#: Of the loops of [track], which `softneck tune` alone closes.
+# Metrics of the loops of [track], which only `tune` runs.
 _TRACK_METRICS = ("circle_rms_deg", "ahead_rms_deg", "variation_rad_s")
 _AXIS_METRICS = (*LARGE, *SMALL)
 _SIM_METRICS = (
@@ -146,7 +146,7 @@ _SIM_METRICS = (
 
 
 def metric_names(robot: Robot, *, track: bool = False) -> tuple[str, ...]:
-    """Return the names of all metrics that a requirement of a robot can be about; `track`: those of [track] too."""
+    """Return the names of all metrics of a robot; with `track`, also those of [track]."""
     name_of = Scale(robot=robot).name_of
     return (
         "stability.radius",
@@ -160,7 +160,7 @@ def metric_names(robot: Robot, *, track: bool = False) -> tuple[str, ...]:
     )
 
 
-#: Of a neck.
+#: Names of all metrics of the neck.
 METRIC_NAMES = metric_names(Robot.preset())
 
 
@@ -198,6 +198,6 @@ _GROUPS = {
 def metric_title(metric: str) -> str:
     """Return the plain name of a metric with its key: "gain margin, worst axis (axes.gain_margin)"."""
     group, _, name = metric.partition(".")
-    # What follows the name is the unit of the robot or of the metric: `load_rms_mm`, `rise_s`.
+    # The suffix is a unit: `load_rms_mm`, `rise_s`.
     known = max((key for key in _TITLES if f"{name}_".startswith(f"{key}_")), key=len, default="")
     return f"{_TITLES[known]}, {_GROUPS.get(group, group)} ({metric})" if known else metric

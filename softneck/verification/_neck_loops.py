@@ -1,4 +1,4 @@
-"""Loops over simulation models: the user's own, or a robot's virtual plant and plausible ones around it."""
+"""Loops over simulation models: the user's, or a robot's virtual plant and random ones near it."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from softneck.plant import PRESETS, NeckParameters, VirtualNeck
 from softneck.robot import Robot, Scaling, load_for_robot
 from softneck.runtime import Block
 
-from ._experiments import LoopUnderTest
+from ._experiments import LoopUnderTest, connections_without_preview
 from ._metrics import Scale
 from ._requirements import Requirements
 from ._steps import Steps
 
-# Set by hand [rad]: pretension changes by some 3 % of itself.
+# Set by hand: the pretension changes by some 3 %.
 _COCONTRACTION_TOLERANCE_RAD = 0.1
-# Of `adaptive` on foreign necks such margins were up to four times the true ones.
+# On held-out robots such margins of `adaptive` were up to four times the true ones.
 ALONE = (
     "not supported by the data: found by experiment on models alone; a controller without linear form (`ss()`) is not "
-    "held against the weight over the recordings"
+    "checked against the recordings"
 )
 
 
@@ -41,10 +41,10 @@ class SimulationModel:
     Attributes:
         name: of its file.
         make: returns a new part, given the seed of its sensor's noise and the loop's sample time [s].
-        quiet: as `make`, without noise where the plant knows how.
-        payload: "inputs" or "parameters", as what it takes one; "" for none.
-        parameters: of a virtual neck; None of another plant.
-        conditions: payload and co-contraction that a model was trained at; nothing where it does not say.
+        quiet: as `make`, without noise if the plant can.
+        payload: "inputs" or "parameters" that set it, or "".
+        parameters: of a virtual neck; else None.
+        conditions: payload and co-contraction of the training data, if known.
     """
 
     name: str
@@ -55,26 +55,22 @@ class SimulationModel:
     conditions: Mapping[str, list[float]] = field(default_factory=dict)
 
     def payloads(self, asked: Sequence[float]) -> list[float]:
-        """Return which of the payloads asked for loops of it carry [kg]; one that is not said is 0."""
-        if self.payload == "parameters":  # a model knows those between its recordings
+        """Return those of the payloads [kg] that the plant can carry; 0 if it has no payload."""
+        if self.payload == "parameters":  # a model is valid between its recordings
             seen = self.conditions["payload_kg"]
             return [kg for kg in asked if _within(kg, seen)] or [min(seen)]
         return list(asked) if self.payload else [0.0]
 
     def carrying(self, payload: float) -> dict[str, Any]:
-        """Return what says a payload [kg] to a `Loop` whose plant it is."""
+        """Return the arguments of `Loop` that set a payload [kg]."""
         return {f"plant_{self.payload}": {"payload": payload}} if self.payload else {}
 
 
 def named_plants(plants: Any, robot: str | Path | Robot | None = None) -> dict[str, Any]:
-    """Return name -> plant of one, several or named plants.
-
-    Args:
-        plants: linear models, families, simulation models, or the files of any, FMUs and presets of necks among them.
-        robot: whose plants they are; None: what the files say.
+    """Return name -> plant of one, several or named plants, objects or files.
 
     Raises:
-        SettingsError: what is no plant.
+        SettingsError: an object that is no plant.
     """
     if isinstance(plants, Mapping):
         named = {str(name): plant for name, plant in plants.items()}
@@ -88,7 +84,7 @@ def named_plants(plants: Any, robot: str | Path | Robot | None = None) -> dict[s
 
 def _opened_plant(item: Any, robot: str | Path | Robot | None) -> Any:
     if isinstance(item, str | Path) and Path(item).suffix == ".fmu":
-        # FMUs are loaded in several threads, each of which works in the FMU's own folder for a moment.
+        # Loading an FMU changes the folder for a moment, in several threads.
         return partial(FmuPart, Path(item).absolute(), role="plant")
     path = Path(item) if isinstance(item, str | Path) else None
     if path is not None and (path.suffix == ".toml" or (str(item) in PRESETS and not path.exists())):
@@ -100,13 +96,13 @@ def _opened_plant(item: Any, robot: str | Path | Robot | None) -> Any:
 
 
 def is_simulation_model(thing: Any) -> bool:
-    """Return whether a thing steps as a plant and has no linear form that a model or a family is judged by."""
+    """Return whether an object steps as a plant and has no linear form."""
     if isinstance(thing, NeckParameters | VirtualNeck | Block):
         return True
     if not hasattr(thing, "tf"):
         return callable(thing) or hasattr(thing, "block")
     try:
-        # Every identified model has the method; nonlinear ones refuse.
+        # Every identified model has the method; nonlinear ones raise.
         thing.tf(robot_of(thing).outputs.names[0])
     except SoftneckError:
         return hasattr(thing, "block")
@@ -114,10 +110,10 @@ def is_simulation_model(thing: Any) -> bool:
 
 
 def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> SimulationModel:
-    """Return a neck's parameters, a nonlinear model, a block, or a function that returns a part, as a plant.
+    """Return neck parameters, a nonlinear model, a block, or a function that returns a part, as a simulation model.
 
     Raises:
-        SettingsError: no plant, or one that does not show pitch and roll, or another robot's outputs.
+        SettingsError: no plant, or one without the robot's outputs.
     """
     if isinstance(thing, NeckParameters | VirtualNeck):
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
@@ -134,13 +130,13 @@ def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> 
         make = partial(BlockPart, block)
     part = make()
     if not hasattr(part, "outputs"):
-        raise SettingsError(f"{name}: a function that is a plant returns a part; this one a {type(part).__name__}.")
+        raise SettingsError(f"{name}: a plant function must return a part; got a {type(part).__name__}.")
     names = [port.name for port in part.outputs]
     part.close()
     outputs = (robot or Robot.preset()).outputs.names
     if part.role != "plant" or not set(outputs) <= set(names):
         raise SettingsError(
-            f"{name}: is no plant with the outputs {' and '.join(outputs)} (it has {', '.join(names)})."
+            f"{name}: needs the outputs {' and '.join(outputs)} of a plant (it has {', '.join(names)})."
         )
     known = getattr(thing, "findings", {}).get("conditions", {})
     settable = part.block.parameters if isinstance(part, BlockPart) and "payload_kg" in known else ()
@@ -154,24 +150,14 @@ def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> 
 def unrecorded_conditions(
     tested: Mapping[str, Any], own: Sequence[SimulationModel], steps: Steps, robot: Robot | None = None
 ) -> dict[str, str]:
-    """Return why nothing is known of the "loop" and of simulation models, "sim"; nothing where all was recorded.
-
-    Args:
-        tested: by the names of families, what each says of its recordings.
-        own: simulation models.
-        steps: which show where the loop holds the motors.
-        robot: whose; None: the neck. Only tendons can be slack.
-    """
+    """Return why the recordings do not support "loop" or "sim"; `steps` give the loop's co-contraction."""
     robot = robot or Robot.preset()
     if robot.tendon_angles is None:
         return {}
-    factor, unit, same = (
-        to_si(robot.motors.unit)[0],
-        robot.motors.unit,
-        _COCONTRACTION_TOLERANCE_RAD * Scaling.of(robot).motor_unit,
-    )
+    factor, unit = to_si(robot.motors.unit)[0], robot.motors.unit
+    same = _COCONTRACTION_TOLERANCE_RAD * Scaling.of(robot).motor_unit
     half = steps.motors.shape[2] // 2
-    # Of most plants: where motors reach their limits their mean is another.
+    # The median, as the mean of motors at their limits differs.
     held = float(np.median(steps.motors[:, :, half - 1].mean(axis=-1)))
     found: dict[str, str] = {}
     for name, item in tested.items():
@@ -179,9 +165,9 @@ def unrecorded_conditions(
         for kg in sorted({value for part in made for value in part["payload_kg"]}):
             if not any(_covers(plant, kg, held) for plant in own):
                 found["sim"] = (
-                    f"not supported by the data: {name} was recorded with {kg:g} kg, and no simulation model carries "
-                    f"that at a co-contraction of {held / factor:.2g} {unit}; `softneck identify greybox` a recording "
-                    "that does, or calibrate a neck to it (`softneck.calibrate` in Python)"
+                    f"not supported by the data: {name} was recorded with {kg:g} kg, and no simulation model covers "
+                    f"that at a co-contraction of {held / factor:.2g} {unit}; run `softneck identify greybox` on a "
+                    "recording that does, or calibrate a neck to it (`softneck.calibrate` in Python)"
                 )
             at = [end for part in made if _within(kg, part["payload_kg"]) for end in part["cocontraction"]]
             if not _within(held, at, same):
@@ -195,22 +181,18 @@ def unrecorded_conditions(
 
 
 def missing_payloads(own: Sequence[SimulationModel], asked: Requirements) -> dict[str, str]:
-    """Return which of the payloads asked for no loop of a plant carried, as it knows none; nothing where all did."""
+    """Return a note on the required payloads that a plant cannot carry."""
     wanted = [kg for kg in asked.sim["payloads_kg"] if kg > 0.0]
     left = {plant.name: [f"{kg:g}" for kg in wanted if kg not in plant.payloads(wanted)] for plant in own}
-    said = [
-        f"no loop of {name} carries {', '.join(heavy)} kg, which it does not know"
-        for name, heavy in left.items()
-        if heavy
-    ]
+    said = [f"{name} does not model {', '.join(heavy)} kg" for name, heavy in left.items() if heavy]
     if not said or asked.robot.neck is None:
         return {}
-    way = "`softneck identify greybox` recordings that say theirs, in a column `payload [kg]`"
+    way = "run `softneck identify greybox` on recordings with a column `payload [kg]`"
     return {"loops with payload": f"{'; '.join(said)}; {way}"}
 
 
 def _covers(plant: SimulationModel, kg: float, held: float) -> bool:
-    """Return whether a plant takes any payload, or was made from recordings with this one and where the loop is."""
+    """Return whether a plant takes any payload, or was identified at this payload and co-contraction."""
     known = plant.conditions
     return plant.payload == "inputs" or (
         _within(kg, known.get("payload_kg", [0.0]))
@@ -222,26 +204,26 @@ def _within(value: float, ends: Sequence[float], more: float = 0.0) -> bool:
     return min(ends) - more <= value <= max(ends) + more
 
 
-# When the step comes [s]: after the controller took over the motors, or has pulled tendons taut.
+# Time of the step: after the controller took over the motors, or has tightened the tendons.
 _STEP_AT_S, _STEP_AT_TAUT_S = 0.5, 3.0
 _AXIS_METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
 _MOTOR_METRICS = ("max_rad", "limit_violation_s", "slack_s")
-# An axis that moves less than this part of the step is not judged as stepped.
+# Smallest share of the step for an axis to count as stepped.
 _STEPPED_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopRun:
-    """One loop over an own plant or the virtual neck.
+    """One loop over a simulation model.
 
     Attributes:
         name: "paper, 0.5 kg, 45 deg".
-        parameters: the neck's; None of a plant that is no virtual neck.
+        parameters: of a virtual neck; else None.
         payload: [kg].
         orientation: of the step [rad].
         seed: of the sensor's noise.
-        metrics: name -> the worse stepped axis, or of the motors; inf where a level is never reached.
-        result: its signals; None where the loop broke off.
+        metrics: name -> value of the worst stepped axis, or of the motors; inf where a level is never reached.
+        result: its signals; None if the loop diverged.
     """
 
     name: str
@@ -254,9 +236,9 @@ class LoopRun:
 
 
 def why_no_virtual_plant(robot: Robot, asked: Requirements) -> str:
-    """Return why there are no loops over a virtual plant; "" where there are."""
+    """Return why there are no loops over a virtual plant, or ""."""
     if not asked.sim["necks"]:
-        return "no loops over the virtual neck were asked for (necks = 0)"
+        return "loops over the virtual neck are switched off (necks = 0)"
     try:
         virtual_plant(robot, asked)
     except SettingsError as error:
@@ -267,20 +249,20 @@ def why_no_virtual_plant(robot: Robot, asked: Requirements) -> str:
 
 
 def preset_of(asked: Requirements) -> str:
-    """Return the preset or neck file of the loops: the given one, else the robot's own."""
+    """Return the preset or neck file of the loops: the required one, else the robot's."""
     own = asked.own.get("sim", {}).get("preset", asked.robot.neck)
     return str(asked.sim["preset"] if own is None else own)
 
 
 def virtual_plant(robot: Robot, asked: Requirements) -> tuple[str, VirtualNeck]:
-    """Return the given virtual plant, else the robot's own, and its name."""
+    """Return name and plant of the required preset, else of the robot."""
     given = asked.own.get("sim", {}).get("preset")
     plant = VirtualNeck.of(robot, None if given is None else NeckParameters.preset(str(given)))
     return preset_of(asked), plant
 
 
 def neck_file_of(robot: Robot, asked: Requirements) -> Path:
-    """Return what names the physics of the loops: a preset or a neck file."""
+    """Return the preset or the path of the neck file of the loops."""
     given = "preset" in asked.own.get("sim", {})
     return Path(preset_of(asked)) if given or robot.folder is None else robot.folder / preset_of(asked)
 
@@ -292,29 +274,19 @@ def direction(orientation: float, robot: Robot) -> tuple[float, ...]:
 
 
 def step_time(controller: Block, asked: Requirements) -> float:
-    """Return when the step comes [s]."""
+    """Return the time of the step [s]."""
     pulls = any(port.name == "least_cocontraction" and (port.start or 0.0) > 0.0 for port in controller.parameters)
     return asked.scale.time * (_STEP_AT_TAUT_S if pulls else _STEP_AT_S)
 
 
 def run_loops(
-    controller: Block,
-    asked: Requirements,
-    *,
-    order: str,
-    observer: Block | None,
-    seed: int,
-    progress: Progress,
+    controller: Block, asked: Requirements, *, order: str, observer: Block | None, seed: int, progress: Progress,
     own: Sequence[SimulationModel] = (),
-) -> list[LoopRun]:
-    """Return all runs that the table [sim] of the requirements asks for, over the user's own plants if there are any.
-
-    Raises:
-        SettingsError: controller and observer that do not fit the neck.
-    """
+) -> list[LoopRun]:  # fmt: skip
+    """Run all loops of the table [sim], over the user's simulation models if there are any."""
     table, robot = asked.sim, asked.robot
     plants = own or _virtual(asked, seed)
-    # One output bends in one plane: other orientations are the same step, or none.
+    # With one output all orientations are the same step.
     angles = table["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
     cases = [
         (plant, payload, angle) for plant in plants
@@ -336,7 +308,7 @@ def run_loops(
 
 
 def _virtual(asked: Requirements, seed: int) -> list[SimulationModel]:
-    """Return the virtual plant that the table [sim] asks for and plausible ones around it."""
+    """Return the virtual plant of the table [sim] and random ones near it."""
     table = asked.sim
     base, plant = virtual_plant(asked.robot, asked)
     rng = np.random.default_rng(seed)
@@ -350,56 +322,40 @@ def _virtual(asked: Requirements, seed: int) -> list[SimulationModel]:
 
 
 def _sample_neck(plant: VirtualNeck, rng: np.random.Generator, spread: float) -> NeckParameters:
-    """Return a plausible neck around a robot's that its tendons do not buckle."""
+    """Return random parameters near those of a neck that its tendons do not buckle."""
     for _ in range(100):
         found = plant.parameters.sample(rng, spread=spread)
         try:
             return VirtualNeck(found, plant.robot).parameters
         except SettingsError:
             continue
-    raise SettingsError(f"no plausible neck within a spread of {spread:g} holds its tendons; lower `spread_pct`.")
+    raise SettingsError(f"no random neck within a spread of {spread:g} supports its tendons; lower `spread_pct`.")
 
 
 def step_loop(
-    controller: Block,
-    part: Part,
-    plant: SimulationModel,
-    payload: float,
-    reference: Callable[[float], tuple[float, ...]],
-    asked: Requirements,
-    *,
-    duration: float,
-    order: str,
-    observer: Block | None,
-    faults: Sequence[Any] = (),
-) -> Loop:
-    """Return a loop over a part that a plant makes."""
+    controller: Block, part: Part, plant: SimulationModel, payload: float, reference: Any, asked: Requirements, *,
+    duration: float, order: str, observer: Block | None, faults: Sequence[Any] = (),
+) -> Loop:  # fmt: skip
+    """Return the loop over a part of a simulation model."""
     return Loop(
         plant=part, controller=BlockPart(controller), observer=None if observer is None else BlockPart(observer),
         reference=reference, duration=duration, order=order, robot=asked.robot, **plant.carrying(payload),
         faults=tuple(faults),
-        # Nobody knows the step before it comes: a predictive controller sees the reference of now as that of later.
-        connections={
-            f"controller.{port.name}": f"reference.{port.name.removesuffix('_ahead')}"
-            for port in controller.inputs if port.name.endswith("_reference_ahead")
-        },
+        connections=connections_without_preview(controller),
     )  # fmt: skip
 
 
 def judge_loop(
     loop: Loop, *, compiled: bool = False, angle: str = "true"
 ) -> tuple[dict[str, float], LoopResult | None]:
-    """Return the metrics of a step, the worse axis and the motors, and the signals; all inf and None if it broke.
+    """Run a step; return metrics of the worst axis and the motors, and signals (inf and None if it diverged).
 
-    Args:
-        loop: that is run.
-        compiled: as one function where all parts are blocks.
-        angle: "true", or "measured" as the sensor tells.
+    `angle` is "true" or "measured".
     """
     try:
         result = run_loop(loop, compiled=compiled)
     except DataError:
-        # Numbers overflowed: the loop is not stable, whatever its margins say.
+        # Overflow: the loop is unstable.
         return dict.fromkeys((*_AXIS_METRICS, *_MOTOR_METRICS), math.inf), None
     table, robot = metrics(result, angle=angle), result.robot
     names = Scale(robot=robot).name_of
@@ -412,7 +368,7 @@ def judge_loop(
             math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
         )
     told = {name: table["motors"][names(name)] for name in _MOTOR_METRICS}
-    # A plant that tells no tension says nothing of slack tendons.
+    # A plant without tension outputs has no slack metric.
     values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
     return values, result
 
@@ -420,24 +376,17 @@ def judge_loop(
 def loops_under_test(
     controller: Block, own: Sequence[SimulationModel], asked: Requirements, *, order: str, observer: Block | None
 ) -> list[LoopUnderTest]:
-    """Return the loops for margins by experiment: each simulation model, with its lightest and its heaviest payload.
-
-    Args:
-        controller, observer: that are judged.
-        own: simulation models.
-        asked: whose payloads count, and how slow and large the robot is.
-        order: of the loop.
-    """
+    """Return the loops for margins by experiment: each simulation model with its lightest and heaviest payload."""
     robot, scale = asked.robot, asked.scale
     names = robot.outputs.names
-    axes = names if len(names) == 1 else (*names, "both")  # one output is all of them
+    axes = names if len(names) == 1 else (*names, "both")
     known = [(plant, plant.payloads(asked.sim["payloads_kg"])) for plant in own]
     return [
         LoopUnderTest(
             name=f"{plant.name}, {kg:g} kg" if plant.payload else plant.name, controller=controller,
             plant=lambda plant=plant: plant.quiet(controller.sample_time), observer=observer,
             order=order, constants=plant.carrying(kg),
-            # Each axis alone with the light payload; with the heavy one both at once, which is the harder test.
+            # The heavy payload is tested with all axes at once, the harder test.
             axes=axes if kg == min(payloads) else axes[-1:], robot=robot, time=scale.time,
             size=scale.si(scale.size) / math.radians(1.0), noise=scale.si(scale.noise) / math.radians(1.0),
         )
@@ -446,14 +395,14 @@ def loops_under_test(
 
 
 def neck_changes(parameters: NeckParameters, robot: Robot) -> dict[str, float]:
-    """Return the parameters of a robot's neck that differ from the preset `paper` standing for it."""
+    """Return the parameters of a robot's neck that differ from the scaled preset `paper`."""
     plain = VirtualNeck.of(robot, NeckParameters.paper()).parameters
     names = [item.name for item in dataclasses.fields(parameters)]
     return {name: getattr(parameters, name) for name in names if getattr(parameters, name) != getattr(plain, name)}
 
 
 def check_blocks(controller: Block, observer: Block | None) -> None:
-    """Raise SettingsError where an observer has another sample time than the controller."""
+    """Raise SettingsError if the observer has another sample time than the controller."""
     if observer is not None and not math.isclose(observer.sample_time, controller.sample_time, rel_tol=1e-9):
         raise SettingsError(
             f"the observer has a sample time of {observer.sample_time:g} s, the controller one of "

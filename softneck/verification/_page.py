@@ -1,8 +1,9 @@
-"""The page of a verification: the verdict at one glance, and all behind it below."""
+"""The page of a verification: the verdict, then charts and tables."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,23 +21,20 @@ from ._steps import Steps
 from ._verify import Verdict, Verification
 
 RED, PURPLE = "#D55E00", "#CC79A7"
-# Of 1 to 8 motors.
+# Colours of up to 8 motors.
 SERIES = (BLUE, ORANGE, GREEN, PURPLE, RED, GREY, "#56B4E9", "#F0E442")
-# Responses that an envelope is taken over; more would not be seen.
+# Responses in an envelope; more would not be visible.
 _MAX_CURVES = 240
 _FREQUENCY_LABEL = "frequency [rad/s]"
 _CAPTION = (
     f"Band: an even choice of up to {_MAX_CURVES} plants; black: nominal; red: the plant with the least disk margin."
 )
-# What no robot's numbers in SI reach: pressures have some 1e6 Pa.
+# Larger numbers in SI diverge: pressures have some 1e6 Pa.
 _LARGEST_DRAWN = 1e9
 
 
 def frequency_charts(part: LinearEvidence, w: Vector, gain: str = "rad/rad") -> list[Chart]:
-    """Return Bode envelopes of the open loops, the gang of four of each axis, and their sensitivities.
-
-    `gain` is the SI unit of the plants' static gains.
-    """
+    """Return Bode envelopes and the gang of four of each axis; `gain` is the SI unit of static gains."""
     back = "/".join(reversed(gain.split("/")))
     rows = _select_rows(part)
     P, L = loops(part.plants.take(rows), part.law, w)
@@ -53,17 +51,16 @@ def frequency_charts(part: LinearEvidence, w: Vector, gain: str = "rad/rad") -> 
         }
         worst = _worst_in(part, rows, f"{axis}.disk_margin")
         panels = [_envelope(w, values, name, worst) for name, values in gang.items()]
-        charts.append(
-            Chart(
-                f"Gang of four: {axis}", panels, _FREQUENCY_LABEL, columns=2, row_height=2.6,
-                caption=_CAPTION,
-            )
-        )  # fmt: skip
+        charts.append(_frequency_chart(f"Gang of four: {axis}", panels))
     return charts
 
 
+def _frequency_chart(title: str, panels: list[Panel]) -> Chart:
+    return Chart(title, panels, _FREQUENCY_LABEL, columns=2, row_height=2.6, caption=_CAPTION)
+
+
 def _select_rows(part: LinearEvidence) -> np.ndarray:
-    """Return the rows that are drawn: the first, an even choice, and the worst ones."""
+    """Return the drawn rows: the first, an even choice, and the worst ones."""
     n = len(part.plants)
     rows = np.unique(np.linspace(0, n - 1, min(n, _MAX_CURVES)).astype(int))
     worst = [int(np.argmin(part.margins[f"{axis}.disk_margin"])) for axis in part.plants.axes]
@@ -80,16 +77,13 @@ def _bode(part: LinearEvidence, rows: np.ndarray, S: np.ndarray, w: Vector) -> C
         L = 1.0 / S[..., i, i] - 1.0
         worst = _worst_in(part, rows, f"{axis}.disk_margin")
         phase = np.degrees(np.unwrap(np.angle(L), axis=1))
-        # All start near the phase of an integrator.
+        # Start all near the phase of an integrator.
         phase -= 360.0 * np.round((phase[:, :1] + 90.0) / 360.0)
         panels.append(_envelope(w, np.abs(L), f"|L| of {axis}", worst, level=1.0))
         panels.append(
             _envelope(w, phase, f"phase of {axis} [deg]", worst, level=-180.0, log=False, y_range=(-540.0, 30.0))
         )
-    return Chart(
-        "Bode envelopes of the open loops", panels, _FREQUENCY_LABEL, columns=2, row_height=2.6,
-        caption=_CAPTION,
-    )  # fmt: skip
+    return _frequency_chart("Bode envelopes of the open loops", panels)
 
 
 def _envelope(
@@ -110,25 +104,18 @@ def _envelope(
 
 
 def mu_charts(part: LinearEvidence) -> list[Chart]:
-    """Return the structured singular value over frequency with its bounds; nothing where the middle is not stable."""
-    panels = []
-    for rows in part.structured:
-        for row in rows:
-            if not np.isfinite(row.upper).all():
-                continue
-            curves = [Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4)]
-            levels = [Level(1.0, "certain below", RED)]
-            top = max(1.1, 1.1 * float(row.upper.max()))
-            panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
-    return (
-        [Chart("Structured singular value for stability of the box", panels, _FREQUENCY_LABEL, row_height=2.4)]
-        if panels
-        else []
-    )
+    """Return the bounds of the structured singular value over frequency, where they are finite."""
+    panels, levels = [], [Level(1.0, "certain below", RED)]
+    for row in (row for rows in part.structured for row in rows if np.isfinite(row.upper).all()):
+        curves = [Curve(row.frequency, row.upper, "upper bound", BLUE, width=1.4)]
+        top = max(1.1, 1.1 * row.mu)
+        panels.append(Panel(curves, f"mu, {row.axes}", levels=levels, log_x=True, y_range=(0.0, top)))
+    title = "Structured singular value for stability of the box"
+    return [Chart(title, panels, _FREQUENCY_LABEL, row_height=2.4)] if panels else []
 
 
 def step_chart(steps: Steps, plants: Plants, scale: Scale) -> Chart:
-    """Return the steps of all plants, the worst drawn through, and what its motors did."""
+    """Return the steps of all plants with the worst ones, and its motors."""
     t = steps.time
     panels = []
     finite: np.ndarray = np.asarray(np.isfinite(steps.angles).all(axis=2))
@@ -156,12 +143,12 @@ def step_chart(steps: Steps, plants: Plants, scale: Scale) -> Chart:
 
 
 def _drawable(y: Vector) -> Vector:
-    """Return `y` without what is too large to draw."""
+    """Replace values that are too large to draw by NaN."""
     return np.where(np.isfinite(y) & (np.abs(y) < _LARGEST_DRAWN), y, np.nan)
 
 
 def neck_chart(evidence: Evidence, scale: Scale) -> Chart:
-    """Return all loops over simulation models: the way along the step, the worst overshoot drawn through."""
+    """Return the outputs of all simulated loops along the step, with the worst ones."""
     runs = [run for run in evidence.necks if run.result is not None]
     if not runs:
         raise ValueError("no simulated loop came to its end")
@@ -192,26 +179,22 @@ _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
 
 
 def verdict_table(found: Verification) -> Table:
-    """Return the requirements with value, limit, verdict and worst plant."""
+    """Return a table of the requirements with value, limit, verdict and worst plant."""
     axes = found.controller.robot.outputs.names
-    rows = [
-        [
-            metric_title(verdict.requirement.metric), number(verdict.value),
-            f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}", _verdict_word(verdict),
-            _worst_plant(verdict, axes),
-        ]
-        for verdict in found.verdicts
-    ]  # fmt: skip
+    rows = [[metric_title(v.requirement.metric), number(v.value), _limit(v), _verdict_word(v), _worst_plant(v, axes)]
+            for v in found.verdicts]  # fmt: skip
     return Table("Requirements", ["metric", "value", "limit", "verdict", "worst plant"], rows)
 
 
+def _limit(verdict: Verdict) -> str:
+    return f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}"
+
+
 def number(value: Any) -> str:
-    """Return a value for a table: `-` where there is none."""
+    """Format a value for a table; None gives `-`."""
     if value is None:
         return "-"
-    if not isinstance(value, int | float | np.floating):
-        return str(value)
-    return f"{value:.4g}"
+    return f"{value:.4g}" if isinstance(value, int | float | np.floating) else str(value)
 
 
 def _verdict_word(verdict: Verdict) -> str:
@@ -230,12 +213,7 @@ def _worst_plant(verdict: Verdict, axes: tuple[str, ...]) -> str:
 
 
 def verification_page(found: Verification, controller: str, certificate: str = "") -> str:
-    """Return the HTML page of a verification.
-
-    Args:
-        found: the verification.
-        controller, certificate: names of their files, for the title and the text.
-    """
+    """Return the HTML page of a verification; `controller` and `certificate` are names of their files."""
     evidence, scale = found.evidence, found.requirements.scale
     first, *others = scale.robot.outputs.names
     stepped = step_chart(evidence.steps, evidence.stepped, scale)
@@ -260,16 +238,16 @@ def verification_page(found: Verification, controller: str, certificate: str = "
 
 
 def _verdict_sentence(found: Verification) -> str:
-    """Return the verdict: what holds, and what fails where."""
+    """Return the verdict with the failed requirements."""
     axes = found.controller.robot.outputs.names
     failed = [
-        f"{metric_title(v.requirement.metric)} is {number(v.value)}, required {_BOUNDS[v.requirement.bound]} "
-        f"{v.requirement.limit:g} ({_worst_plant(v, axes)})"
+        f"{metric_title(v.requirement.metric)} is {number(v.value)}, required {_limit(v)} ({_worst_plant(v, axes)})"
         for v in found.failed
     ]
     count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"
     if not failed:
-        held, absent = (sum(map(test, found.verdicts)) for test in (_held, _absent))
+        held = sum(verdict.holds is True for verdict in found.verdicts)
+        absent = sum(verdict.value is None for verdict in found.verdicts)
         open_ = [(count - held - absent, "do not decide"), (absent, "are not computed")]
         rest = "".join(f", {number} {words}" for number, words in open_ if number)
         return (
@@ -280,23 +258,13 @@ def _verdict_sentence(found: Verification) -> str:
     return f"{len(failed)} of {count} requirements fail: {'; '.join(failed[:3])}{more}."
 
 
-def _held(verdict: Verdict) -> bool:
-    return verdict.holds is True
-
-
-def _absent(verdict: Verdict) -> bool:
-    return verdict.value is None
-
-
 def _requirements_section(found: Verification, certificate: str, stepped: Chart) -> Section:
     text = [f"{found.summary()[0].upper()}{found.summary()[1:]}."]
     if certificate:
         text.append(f"Certificate: {certificate}. Each worst plant stands beside it as a loop for softneck simulate.")
     text += [f"Not computed: {name}: {why}." for name, why in found.evidence.not_computed.items()]
-    table = verdict_table(found)
-    return Section(
-        "Requirements", charts=[stepped], tables=[Table("Each at its worst plant", table.head, table.rows)], method=text
-    )
+    table = replace(verdict_table(found), caption="Each at its worst plant")
+    return Section("Requirements", charts=[stepped], tables=[table], method=text)
 
 
 def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]:
@@ -305,17 +273,12 @@ def _linear_sections(found: Verification, part: LinearEvidence) -> list[Section]
         [neck.name, row.axes, f"{row.mu:.3f}"]
         for neck, rows in zip(found.necks, part.structured, strict=True) for row in rows
     ]  # fmt: skip
-    head = ["plants", "axis", "mu, bound"]
+    bounds = Table("Bounds", ["plants", "axis", "mu, bound"], mu, text=2)
+    charts = frequency_charts(part, found.evidence.frequency, found.necks[0].gain_unit)
     return [
-        Section(
-            f"Frequency responses{title}",
-            tables=[_margin_table(part)],
-            charts=frequency_charts(part, found.evidence.frequency, found.necks[0].gain_unit),
-        ),
-        Section(
-            f"Structured singular value{title}", tables=[Table("Bounds", head, mu, text=2)], charts=mu_charts(part)
-        ),
-    ]  # fmt: skip
+        Section(f"Frequency responses{title}", tables=[_margin_table(part)], charts=charts),
+        Section(f"Structured singular value{title}", tables=[bounds], charts=mu_charts(part)),
+    ]
 
 
 def _margin_table(part: LinearEvidence) -> Table:
@@ -354,14 +317,8 @@ def _plants_section(found: Verification) -> Section:
             for title, values in (("least", box.low), ("nominal", box.nominal), ("largest", box.high)):
                 numbers = [f"{motor * scale.shown(values[0]):.4g}", f"{values[1]:.4g}", f"{1e3 * values[2]:.4g}"]
                 rows.append([neck.name, axis, title, *numbers])
-    head = [
-        "source",
-        "axis",
-        "",
-        f"static gain [{error_unit(robot)[0]}/{robot.motors.unit}]",
-        "pole [1/s]",
-        "dead time [ms]",
-    ]
+    gain = f"static gain [{error_unit(robot)[0]}/{robot.motors.unit}]"
+    head = ["source", "axis", "", gain, "pole [1/s]", "dead time [ms]"]
     cross = [
         f"{neck.name}: {robot.input_names[j]} into {axis} {mixed[i, j]:+.3f} of its own gain."
         for neck in found.necks for mixed in [mixing_matrix(neck.cross, len(neck.names))]

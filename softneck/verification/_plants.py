@@ -1,7 +1,7 @@
-"""What a robot may be: a box of static gain, pole and dead time for each axis, and plants drawn from it.
+"""Uncertain plants: a box of static gain, pole and dead time for each axis, and plants drawn from it.
 
-An axis is `K p exp(-L s)/(s + p)` behind a zero-order hold, sampled exactly for every dead time L, also between
-samples, times dynamics that are certain (of a model of higher order, all but its slowest pole).
+An axis is `K p exp(-L s)/(s + p)` with a zero-order hold, discretised exactly for every dead time L, times certain
+dynamics (for a model of higher order, all but its slowest pole).
 """
 
 from __future__ import annotations
@@ -19,22 +19,21 @@ from softneck.estimation import AxisPlant, axis_plant, directions_of, robot_of
 from softneck.identification import AxisMeasured, response_of
 from softneck.robot import Robot
 
-# Halvings of the way to a plant that is excluded: to a thousandth.
+# Bisection steps towards an excluded plant, to a thousandth.
 _BISECTION_STEPS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisBox:
-    """What one axis may be; numbers are static gain [rad/rad, else SI], pole [1/s], dead time [s].
+    """The uncertain first-order part of one axis: static gain [rad/rad, else SI], pole [1/s], dead time [s].
 
     Attributes:
         nominal: (3,).
         low, high: (3,).
-        samples: (n, 3) plants that were identified; none for a model.
-        std: (n, 3) their standard deviations; None where nobody knows.
-        rest: numerator and denominator (r + 1,) each, highest power first, of dynamics that are certain.
-        measured: of a family that was tested against its recordings, what they show; plants that these exclude are
-            none of the box.
+        samples: (n, 3) identified plants; none for a model.
+        std: (n, 3) their standard deviations, if known.
+        rest: numerator and denominator (r + 1,) of certain dynamics, highest power first.
+        measured: response in the recordings of a tested family; plants that these exclude are not in the box.
     """
 
     nominal: Vector
@@ -47,20 +46,20 @@ class AxisBox:
 
     @property
     def widths(self) -> Vector:
-        """Half the width of the box (3,), 0 where it is certain."""
+        """Half the width of the box (3,)."""
         return 0.5 * (self.high - self.low)
 
     @property
     def middle(self) -> Vector:
-        """(3,) of the box."""
+        """Middle of the box (3,)."""
         return 0.5 * (self.high + self.low)
 
 
 def within_weight(numbers: Matrix, box: AxisBox, Ts: float) -> Matrix:
-    """Return the plants of an axis (n, 3), those that the recordings exclude drawn towards one that they do not.
+    """Return plants of an axis (n, 3); those that the recordings exclude are moved towards the best sample.
 
-    Corners put together what no recording has, such as the slowest pole and the longest dead time. Where even the best
-    sample is excluded, poles are too few for this plant, and the box stays whole.
+    Corners combine values of different recordings. If even the best sample is excluded, the order is too low for this
+    plant, and the box stays as it is.
     """
     if box.measured is None:
         return numbers
@@ -79,7 +78,7 @@ def within_weight(numbers: Matrix, box: AxisBox, Ts: float) -> Matrix:
 
 
 def _excess(numbers: Matrix, box: AxisBox, Ts: float) -> Vector:
-    """Return how many times the weight over the recordings each plant (n, 3) needs in their band."""
+    """Return the largest relative error of each plant (n, 3) over the weight of the recordings."""
     measured: Any = box.measured
     z = np.exp(1j * measured.frequency * Ts)
     above, below, delay = discretize_axis(numbers, box.rest, Ts)
@@ -92,7 +91,7 @@ def _excess(numbers: Matrix, box: AxisBox, Ts: float) -> Vector:
 def discretize_axis(numbers: Matrix, rest: tuple[Vector, Vector], Ts: float) -> tuple[Matrix, Matrix, np.ndarray]:
     """Return numerator and denominator (n, q) and delay (n,) of one axis: y+ = a y + b0 u(k-d) + b1 u(k-d-1)."""
     K, p, L = numbers.T
-    # 1e-9: dead times such as 0.08 / 0.02 are whole but for rounding.
+    # 1e-9: rounding of dead times such as 0.08 / 0.02.
     d = np.floor(L / Ts + 1e-9)
     part = np.clip(L / Ts - d, 0.0, 1.0)
     a = np.exp(-p * Ts)
@@ -109,24 +108,24 @@ def _products(rows: Matrix, polynomial: Vector) -> Matrix:
     return np.stack([np.convolve(row, polynomial) for row in rows])
 
 
-# A pole that does not count, by the sample rate: so fast that a sample is over before it shows.
+# A pole times the sample time that is too fast to see.
 _INVISIBLE_POLE = 200.0
 _CROSS_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PlantSource:
-    """One source of plants.
+    """A model or family as a source of plants.
 
     Attributes:
         name: of its file.
         sample_time: [s].
-        axes: one for each output: pitch and roll.
-        cross: (m (m - 1),) what of the other axes' inputs acts on each axis, as a part of its own gain, axis by axis:
-            of a neck phi_i into pitch, and theta_i into roll.
+        axes: one for each output.
+        cross: (m (m - 1),) gains of the other axes' inputs over the axis's own, axis by axis: for the neck phi_i into
+            pitch, theta_i into roll.
         kind: "family" or "model".
-        robot: whose plant it is.
-        weights: (m, motors) of the motors in each axis's input: of a neck Eq. 9, 10.
+        robot: of the plant.
+        weights: (m, motors) of the motors in each axis's input; for the neck Eq. 9, 10.
     """
 
     name: str
@@ -139,29 +138,29 @@ class PlantSource:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the axes: the robot's outputs."""
+        """Names of the axes: the robot's outputs."""
         return self.robot.outputs.names
 
     @property
     def gain_unit(self) -> str:
-        """Of static gains in SI: `rad/rad` of a neck."""
+        """SI unit of static gains: `rad/rad` for the neck."""
         return f"{to_si(self.robot.outputs.unit)[1]}/{to_si(self.robot.motors.unit)[1]}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plants:
-    """Plants, one a row.
+    """Plants, one per row.
 
     Attributes:
         sample_time: [s].
         numbers: (n, axes, 3) static gain, pole, dead time of every axis.
         cross: (n, axes (axes - 1)).
         names: of each.
-        source: (n,) number of the neck that each comes from.
-        numerator, denominator: (n, axes, q) highest power first, monic; the numerator's first is 0.
-        delay: (n, axes) samples besides.
+        source: (n,) number of its source.
+        numerator, denominator: (n, axes, q) highest power first, monic; the numerator starts with 0.
+        delay: (n, axes) additional samples.
         axes: names of the axes.
-        unit: of static gains in SI, as a word.
+        unit: SI unit of static gains, as a word.
     """
 
     sample_time: float
@@ -179,14 +178,14 @@ class Plants:
         return len(self.names)
 
     def take(self, rows: Any) -> Plants:
-        """Return some of them: rows as indices."""
+        """Return the plants of some rows."""
         rows = np.atleast_1d(np.asarray(rows, dtype=int))
         fields = ("numbers", "cross", "source", "numerator", "denominator", "delay")
         taken: Any = {name: getattr(self, name)[rows] for name in fields}
         return replace(self, names=tuple(self.names[int(row)] for row in rows), **taken)
 
     def later(self, samples: int) -> Plants:
-        """Return the same with `samples` of delay more on all axes, as a loop's order adds."""
+        """Return the plants with additional delay, as a loop's order adds."""
         return replace(self, delay=self.delay + samples)
 
     def response(self, frequency: Vector) -> np.ndarray:
@@ -197,7 +196,7 @@ class Plants:
 
 
 def source_of_family(family: Any, name: str) -> PlantSource:
-    """Return a `Family` as a source of plants, the samples that it uses with their standard deviations.
+    """Return a `Family` as a source of plants.
 
     Raises:
         SettingsError: it has no samples.
@@ -225,12 +224,12 @@ def source_of_family(family: Any, name: str) -> PlantSource:
 
 
 def off_diagonal(matrix: Matrix) -> Vector:
-    """Return the entries of a matrix (m, m) beside its diagonal (m (m - 1),), row by row."""
+    """Return the off-diagonal entries (m (m - 1),) of a matrix (m, m), row by row."""
     return np.asarray(matrix)[~np.eye(len(matrix), dtype=bool)]
 
 
 def mixing_matrix(cross: np.ndarray, axes: int) -> np.ndarray:
-    """Return X (..., m, m) with which the inputs v of all axes act as X v: ones, and `cross` (..., m (m - 1))."""
+    """Return X (..., m, m) of the inputs X v: ones on the diagonal, `cross` (..., m (m - 1)) beside it."""
     X = np.zeros((*cross.shape[:-1], axes, axes))
     X[..., np.eye(axes, dtype=bool)] = 1.0
     X[..., ~np.eye(axes, dtype=bool)] = cross
@@ -264,7 +263,7 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
     gain, Ts = plant.static_gain, plant.sample_time
     dead = plant.delay * Ts
     if abs(slowest.imag) > 1e-9 or slowest.real <= 1e-6:
-        # No slowest real pole to be uncertain about: one that does not show, and all else is certain.
+        # Without a slowest real pole the whole model is certain but for gain and delay.
         nominal = np.array([gain, _INVISIBLE_POLE / Ts, dead])
         rest = (np.append(plant.numerator, 0.0) / gain, plant.denominator)
         pole_spread = 0.0
@@ -272,7 +271,7 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
         a = slowest.real
         others = np.atleast_1d(np.real(np.poly(np.delete(poles, int(np.argmax(np.abs(poles)))))))
         nominal = np.array([gain, -math.log(a) / Ts, dead])
-        # The first-order part has one sample of its own, (1 - a)/(z - a); the rest is B over all other poles.
+        # The first-order part is (1 - a)/(z - a); the rest is B over all other poles.
         rest = (plant.numerator / (gain * (1.0 - a)), others)
         pole_spread = spread["pole"]
     half = np.array([abs(gain) * spread["gain"], nominal[1] * pole_spread, spread["delay"]])
@@ -282,7 +281,7 @@ def _axis_of(plant: AxisPlant, spread: Mapping[str, float]) -> AxisBox:
 
 
 def _cross_gains(model: Any, plants: list[AxisPlant], robot: Robot) -> Vector:
-    """Return what the others' inputs do to each axis in steady state, as parts of its own gain."""
+    """Return the static gains from the other axes' inputs to each axis over its own gain."""
 
     def gain(axis: str, name: str) -> float:
         try:
@@ -293,18 +292,18 @@ def _cross_gains(model: Any, plants: list[AxisPlant], robot: Robot) -> Vector:
     gains = [[gain(axis, name) / plant.static_gain for name in robot.input_names]
              for axis, plant in zip(robot.outputs.names, plants, strict=True)]  # fmt: skip
     cross = np.nan_to_num(off_diagonal(np.array(gains)), posinf=0.0, neginf=0.0)
-    # What rounding leaves of axes that do not meet.
+    # Remove rounding errors of decoupled axes.
     return np.where(np.abs(cross) < _CROSS_TOLERANCE, 0.0, cross)
 
 
 def make_plants(neck: PlantSource, numbers: np.ndarray, names: list[str], *, source: int = 0) -> Plants:
-    """Return plants of `neck` with `numbers` (n, axes, 3), sampled exactly; of a tested family within its weight."""
+    """Return exactly discretised plants with `numbers` (n, axes, 3), within the weight of a tested family."""
     Ts = neck.sample_time
     numbers = np.stack([within_weight(numbers[:, i], box, Ts) for i, box in enumerate(neck.axes)], axis=1)
     parts = [discretize_axis(numbers[:, i], box.rest, Ts) for i, box in enumerate(neck.axes)]
     q = max(part[0].shape[1] for part in parts)
     padded = [[np.pad(p, ((0, 0), (0, q - p.shape[1]))) for p in part[:2]] for part in parts]
-    # Zeros behind both polynomials of an axis are poles and zeros at 0 that cancel.
+    # Zeros appended to both polynomials of an axis are poles and zeros at 0 that cancel.
     numerator, denominator = (np.stack([part[k] for part in padded], axis=1) for k in (0, 1))
     delay = np.stack([part[2] for part in parts], axis=1)
     n = numbers.shape[0]
@@ -315,12 +314,12 @@ def make_plants(neck: PlantSource, numbers: np.ndarray, names: list[str], *, sou
 
 
 def measured_plant(neck: PlantSource, source: int) -> Plants | None:
-    """Return the plant in the middle of what the recordings show, of one to three poles; None where none was tested."""
+    """Return the middle of the measured responses, of one to three poles; None without a tested family."""
     models = [box.measured.model for box in neck.axes if box.measured is not None]
     if len(models) < len(neck.axes):
         return None
     parts = [model.discretize(neck.sample_time) for model in models]
-    # As `response_of` reads them: b/(z A) behind the whole samples.
+    # As in `response_of`: b/(z A) after the whole samples of delay.
     above, below = (
         np.array([np.pad(row, (0, 5 - row.size)) for row in rows])
         for rows in ([np.append(0.0, b) for _, b, _ in parts], [np.append(1.0, a) for a, _, _ in parts])
@@ -334,7 +333,7 @@ def measured_plant(neck: PlantSource, source: int) -> Plants | None:
 
 
 def nominal_plants(necks: list[PlantSource]) -> list[Plants]:
-    """Return the nominal plant of each neck."""
+    """Return the nominal plant of each source."""
     return [
         make_plants(neck, np.stack([box.nominal for box in neck.axes])[None], [f"{neck.name}: nominal"], source=i)
         for i, neck in enumerate(necks)
@@ -342,10 +341,9 @@ def nominal_plants(necks: list[PlantSource]) -> list[Plants]:
 
 
 def all_plants(necks: list[PlantSource], count: int, seed: int) -> Plants:
-    """Return nominals, corners, identified samples and, up to `count` in all, plants from inside the boxes.
+    """Return nominal plants, corners, samples and, up to `count` in all, a Latin hypercube inside the boxes.
 
-    Corners of pitch stand beside the same of roll, and beside the opposite ones; of more axes every other one is
-    opposite. Inside, a Latin hypercube.
+    Corners of the first axis are combined with equal and with opposite ones of every other axis.
     """
     share = max(1, count // len(necks))
     return join([_plants_of(neck, share, seed + i, i) for i, neck in enumerate(necks)])
@@ -386,16 +384,13 @@ def _corner(box: AxisBox, signs: Vector) -> Vector:
 
 
 def join(parts: list[Plants]) -> Plants:
-    """Return all rows of several."""
+    """Return the plants of several objects as one."""
     q = max(part.numerator.shape[2] for part in parts)
 
-    def stacked(name: str) -> np.ndarray:
+    joined: Any = {}
+    for name in ("numbers", "cross", "source", "delay", "numerator", "denominator"):
         rows = [getattr(part, name) for part in parts]
-        return np.concatenate([np.pad(row, ((0, 0), (0, 0), (0, q - row.shape[2]))) for row in rows])
-
-    fields = ("numbers", "cross", "source", "delay")
-    joined: Any = {name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
-    return replace(
-        parts[0], names=tuple(itertools.chain.from_iterable(part.names for part in parts)),
-        numerator=stacked("numerator"), denominator=stacked("denominator"), **joined,
-    )  # fmt: skip
+        if name in ("numerator", "denominator"):
+            rows = [np.pad(row, ((0, 0), (0, 0), (0, q - row.shape[2]))) for row in rows]
+        joined[name] = np.concatenate(rows)
+    return replace(parts[0], names=tuple(name for part in parts for name in part.names), **joined)

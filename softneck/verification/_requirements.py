@@ -1,4 +1,4 @@
-"""The requirements file: readable, versioned, with defaults; what it may not say is refused in words."""
+"""Read and check the requirements file; defaults fill the rest."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ._steps import StepTest
 
 
 def select_for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a file asks of `verify`: its limits less their reserve, and nothing of the loops of [track]."""
+    """Return the part of a file that `verify` uses: limits less safety margins, without [track]."""
     found = {name: table for name, table in own.items() if name not in ("track", "reserve")}
     require = found.get("require", {})
     if isinstance(require, Mapping):
@@ -40,12 +40,12 @@ def select_for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tune_only_metrics(own: Mapping[str, Any]) -> list[str]:
-    """Return what of a file's requirements `verify` does not look at."""
+    """Return the required metrics that only `tune` checks."""
     return [metric for metric, entry in own.get("require", {}).items() if metric.startswith("track.") and entry]
 
 
 def apply_safety_margin(require: Mapping[str, Any], reserve: Any) -> tuple[dict[str, Any], dict[str, float]]:
-    """Return the requirements less their reserve, and the reserve of those that are asked."""
+    """Subtract the safety margins of [reserve]; return the requirements and the margins used."""
     if not isinstance(reserve, Mapping):
         raise SettingsError("`reserve` must be a table: [reserve].")
     if not isinstance(require, Mapping):
@@ -54,22 +54,22 @@ def apply_safety_margin(require: Mapping[str, Any], reserve: Any) -> tuple[dict[
     for metric, value in reserve.items():
         if not metric.startswith(("sim.", "track.")):
             raise SettingsError(
-                f"[reserve] is for loops over simulation models, `sim.*` and `track.*`; got `{metric}`."
+                f"[reserve] takes metrics of loops over simulation models, `sim.*` and `track.*`; got `{metric}`."
             )
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value < math.inf:
             raise SettingsError(f"the reserve of `{metric}` must be a number from 0 on; got {value!r}.")
         if metric not in require:
             raise SettingsError(
-                f"[reserve] keeps back of `{metric}`, of which [require] asks nothing; state its limit there."
+                f"[reserve] has a safety margin for `{metric}`, which [require] does not limit; state its limit there."
             )
         entry = require[metric]
         limit = entry.get("max") if isinstance(entry, Mapping) else None
         if isinstance(limit, bool) or not isinstance(limit, int | float) or limit < 0.0 or value == 0.0:
-            continue  # dropped, or refused by what reads the limit
+            continue  # dropped, or refused when the limit is read
         if limit - value <= 0.0:
             raise SettingsError(
-                f"`{metric}` <= {limit:g} leaves nothing beside its reserve of {value:g}; ask for more, or state "
-                f"another one ([reserve])."
+                f"`{metric}` <= {limit:g} is not above its safety margin of {value:g}; raise the limit, or lower "
+                f"the margin ([reserve])."
             )
         less[metric] = {**entry, "max": round_12_digits(limit - value)}
         kept[metric] = float(value)
@@ -79,15 +79,15 @@ def apply_safety_margin(require: Mapping[str, Any], reserve: Any) -> tuple[dict[
 _T = TypeVar("_T")
 DEFAULT_FILE = Path(__file__).with_name("requirements.toml")
 VERSION = 1
-# Of requirements files, `tune`'s included.
+# Tables of requirements files of `verify` and `tune`.
 _TABLE_NAMES = ("version", "uncertainty", "sampling", "step", "sim", "require", "track", "reserve")
 
 
 def expand_metrics(table: Mapping[str, Any], robot: Robot, *, stepping: bool, track: bool = False) -> dict[str, Any]:
-    """Return a table like a requirements file of one that may be flat: `{"overshoot_pct": 5}`.
+    """Expand a flat table such as `{"overshoot_pct": 5}` to one like a requirements file.
 
-    A metric without its group is one of the simulation models if there are any, else of the linear ones, or of the only
-    group that has it; a number is the least that margins may be, and the most that all else may.
+    A metric without a group belongs to the simulation models if there are any, else to the linear plants, or to the
+    only group that has it. A number is a lower bound of a margin and an upper bound of other metrics.
     """
     table = rename_neck_table(table, robot)
     order = ("sim", "step", "track") if stepping else ("step", "track")
@@ -98,7 +98,7 @@ def expand_metrics(table: Mapping[str, Any], robot: Robot, *, stepping: bool, tr
         metric = next((name for name in full if name in known), None)
         if metric is None:
             if isinstance(value, Mapping) or key in _TABLE_NAMES:
-                nested[key] = value  # a table, which is refused below where nobody knows it
+                nested[key] = value  # a table; unknown ones are refused below
                 continue
             ends = sorted({name.partition(".")[2] for name in known})
             hint = did_you_mean(str(key), ends)
@@ -113,7 +113,7 @@ def expand_metrics(table: Mapping[str, Any], robot: Robot, *, stepping: bool, tr
 
 
 def rename_neck_table(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
-    """Return a requirements table with today's names: files up to softneck 0.2 use `neck` for `sim`."""
+    """Rename `neck` of files up to softneck 0.2 to `sim`."""
     if "neck" in robot.outputs.names:
         return dict(table)
     found = {sim_name(key): value for key, value in table.items()}
@@ -123,10 +123,10 @@ def rename_neck_table(table: Mapping[str, Any], robot: Robot) -> dict[str, Any]:
     return found
 
 
-# What no loop can do: least or largest value of a metric.
+# Smallest and largest possible value of a metric.
 _POSSIBLE = {"sensitivity": (1.0, math.inf), "disk_margin": (0.0, 2.0), "gain_margin": (1.0, math.inf)}
 _BOUND_NAMES = ("min", "max", "below")
-# Number -> least, largest, unit.
+# Number -> minimum, maximum, unit.
 _NUMBERS: dict[str, dict[str, tuple[float, float, str]]] = {
     "uncertainty": {
         "gain_pct": (0.0, 95.0, "%"), "pole_pct": (0.0, 95.0, "%"), "delay_ms": (0.0, 1e9, "ms"),
@@ -152,8 +152,8 @@ class Requirement:
     Attributes:
         metric: such as `axes.sensitivity`.
         bound: "min", "max" or "below" (which excludes the limit itself).
-        limit: of the worst plant.
-        asked: whether a file of the user's states it; what only the defaults state may be impossible to compute.
+        limit: for the worst plant.
+        asked: whether the user states it; a default that cannot be computed does not fail.
     """
 
     metric: str
@@ -162,7 +162,7 @@ class Requirement:
     asked: bool
 
     def holds(self, value: float) -> bool:
-        """Return whether `value` keeps it; NaN does not."""
+        """Return whether `value` meets the bound; NaN does not."""
         if self.bound == "min":
             return value >= self.limit
         return value < self.limit if self.bound == "below" else value <= self.limit
@@ -170,14 +170,14 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Requirements(ReprMixin):
-    """What a verification asks of a controller, and how it is tried.
+    """Requirements of a verification and the settings of its tests.
 
     Attributes:
         bounds: in the order of the file.
-        uncertainty, sampling, step, sim: the tables of the file by the neck's names of their keys; what ends in `_deg`
-            or `_rad` is in the units of the robot's outputs and motors.
-        scale: by which the defaults are the robot's.
-        own: what the user's file says.
+        uncertainty, sampling, step, sim: tables of the file under the neck's key names; `_deg` and `_rad` stand for
+            the units of the robot's outputs and motors.
+        scale: of the defaults.
+        own: the user's file.
     """
 
     bounds: tuple[Requirement, ...]
@@ -190,15 +190,15 @@ class Requirements(ReprMixin):
 
     @property
     def robot(self) -> Robot:
-        """Whose controller is judged."""
+        """The robot of the controller."""
         return self.scale.robot
 
     def si(self, value: float) -> float:
-        """Return an output as people see it, such as in deg, in SI."""
+        """Convert an output from its display unit, such as deg, to SI."""
         return self.scale.si(value)
 
     def step_test(self, seed: int) -> StepTest:
-        """Return the step that is made on linear plants."""
+        """Return the step test on linear plants."""
         load = to_si(self.robot.motors.unit)[0] * float(self.step["load_rad"])
         return StepTest(
             step=self.si(self.step["size_deg"]), duration=float(self.step["duration_s"]),
@@ -206,11 +206,11 @@ class Requirements(ReprMixin):
         )  # fmt: skip
 
     def table(self, name: str) -> dict[str, Any]:
-        """Return a table by the robot's names of its keys."""
+        """Return a table under the robot's key names."""
         return {self.scale.name_of(key): value for key, value in getattr(self, name).items()}
 
     def at(self, scale: Scale) -> Requirements:
-        """Return them with the defaults of a scale, unless those of the same robot are known."""
+        """Return the requirements with defaults of a scale, unless this robot's scale is known already."""
         kept = scale.robot.hash == self.robot.hash and self.scale.known
         return self if kept else make_requirements(self.own, scale=scale)
 
@@ -218,15 +218,14 @@ class Requirements(ReprMixin):
 def read_requirements(
     path: str | Path | None = None, *, robot: Robot | None = None, scale: Scale | None = None
 ) -> Requirements:
-    """Return the defaults, with what the file at `path` says instead.
+    """Return the requirements of a file, with defaults for the rest.
 
-    Keys and metrics in deg or rad are in the units of the robot and called by them, such as `size_mm` and
-    `step.load_rms_mm`; angles stay in deg.
+    Keys and metrics use the units of the robot, such as `size_mm` and `step.load_rms_mm`.
 
     Args:
         path: of the file.
-        robot: whose controller is judged; None: a neck's.
-        scale: by which the defaults are the robot's; None: by what the robot alone tells.
+        robot: of the controller; None: the neck.
+        scale: of the defaults; None: from the robot alone.
 
     Raises:
         FileFormatError: no such file, no TOML, another version.
@@ -236,7 +235,7 @@ def read_requirements(
 
 
 def read_file(path: str | Path | None, make: Callable[[Mapping[str, Any]], _T]) -> _T:
-    """Return what `make` makes of the tables of a file, of none where there is no file; its errors name the file."""
+    """Call `make` with the tables of a file, or with none; its errors name the file."""
     if path is None:
         return make({})
     if not isinstance(path, str | Path):
@@ -251,7 +250,7 @@ def read_file(path: str | Path | None, make: Callable[[Mapping[str, Any]], _T]) 
 def make_requirements(
     table: Mapping[str, Any], *, robot: Robot | None = None, scale: Scale | None = None
 ) -> Requirements:
-    """Return the defaults with what a table like a requirements file says instead."""
+    """Return the requirements of a table like a requirements file, with defaults for the rest."""
     scale = scale or Scale.of(robot or Robot.preset())
     said = {"version": VERSION, **rename_neck_table(table, scale.robot)}
     own, defaults = select_for_verify(said), tomllib.loads(default_text())
@@ -282,8 +281,8 @@ def _read(source: Path) -> dict[str, Any]:
         raise FileFormatError(f"{source}: cannot be read ({error.strerror}); {hint}") from error
     if table.get("version") != VERSION:
         raise FileFormatError(
-            f"{source}: must say `version = {VERSION}`, the form of requirements that this softneck reads; "
-            f"it says {table.get('version')}."
+            f"{source}: `version` must be {VERSION}, the version of requirements that this softneck reads; "
+            f"got {table.get('version')}."
         )
     return table
 
@@ -314,7 +313,7 @@ def _table(name: str, defaults: Mapping[str, Any], own: Any, scale: Scale) -> di
 
 
 def check_number(name: str, value: Any, key: str, ends: tuple[float, float, str], scale: Scale) -> None:
-    """Raise SettingsError unless a value is a number between ends of the neck's, as far as the robot's are known."""
+    """Raise SettingsError unless a value is a number within the neck's limits, scaled to the robot."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SettingsError(f"`{name}` must be a number; got {value!r}.")
     low, high, unit = ends
@@ -332,12 +331,12 @@ def _bounds(defaults: Mapping[str, Any], own: Any, robot: Robot) -> tuple[Requir
                if metric != "sim.slack_s" or metric in own or robot.tendon_angles is not None}  # fmt: skip
     found = bounds_of(require, metric_names(robot), own)
     if not found:
-        raise SettingsError("nothing is required; a certificate needs at least one requirement.")
+        raise SettingsError("there is no requirement; a certificate needs at least one.")
     return found
 
 
 def bounds_of(require: Mapping[str, Any], names: tuple[str, ...], own: Any) -> tuple[Requirement, ...]:
-    """Return the requirements of a table; `names`: of all metrics, `own`: those that a user states."""
+    """Return the bounds of a table; `names`: all metrics, `own`: those the user states."""
     found = []
     for metric, entry in require.items():
         if metric not in names:
@@ -346,7 +345,7 @@ def bounds_of(require: Mapping[str, Any], names: tuple[str, ...], own: Any) -> t
             continue
         if not isinstance(entry, Mapping) or not entry or any(key not in _BOUND_NAMES for key in entry):
             raise SettingsError(
-                f"`{metric}` must say {{ min = NUMBER }}, {{ max = NUMBER }}, both, or false; got {entry!r}."
+                f"`{metric}` must be {{ min = NUMBER }}, {{ max = NUMBER }}, both, or false; got {entry!r}."
             )
         for bound, limit in entry.items():
             if isinstance(limit, bool) or not isinstance(limit, int | float) or not math.isfinite(limit):
@@ -359,7 +358,7 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
     low: dict[str, float] = {}
     high: dict[str, float] = {}
     for item in bounds:
-        # What the worse axis keeps, both keep.
+        # A bound on the worst axis applies to every axis.
         group, _, name = item.metric.partition(".")
         both = [f"{axis}.{name}" for axis in robot.outputs.names]
         for metric in both if group == "axes" else (item.metric,):
@@ -370,7 +369,7 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
         least, most = _POSSIBLE.get(name, (0.0, math.inf))
         if (item.bound == "min" and item.limit > most) or (item.bound != "min" and item.limit < least):
             raise SettingsError(
-                f"no loop has `{item.metric}` {item.bound} {item.limit:g}; it lies between {least:g} and {most:g}."
+                f"no loop has `{item.metric}` {item.bound} {item.limit:g}; its range is {least:g} to {most:g}."
             )
     for metric in low:
         if low[metric] > high.get(metric, math.inf):
@@ -383,15 +382,15 @@ def _refuse_contradictions(bounds: tuple[Requirement, ...], robot: Robot) -> Non
         _refuse_margins(axis, low, high)
 
 
-# Metrics that no loop has less of, or more of: a bound there always holds.
+# Smallest and largest possible values, at which a bound always holds.
 _ALWAYS_AT_LEAST = {"gain_margin": 1.0, "sensitivity": 1.0}
 _ALWAYS_AT_MOST = {"disk_margin": 2.0, "phase_margin_deg": 180.0}
-# By the small gain theorem and by definition: what is not below 1 is not stable.
+# By definition and by the small gain theorem stability requires these below 1.
 _STABILITY_METRICS = ("stability.radius", "stability.searched_radius", "robust.mu")
 
 
 def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[str, Any]], scale: Scale) -> None:
-    """Refuse what would hold whatever the controller does, and what is probably another unit."""
+    """Refuse limits that always hold, and probable errors of unit."""
     for key in ("gain_pct", "pole_pct"):
         if 0.0 < (value := float(tables["uncertainty"][key])) < 1.0:
             raise SettingsError(
@@ -399,31 +398,25 @@ def _refuse_weak(bounds: tuple[Requirement, ...], tables: Mapping[str, Mapping[s
             )
     for item in bounds:
         name = item.metric.rpartition(".")[2]
-        always = (
-            item.limit <= _ALWAYS_AT_LEAST.get(name, 0.0)
-            if item.bound == "min"
-            else item.limit >= _ALWAYS_AT_MOST.get(name, math.inf)
-        )
+        always = item.limit >= _ALWAYS_AT_MOST.get(name, math.inf)
+        if item.bound == "min":
+            always = item.limit <= _ALWAYS_AT_LEAST.get(name, 0.0)
         if always or (item.metric in _STABILITY_METRICS and item.limit > 1.0):
             raise SettingsError(
                 f"`{item.metric}` {item.bound} {item.limit:g} "
-                + ("allows unstable loops; 1 is the limit." if not always else "always holds, so it says nothing.")
+                + ("allows unstable loops; 1 is the limit." if not always else "always holds; tighten or remove it.")
             )
-        group, _, name = item.metric.partition(".")
-        if (
-            name == "settling_s"
-            and scale.known
-            and item.bound != "min"
-            and item.limit > float(tables[group]["duration_s"])
-        ):
+        group = item.metric.partition(".")[0]
+        upper = name == "settling_s" and scale.known and item.bound != "min"
+        if upper and item.limit > float(tables[group]["duration_s"]):
             raise SettingsError(
                 f"`[{group}] duration_s` = {tables[group]['duration_s']:g} is shorter than the settling time that "
-                f"`{item.metric}` allows ({item.limit:g} s); nobody would see whether it settles."
+                f"`{item.metric}` allows ({item.limit:g} s); lengthen it."
             )
 
 
 def _refuse_margins(axis: str, low: Mapping[str, float], high: Mapping[str, float]) -> None:
-    """Refuse what excludes each other: the gain margin is at least Ms/(Ms - 1), |S - T| at least 2 Ms - 1."""
+    """Refuse contradictory margins: the gain margin is at least Ms/(Ms - 1), |S - T| at least 2 Ms - 1."""
     gain, disk = high.get(f"{axis}.gain_margin", math.inf), low.get(f"{axis}.disk_margin", 0.0)
     largest, least = high.get(f"{axis}.sensitivity", math.inf), low.get(f"{axis}.sensitivity", 1.0)
     if 1.0 < largest < math.inf and gain < largest / (largest - 1.0):

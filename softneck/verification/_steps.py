@@ -1,4 +1,4 @@
-"""Steps and loads in time: the controller's own runtime against every plant, with all its limits, and noise."""
+"""Step and load responses of every linear plant with the controller's own runtime, limits and noise."""
 
 from __future__ import annotations
 
@@ -20,26 +20,25 @@ from softneck.runtime import Block, load_functions
 from ._plants import Plants, mixing_matrix
 
 _SWEEP_RUNTIME = "softneck.verification._sweep_runtime"
-# Of a controller that is told the payload.
 NO_PAYLOAD_IN_STEPS = (
-    "linear plants are stepped with the payload at its start value (0 kg); the estimate is in the loops over plants "
-    "that step"
+    "linear plants are stepped with the payload at its start value (0 kg); the loops over simulation models have the "
+    "estimate"
 )
 METRICS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "load_rms_deg", "coupling_deg")
-# As the lab and `softneck.loop` measure a rise, and the part of the time in which all is settled.
+# Levels of the rise as in `softneck.loop`, and the final share of the time that is the steady state.
 _RISE_LEVELS, _STEADY_SHARE = (0.1, 0.9), 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepTest:
-    """A step of one axis after the other, then a load; where outputs are no angles, SI stands for rad.
+    """A step of one axis after the other, then a load; [rad] is the SI unit of the outputs.
 
     Attributes:
         step: size [rad].
-        duration: until the load comes [s], and once more as long with it.
+        duration: of the step, and of the load after it [s].
         noise: standard deviation of the measured angles [rad].
         load: added to the plant's input after `duration` [rad].
-        seed: of the noise, which all plants share.
+        seed: of the noise, equal for all plants.
     """
 
     step: float
@@ -51,7 +50,7 @@ class StepTest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Steps:
-    """What all plants did, of the step in each axis; where outputs are no angles, SI stands for rad.
+    """Responses of all plants to a step of each axis; [rad] is the SI unit of the outputs.
 
     Attributes:
         time: (rows,) [s].
@@ -59,7 +58,7 @@ class Steps:
         motors: (axes, n, rows, motors) set-points [rad].
         metrics: name -> (n,) the worst of all axes, in deg or the robot's display unit; inf where a level is never
             reached or numbers overflow.
-        worse: name -> (n,) the axis that is it.
+        worse: name -> (n,) the worst axis.
     """
 
     time: Vector
@@ -91,10 +90,10 @@ def run_steps(
     Args:
         plants: with the delay that the loop's order adds.
         block: the controller.
-        test: what is asked.
-        workers: threads; all cores where None.
-        robot: whose they are; None for a neck.
-        weights: (axes, motors) of the motors in each axis's input; None: those that the robot's file gives.
+        test: the step.
+        workers: threads; None: one per core.
+        robot: of the plants; None: the neck.
+        weights: (axes, motors) of the motors in each axis's input; None: those of the robot's file.
     """
     whose = Robot.preset() if robot is None else robot
     T = whose.redefinition(weights)[0]
@@ -103,7 +102,7 @@ def run_steps(
     Ts = plants.sample_time
     half = round(test.duration / Ts)
     rows = 2 * half
-    # Motors begin at zero: those that work around something else are first brought there, before what is judged.
+    # Motors start at zero; those with another operating point are moved there before the test.
     first = rows if before.any() else 0
     rng = np.random.default_rng(test.seed)
     noise = test.noise * rng.standard_normal((rows, m))
@@ -114,7 +113,7 @@ def run_steps(
         signals[first:, axis] += test.step
         signals[:, m + 1 : 2 * m + 1] = around
         signals[first:, m + 1 : 2 * m + 1] += noise
-        # The plants are linear around there.
+        # The plants are linear around that point.
         signals[:, 2 * m + 1 :] -= before[:m]
         signals[first + half :, 2 * m + 1 + axis] += test.load
         y, P = _run(plants, block, signals, T, whose, workers or os.cpu_count() or 1)
@@ -124,17 +123,13 @@ def run_steps(
         motors.append(P)
     parts = [_metrics(angles[i], other[i], test, half, Ts, error_unit(whose)[1]) for i in range(m)]
     table = {name: np.stack([part[name] for part in parts]) for name in METRICS}
-    return Steps(
-        np.arange(rows) * Ts,
-        np.array(angles),
-        np.array(motors),
-        {name: both.max(axis=0) for name, both in table.items()},
-        {name: both.argmax(axis=0) for name, both in table.items()},
-    )
+    worst = {name: values.max(axis=0) for name, values in table.items()}
+    worse = {name: values.argmax(axis=0) for name, values in table.items()}
+    return Steps(np.arange(rows) * Ts, np.array(angles), np.array(motors), worst, worse)
 
 
 def middle_of(robot: Robot) -> Vector:
-    """Return around which outputs steps are made: at rest, or else in the middle of what the robot's may be."""
+    """Return the outputs around which steps are made: rest, or the middle of their range."""
     outputs, factor = robot.outputs, to_si(robot.outputs.unit)[0]
     if outputs.rest is not None:
         return factor * np.array(outputs.rest)
@@ -144,7 +139,7 @@ def middle_of(robot: Robot) -> Vector:
 
 
 def middle_motors(robot: Robot, block: Block) -> Vector:
-    """Return around which set-points (motors,) steps are made: from one end of their range motors go only one way."""
+    """Return the set-points (motors,) around which steps are made: rest, or the middle of their range."""
     if robot.motors.rest is not None:
         return to_si(robot.motors.unit)[0] * np.array(robot.motors.rest)
     limits = {port.name: port.start for port in block.parameters}
@@ -169,14 +164,14 @@ def _run(
     outputs_at = np.array([*(outputs.index(name) for name in set_points), len(outputs)])
     start = np.array([port.start for port in block.inputs])
     for axis, name in enumerate(axes):
-        if f"{name}_reference_ahead" in names:  # of a predictive one; the step is there from the start
+        if f"{name}_reference_ahead" in names:  # predictive controllers see the step from the start
             start[names.index(f"{name}_reference_ahead")] = signals[0, axis]
     n, rows = len(plants), signals.shape[0]
     angles, motors = np.empty((n, rows, len(axes))), np.empty((n, rows, len(set_points)))
     mixed = mixing_matrix(plants.cross, len(axes))
 
     def part(chosen: slice) -> None:
-        with np.errstate(all="ignore"):  # an own controller runs in plain Python, and loops may diverge
+        with np.errstate(all="ignore"):  # user controllers run in plain Python, and loops may diverge
             functions.sweep_run(
                 arrays, parameters, start, places, outputs_at, plants.numerator[chosen], plants.denominator[chosen],
                 plants.delay[chosen], mixed[chosen], signals, angles[chosen], motors[chosen],
@@ -193,19 +188,15 @@ def _run(
 def _metrics(
     y: Matrix, other: np.ndarray, test: StepTest, half: int, Ts: float, factor: float | None = None
 ) -> Mapping[str, Vector]:
-    """Return the metrics (n,) of one axis: of the step before the load, of the load's effect, of the other axes.
-
-    `factor` from the display unit to SI; None for deg.
-    """
+    """Return the metrics (n,) of one axis; `factor` converts from the display unit to SI, None: from deg."""
     first = y[:, :half] / test.step
     other = other.reshape(len(y), -1)
     finite: np.ndarray = np.asarray(np.isfinite(y).all(axis=1) & np.isfinite(other).all(axis=1))
 
-    def shown(values: np.ndarray) -> np.ndarray:
-        return np.degrees(values) if factor is None else values / factor
-
+    display = np.degrees if factor is None else lambda values: values / factor
     first = np.where(finite[:, None], first, 0.0)
     rise = [np.where((first >= level).any(axis=1), (first >= level).argmax(axis=1), np.inf) for level in _RISE_LEVELS]
+    begin = np.where(np.isfinite(rise[0]), rise[0], 0.0)
     outside = np.abs(first - 1.0) >= SETTLING_BAND
     settled = half - outside[:, ::-1].argmax(axis=1)
     settled = np.where(outside.any(axis=1), settled, 0)
@@ -214,12 +205,10 @@ def _metrics(
     with np.errstate(invalid="ignore", over="ignore"):
         found = {
             "overshoot_pct": np.maximum(0.0, 100.0 * (first.max(axis=1) - 1.0)),
-            "rise_s": np.where(
-                np.isfinite(rise[1]), (rise[1] - np.where(np.isfinite(rise[0]), rise[0], 0.0)) * Ts, np.inf
-            ),
+            "rise_s": np.where(np.isfinite(rise[1]), (rise[1] - begin) * Ts, np.inf),
             "settling_s": np.where(settled < half, settled * Ts, np.inf),
-            "steady_rms_deg": shown(np.sqrt((steady**2).mean(axis=1))),
-            "load_rms_deg": shown(np.sqrt(((tail[:, half:] - test.step) ** 2).mean(axis=1))),
-            "coupling_deg": shown(np.abs(other).max(axis=1, initial=0.0)),
+            "steady_rms_deg": display(np.sqrt((steady**2).mean(axis=1))),
+            "load_rms_deg": display(np.sqrt(((tail[:, half:] - test.step) ** 2).mean(axis=1))),
+            "coupling_deg": display(np.abs(other).max(axis=1, initial=0.0)),
         }
     return {name: np.where(finite, values, np.inf) for name, values in found.items()}

@@ -1,12 +1,12 @@
-"""The structured singular value of a loop over its box, on the exact discrete response.
+"""Structured singular value of a loop over its box, and the search for its worst plant.
 
-Behind a zero-order hold an axis without its dead time is `y0+ = y0 + alpha (K u - y0)`, alpha = 1 - exp(-p Ts): gain
-and pole enter once each, as real scalars, exactly. The dead time is a complex scalar whose weight is the largest
-relative change that a dead time of the box makes to any plant of the box. So the loop is `z = M w`, `w = Delta z` with
-two real and one complex scalar for an axis, and `mu < 1` at every frequency proves stability of the whole box.
+With a zero-order hold an axis without its dead time is `y0+ = y0 + alpha (K u - y0)`, alpha = 1 - exp(-p Ts): gain
+and pole are real scalars that enter once each, exactly. The dead time is a complex scalar, weighted by its largest
+relative change of any plant of the box. The loop is `z = M w`, `w = Delta z` with two real and one complex scalar per
+axis, and `mu < 1` at every frequency proves stability of the whole box.
 
-Of a family that was tested against its recordings it is `y = (1 + W Delta) G0 u` instead: one complex scalar for an
-axis, with the weight that covers what they show, in the band that they excite.
+For a family tested against its recordings it is `y = (1 + W Delta) G0 u`: one complex scalar per axis, with the weight
+of the recordings, in their band.
 """
 
 from __future__ import annotations
@@ -27,25 +27,22 @@ from ._linear import LinearLaw, inverse, loops, radii
 from ._metrics import Scale
 from ._plants import AxisBox, Plants, PlantSource, join, make_plants, measured_plant, mixing_matrix
 
-# Members of a generation per unknown.
 _POPULATION_PER_UNKNOWN = 10
-# An unstable loop is worse than any peak; a peak is at most this.
+# Objective of an unstable loop, and largest objective of a stable one.
 _UNSTABLE_BADNESS = 1e3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """What a search found.
+    """Result of a search.
 
     Attributes:
-        plants: the worst plant of each neck (and axis, where the axes are apart).
-        radius: largest spectral radius met.
-        evaluations: plants tried.
+        plants: the worst plant of each source, and of each axis if they are decoupled.
+        radius: largest spectral radius.
     """
 
     plants: Plants
     radius: float
-    evaluations: int
 
 
 def search(
@@ -53,55 +50,44 @@ def search(
 ) -> SearchResult:
     """Return the plants inside the boxes with the smallest disk margin, unstable ones first.
 
-    Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis alone, or of all where
-    the axes are coupled by the plant or the controller.
-
-    Args:
-        necks: with their boxes.
-        law: the controller's linear form.
-        w: (m,) frequencies [rad/s].
-        extra: samples of delay that the loop's order adds.
-        generations: of the search.
-        seed: of the search.
+    Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis, or of all coupled axes;
+    `w` (m,) in rad/s, `extra` samples of delay from the loop's order.
     """
     worst: list[Plants] = []
-    largest, count = 0.0, 0
+    largest = 0.0
     for source, neck in enumerate(necks):
         for axes in coupled_axes(neck, law):
             task = _Task(neck, source, axes, law, w, extra)
             found = _evolve(task.badness, 3 * len(axes), generations, seed)
-            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({_axes_label(neck, axes)})"))
-            largest, count = max(largest, task.radius), count + task.count
-    return SearchResult(join(worst), largest, count)
+            label = axes_name(neck, axes) + (" axes" if len(axes) > 1 else "")
+            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({label})"))
+            largest = max(largest, task.radius)
+    return SearchResult(join(worst), largest)
 
 
 def coupled_axes(neck: PlantSource, law: LinearLaw) -> list[tuple[int, ...]]:
-    """Return which axes are judged together: all where plant or controller couple them, else each alone."""
+    """Return groups of coupled axes: all if plant or controller couples them, else each alone."""
     every = tuple(range(len(neck.axes)))
     whole = law.coupled or bool(np.any(neck.cross != 0.0))
     return [every] if whole else [(i,) for i in every]
 
 
 def axes_name(neck: PlantSource, axes: Sequence[int]) -> str:
-    """Return what axes that are judged together are called."""
+    """Return the name of a group of axes."""
     return neck.names[axes[0]] if len(axes) == 1 else "both" if len(axes) == 2 else "all"
 
 
-def _axes_label(neck: PlantSource, axes: tuple[int, ...]) -> str:
-    return neck.names[axes[0]] if len(axes) == 1 else f"{axes_name(neck, axes)} axes"
-
-
 class _Task:
-    """The badness of plants of one neck, and the largest radius that was met."""
+    """The objective of the search in one source, and the largest radius."""
 
     def __init__(
         self, neck: PlantSource, source: int, axes: tuple[int, ...], law: LinearLaw, w: Vector, extra: int
     ) -> None:
         self.neck, self.source, self.axes, self.law, self.w, self.extra = neck, source, axes, law, w, extra
-        self.radius, self.count = 0.0, 0
+        self.radius = 0.0
 
     def plants(self, x: Matrix, name: str = "") -> Plants:
-        """Return the plants at x (n, 3 axes), each number 0 to 1 across its box, without the order's delay."""
+        """Return the plants at x (n, 3 axes), from 0 to 1 across the box, without the order's delay."""
         numbers = np.tile(np.stack([box.nominal for box in self.neck.axes]), (x.shape[0], 1, 1))
         for k, axis in enumerate(self.axes):
             box = self.neck.axes[axis]
@@ -109,42 +95,33 @@ class _Task:
         return make_plants(self.neck, numbers, [f"{self.neck.name}: {name}"] * x.shape[0], source=self.source)
 
     def badness(self, x: Matrix) -> Vector:
-        """Return minus the badness (n,) of x (3 axes, n) as scipy lays it out."""
+        """Return the objective (n,) at x (3 axes, n), which scipy minimises."""
         plants = self.plants(x.T).later(self.extra)
         size = radii(plants, self.law)
-        self.radius, self.count = max(self.radius, float(size.max())), self.count + len(plants)
+        self.radius = max(self.radius, float(size.max()))
         S = inverse(np.eye(len(self.neck.axes)) + loops(plants, self.law, self.w)[1])
         peaks = np.stack([np.abs(2.0 * S[..., i, i] - 1.0).max(axis=1) for i in self.axes]).max(axis=0)
-        # Beyond stability the radius leads on; before it the peak does, which is infinite on the border.
+        # The radius of unstable loops, else the peak of |S - T|, which is infinite at the stability limit.
         return -np.where(size >= 1.0, _UNSTABLE_BADNESS * size, np.minimum(peaks, _UNSTABLE_BADNESS))
 
 
 def _evolve(function: Callable[[Matrix], Vector], unknowns: int, generations: int, seed: int) -> Vector:
     from scipy.optimize import differential_evolution
 
+    rng, size = np.random.default_rng(seed), _POPULATION_PER_UNKNOWN
     result = differential_evolution(
-        function,
-        [(0.0, 1.0)] * unknowns,
-        vectorized=True,
-        updating="deferred",
-        popsize=_POPULATION_PER_UNKNOWN,
-        maxiter=generations,
-        init="sobol",
-        rng=np.random.default_rng(seed),
-        polish=False,
-        tol=1e-6,
-    )
+        function, [(0.0, 1.0)] * unknowns, vectorized=True, updating="deferred", popsize=size, maxiter=generations,
+        init="sobol", rng=rng, polish=False, tol=1e-6,
+    )  # fmt: skip
     return np.asarray(result.x)
 
 
-# Dead times and poles of a box that its weight is taken over.
+# Grid of dead times and poles for the weight of the dead time.
 _DELAY_COUNT, _POLE_COUNT = 15, 5
-# What lies between those is covered by this part more; and a complex change of this size is always allowed for, which
-# makes peaks of purely real uncertainty wider than a point.
+# Factor for values between the grid points, and the smallest weight, which widens peaks of real uncertainty.
 _WEIGHT_MARGIN, _MIN_WEIGHT = 1.01, 0.01
 _FREQUENCY_COUNT = 90
-# Between which the peaks of a real scalar alone are looked for: 0.2 % apart, so that a dead time of 0.1 s turns by
-# 0.03 rad at the most from one to the next.
+# Grid of the search for peaks of real scalars: 0.2 % apart, at most 0.03 rad of phase of a dead time of 0.1 s.
 _FINE_FREQUENCY_COUNT = 4000
 
 
@@ -153,7 +130,7 @@ class StructuredResult:
     """Bounds over frequency.
 
     Attributes:
-        axes: "pitch", "roll", or "both" (of more than two "all") where they are coupled.
+        axes: name of the axis, "both" of two coupled ones, or "all".
         frequency: (m,) [rad/s].
         upper: (m,) bound of mu for stability.
     """
@@ -164,21 +141,14 @@ class StructuredResult:
 
     @property
     def mu(self) -> float:
-        """The largest upper bound."""
+        """Largest upper bound."""
         return float(self.upper.max())
 
 
 def structured_singular_value(
     neck: PlantSource, law: LinearLaw, *, extra: int, scale: Scale | None = None
 ) -> list[StructuredResult]:
-    """Return the bounds of each axis, or of both together where plant or controller couple them.
-
-    Args:
-        neck: with its box.
-        law: the controller's linear form.
-        extra: samples of delay that the loop's order adds.
-        scale: of the robot; None: the neck's. The bound is descended to in scaled quantities.
-    """
+    """Return the bounds of each axis, or of all coupled axes, computed in quantities scaled by `scale`."""
     time, gain = (1.0, 1.0) if scale is None else (scale.time, scale.gain)
     Ts = neck.sample_time
     results = []
@@ -190,7 +160,7 @@ def structured_singular_value(
         M, blocks = interconnection(neck, law, w, axes, extra, gain)
         name = axes_name(neck, axes)
         if not _middle_is_stable(neck, law, axes, extra):
-            # The bound grows the box from a stable middle; without one there is nothing to grow.
+            # The bound is only valid around a stable nominal loop.
             never = np.full(w.size, math.inf)
             results.append(StructuredResult(name, w, never))
             continue
@@ -199,10 +169,7 @@ def structured_singular_value(
 
 
 def _real_peaks(neck: PlantSource, law: LinearLaw, w: Vector, axes: Sequence[int], extra: int, gain: float) -> Vector:
-    """Return where a real scalar alone could make the loop unstable: peaks that no grid meets.
-
-    Packard and Pandey, 1993: mu of real scalars is not continuous in frequency.
-    """
+    """Return frequencies of peaks of real scalars, where mu is not continuous (Packard and Pandey 1993)."""
     M, blocks = interconnection(neck, law, w, axes, extra, gain)
     own = np.imag(np.diagonal(M, axis1=1, axis2=2))[:, [kind < 0 for kind, _ in blocks]]
     i, k = np.nonzero(np.diff(np.signbit(own), axis=0))
@@ -210,7 +177,7 @@ def _real_peaks(neck: PlantSource, law: LinearLaw, w: Vector, axes: Sequence[int
 
 
 def _middle_is_stable(neck: PlantSource, law: LinearLaw, axes: Sequence[int], extra: int) -> bool:
-    """Return whether the loop around which the box is modelled is stable; an axis that is not judged is nominal."""
+    """Return whether the loop in the middle of the box is stable; other axes are nominal."""
     measured = measured_plant(neck, 0)
     if measured is not None:
         return bool(radii(measured.later(extra), law)[0] < 1.0)
@@ -247,7 +214,7 @@ def interconnection(
 
 
 def _uncertain(neck: PlantSource, axis: int, start: int) -> list[int]:
-    """Return which of gain and pole of an axis are uncertain, and its dead time, which always is a little."""
+    """Return the rows of the uncertain ones of gain and pole, and of the dead time."""
     widths = neck.axes[axis].widths if neck.axes[axis].measured is None else np.zeros(3)
     return [start + k for k in range(3) if widths[k] > 0.0 or k == 2]
 
@@ -280,13 +247,13 @@ def _axis_model(box: Any, w: Vector, Ts: float, extra: int, gain: float = 1.0) -
 
 
 def _middle_pole(box: AxisBox, Ts: float) -> float:
-    """Return the pole [1/s] that is sampled to the middle of its box's ends, also where neither shows in one."""
+    """Return the pole [1/s] whose discrete pole is the middle of those of the box."""
     low, high = -Ts * box.low[1], -Ts * box.high[1]
     return float(math.log(2.0) - np.logaddexp(low, high)) / Ts
 
 
 def _delay_factor(p: float, L: float, z: np.ndarray, Ts: float) -> np.ndarray:
-    """Return what a dead time L does to the sampled lag of pole p: exact, also between samples."""
+    """Return the exact factor of a dead time L on the discretised lag of pole p."""
     d = math.floor(L / Ts + 1e-9)
     part = min(max(L / Ts - d, 0.0), 1.0)
     a, late = math.exp(-p * Ts), math.exp(-p * Ts * (1.0 - part))

@@ -1,7 +1,7 @@
-"""A controller's own runtime against many linear plants, one after the other, as in a loop of sequential order.
+"""Run a controller's own runtime with many linear plants, one after the other, in sequential order.
 
-Set-points act on the plant's input one sample later than the angle that they were computed from was read, plus its
-delay; motors are where they were told to be.
+Set-points act on the plant one sample after the angle they were computed from, plus its delay. Motors follow their
+set-points at once.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from softneck.verification._linear_plant_runtime import axis_advance
 
 
 class SweepArrays(Arrays):
-    """What stands between controller and plants; the arrays of the controller follow."""
+    """Arrays between controller and plants; the arrays of the controller follow."""
 
     T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")
 
@@ -33,9 +33,9 @@ def sweep_run(
 ) -> None:
     """Run every plant; fill `angles` (n, time, axes) and `motors` (n, time, motors).
 
-    start: the controller's inputs where nobody sets them.
-    places: where in them stand the references, all angles, all motors, healthy, enabled; -1: nowhere.
-    outputs_at: (motors + 1,) where the set-points stand in its outputs, and the number of all outputs behind them.
+    start: default values of the controller's inputs.
+    places: index there of the references, angles, motors, healthy, enabled; -1 for none.
+    outputs_at: (motors + 1,) index of the set-points in its outputs, then the number of all outputs.
     numerator, denominator (n, axes, q), delay (n, axes), mixed (n, axes, axes): of the plants.
     signals: (time, 3 axes + 1) references, the last of co-contraction, noise of all angles, load on all inputs.
     """

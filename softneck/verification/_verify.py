@@ -1,4 +1,4 @@
-"""Verification: a controller against all that its plant may be, requirement by requirement."""
+"""Verify a controller on every plant, requirement by requirement, and write its certificate."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ from ._worst import write_linear, write_neck
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Verdict(ReprMixin):
-    """One requirement and what came of it.
+    """The verdict on one requirement.
 
     Attributes:
         requirement: metric, bound and limit.
-        value: of the worst plant; inf where a level is never reached, None where it was not computed.
-        holds: None where it was not computed and only the defaults ask for it.
-        worst: the plant behind the value, as JSON values.
-        note: why it was not computed, or why it does not decide or hold.
+        value: of the worst plant; inf where a level is never reached, None if not computed.
+        holds: None for a default that was not computed.
+        worst: the worst plant, as JSON values.
+        note: why it was not computed, does not count or does not hold.
     """
 
     requirement: Requirement
@@ -65,18 +65,18 @@ class Verdict(ReprMixin):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class Verification(ReprMixin):
-    """What a verification found: each requirement, its worst plant, and whether all hold.
+    """Result of a verification: each requirement with its worst plant.
 
     Attributes:
         verdicts: one for each requirement.
-        evidence: all that was computed.
-        controller: as it was judged.
-        necks: the sources of plants.
-        requirements: that were asked.
+        evidence: all results.
+        controller: under test.
+        necks: sources of plants.
+        requirements: of the verdicts.
         files: role -> (path, SHA-256) of every file read.
-        observer: whether the loops over the virtual neck had one.
+        observer: whether the simulated loops had one.
         wall_time: [s].
-        tested: by the names of families, what each says of the recordings that it was tested against.
+        tested: name of a family -> facts on the recordings that it was tested against.
     """
 
     verdicts: list[Verdict]
@@ -96,17 +96,17 @@ class Verification(ReprMixin):
 
     @property
     def failed(self) -> list[Verdict]:
-        """Those that do not hold."""
+        """The failed requirements."""
         return [verdict for verdict in self.verdicts if verdict.holds is False]
 
     def order_words(self) -> str:
-        """Return what the loop's order adds, in words."""
+        """Return a text about the delay that the loop's order adds."""
         extra = self.controller.extra
         words = "no sample" if extra == 0 else f"{extra} sample{'s' if extra > 1 else ''}"
         return f"{self.controller.order} order: {words} of delay added to every plant"
 
     def summary(self) -> str:
-        """Return a line or two for people."""
+        """Return a summary of one line."""
         count, absent = len(self.verdicts), sum(verdict.value is None for verdict in self.verdicts)
         text = f"{count - len(self.failed)} of {count}" if self.failed else f"all {count}"
         text += " requirements hold" + (f", {absent} of them not computed" if absent else "")
@@ -116,7 +116,7 @@ class Verification(ReprMixin):
         )
 
     def contents(self, loops: Mapping[int, Path] | None = None) -> dict[str, Any]:
-        """Return the certificate's JSON values; `loops`: number of a verdict -> the loop file of its worst plant."""
+        """Return the certificate's JSON values; `loops` maps a verdict's number to the loop file of its worst plant."""
         rows = []
         for number, verdict in enumerate(self.verdicts):
             item = verdict.requirement
@@ -129,7 +129,7 @@ class Verification(ReprMixin):
             if loops and number in loops:
                 row["loop"] = str(loops[number])
             rows.append(row)
-        evidence = self.evidence
+        evidence, scale, robot = self.evidence, self.requirements.scale, self.controller.robot
         more = {
             "requirements": rows,
             "not_computed": evidence.not_computed,
@@ -140,36 +140,24 @@ class Verification(ReprMixin):
             "observer": self.observer,
             "plants": {
                 "count": len(evidence.plants),
-                "sources": [
-                    {"name": neck.name, "kind": neck.kind, "cross": neck.cross, **_box_facts(neck)}
-                    for neck in self.necks
-                ],
+                "sources": [_source_facts(neck) for neck in self.necks],
             },
             "virtual_neck_loops": len(evidence.necks),
             "foreign_plants": evidence.foreign,
             **validity(evidence, self.tested),
             "settings": {name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")},
-            **self._robot(),
         }
+        if robot.in_header():
+            more["robot"] = {"name": robot.name, "hash": robot.hash}
+            more["scale"] = {"time": scale.time, "size": scale.size}
         return certificate_contents("verify", holds=self.holds, files=self.files, more=to_json(more))
-
-    def _robot(self) -> dict[str, Any]:
-        """Return of another robot than the preset `neck` who it is, and by what the defaults are its own."""
-        scale, robot = self.requirements.scale, self.controller.robot
-        if not robot.in_header():
-            return {}
-        said = {"time": scale.time, "size": scale.size}
-        return {"robot": {"name": robot.name, "hash": robot.hash}, "scale": said}
 
     def write_worst(
         self, folder: str | Path, *, controller: str | Path, observer: str | Path | None = None, force: bool = False
     ) -> dict[int, Path]:
         """Write a loop file for the worst plant of each requirement; return number of the verdict -> file.
 
-        Args:
-            folder: where.
-            controller, observer: their files, which the loop files name.
-            force: replace what stands there.
+        `controller` and `observer` are their files; `force` replaces existing loop files.
         """
         target, files = Path(folder), {}
         axes = self.controller.robot.outputs.names
@@ -186,31 +174,29 @@ class Verification(ReprMixin):
                     block=self.controller.block, weights=self.necks[0].weights, force=force,
                 )  # fmt: skip
             elif worst.get("kind") == "neck":
-                seen = None if observer is None else Path(observer)
-                files[number] = write_neck(target, name, worst, controller=Path(controller), observer=seen, force=force,
-                                           robot=self.controller.robot)  # fmt: skip
+                paths = Path(controller), None if observer is None else Path(observer)
+                files[number] = write_neck(target, name, worst, *paths, robot=self.controller.robot, force=force)
         return files
 
 
 def with_robot(thing: Any, robot: Robot) -> Any:
-    """Return a plant of one's own, a neck's physics as those of the robot that it stands for."""
+    """Return a simulation model; a neck's physics are scaled to the robot."""
     return VirtualNeck.of(robot, thing) if isinstance(thing, NeckParameters) else thing
 
 
 def sources_of(things: Mapping[str, Any], requirements: Requirements | None = None) -> list[PlantSource]:
-    """Return models and families as sources of plants: name -> model (anything with `tf`) or family.
+    """Return linear models and families, by name, as sources of plants.
 
-    Models are as uncertain as the requirements say; without requirements they are certain.
+    The requirements give the uncertainty of a model; without them it is certain.
 
     Raises:
         SettingsError: none, an empty family, one that is not linear.
     """
     if not things:
         raise SettingsError("no plant: give at least one MODEL or FAMILY.")
-    asked = (
-        dict.fromkeys(("gain_pct", "pole_pct", "delay_ms"), 0.0) if requirements is None else requirements.uncertainty
-    )
-    spread = {"gain": asked["gain_pct"] / 100.0, "pole": asked["pole_pct"] / 100.0, "delay": asked["delay_ms"] / 1e3}
+    keys = {"gain": ("gain_pct", 100.0), "pole": ("pole_pct", 100.0), "delay": ("delay_ms", 1e3)}
+    asked = {} if requirements is None else requirements.uncertainty
+    spread = {name: asked.get(key, 0.0) / unit for name, (key, unit) in keys.items()}
     necks = []
     for name, thing in things.items():
         if hasattr(thing, "axes") and hasattr(thing, "cross"):
@@ -233,17 +219,17 @@ def verify(
     files: Mapping[str, tuple[str, str]] | None = None,
     progress: Progress | None = None,
 ) -> Verification:
-    """Judge a controller on all that its plant may be.
+    """Verify a controller on all plants.
 
     Args:
-        controller: anything with `block()`, its file, or an object with `step`; with `ss()` linear checks too.
-        plants: linear models, families, simulation models, or the files of any: one, a list, or name -> one.
-        requirements: what is asked beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`,
-            which is asked of the simulation models if there are any, else of the linear ones.
-        order: of the loop; the one that the controller was designed for if not given.
-        observer: for the loops over the virtual neck; none if not given.
-        files: role -> (path, SHA-256) of all that was read for it, for the certificate.
-        progress: called now and then; a bar in a terminal if not given.
+        controller: an object with `block()` or `step`, or its file; linear checks need `ss()`.
+        plants: linear models, families, simulation models, or their files: one, a list, or name -> one.
+        requirements: beside the defaults: a file, a table like one, or flat as in `{"overshoot_pct": 5}`, which applies
+            to the simulation models if there are any, else to the linear plants.
+        order: of the loop; default that of the design.
+        observer: in the simulated loops; default none.
+        files: role -> (path, SHA-256) of the files read, for the certificate.
+        progress: called now and then; default a bar in a terminal.
 
     Raises:
         SettingsError: another sample time, other channels, no plants.
@@ -263,7 +249,7 @@ def verify(
     observer = None if observer is None else load_for_robot(observer, "observer")
     robot, named = robot_of(controller), named_plants(plants)
     for what, thing in (*named.items(), *(() if observer is None else (("observer", observer),))):
-        # Physics and functions of one's own say nothing of a robot: their ports have to be its own.
+        # Neck physics and user functions have no robot; their ports are checked instead.
         if hasattr(thing, "robot") or not is_simulation_model(thing):
             require_same_robot(robot_of(thing), robot, f"the controller and {what}")
     own = {name: with_robot(thing, robot) for name, thing in named.items() if is_simulation_model(thing)}
@@ -293,17 +279,11 @@ def verify(
     elsewhere = unrecorded_conditions(tested, step, evidence.steps, robot)
     if tested and not judged.laws:
         elsewhere["margins"] = ALONE
+    verdicts = [_verdict(item, evidence, elsewhere) for item in asked.bounds]
     return Verification(
-        verdicts=[_verdict(item, evidence, elsewhere) for item in asked.bounds],
-        evidence=evidence,
-        controller=judged,
-        necks=necks,
-        requirements=asked,
-        files=dict(files or {}),
-        observer=observer is not None,
-        wall_time=time.perf_counter() - begin,
-        tested=tested,
-    )
+        verdicts=verdicts, evidence=evidence, controller=judged, necks=necks, requirements=asked, tested=tested,
+        files=dict(files or {}), observer=observer is not None, wall_time=time.perf_counter() - begin,
+    )  # fmt: skip
 
 
 def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]) -> Verdict:
@@ -325,7 +305,7 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
 
 
 _BUILT_IN_NOTE = "shown only: this is a built-in plant; add a model of your robot to count it, or set `[sim] decides`"
-# What is about the loop's response, which the data may not reach.
+# Groups about the loop's response, which the data must support.
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 
 
@@ -344,7 +324,7 @@ def unsupported_reason(item: Requirement, evidence: Evidence, elsewhere: Mapping
 
 
 def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a certificate says of where it is valid (band, amplitudes, confidence, recordings), and margins."""
+    """Return the validity of a certificate: band, amplitudes, confidence, recordings, margins."""
     bands = np.array([part.band for part in evidence.tested])
     amplitudes = [size for item in tested.values() for size in item["amplitude"] if size > 0.0]
     simulated = crossing_values(evidence.crossings)
@@ -374,18 +354,16 @@ def validity(evidence: Evidence, tested: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _box_facts(neck: PlantSource) -> dict[str, Any]:
-    return {
-        axis: {
-            "nominal": box.nominal, "low": box.low, "high": box.high, "samples": box.samples.shape[0],
-            "unit": [neck.gain_unit, "1/s", "s"],
-        }
-        for axis, box in zip(neck.names, neck.axes, strict=True)
-    }  # fmt: skip
+def _source_facts(neck: PlantSource) -> dict[str, Any]:
+    found: dict[str, Any] = {"name": neck.name, "kind": neck.kind, "cross": neck.cross}
+    for axis, box in zip(neck.names, neck.axes, strict=True):
+        found[axis] = {"nominal": box.nominal, "low": box.low, "high": box.high, "samples": len(box.samples)}
+        found[axis]["unit"] = [neck.gain_unit, "1/s", "s"]
+    return found
 
 
 def to_json(value: Any) -> Any:
-    """Return JSON values of numbers, arrays, tables: what is not finite becomes None."""
+    """Convert numbers, arrays and tables to JSON values; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): to_json(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | np.generic):

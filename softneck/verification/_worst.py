@@ -1,4 +1,4 @@
-"""The worst plants as files that `softneck simulate` runs."""
+"""Write the worst plants as loop files for `softneck simulate`."""
 
 from __future__ import annotations
 
@@ -68,21 +68,20 @@ def linear_plant(
     inputs: ArrayLike = (),
     outputs: ArrayLike = (),
 ) -> Block:
-    """Return linear axes as a plant for loops, with noise on the measured angles and a load on each input.
+    """Return linear axes as a plant block, with measurement noise and a load on each input.
 
     Args:
-        numerator: (outputs, q) of pitch and roll, highest power of z first; the first of each is 0.
-        denominator: (outputs, q) monic.
-        delay: samples besides, of each axis.
-        cross: phi_i into pitch as a part of theta_i's effect, and theta_i into roll; of m outputs m (m - 1), axis by
-            axis.
+        numerator: (outputs, q), highest power of z first; the first of each is 0.
+        denominator: (outputs, q), monic.
+        delay: additional samples of each axis.
+        cross: (outputs (outputs - 1),) gains of the other axes' inputs over the axis's own, axis by axis.
         sample_time: [s].
-        robot: the tables of another robot than the neck.
+        robot: tables of a robot other than the neck.
         directions: (outputs, motors) weights of its motors in each axis's input.
-        inputs, outputs: (outputs,) of each axis, around which the plant is linear; zero where not given.
+        inputs, outputs: (outputs,) operating point; default zero.
 
     Raises:
-        SettingsError: shapes that do not fit, a direct way from input to angle, a negative delay.
+        SettingsError: wrong shapes, direct feedthrough, a negative delay.
     """
     above, below = (np.atleast_2d(np.asarray(item, dtype=np.float64)) for item in (numerator, denominator))
     whose = Robot.preset() if robot is None else Robot.from_dict(robot)
@@ -110,31 +109,18 @@ def linear_plant(
     ]
     angles = [Port(name=name, unit=unit) for name in (*names, *(f"{axis}_measured" for axis in names))]
     positions = [Port(name=name, unit=motor) for name in whose.motor_positions]
+    most = 0.2 if unit == "rad" else None
+    noise = Port(name="noise_std", unit=unit, description="noise of the measured angles", minimum=0.0, maximum=most)
+    mixed = mixing_matrix(np.asarray(cross[: m * (m - 1)], float), m)
     return Block(
         kind="linear_plant",
         role="plant",
         runtime=_PLANT_RUNTIME,
         sample_time=sample_time,
-        arrays=(
-            above,
-            below,
-            np.asarray(delay, dtype=np.float64),
-            mixing_matrix(np.asarray(cross[: m * (m - 1)], float), m),
-            T,
-            around,
-        ),
+        arrays=(above, below, np.asarray(delay, dtype=np.float64), mixed, T, around),
         inputs=(*motors, *loads),
         outputs=(*angles, *positions),
-        parameters=(
-            Port(
-                name="noise_std",
-                unit=unit,
-                description="noise of the measured angles",
-                minimum=0.0,
-                maximum=0.2 if unit == "rad" else None,
-            ),
-            Port(name="noise_seed", description="seed of that noise", minimum=0.0),
-        ),
+        parameters=(noise, Port(name="noise_seed", description="seed of that noise", minimum=0.0)),
     )
 
 
@@ -142,19 +128,19 @@ def write_linear(
     folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, asked: Requirements,
     block: Block, weights: Matrix, force: bool
 ) -> Path:  # fmt: skip
-    """Write `name.toml` and the plant beside it; return the loop file.
+    """Write `name.toml` and its plant; return the loop file.
 
-    Where a robot's motors work around something else than zero, they are brought there first, as in the step test.
+    As in the step test, motors are first moved to their operating point.
 
     Args:
-        folder: where.
+        folder: of the files.
         name: of the loop file.
-        worst: name, numerator, denominator, delay, cross, sample_time and axis (0 pitch, 1 roll) of the plant.
+        worst: name, numerator, denominator, delay, cross, sample_time and axis (its number) of the plant.
         controller: its file.
         asked: the requirements.
         block: the controller.
         weights: (outputs, motors) of the motors in each axis's input.
-        force: replace what stands there.
+        force: replace existing files.
     """
     robot, step = asked.robot, asked.step
     around, names = middle_of(robot), robot.outputs.names
@@ -162,22 +148,19 @@ def write_linear(
     before = robot.redefinition(weights)[0] @ middle_motors(robot, block)
     more = f"\n        robot={robot.as_dict()!r}," if robot.in_header() else ""
     own = robot.weights()
-    more += (
-        ""
-        if own is not None and np.array_equal(own, weights)
-        else f"\n        directions={np.asarray(weights).tolist()!r},"
-    )
+    if own is None or not np.array_equal(own, weights):
+        more += f"\n        directions={np.asarray(weights).tolist()!r},"
     if before.any() or around.any():
         more += f"\n        inputs={before[:-1].tolist()!r},\n        outputs={around.tolist()!r},"
     named = {**worst, "name": str(worst["name"]).replace("\\", "/").replace('"', "'")}
     text = _PLANT_TEMPLATE.format(**named, axes=inputs, more=more)
-    # Modules of one name are imported once: another plant needs another name.
+    # Python imports a module name once, so each plant has its own.
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     _write(folder / f"{module}.py", text, force=True)
     Ts, duration = float(worst["sample_time"]), float(step["duration_s"])
     stepped = around + asked.si(float(step["size_deg"])) * (np.arange(around.size) == worst["axis"])
     if before.any():
-        rows = 2 * round(duration / Ts)  # until the step, as long as the step test gives them
+        rows = 2 * round(duration / Ts)  # as long as in the step test
         duration += rows * Ts
         levels = np.vstack([np.tile([*around, before[-1]], (rows, 1)), [*stepped, before[-1]]])
         _write_reference(folder / f"{name}_reference.csv", robot, levels, Ts, force=force)
@@ -195,18 +178,16 @@ def write_linear(
 
 
 def write_neck(
-    folder: Path, name: str, worst: Mapping[str, Any], *, controller: Path, observer: Path | None, force: bool,
-    robot: Robot | None = None,
+    folder: Path, name: str, worst: Mapping[str, Any], controller: Path, observer: Path | None, *, force: bool,
+    robot: Robot,
 ) -> Path:  # fmt: skip
-    """Write `name.toml`, a loop over the virtual neck; `worst` is what the certificate says of that run."""
-    whose = Robot.preset() if robot is None else robot
-    unit = error_unit(whose)[0]
-    ends = [worst[f"{axis}_{unit}"] for axis in whose.outputs.names]
+    """Write `name.toml`, a loop over the virtual neck; `worst` are the certificate's facts on the run."""
+    ends = [worst[f"{axis}_{error_unit(robot)[0]}"] for axis in robot.outputs.names]
     values = {**worst["parameters"], "payload": worst["payload_kg"], "noise_seed": float(worst["seed"])}
     text = _loop_text(
         folder, f"{name}.toml", title=f"{name} on {worst['name']}", plant='neck = "paper"',
         parameters=", ".join(f"{key} = {float(value)!r}" for key, value in values.items()), controller=controller,
-        observer=observer, wanted=_step(whose, ends, worst["at_s"]),
+        observer=observer, wanted=_step(robot, ends, worst["at_s"]),
         duration=worst["duration_s"], sample_time=worst["sample_time_s"], order=worst["order"],
     )  # fmt: skip
     _write(folder / f"{name}.toml", text, force=force)
@@ -214,14 +195,14 @@ def write_neck(
 
 
 def _step(robot: Robot, levels: Iterable[float], at: float) -> str:
-    """Return the keys of a step from zero to levels in the unit that people see."""
+    """Return the keys of a step from zero to levels in the display unit."""
     unit = error_unit(robot)[0]
     wanted = [f"{axis}_{unit} = {float(level)!r}" for axis, level in zip(robot.outputs.names, levels, strict=True)]
     return "\n".join(['kind = "step"', *wanted, f"at_s = {at:g}"])
 
 
 def _write_reference(path: Path, robot: Robot, levels: Matrix, sample_time: float, *, force: bool) -> None:
-    """Write (rows, outputs + 1) of all outputs and co-contraction as a recording; the last row is held to the end."""
+    """Write levels (rows, outputs + 1) of outputs and co-contraction as a recording."""
     time = np.arange(len(levels)) * sample_time
     channels: dict[str, Vector] = dict.fromkeys(robot.set_points, np.zeros(len(levels)))
     channels["cocontraction_reference"] = levels[:, -1]

@@ -96,13 +96,13 @@ def test_without_a_plant_that_steps_the_linear_ones_are_asked() -> None:
         ({"track": {"circle_deg": -1.0}}, "must be between 0.1 and 40"),
         ({"track": {"noise_deg": True}}, "must be a number"),
         ({"require": {"track.lap_s": {"max": 1.0}}}, r"unknown metric `track.lap_s`"),
-        ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must say"),
-        ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "of a positive number"),
-        ({"reserve": {"axes.gain_margin": 0.1}}, "is for loops over simulation models"),
+        ({"require": {"track.circle_rms_deg": {"min": 1.0}}}, "must be"),
+        ({"require": {"track.circle_rms_deg": {"max": 0.0}}}, "with a positive number"),
+        ({"reserve": {"axes.gain_margin": 0.1}}, "takes metrics of loops over simulation models"),
         ({"reserve": {"sim.rise_s": -0.1}}, "must be a number from 0 on; got -0.1"),
-        ({"reserve": {"sim.rise_s": 0.49}}, "<= 0.49 leaves nothing beside its reserve of 0.49"),
-        ({"require": {"sim.overshoot_pct": {"max": 0.0}}}, "<= 0 leaves nothing beside its reserve of 1.6"),
-        ({"reserve": {"sim.ris_s": 0.1}}, r"of which \[require\] asks nothing"),
+        ({"reserve": {"sim.rise_s": 0.49}}, "<= 0.49 is not above its safety margin of 0.49"),
+        ({"require": {"sim.overshoot_pct": {"max": 0.0}}}, "<= 0 is not above its safety margin of 1.6"),
+        ({"reserve": {"sim.ris_s": 0.1}}, r"which \[require\] does not limit"),
         ({"reserve": 1.0}, "must be a table"),
         ({"require": 1.0}, "must be a table"),
         ({"require": {"sim.rise_s": {"min": 1.0, "max": 0.4}}}, "cannot be at least 1 and at most"),
@@ -120,7 +120,7 @@ def test_a_file_says_what_differs(tmp_path: Path) -> None:
     asked = read_tune_requirements(path)
     assert (asked.robot_limit("sim.rise_s"), asked.track["circle_deg"], asked.track["circle_rad_s"]) == (0.6, 10.0, 1.2)
     path.write_text("version = 2\n")
-    with pytest.raises(FileFormatError, match="version = 1"):
+    with pytest.raises(FileFormatError, match="`version` must be 1"):
         read_tune_requirements(path)
     with pytest.raises(FileFormatError, match="cannot be read"):
         read_tune_requirements(tmp_path / "none.toml")
@@ -199,7 +199,7 @@ def test_what_may_rise_later_than_it_settles_is_refused(
 ) -> None:
     table = {"require": {f"{group}.rise_s": {"max": rise}, f"{group}.settling_s": {"max": settling}}}
     if refused:
-        with pytest.raises(SettingsError, match=r"what has settled has risen; ask for a rise of at most 0\.3 s"):
+        with pytest.raises(SettingsError, match=r"a settled step has risen; require a rise of at most 0\.3 s"):
             check_feasibility(make_tune_requirements(table), neck())
     else:
         check_feasibility(make_tune_requirements(table), neck())
@@ -213,7 +213,7 @@ def test_a_slow_rise_beside_a_settling_that_nobody_asked_is_no_contradiction() -
 def test_a_steady_state_quieter_than_the_sensor_is_refused(limit: float, noise: float, refused: bool) -> None:
     table = {"require": {"sim.steady_rms_deg": {"max": limit}}, "track": {"noise_deg": noise}}
     if refused:
-        with pytest.raises(SettingsError, match="noise of the sensor alone"):
+        with pytest.raises(SettingsError, match="the sensor noise alone"):
             check_feasibility(make_tune_requirements(table), neck())
     else:
         check_feasibility(make_tune_requirements(table), neck())

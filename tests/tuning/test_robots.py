@@ -148,12 +148,12 @@ def test_a_plant_of_another_robot_is_refused_before_anything_is_searched(tmp_pat
     own, other = "antagonist", "trunk4"
     with pytest.raises(DataError, match="of two robots cannot be used together"):
         tune({"model": plant(Robot.preset(other)), "nonlinear": plant(Robot.preset(own))}, folder=tmp_path)
-    with pytest.raises(SettingsError, match="own: is no plant with the outputs"):
+    with pytest.raises(SettingsError, match="own: needs the outputs"):
         tune(
             {"model": plant(Robot.preset("trunk4")), "own": plant(Robot.preset("antagonist")).block()}, folder=tmp_path
         )
     with pytest.raises(
-        SettingsError, match=r"would begin at zero, where `bellows` \(\w{8}\) cannot be; give linear plants alone"
+        SettingsError, match=r"start at zero, outside the range of `bellows` \(\w{8}\); give linear plants only"
     ):
         tune({"model": plant(BELLOWS), "own": plant(BELLOWS).block()}, folder=tmp_path)
     assert not list(tmp_path.iterdir())

@@ -125,13 +125,13 @@ def test_a_log_gives_back_what_was_judged_and_has_refusals_tried_again(tmp_path:
 
     log = Log(tmp_path, "d")
     job = Job.of("pi", {"b": 1.25, "a": 1e-17 + 0.1}, "all")
-    log.add(job, Judgement({"x": 1.0 / 3.0, "y": float("inf")}))
+    log.found[job] = Judgement({"x": 1.0 / 3.0, "y": float("inf")})
     refused = Job.of("pi", {}, "all")
-    log.add(refused, Judgement({}, "no plant"))
+    log.found[refused] = Judgement({}, "no plant")
     log.write()
     again = Log(tmp_path, "d")
-    assert refused in log
-    assert dict(again.items()) == {job: log[job]}
+    assert refused in log.found
+    assert again.found == {job: log.found[job]}
     assert job == Job.of("pi", {"a": 1e-17 + 0.1, "b": 1.25}, "all")
 
 

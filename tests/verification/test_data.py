@@ -192,7 +192,7 @@ def held_at(common: float) -> Steps:
     ("payload", "at", "loop", "said"),
     [
         ([1.0], [0.0], 0.0, {}),
-        ([0.0], [0.0], 0.0, {"sim": "recorded with 1 kg, and no simulation model carries that"}),
+        ([0.0], [0.0], 0.0, {"sim": "recorded with 1 kg, and no simulation model covers that"}),
         ([1.0], [0.0], 2.0, {"sim": "at a co-contraction of 2 rad", "loop": "recorded at -0.5 to 0.5 rad"}),
         ([1.0], [2.0], 0.0, {"sim": "at a co-contraction of 0 rad"}),
         (None, [0.0], 2.0, {"loop": "holds its motors at a co-contraction of 2 rad, and with 1 kg"}),
@@ -278,7 +278,7 @@ def test_what_steps_is_told_from_what_is_linear() -> None:
     assert is_simulation_model(NeckParameters.paper())
     assert not is_simulation_model(linear_neck())
     assert not is_simulation_model(family())
-    with pytest.raises(SettingsError, match="c: is no plant with the outputs pitch and roll"):
+    with pytest.raises(SettingsError, match="c: needs the outputs pitch and roll"):
         make_simulation_model(pi().block(), "c")
 
 

@@ -219,7 +219,7 @@ def test_of_a_loop_that_does_not_answer_nothing_is_certified() -> None:
 
 def test_a_plant_of_ones_own_has_to_be_of_the_robot() -> None:
     antagonist, trunk = (plant(Robot.preset(name)) for name in ("antagonist", "trunk4"))
-    with pytest.raises(SettingsError, match="x: is no plant with the outputs pitch and roll"):
+    with pytest.raises(SettingsError, match="x: needs the outputs pitch and roll"):
         make_simulation_model(antagonist.block(), "x", Robot.preset("trunk4"))
     assert make_simulation_model(trunk.block(), "x", Robot.preset("trunk4")).name == "x"
 

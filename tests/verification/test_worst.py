@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from softneck.cosim import load_loop
+from softneck.robot import Robot
 from softneck.verification import make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
 from softneck.verification._linear import LinearLaw, frequency_grid, margins
@@ -78,7 +79,9 @@ def test_the_loop_of_a_worst_neck_runs_at_a_sample_time_estimated_from_a_log(tmp
         "name": "paper, 1 kg", "parameters": {}, "payload_kg": 1.0, "seed": 7, "pitch_deg": 15.0, "roll_deg": 0.0,
         "at_s": 0.5, "duration_s": 2.5, "sample_time_s": sample_time, "order": "sequential",
     }  # fmt: skip
-    file = write_neck(tmp_path, "neck", worst, controller=tmp_path / "pi.npz", observer=None, force=False)
+    file = write_neck(
+        tmp_path, "neck", worst, controller=tmp_path / "pi.npz", observer=None, force=False, robot=Robot.preset()
+    )
     parts = load_loop(file).loop.parts
     assert {name: part.sample_time for name, part in parts.items()} == {
         "plant": sample_time, "controller": sample_time
