@@ -123,19 +123,19 @@ def loop_of(
     together = 0.0 if pulls else common
     if together:
         at = max(at, 3.0 * time)
-    size = case.part * asked.si(float(asked.sim["size_deg"]))
+    size = case.part * asked.scale.si(float(asked.sim["size_deg"]))
     ends = tuple(size * share for share in direction(case.orientation, robot))
     duration = at + float(asked.sim["duration_s"])
     faults = []
     if case.noise and track["noise_deg"] > 0.0:
-        faults.append(SensorFault(kind="noise", std=asked.si(track["noise_deg"]), seed=_seed(case, task)))
+        faults.append(SensorFault(kind="noise", std=asked.scale.si(track["noise_deg"]), seed=_seed(case, task)))
     Ts = block.sample_time
     if case.late and round(track["delay_ms"] / 1e3 / Ts):
         faults.append(SensorFault(kind="delay", delay=Ts * round(track["delay_ms"] / 1e3 / Ts)))
     reference = RobotReference(kind="step", values=ends, at=at)
     if case.circle:
         frequency = track["circle_rad_s"] / (2.0 * math.pi)
-        led, inclination = _LEAD_IN_S * time, (asked.si(track["circle_deg"]),)
+        led, inclination = _LEAD_IN_S * time, (asked.scale.si(track["circle_deg"]),)
         reference = RobotReference(kind="rotation", values=inclination, frequency=frequency, at=at, rise=led)
         duration = at + led + _TURN_COUNT / frequency
     return step_loop(

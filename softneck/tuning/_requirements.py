@@ -225,7 +225,7 @@ def fastest_rise(plant: Any) -> float:
 def default_rise(plants: list[Any], asked: TuneRequirements) -> float | None:
     """Return the default rise time [s] of the slowest axis; None if no step can be reached."""
     uncertain = uncertain_plant(plants[0] if len(plants) == 1 else plants)
-    limits, size = LoopSettings().limits(uncertain.robot), asked.certificate.si(asked.certificate.sim["size_deg"])
+    limits, size = LoopSettings().limits(uncertain.robot), asked.certificate.scale.si(asked.certificate.sim["size_deg"])
     time, found = asked.certificate.scale.time, []
     for name in uncertain.names:
         axis = uncertain.axis(name)
@@ -273,7 +273,7 @@ def _refuse_rise(
         if limit is None:
             continue
         table = asked.certificate.sim if metric.startswith("sim.") else asked.certificate.step
-        least = least_rise(plant, test, asked.certificate.si(float(table["size_deg"])))
+        least = least_rise(plant, test, asked.certificate.scale.si(float(table["size_deg"])))
         if math.isinf(least):
             raise SettingsError(
                 f"`{metric}` cannot be: the motors' range does not reach {name}'s step of the requirements; ask for a "
@@ -350,7 +350,7 @@ def _refuse_load(asked: TuneRequirements, name: str, plant: AxisPlant) -> None:
     alone = np.zeros(rows)
     felt = load * _step_response(plant, plant.delay + 2)
     alone[plant.delay : plant.delay + felt.size] = felt[: max(rows - plant.delay, 0)]
-    least = math.sqrt(float((alone**2).mean())) / certificate.si(1.0)
+    least = math.sqrt(float((alone**2).mean())) / certificate.scale.si(1.0)
     if limit < least:
         raise SettingsError(
             f"`{metric}` <= {limit:g} cannot be: the load of the requirements moves {name} for a dead time before any "

@@ -31,10 +31,9 @@ _NECK = Robot.preset()
 _BUFFER_SAMPLES = 34
 # The experiment [s]: time to reach the posture, time of the step, a transient, and each of two windows.
 _LEAD_IN_S, _REST_S, _TRANSIENT_S, _WINDOW_S = 1.0, 3.0, 2.0, 4.0
-# Steps and postures (pitch, roll), within reach of every neck with a payload.
+# Steps and lean of a posture, within reach of every neck with a payload.
 _SMALL_RAD, _LARGE_RAD = math.radians(1.0), math.radians(8.0)
 _LEAN_RAD = math.radians(5.0)
-_POSTURES = ((0.0, 0.0), (_LEAN_RAD, 0.0), (0.0, -_LEAN_RAD))
 _ALL_AXES = "both"
 # Unit of the scanned delays.
 _NECK_SAMPLE_TIME_S = 0.02
@@ -106,10 +105,7 @@ class LoopUnderTest:
 
     def postures(self) -> tuple[tuple[float, ...], ...]:
         """Return the postures, in rad of the neck: upright, and leaning to either side."""
-        m = len(self.outputs)
-        if m == len(_POSTURES[0]):
-            return _POSTURES
-        rest = (0.0,) * (m - 1)
+        rest = (0.0,) * (len(self.outputs) - 1)
         return ((0.0, *rest), (_LEAN_RAD, *rest), (*rest, -_LEAN_RAD))
 
 

@@ -344,9 +344,10 @@ class AxisMargins:
         if math.isfinite(self.crossover):
             return ""
         low, high = self.band
+        band = f"{max(low, 0.3 * high):.2g},{3.0 * high:.2g}"
         return (
             f"not supported by the data: {self.source} excites {self.axis} from {low:.2g} to {high:.2g} rad/s, and the "
-            f"loop may cross above; record `multisine --band {max(0.5, 0.3 * high):.2g},25` and add it to the family"
+            f"loop may cross above; record `multisine --band {band}` and add it to the family"
         )
 
 

@@ -292,9 +292,10 @@ def run_loops(
         (plant, payload, angle) for plant in plants
         for payload in plant.payloads(table["payloads_kg"]) for angle in angles
     ]  # fmt: skip
-    runs, size, at = [], asked.si(float(table["size_deg"])), step_time(controller, asked)
+    runs, size, at = [], asked.scale.si(float(table["size_deg"])), step_time(controller, asked)
     for number, (plant, payload, angle) in enumerate(cases):
-        name = f"{plant.name}, {payload:g} kg, {angle:g} deg"
+        words = [f"{payload:g} kg"] * bool(plant.payload) + [f"{angle:g} deg"] * (len(robot.outputs.names) > 1)
+        name = ", ".join([plant.name, *words])
         progress(number / len(cases), name)
         ends = tuple(size * share for share in direction(math.radians(angle), robot))
         loop = step_loop(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from softneck.core import Vector, to_si
 from softneck.loop import error_unit
-from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel, Section, Table, page
+from softneck.plots import BLUE, GREEN, GREY, ORANGE, Chart, Curve, Level, Panel, Section, Table, cell, page
 
 from ._evidence import Evidence, LinearEvidence
 from ._linear import inverse, loops
@@ -181,20 +180,13 @@ _BOUNDS = {"min": ">=", "max": "<=", "below": "<"}
 def verdict_table(found: Verification) -> Table:
     """Return a table of the requirements with value, limit, verdict and worst plant."""
     axes = found.controller.robot.outputs.names
-    rows = [[metric_title(v.requirement.metric), number(v.value), _limit(v), _verdict_word(v), _worst_plant(v, axes)]
+    rows = [[metric_title(v.requirement.metric), cell(v.value), _limit(v), _verdict_word(v), _worst_plant(v, axes)]
             for v in found.verdicts]  # fmt: skip
     return Table("Requirements", ["metric", "value", "limit", "verdict", "worst plant"], rows)
 
 
 def _limit(verdict: Verdict) -> str:
     return f"{_BOUNDS[verdict.requirement.bound]} {verdict.requirement.limit:g}"
-
-
-def number(value: Any) -> str:
-    """Format a value for a table; None gives `-`."""
-    if value is None:
-        return "-"
-    return f"{value:.4g}" if isinstance(value, int | float | np.floating) else str(value)
 
 
 def _verdict_word(verdict: Verdict) -> str:
@@ -241,7 +233,7 @@ def _verdict_sentence(found: Verification) -> str:
     """Return the verdict with the failed requirements."""
     axes = found.controller.robot.outputs.names
     failed = [
-        f"{metric_title(v.requirement.metric)} is {number(v.value)}, required {_limit(v)} ({_worst_plant(v, axes)})"
+        f"{metric_title(v.requirement.metric)} is {cell(v.value)}, required {_limit(v)} ({_worst_plant(v, axes)})"
         for v in found.failed
     ]
     count, plants = len(found.verdicts), f"{len(found.evidence.plants)} plants"
@@ -286,7 +278,7 @@ def _margin_table(part: LinearEvidence) -> Table:
     for name, values in part.margins.items():
         finite = values[np.isfinite(values)]
         middle = float(np.median(finite)) if finite.size else math.inf
-        rows.append([name, *(number(float(v)) for v in (values[0], middle, values.min(), values.max()))])
+        rows.append([name, *(cell(float(v)) for v in (values[0], middle, values.min(), values.max()))])
     return Table("Margins over all plants tried", ["margin", "nominal", "median", "least", "largest"], rows)
 
 
@@ -296,14 +288,14 @@ def _spread(found: Verification, group: str) -> Table:
         if name.startswith(f"{group}."):
             v = values.values
             worst = values.describe(int(np.argmax(v)))["name"]
-            rows.append([name.partition(".")[2], *(number(float(x)) for x in (v[0], np.median(v), v.max())), worst])
+            rows.append([name.partition(".")[2], *(cell(float(x)) for x in (v[0], np.median(v), v.max())), worst])
     return Table("Over all of them", ["metric", "nominal", "median", "worst", "worst plant"], rows)
 
 
 def _runs_table(found: Verification) -> Table:
     runs = found.evidence.necks
     names = list(runs[0].metrics)
-    rows = [[run.name, *(number(run.metrics[name]) for name in names)] for run in runs]
+    rows = [[run.name, *(cell(run.metrics[name]) for name in names)] for run in runs]
     shown = [found.requirements.scale.name_of(f"sim.{name}").partition(".")[2] for name in names]
     return Table("Each loop", ["plant, payload, direction", *shown], rows)
 

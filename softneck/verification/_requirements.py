@@ -193,16 +193,12 @@ class Requirements(ReprMixin):
         """The robot of the controller."""
         return self.scale.robot
 
-    def si(self, value: float) -> float:
-        """Convert an output from its display unit, such as deg, to SI."""
-        return self.scale.si(value)
-
     def step_test(self, seed: int) -> StepTest:
         """Return the step test on linear plants."""
         load = to_si(self.robot.motors.unit)[0] * float(self.step["load_rad"])
         return StepTest(
-            step=self.si(self.step["size_deg"]), duration=float(self.step["duration_s"]),
-            noise=self.si(self.step["noise_deg"]), load=load, seed=seed,
+            step=self.scale.si(self.step["size_deg"]), duration=float(self.step["duration_s"]),
+            noise=self.scale.si(self.step["noise_deg"]), load=load, seed=seed,
         )  # fmt: skip
 
     def table(self, name: str) -> dict[str, Any]:

@@ -158,7 +158,7 @@ def write_linear(
     module = f"plant_{hashlib.sha256(text.encode()).hexdigest()[:10]}"
     _write(folder / f"{module}.py", text, force=True)
     Ts, duration = float(worst["sample_time"]), float(step["duration_s"])
-    stepped = around + asked.si(float(step["size_deg"])) * (np.arange(around.size) == worst["axis"])
+    stepped = around + asked.scale.si(float(step["size_deg"])) * (np.arange(around.size) == worst["axis"])
     if before.any():
         rows = 2 * round(duration / Ts)  # as long as in the step test
         duration += rows * Ts
@@ -167,7 +167,7 @@ def write_linear(
         wanted = f'kind = "recording"\nfile = "{name}_reference.csv"'
     else:
         wanted = _step(robot, asked.scale.shown(stepped), 0.0)
-    noise = f"noise_std = {asked.si(step['noise_deg'])!r}"
+    noise = f"noise_std = {asked.scale.si(step['noise_deg'])!r}"
     text = _loop_text(
         folder, f"{name}.toml", title=f"{name} on {worst['name']}, with a step", plant=f'python = "{module}:plant"',
         parameters=noise, controller=controller, observer=None, wanted=wanted,

@@ -14,7 +14,6 @@ from softneck.plant import NeckParameters, VirtualNeck
 from softneck.runtime import Block
 from softneck.verification import linear_plant
 from softneck.verification._experiments import (
-    _POSTURES,
     _SMALL_RAD,
     Crossing,
     LoopUnderTest,
@@ -50,7 +49,7 @@ def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
 
 def first(loop: LoopUnderTest, axes: str, what: str) -> float:
     """The first crossing of a small kick from upright."""
-    case = _Case(loop, axes, what, _SMALL_RAD, _POSTURES[0])
+    case = _Case(loop, axes, what, _SMALL_RAD, (0.0, 0.0))
     return _first_crossing(case, case.floor(), math.inf, False)
 
 
@@ -106,7 +105,7 @@ def test_the_first_crossing_is_found_where_stability_is_not_monotone(monkeypatch
 
 def test_the_least_over_plants_axes_and_kinds_is_each_metric_s() -> None:
     def crossing(axes: str, what: str, value: float) -> Crossing:
-        return Crossing("p", axes, what, _SMALL_RAD, _POSTURES[0], value, 0.0)
+        return Crossing("p", axes, what, _SMALL_RAD, (0.0, 0.0), value, 0.0)
 
     found = [
         crossing("pitch", "gain_up", 3.0), crossing("pitch", "gain_down", 2.5), crossing("roll", "gain_up", 4.0),
@@ -184,7 +183,7 @@ def test_a_loop_that_feeds_a_kick_oscillates_though_slow_parts_of_its_plant_let_
 ) -> None:
     """Seen on a foreign neck: 3.5 deg from a kick of 1, then 3.1; it was called calm."""
     case = _Case(
-        over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", _SMALL_RAD, _POSTURES[0]
+        over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", _SMALL_RAD, (0.0, 0.0)
     )
     monkeypatch.setattr(_Case, "_windows", lambda *_: (3.5 * _SMALL_RAD, 3.1 * _SMALL_RAD))
     assert case.oscillates(1.6, 0.0)
@@ -221,5 +220,5 @@ def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
     loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for size, loud in ((0.2, False), (1.5, True)):
         monkeypatch.setattr(_Case, "_windows", lambda *_, size=size: (size * _SMALL_RAD, size * _SMALL_RAD))
-        assert _Case(loop, "both", "gain_down", _SMALL_RAD, _POSTURES[0]).oscillates(1.4, 0.0) is loud
-        assert _Case(loop, "both", "gain_up", _SMALL_RAD, _POSTURES[0]).oscillates(1.4, 0.0)
+        assert _Case(loop, "both", "gain_down", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0) is loud
+        assert _Case(loop, "both", "gain_up", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0)

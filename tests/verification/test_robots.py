@@ -121,7 +121,7 @@ def test_defaults_are_stretched_to_the_robot_and_what_is_asked_stays(tmp_path: P
     # from the middle of its range; over the 0.8 rad of a neck, in mm.
     assert size == pytest.approx(10.0 / math.degrees(0.8))
     assert limits["step.load_rms_mm"] == pytest.approx(2.0 * size)
-    assert found.requirements.si(found.requirements.step["size_deg"]) == pytest.approx(3e-3)
+    assert found.requirements.scale.si(found.requirements.step["size_deg"]) == pytest.approx(3e-3)
     verdicts = {item.requirement.metric: item for item in found.verdicts}
     assert verdicts["step.load_rms_mm"].value is not None
     assert verdicts["step.settling_s"].holds, "bellows cannot be stepped from 0 bar, but around 1.5 bar"
