@@ -103,10 +103,6 @@ def read_tune_requirements(
         scale: of the defaults; None: from the robot alone.
         stepping: whether there are simulation models; else default `sim.*` limits apply to the linear plants.
         rise: the default [s]; None: that of the paper's neck, by the robot's time constant.
-
-    Raises:
-        FileFormatError: no such file, no TOML, another version.
-        SettingsError: an unknown key or metric, a value out of range, or bounds that contradict each other.
     """
     return read_file(path, partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise))
 

@@ -319,11 +319,7 @@ class Search:
 def run_jobs(
     jobs: Sequence[Job], run: Callable[[Job], Future], crew: WorkerPool, took: Callable[[Job, Judgement], None]
 ) -> None:
-    """Run jobs, two per worker at a time, and store each result when it arrives.
-
-    Raises:
-        SoftneckError: a worker died.
-    """
+    """Run jobs, two per worker at a time, and store each result when it arrives."""
     left, out = list(jobs)[::-1], dict[Future, Job]()
     try:
         while left or out:

@@ -114,12 +114,8 @@ def spaces(
 ) -> list[Space]:
     """Return the space of every kind.
 
-    Args:
-        kinds: of controllers.
-        rise: longest allowed rise [s].
-        cocontraction: of the recordings, in the unit of the motors; None: not set.
-        robot: of the controller; only tendons on winches need a `lead_limit`.
-        least: shortest rise of the motors [s].
+    `rise` and `least` [s] are the longest allowed rise and the shortest of the motors; `cocontraction` is that of the
+    recordings in the unit of the motors, or None. Only tendons on winches need a `lead_limit`.
 
     Raises:
         SettingsError: an unknown kind, or one with nothing to search.

@@ -101,13 +101,7 @@ _LOG_FORMAT = 1
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One candidate at one level.
-
-    Attributes:
-        kind: of controller.
-        settings: as JSON text with sorted keys.
-        level: one of `LEVELS`.
-    """
+    """One candidate at one of the `LEVELS`; `settings` is a JSON text with sorted keys."""
 
     kind: str
     settings: str
@@ -128,11 +122,7 @@ class Log:
     """
 
     def __init__(self, folder: Path | None, digest: str, *, force: bool = False) -> None:
-        """Start a log, or continue that of the same search.
-
-        Raises:
-            OutputFileError: the folder holds another search and `force` is not given.
-        """
+        """Start a log, or continue that of the same search; without `force` another one raises OutputFileError."""
         self.folder, self._digest = folder, digest
         self.found: dict[Job, Judgement] = {}
         if folder is None or not (folder / FILE).is_file():

@@ -144,8 +144,8 @@ def crossings(
     Args:
         loops: over each plant.
         coarse: one posture, both axes at once, coarse gains, no bisection: the last value without oscillation.
-        overall: find only the smallest gain and delay margin of all loops, in half the runs: the last loop with both
-            axes at once, the hardest test, bounds the scans of all others, which take every other step.
+        overall: find only the smallest gain and delay margin of all loops: the last loop with all axes at once, the
+            hardest test, bounds the scans of all others, which take every other step.
         progress: called now and then.
     """
     kinds = ("gain_up", "gain_down", "delay")
@@ -155,9 +155,8 @@ def crossings(
     # The first run compiles the loop, once instead of in every thread.
     leaders = groups[:1]
     if overall:
-        leaders = [
-            job for job in groups if job[0] is loops[-1] and job[1] == loops[-1].axes[-1] and job[2] in _BOUNDED_SCANS
-        ]
+        last = loops[-1]
+        leaders = [job for job in groups if job[0] is last and job[1] == last.axes[-1] and job[2] in _BOUNDED_SCANS]
     others = [job for job in groups if job not in leaders]
     least: dict[str, float] = dict.fromkeys(kinds, math.inf)
     done = 0

@@ -67,11 +67,7 @@ class SimulationModel:
 
 
 def named_plants(plants: Any, robot: str | Path | Robot | None = None) -> dict[str, Any]:
-    """Return name -> plant of one, several or named plants, objects or files.
-
-    Raises:
-        SettingsError: an object that is no plant.
-    """
+    """Return name -> plant of one, several or named plants, objects or files; else raise SettingsError."""
     if isinstance(plants, Mapping):
         named = {str(name): plant for name, plant in plants.items()}
     else:

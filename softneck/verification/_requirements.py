@@ -32,11 +32,8 @@ from ._steps import StepTest
 def select_for_verify(own: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a file that `verify` uses: limits less safety margins, without [track]."""
     found = {name: table for name, table in own.items() if name not in ("track", "reserve")}
-    require = found.get("require", {})
-    if isinstance(require, Mapping):
-        kept, _ = apply_safety_margin(require, own.get("reserve", {}))
-        found["require"] = {metric: entry for metric, entry in kept.items() if not metric.startswith("track.")}
-    return found
+    kept, _ = apply_safety_margin(found.get("require", {}), own.get("reserve", {}))
+    return found | {"require": {metric: entry for metric, entry in kept.items() if not metric.startswith("track.")}}
 
 
 def tune_only_metrics(own: Mapping[str, Any]) -> list[str]:
@@ -254,9 +251,7 @@ def make_requirements(
         if key not in ("version", *_NUMBERS, "require"):
             raise SettingsError(f"unknown table `{key}` of a requirements file; it has {', '.join(_NUMBERS)}, require.")
     tables: Any = {name: _table(name, defaults[name], own.get(name, {}), scale) for name in _NUMBERS}
-    if not isinstance(own.get("require", {}), Mapping):
-        raise SettingsError("`require` must be a table: [require].")
-    bounds = _bounds(scale.table(defaults["require"]), own.get("require", {}), scale.robot)
+    bounds = _bounds(scale.table(defaults["require"]), own["require"], scale.robot)
     _refuse_contradictions(bounds, scale.robot)
     _refuse_weak(bounds, tables, scale)
     return Requirements(bounds, **tables, scale=scale, own=said)

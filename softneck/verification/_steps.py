@@ -85,15 +85,9 @@ def run_steps(
     plants: Plants, block: Block, test: StepTest, *, workers: int | None = None, robot: Robot | None = None,
     weights: Matrix | None = None,
 ) -> Steps:  # fmt: skip
-    """Return the responses of all plants.
+    """Return the responses of all plants, which include the delay of the loop's order, with a controller `block`.
 
-    Args:
-        plants: with the delay that the loop's order adds.
-        block: the controller.
-        test: the step.
-        workers: threads; None: one per core.
-        robot: of the plants; None: the neck.
-        weights: (axes, motors) of the motors in each axis's input; None: those of the robot's file.
+    `workers` None is one thread per core, `robot` None the neck, `weights` (axes, motors) None those of the robot.
     """
     whose = Robot.preset() if robot is None else robot
     T = whose.redefinition(weights)[0]

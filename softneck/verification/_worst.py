@@ -130,17 +130,8 @@ def write_linear(
 ) -> Path:  # fmt: skip
     """Write `name.toml` and its plant; return the loop file.
 
-    As in the step test, motors are first moved to their operating point.
-
-    Args:
-        folder: of the files.
-        name: of the loop file.
-        worst: name, numerator, denominator, delay, cross, sample_time and axis (its number) of the plant.
-        controller: its file.
-        asked: the requirements.
-        block: the controller.
-        weights: (outputs, motors) of the motors in each axis's input.
-        force: replace existing files.
+    As in the step test, motors are first moved to their operating point. `worst` has name, numerator, denominator,
+    delay, cross, sample_time and axis (its number) of the plant, `weights` (outputs, motors) those of the axes' inputs.
     """
     robot, step = asked.robot, asked.step
     around, names = middle_of(robot), robot.outputs.names
