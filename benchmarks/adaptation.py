@@ -21,7 +21,7 @@ import numpy as np
 from softneck.core import Vector, load, resolve
 from softneck.core._kinds import KINDS
 from softneck.identification import WARM_UP, Model
-from softneck.identification.adaptation._adapt import Adaptation
+from softneck.identification._adapt import Adaptation
 from softneck.signals import Recording, concatenate, import_log, read_layout, signal
 from tests.foreign_necks.choosing import leave_one_out
 from tests.foreign_necks.necks import CHOOSING, ForeignNeck, record

@@ -18,7 +18,7 @@ from softneck.core import KINDS, Matrix, resolve
 from softneck.identification import Model
 from softneck.identification.models._model import WARM_UP
 from softneck.identification.models._validity import tolerance_of, with_validity_region
-from softneck.identification.validation._bounds import reliability
+from softneck.identification.validation._error_statistics import reliability
 from softneck.signals import Recording, signal
 from tests.foreign_necks.necks import CHOOSING
 

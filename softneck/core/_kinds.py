@@ -52,7 +52,7 @@ KINDS: dict[str, Kind] = {
              f"{_IDENT}.linear._regression:check_linear"),
         Kind("nlsm", "model", "softneck.identification:SetMembership", _MODEL, f"{_IDENT}.set_membership._nlsm_runtime",
              "nonlinear set membership (Eq. 12-21, Algorithm 1)",
-             f"{_IDENT}.set_membership._trees:check_nlsm"),
+             f"{_IDENT}.set_membership._regressor:check_nlsm"),
         Kind("nn", "model", "softneck.identification:Network", _MODEL, f"{_IDENT}.networks._nn_runtime",
              "NLARX neural network, two hidden layers of 25 (section 6.2)",
              f"{_IDENT}.networks._network:check_nn"),

@@ -186,7 +186,7 @@ class WalkCost:
     """The cost over a nonlinear model: it is simulated once, and its error is a random walk."""
 
     def __init__(self, observer: NonlinearObserver, runs: Sequence[Recording]) -> None:
-        self._cost = load_functions("softneck.estimation._walk_likelihood_runtime").walk_cost
+        self._cost = load_functions("softneck.estimation._likelihood_runtime").walk_cost
         self._start = observer.start**2
         self._tables: list[tuple[Matrix, np.ndarray, Vector]] = []
         self.outliers = 0

@@ -82,6 +82,6 @@ def test_a_thousand_resamples_of_30000_rows(benchmark: BenchmarkFixture) -> None
     rng = np.random.default_rng(0)
     y = np.cumsum(rng.standard_normal((ROWS, 2)), axis=0)
     e = rng.standard_normal((ROWS, 2))
-    stretch = np.zeros(ROWS, dtype=int)
-    intervals = benchmark(fit_intervals, [y] * 4, [y - e] * 4, stretch, 10.0)
+    segment = np.zeros(ROWS, dtype=int)
+    intervals = benchmark(fit_intervals, [y] * 4, [y - e] * 4, segment, 10.0)
     assert len(intervals) == 4

@@ -44,7 +44,7 @@ CASES: dict[str, tuple[Recording, tuple[str, ...], str]] = {
     "a horizon longer than the run": (
         WHOLE,
         ("--horizon", "1,300,inf"),
-        "a horizon of 300 samples is longer than what is judged: the longest stretch of rows that the model was not "
+        "a horizon of 300 samples is longer than what is judged: the longest segment of rows that the model was not "
         "trained on has 300",
     ),
 }

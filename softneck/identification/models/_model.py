@@ -272,7 +272,7 @@ class Model(ReprMixin):
             SettingsError: a kind that cannot adapt.
         """
         # Resolved by name, as `adaptation` imports this module.
-        return resolve("softneck.identification.adaptation._adapt:adapt_model")(self, recording, window)
+        return resolve("softneck.identification._adapt:adapt_model")(self, recording, window)
 
     def tf(
         self,

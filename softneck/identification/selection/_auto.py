@@ -30,7 +30,7 @@ from ..set_membership._set_membership import noise_si
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
-from ._left_out import Fold, agreement, everything, exams, folds, free_runs
+from ._left_out import Fold, agreement, all_rows, exams, folds, free_runs
 
 EXAM, HOLD_OUT, COLD = "agreement", "hold-out", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
@@ -108,10 +108,10 @@ def _mean(fits: Mapping[str, float | None]) -> float:
 # Fits closer than this are alike [points]: seeds of noise and training move them by as much.
 ALIKE = 0.5
 # Below this [%] no kind has understood the recording.
-_POOR = 70.0
+_POOR_FIT_PCT = 70.0
 
 
-def reasons(ranking: Sequence[KindTrial]) -> str:
+def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
     """Return why kinds failed, each reason once."""
     said: dict[str, list[str]] = {}
     for one in ranking:
@@ -121,13 +121,13 @@ def reasons(ranking: Sequence[KindTrial]) -> str:
     return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
 
 
-def word(kind: str, tried: list[KindTrial]) -> str:
+def _progress_text(kind: str, tried: list[KindTrial]) -> str:
     """Return what is tried, and the best so far."""
     best = max(tried, key=lambda one: one.fit, default=None)
     return kind if best is None or best.fit == float("-inf") else f"{kind} (best so far {best.kind}, {best.fit:.1f} %)"
 
 
-def why(chosen: KindTrial, alike: list[KindTrial]) -> str:
+def _explain_choice(chosen: KindTrial, alike: list[KindTrial]) -> str:
     """Return why a kind is taken before those that are alike."""
     said = f"{chosen.kind} runs free with {chosen.fit:.1f} % at its worst ({chosen.worst})"
     if not alike:
@@ -139,7 +139,7 @@ def why(chosen: KindTrial, alike: list[KindTrial]) -> str:
     )
 
 
-def guarded_why(best: KindTrial, chosen: KindTrial) -> str:
+def _explain_guarded(best: KindTrial, chosen: KindTrial) -> str:
     """Return what the guarded form of the best is, where it was taken."""
     if chosen is best or chosen.model is None:
         return ""
@@ -151,7 +151,7 @@ def guarded_why(best: KindTrial, chosen: KindTrial) -> str:
     )
 
 
-def remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
+def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
     """Return what to be wary of in a ranking."""
     remarks = []
     if not other_excitation:
@@ -159,10 +159,10 @@ def remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str
             "The rows held out are of the excitation that was trained on: this ranking may not hold for other "
             "motions. Give a second recording with another signal; the last one is held out."
         )
-    if ranking[0].fit < _POOR:
+    if ranking[0].fit < _POOR_FIT_PCT:
         remarks.append(
-            f"No kind reaches {_POOR:g} % in free run. Look for a drifting sensor, a wrong sample time or sign, motors "
-            "that were not logged, or an excitation that hardly moves the robot."
+            f"No kind reaches {_POOR_FIT_PCT:g} % in free run. Look for a drifting sensor, a wrong sample time or "
+            "sign, motors that were not logged, or an excitation that hardly moves the robot."
         )
     failed = [one.kind for one in ranking if one.fit == float("-inf")]
     if failed:
@@ -181,7 +181,7 @@ _SCREENED: dict[str, dict[str, Any]] = {
     "nlsm": {"output_weight": 5.0},
 }
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
-_SIGMAS = 8.0
+_EPSILON_SIGMAS = 8.0
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
 _GUARD_COST = 2.0
 # So many kinds are trained on all rows at most, before the better of them is taken.
@@ -243,24 +243,24 @@ def choose(
     Raises:
         DataError: no kind could be identified.
     """
-    wanted = _wanted(kinds)
+    wanted = _kinds_in_order(kinds)
     race = _Race(train, hold_out, folds(train, hold_out, other_excitation=other_excitation), seed)
     for number, kind in enumerate(wanted):
-        progress(0.7 * number / len(wanted), word(kind, list(race.tried.values())))
+        progress(0.7 * number / len(wanted), _progress_text(kind, list(race.tried.values())))
         race.screen(kind)
     race.examine()
     race.leave_out(lambda done, what: progress(0.7 + 0.1 * done, what))
-    best = race.trained(lambda done, what: progress(0.8 + 0.1 * done, what))
-    chosen = race.guarded(best, lambda done, what: progress(0.9 + 0.1 * done, what))
+    best = race.train_best(lambda done, what: progress(0.8 + 0.1 * done, what))
+    chosen = race.guard_best(best, lambda done, what: progress(0.9 + 0.1 * done, what))
     race.train_other(chosen)
     ranking = race.ranking()
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
-    wary = (*poor_excitation(train), *remarks(ranking, other_excitation))
-    return Choice(ranking, chosen, why(best, alike) + guarded_why(best, chosen), wary)
+    wary = (*poor_excitation(train), *_remarks(ranking, other_excitation))
+    return Choice(ranking, chosen, _explain_choice(best, alike) + _explain_guarded(best, chosen), wary)
 
 
-def _wanted(kinds: Sequence[str]) -> list[str]:
+def _kinds_in_order(kinds: Sequence[str]) -> list[str]:
     known = kinds_to_try()
     unknown = [kind for kind in kinds if kind not in known]
     if unknown:
@@ -299,7 +299,7 @@ class _Race:
         try:
             model = self.short[kind] = self._short(kind, fold.train)
             seconds = time.perf_counter() - begin
-            found = {part.name: part.fit(model) for part in (*fold.judged, everything(HOLD_OUT, self.hold_out))}
+            found = {part.name: part.fit(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
         except (SoftneckError, np.linalg.LinAlgError) as error:
             self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=str(error))
             return
@@ -340,7 +340,7 @@ class _Race:
         one = self.tried[kind]
         self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin), found)
 
-    def trained(self, progress: Progress) -> KindTrial:
+    def train_best(self, progress: Progress) -> KindTrial:
         """Train the best on all rows, and the next one where the best then falls behind it; return the one to take."""
         trained = 0
         while True:
@@ -354,7 +354,7 @@ class _Race:
             self.whole(best.kind)
             trained += 1
 
-    def guarded(self, best: KindTrial, progress: Progress) -> KindTrial:
+    def guard_best(self, best: KindTrial, progress: Progress) -> KindTrial:
         """Return the guarded form of a learned kind unless it is worse on the rows held out.
 
         Over `greybox` its members are there already: the model of all rows, and the short one without the largest and
@@ -373,7 +373,7 @@ class _Race:
                 base = fitted_base("greybox", self.train, _settings("greybox", self.seed, _SCREENED["greybox"]))
                 parts = [best.model, self.short[best.kind]]
                 model = replace(settings, members=len(parts)).around(base, parts, self.train)
-            judged = self._judged("guarded", model)
+            judged = self._validate("guarded", model)
         except (SoftneckError, np.linalg.LinAlgError) as error:
             self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=str(error))
             return best
@@ -395,8 +395,8 @@ class _Race:
             if one.model is None:
                 raise DataError(one.failure)
             model = _settings(kind, self.seed, {}).fit(self.train)
-            judged = self._judged(kind, model)
-            error = everything(HOLD_OUT, self.hold_out).fit(model)[1]
+            judged = self._validate(kind, model)
+            error = all_rows(HOLD_OUT, self.hold_out).fit(model)[1]
         except (SoftneckError, np.linalg.LinAlgError) as error:
             self.tried[kind] = KindTrial(kind, one.seconds, failure=str(error))
             return
@@ -407,17 +407,17 @@ class _Race:
         ranking = self.ranking()
         best = ranking[0]
         if best.fit == float("-inf"):
-            raise DataError(f"no kind could be identified: {reasons(ranking)}")
+            raise DataError(f"no kind could be identified: {_failure_reasons(ranking)}")
         alike = [one for one in ranking if one.fit > best.fit - ALIKE]
         return min(alike, key=lambda one: (one.numbers, _SIMPLE_FIRST.index(one.kind)))
 
     def _short(self, kind: str, train: Recording) -> Model:
         short = dict(_SCREENED.get(kind, {}))
         if kind == "nlsm":
-            short["epsilon"] = _SIGMAS * float(noise_si(train).max())
+            short["epsilon"] = _EPSILON_SIGMAS * float(noise_si(train).max())
         return _settings(kind, self.seed, short).fit(train)
 
-    def _judged(self, kind: str, model: Model) -> Validation:
+    def _validate(self, kind: str, model: Model) -> Validation:
         rules = Rules((1, INFINITE))
         return judge(model, judged_parts(model, self.hold_out, rules, self._known), rules, names=(kind, HOLD_OUT))
 

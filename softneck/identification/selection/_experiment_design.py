@@ -6,7 +6,7 @@ motion is scored by what it would make known of all of them: a sample's doubt,
     s^2 = spread of the members^2 + (slope d)^2,
 
 d the distance from the set-points that were seen, falls by `1 - k^2` where the nearest recorded sample has the
-correlation k with it in set-points and their change (a kernel of length `_LENGTH`). The sum of what is left is
+correlation k with it in set-points and their change (a kernel of length `_KERNEL_LENGTH`). The sum of what is left is
 submodular: taking the best motion first and so on reaches 63 % of the best choice at least (Nemhauser, Wolsey and
 Fisher 1978; Krause, Singh and Guestrin 2008). What is expected is expected by the members: what they share, they do not
 know.
@@ -41,14 +41,14 @@ from ..models._fitting import in_display_unit
 from ..models._model import Model
 
 # Of what each signal asks for: small motions show friction, large ones what bends.
-_SIZES = (0.5, 0.75, 1.0)
+_SIZE_FACTORS = (0.5, 0.75, 1.0)
 # Of the signals' own pace; `rotation`, `aprbs` and `multisine` are as fast as the paper's at 1.
-_SPEEDS = (0.5, 1.0, 2.0)
-_PLAYED = ("eq22", "aprbs", "multisine", "rotation")
+_SPEED_FACTORS = (0.5, 1.0, 2.0)
+_SIGNAL_NAMES = ("eq22", "aprbs", "multisine", "rotation")
 # Parts of `mixed` in which one motor moves at a time, and all alike: from which to which part of its length.
-_OF_MIXED = {"single_tendon": (0.88, 0.95), "cocontraction": (0.95, 1.0)}
+_PARTS_OF_MIXED = {"single_tendon": (0.88, 0.95), "cocontraction": (0.95, 1.0)}
 # How long that is [s]: each part of it is played again and again.
-_MIXED = 120.0
+_MIXED_LENGTH_S = 120.0
 # [s] from rest into each motion and back.
 RAMP = 1.0
 
@@ -117,7 +117,7 @@ def motions(robot: Robot, sample_time: float, rows: int, bounds: Bounds, seed: i
     """Return motions of `rows` rows each: every signal in every size and speed."""
     found = []
     for name, speed, P in _signals(robot, sample_time, rows, seed):
-        found += [Motion(name, size, speed, bounds.within(size * P, sample_time)) for size in _SIZES]
+        found += [Motion(name, size, speed, bounds.within(size * P, sample_time)) for size in _SIZE_FACTORS]
     return found
 
 
@@ -125,27 +125,27 @@ def _signals(robot: Robot, sample_time: float, rows: int, seed: int) -> Iterator
     """Yield name, speed and set-points (rows, motors)."""
     # At the sample time of the data, which a robot file need not give.
     robot = replace(robot, sample_time_s=sample_time)
-    longest = (rows * max(_SPEEDS) + 1) * sample_time
-    mixed = signal("mixed", duration=_MIXED, seed=seed, robot=robot).set_points
-    for number, speed in enumerate(_SPEEDS):
+    longest = (rows * max(_SPEED_FACTORS) + 1) * sample_time
+    mixed = signal("mixed", duration=_MIXED_LENGTH_S, seed=seed, robot=robot).set_points
+    for number, speed in enumerate(_SPEED_FACTORS):
         # Slower or faster: read at other instants.
         at = np.arange(rows) * speed
-        for name in _PLAYED:
+        for name in _SIGNAL_NAMES:
             # Other levels and phases at each speed.
             P = signal(name, duration=longest, seed=seed + number, robot=robot).set_points
             yield name, speed, np.column_stack([np.interp(at, np.arange(len(P)), column) for column in P.T])
-        for name, share in _OF_MIXED.items():
+        for name, share in _PARTS_OF_MIXED.items():
             start, stop = (round(part * len(mixed)) for part in share)
             yield name, speed, mixed[start + (at.astype(int) % (stop - start))]
 
 
 # Of a motion, ramps included [s]; a sequence has whole ones.
-_SECONDS = 10.0
-_LEAST, _MOST = 4.0 * RAMP, 3600.0
+_MOTION_LENGTH_S = 10.0
+_MIN_DURATION_S, _MAX_DURATION_S = 4.0 * RAMP, 3600.0
 # Samples are compared so often, and their change taken over so long [s].
-_EVERY, _CHANGE = 0.2, 0.4
+_FEATURE_PERIOD_S, _CHANGE_PERIOD_S = 0.2, 0.4
 # Of the kernel, in standard deviations of set-points and changes over all motions.
-_LENGTH = 0.5
+_KERNEL_LENGTH = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -272,14 +272,14 @@ def next_experiment(
         SettingsError: too short or too long, or no motion within the outputs' range.
         DataError: no member runs free.
     """
-    require_between("duration", duration, _LEAST, _MOST, "s")
+    require_between("duration", duration, _MIN_DURATION_S, _MAX_DURATION_S, "s")
     robot, Ts = known.robot, known.sample_time
-    count = max(1, round(duration / _SECONDS))
+    count = max(1, round(duration / _MOTION_LENGTH_S))
     rows, bounds = round(duration / Ts) // count, bounds or Bounds.of(robot)
     drawn, tried = motions(robot, Ts, rows, bounds, seed), []
     for number, motion in enumerate(drawn):
         progress(number / len(drawn), str(motion))
-        tried.append(_Tried.of(motion, known))
+        tried.append(_Candidate.of(motion, known))
     tried = [one for one in tried if one.inside]
     if not tried:
         raise SettingsError("every motion leads an output out of the robot's range; lower --max-position.")
@@ -302,8 +302,8 @@ def next_experiment(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Tried:
-    """A motion and what is doubted of it, at samples `_EVERY` apart: squared doubt and features (samples, n)."""
+class _Candidate:
+    """A motion with its squared doubt and its features (samples, n), every `_FEATURE_PERIOD_S`."""
 
     motion: Motion
     expected: Matrix
@@ -315,7 +315,7 @@ class _Tried:
     inside: bool
 
     @classmethod
-    def of(cls, motion: Motion, known: Known) -> _Tried:
+    def of(cls, motion: Motion, known: Known) -> _Candidate:
         """Run the members over a motion."""
         from scipy.spatial import KDTree
 
@@ -332,8 +332,8 @@ class _Tried:
         variance = np.mean(apart**2, axis=0)
         distance = np.maximum(KDTree(known.seen).query(P)[0] - known.reach, 0.0)
         unseen = (distance[:, None] * known.slope) ** 2
-        every = slice(None, None, max(round(_EVERY / Ts), 1))
-        back = max(round(_CHANGE / Ts), 1)
+        every = slice(None, None, max(round(_FEATURE_PERIOD_S / Ts), 1))
+        back = max(round(_CHANGE_PERIOD_S / Ts), 1)
         change = P - np.vstack([np.repeat(P[:1], back, axis=0), P])[: len(P)]
         low, high = (
             np.full(outputs, side) if ends is None else np.array(ends)
@@ -357,7 +357,7 @@ def _coverage(features: Sequence[Matrix]) -> Matrix:
     scale = np.repeat([max(float(every[:, part].std()), 1e-12) for part in (slice(half), slice(half, None))], half)
     distances = [KDTree(own / scale).query(every / scale)[0] for own in features]
     # k^2 = exp(-d^2 / length^2).
-    return np.exp(-((np.column_stack(distances) / _LENGTH) ** 2))
+    return np.exp(-((np.column_stack(distances) / _KERNEL_LENGTH) ** 2))
 
 
 def _greedy(doubt: Vector, cover: Matrix, count: int) -> tuple[list[int], Vector]:

@@ -29,7 +29,7 @@ from ..models._fitting import MIN_ROWS
 from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 
-_SECONDS = 30.0
+_EXAM_LENGTH_S = 30.0
 # A model that is right to a percent weighs no more than that.
 _LEAST_ERROR = 1.0
 # With two there is no middle.
@@ -38,7 +38,7 @@ _LEAST_VOTES = 3
 
 def exams(train: Recording) -> list[Recording]:
     """Return the motions of the exam, whose outputs are NaN but for the start."""
-    return make_test_motions(train, _SECONDS)
+    return make_test_motions(train, _EXAM_LENGTH_S)
 
 
 def free_runs(model: Model, motions: Sequence[Recording]) -> list[Matrix]:
@@ -88,9 +88,9 @@ _MOVED_OVER = 2.5
 # Runs are left out in so many groups at most; a group of fewer rows says nothing of a free run.
 _MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
 # Errors within 2 s of each other belong together: that is ten time constants of the neck.
-_BLOCK = 100
+_BLOCK_SAMPLES = 100
 # The standard error itself is then known to 5 %.
-_RESAMPLES = 200
+_BOOTSTRAP_RESAMPLES = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,22 +137,22 @@ def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> l
         hold_out: shown to no training but those that leave `train` out.
         other_excitation: whether `hold_out` is another experiment.
     """
-    head, tail = _thinned(train)
+    head, tail = _first_rows(train)
     seconds = time_constant_of(train)
-    blanked, judged = (head, []) if seconds is None else _blanked(head, seconds / train.sample_time)
+    blanked, judged = (head, []) if seconds is None else _blank_extreme_motions(head, seconds / train.sample_time)
     if tail is not None:
-        judged.append(everything("later block", tail))
+        judged.append(all_rows("later block", tail))
     if other_excitation:
-        judged.append(everything("other excitation", hold_out))
+        judged.append(all_rows("other excitation", hold_out))
     found = [Fold(blanked, tuple(judged))] if judged else []
     for number, (group, others) in enumerate(_groups(train), start=1):
-        found.append(Fold(_thinned(others)[0], (everything(f"excitation {number}", group),)))
+        found.append(Fold(_first_rows(others)[0], (all_rows(f"excitation {number}", group),)))
     if other_excitation and len(hold_out) >= _LEAST_ROWS:
-        found.append(Fold(_thinned(hold_out)[0], (everything("trained on the other", head),)))
+        found.append(Fold(_first_rows(hold_out)[0], (all_rows("trained on the other", head),)))
     return found
 
 
-def _thinned(recording: Recording) -> tuple[Recording, Recording | None]:
+def _first_rows(recording: Recording) -> tuple[Recording, Recording | None]:
     """Return the beginnings of all runs, `SCREENED_ROWS` in all, and what follows; None where that is too little."""
     share = SCREENED_ROWS / len(recording)
     if share >= 1.0:
@@ -175,17 +175,17 @@ def _groups(train: Recording) -> list[tuple[Recording, Recording]]:
     return found
 
 
-def everything(name: str, recording: Recording) -> Judged:
+def all_rows(name: str, recording: Recording) -> Judged:
     """Return all rows of a recording but those that align each run."""
-    return Judged(name, recording, _scored(recording))
+    return Judged(name, recording, _scored_rows(recording))
 
 
-def _scored(recording: Recording) -> np.ndarray:
+def _scored_rows(recording: Recording) -> np.ndarray:
     """Return (time,) without what aligns each run."""
     return np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
 
 
-def _blanked(recording: Recording, slow: float) -> tuple[Recording, list[Judged]]:
+def _blank_extreme_motions(recording: Recording, slow: float) -> tuple[Recording, list[Judged]]:
     """Return the recording without its largest and fastest motions, and those; as it was where too little is left.
 
     Args:
@@ -193,18 +193,18 @@ def _blanked(recording: Recording, slow: float) -> tuple[Recording, list[Judged]
         slow: the robot's time constant in samples.
     """
     reach, span = round(_WIDEN * slow), max(round(_MOVED_OVER * slow), 1)
-    far, fast = (_widened(recording, size, reach) for size in (_sizes(recording), _speeds(recording, span)))
+    far, fast = (_largest_rows(recording, size, reach) for size in (_sizes(recording), _speeds(recording, span)))
     rest = ~(far | fast)
     Y = np.where(rest[:, None], recording.outputs, np.nan)
     if np.isfinite(Y).sum(axis=0).min() < 2 * MIN_ROWS:
         return recording, []
-    scored = _scored(recording)
+    scored = _scored_rows(recording)
     judged = [Judged("largest motions", recording, far & scored), Judged("fastest motions", recording, fast & scored)]
     names = recording.robot.outputs.names
     return recording.with_channels(**dict(zip(names, Y.T, strict=True))), judged
 
 
-def _widened(recording: Recording, size: Vector, reach: int) -> np.ndarray:
+def _largest_rows(recording: Recording, size: Vector, reach: int) -> np.ndarray:
     """Return (time,) the rows with the largest `size`, and those near them in their run."""
     inside = size > np.quantile(size, 1.0 - _REGION)
     near = np.ones(2 * reach + 1)
@@ -214,13 +214,13 @@ def _widened(recording: Recording, size: Vector, reach: int) -> np.ndarray:
 
 def _sizes(recording: Recording) -> Vector:
     """Return how far the set-points are from their mean (time,), in standard deviations."""
-    return np.linalg.norm(_scaled(recording), axis=1)
+    return np.linalg.norm(_standardise_set_points(recording), axis=1)
 
 
 def _speeds(recording: Recording, span: int) -> Vector:
     """Return how much the set-points change over `span` samples around each row (time,)."""
     found, start = np.zeros(len(recording)), 0
-    U = _scaled(recording)
+    U = _standardise_set_points(recording)
     for run in recording.runs():
         u = U[start : start + len(run)]
         if len(u) > span:
@@ -230,7 +230,7 @@ def _speeds(recording: Recording, span: int) -> Vector:
     return found
 
 
-def _scaled(recording: Recording) -> np.ndarray:
+def _standardise_set_points(recording: Recording) -> np.ndarray:
     U = recording.set_points - recording.set_points.mean(axis=0)
     spread = U.std(axis=0)
     return U / np.where(spread > 0.0, spread, 1.0)
@@ -240,12 +240,12 @@ def standard_error(y: Matrix, outputs: Matrix) -> float:
     """Return the standard error of the mean of all fits [%], by resampling blocks of the hold-out."""
     wrong, spread = _block_sums((y - outputs) ** 2), _block_sums((y - np.nanmean(y, axis=0)) ** 2)
     # Any generator will do, but the same choice must give the same answer.
-    drawn = np.random.default_rng(0).integers(len(wrong), size=(_RESAMPLES, len(wrong)))
+    drawn = np.random.default_rng(0).integers(len(wrong), size=(_BOOTSTRAP_RESAMPLES, len(wrong)))
     ratio = wrong[drawn].sum(axis=1) / np.maximum(spread[drawn].sum(axis=1), 1e-300)
     return float((100.0 * (1.0 - np.sqrt(ratio))).mean(axis=1).std())
 
 
 def _block_sums(squares: Matrix) -> Matrix:
     """Return the sums (blocks, outputs) over consecutive rows (time, outputs), samples that are NaN left out."""
-    borders = np.arange(0, len(squares), _BLOCK)
+    borders = np.arange(0, len(squares), _BLOCK_SAMPLES)
     return np.add.reduceat(np.nan_to_num(squares), borders, axis=0)

@@ -51,7 +51,7 @@ def gamma_leaves(
     """Raise the gammas to what the pairs between two nodes of the last level need."""
     rows = values.shape[0]
     n = points.shape[0]
-    # The second half of `nodes` is the last level; its leaves share the columns evenly (see `borders` in `_trees`).
+    # The second half of `nodes` is the last level; its leaves share the columns evenly (see `borders` in `_regressor`).
     count = nodes.shape[0] // 2
     a = leaves[0] - count
     b = leaves[1]
@@ -96,7 +96,7 @@ def gamma_search(
     Args:
         points: (n, N) in tree order.
         values: (N,).
-        nodes: see `_trees`.
+        nodes: see `_regressor`.
         slacks: (m,) rising: epsilon for the paper's rule f_u(i) >= y(i), 2 epsilon for Milanese and Novara's.
         gammas: (m,) zeros; become the result, beyond 1e200 where equal points are further apart than the slack.
         pairs: (m, 2) become the pairs that decide.

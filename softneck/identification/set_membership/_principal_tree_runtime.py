@@ -1,4 +1,4 @@
-"""Exact bounds by branch and bound over a slanted tree (see `_trees`).
+"""Exact bounds by branch and bound over a slanted tree (see `_regressor`).
 
 Node j of level l is row 2^l + j of `nodes`.
 
@@ -163,7 +163,7 @@ def slant_search(
     plane = np.empty(5)
     plane[0] = m * at[0]
     plane[1] = m
-    # m < gamma, for whoever makes the tree keeps m at 0.98 gamma at most (`_STEEPEST`); m = 0 has no plane to follow.
+    # The tree keeps m at 0.98 gamma at most (`_MAX_SLOPE_RATIO`); m = 0 has no plane to follow.
     plane[2] = m / math.sqrt(gamma * gamma - m * m) if m > 0.0 else 0.0
     plane[3] = gamma
     plane[4] = (x.shape[0] + 8) * SLANT_ROUNDING * (gamma * size + nodes[0, 2])

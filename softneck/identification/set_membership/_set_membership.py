@@ -30,8 +30,18 @@ from ..models._drive import DriveModel, fit_drive
 from ..models._fitting import ScaledData, in_display_unit, training_recording
 from ..models._model import WARM_UP, Model
 from ..models._regressors import eq21_table, lag_table
-from ._regressor import Data, Ground, gammas, require_feasible, residual_lags, scaled, set_in_si, widened, widening
-from ._trees import usual_width
+from ._regressor import (
+    Data,
+    Ground,
+    apply_scale,
+    double_epsilon_until_feasible,
+    gammas,
+    require_feasible,
+    residual_lags,
+    set_in_si,
+    usual_width,
+    widening,
+)
 
 # Sources of a regressor's rows (`_narx_runtime`): own output or both of the base, set-points, motors.
 _OUTPUTS, _MOTORS = (0, 3), 2
@@ -39,7 +49,7 @@ _OUTPUTS, _MOTORS = (0, 3), 2
 AS_GOOD = 1.0
 # Issue 5 asks it of the bounds on data like those they were made of.
 COVERAGE = 0.97
-_THREADS = 2
+_MAX_THREADS = 2
 
 
 def grouped_scale(table: Matrix, output_weight: float, motor_weight: float = 1.0) -> Vector:
@@ -119,7 +129,7 @@ class HoldOut:
     def _try(self, weights: Sequence[tuple[float, float]], progress: Progress) -> list[ScaleTrial]:
         tried: list[ScaleTrial] = []
         # Queries and the search for gamma are compiled and let go of Python's lock.
-        with ThreadPoolExecutor(_THREADS) as pool:
+        with ThreadPoolExecutor(_MAX_THREADS) as pool:
             for number, part in enumerate(pool.map(self._weights, weights), start=1):
                 progress(number / (len(weights) + 1), f"weights of outputs and motors {weights[number - 1]}")
                 tried += part
@@ -138,9 +148,9 @@ class HoldOut:
             )
 
 
-_FINDING = "usual_half_width"
+_WIDTH_FINDING = "usual_half_width"
 # Of the training rows' widths, themselves left out.
-_QUANTILE = 0.99
+_WIDTH_QUANTILE = 0.99
 
 
 def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> Vector:
@@ -153,7 +163,7 @@ def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: 
     """
     # Half a second on either side is the same motion; less where there is hardly more than that.
     widths = [
-        usual_width(points, values, float(gamma[axis]), min(WARM_UP, values.size // 8), _QUANTILE)
+        usual_width(points, values, float(gamma[axis]), min(WARM_UP, values.size // 8), _WIDTH_QUANTILE)
         for axis, (points, values) in enumerate(data)
     ]
     return epsilon + np.array(widths)
@@ -166,7 +176,7 @@ def can_detect_extrapolation(model: Model) -> bool:
 
 def usual_finding(robot: Robot) -> str:
     """Return the name of the finding that holds `usual_widths`, with its unit."""
-    return f"{_FINDING}_{robot.outputs.display_unit}"
+    return f"{_WIDTH_FINDING}_{robot.outputs.display_unit}"
 
 
 def is_extrapolating(model: Model, outputs: Matrix) -> np.ndarray:
@@ -258,10 +268,10 @@ class SetMembership:
         asked = None if self.epsilon is None else self.epsilon / training.scaling.output_unit
         chosen, tried = self._choose(ground, training, noise, asked, progress)
         scale = chosen.scale
-        sets = [(scaled(X, scale), y) for X, y in data]
+        sets = [(apply_scale(X, scale), y) for X, y in data]
         # An epsilon that was asked for is kept or refused.
         if asked is None:
-            epsilon, gamma = widened(data, scale, chosen.epsilon)
+            epsilon, gamma = double_epsilon_until_feasible(data, scale, chosen.epsilon)
         else:
             epsilon, gamma = chosen.epsilon, gammas(data, scale, [chosen.epsilon])[0]
         require_feasible(training, ground.table, sets, gamma, epsilon)

@@ -96,19 +96,19 @@ PAYLOAD_PARAMETERS = (
 # Those that have no meaning where the link bends in one plane.
 OUT_OF_PLANE_PARAMETERS = ("asymmetry", "rest_roll", "twist")
 
-_FUNCTIONS = "softneck.identification.structured._greybox_fit_runtime"
+_SIMULATION_RUNTIME = "softneck.identification.structured._neck_equations_runtime"
 # An error of a motor counts as much as one of the tilt twenty times smaller: about the ratio of their ranges.
 _MOTOR_WEIGHT = 0.05
 # How much a number a spread away from its guess counts, as an error [rad] of one row: next to nothing.
-_PRIOR = 0.005
+_PRIOR_WEIGHT_RAD = 0.005
 # The start is unknown for so long [s of a neck's time], a held input is forgotten after so long.
-_SETTLED, _MEMORY = 0.5, 3.0
-_DELAYS = (2, 1, 3, 4)
+_SETTLING_S, _MEMORY_S = 0.5, 3.0
+_SENSOR_DELAYS = (2, 1, 3, 4)
 # Those are samples of a neck.
 _NECK_SAMPLE = 0.02
 _TYPICAL_DRIVE_DELAY = 0.08
-_THIN = 2
-_ECHO = 8
+_DECIMATION = 2
+_NOISE_ORDER = 8
 INTERRUPTED = "the fit was interrupted; these are the best numbers until then"
 
 
@@ -216,7 +216,7 @@ class _FitProblem:
     def delays(self) -> tuple[int, ...]:
         """Return the sensor's dead times to try [samples], the likeliest first."""
         samples = max(_NECK_SAMPLE / self.sample_time, 1.0)  # a sensor is not faster for a robot that is
-        return tuple(dict.fromkeys(round(delay * samples) for delay in _DELAYS))
+        return tuple(dict.fromkeys(round(delay * samples) for delay in _SENSOR_DELAYS))
 
     def decode(self, x: Vector) -> Vector:
         """Return all numbers of what the search moved, then the tendons."""
@@ -233,12 +233,12 @@ class _FitProblem:
 
     def simulate(self, x: Vector, delay: int) -> list[tuple[Matrix, Matrix]]:
         """Return motors and outputs of all runs under what the search moved."""
-        settle = round(_SETTLED / self.sample_time)
+        settle = round(_SETTLING_S / self.sample_time)
         numbers, load = self.decode(x), self.load(x)
         parts = []
         for (u, start, _, y), payload in zip(self.runs, self.payloads, strict=True):
             M, Y = np.empty(u.shape), np.empty(y.shape)
-            load_functions(_FUNCTIONS).neck_run(
+            load_functions(_SIMULATION_RUNTIME).neck_run(
                 loaded_neck(numbers, load, payload) if load.size else numbers,
                 self.sample_time,
                 self.drive[:, 1],
@@ -254,14 +254,14 @@ class _FitProblem:
 
     def errors(self, x: Vector, delay: int) -> Vector:
         """Return the errors that are minimised: of tilts, of motors, and of the numbers against their guesses."""
-        skip = round(_SETTLED / self.sample_time)
+        skip = round(_SETTLING_S / self.sample_time)
         guess = np.array([number.encode(number.guess) for number in self.numbers])
         spread = np.array([number.spread for number in self.numbers])
-        parts = [_PRIOR * (x - guess) / spread]
+        parts = [_PRIOR_WEIGHT_RAD * (x - guess) / spread]
         for (M, Y), (_, _, m, y) in zip(self.simulate(x, delay), self.runs, strict=True):
-            parts.append((Y - y)[skip::_THIN].ravel())
+            parts.append((Y - y)[skip::_DECIMATION].ravel())
             if self.logged:
-                parts.append(_MOTOR_WEIGHT * (M - m)[skip::_THIN].ravel())
+                parts.append(_MOTOR_WEIGHT * (M - m)[skip::_DECIMATION].ravel())
         return np.nan_to_num(np.concatenate(parts))
 
     def search(self, start: Vector, delay: int, evaluations: int, tell: _SearchProgress) -> OptimizeResult:
@@ -311,20 +311,20 @@ class _SearchProgress:
 
 def _model(settings: GreyBox, problem: _FitProblem, scaled: ScaledData, delay: int, x: Vector) -> Model:
     numbers, load, outputs = problem.decode(x), problem.load(x), scaled.data.outputs.shape[1]
-    skip = round(_SETTLED / problem.sample_time)
+    skip = round(_SETTLING_S / problem.sample_time)
     errors = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(x, delay), problem.runs, strict=True)]
     for error in errors:
         error[:skip] = np.nan
-    echo = np.array([fit_noise_model([error[:, axis] for error in errors], _ECHO) for axis in range(outputs)])
+    echo = np.array([fit_noise_model([error[:, axis] for error in errors], _NOISE_ORDER) for axis in range(outputs)])
     pole = np.exp(-numbers[0] * problem.sample_time)
     drive = np.column_stack([np.full(len(problem.drive), pole), problem.drive[:, 1]])
     arrays = {
-        "history": history_array(int(max(_ECHO, drive[:, 1].max())), outputs),
+        "history": history_array(int(max(_NOISE_ORDER, drive[:, 1].max())), outputs),
         "drive": drive,
         "neck": numbers,
         "sensor": np.array([float(delay), problem.sample_time]),
         "echo": echo,
-        "memory": memory_array(_MEMORY, problem.sample_time),
+        "memory": memory_array(_MEMORY_S, problem.sample_time),
         **({"payload": load} if load.size else {}),
     }
     table = _table(problem, x, delay, errors)
@@ -344,7 +344,7 @@ def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]
         step[i] = 1e-4
         J[:, i] = (problem.errors(x + step, delay) - problem.errors(x - step, delay)) / 2e-4
     e = problem.errors(x, delay)
-    covariance = np.linalg.pinv(J.T @ J) * float(e @ e) / max(e.size - x.size, 1) * _colour(errors)
+    covariance = np.linalg.pinv(J.T @ J) * float(e @ e) / max(e.size - x.size, 1) * _correlation_time(errors)
     half = 1.96 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     rows = []
     for i, number in enumerate(problem.numbers):
@@ -360,7 +360,7 @@ def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]
     return rows
 
 
-def _colour(errors: Sequence[Matrix]) -> float:
+def _correlation_time(errors: Sequence[Matrix]) -> float:
     """Return how many samples of the errors say as much as one of white noise: `1 + 2 sum r(k)` to its first zero."""
     e = np.nan_to_num(np.concatenate(errors))[:, 0]
     e = e - e.mean()
@@ -371,7 +371,7 @@ def _colour(errors: Sequence[Matrix]) -> float:
         if r <= 0.0:
             break
         total += 2.0 * r
-    return total / _THIN if total > _THIN else 1.0
+    return total / _DECIMATION if total > _DECIMATION else 1.0
 
 
 def check_greybox(arrays: Mapping[str, Matrix], sizes: Mapping[str, int]) -> None:

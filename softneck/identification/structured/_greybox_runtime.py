@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from softneck.identification.structured._greybox_parts_runtime import (
+from softneck.identification.structured._neck_equations_runtime import (
     GreyBoxArrays,
     GreyBoxState,
     greybox_rest,

@@ -7,17 +7,15 @@ payloads of the recordings; between those they hold, beyond them nothing is know
 
 import numpy as np
 
-from softneck.identification.structured._greybox_parts_runtime import (
-    GreyBoxArrays,
-    GreyBoxState,
-    greybox_rest,
-    greybox_step,
-)
 from softneck.identification.structured._neck_equations_runtime import (
     NECK_ASYMMETRY,
     NECK_PRETENSION,
     NECK_REST,
     NECK_STIFFNESS,
+    GreyBoxArrays,
+    GreyBoxState,
+    greybox_rest,
+    greybox_step,
 )
 from softneck.runtime._layout import array
 

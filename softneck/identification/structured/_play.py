@@ -180,18 +180,18 @@ def _far(signals: Matrix, good: np.ndarray) -> np.ndarray:
 
 # What the hold-out chooses from, scaled: filters about as fast as the robot, 5, and three times that; plays up to a
 # tenth of the motors' range of 6.
-_RATES = (6.0, 15.0)
+_FILTER_RATES = (6.0, 15.0)
 # Of robots whose time constant is found from data, only roughly.
-_MORE_RATES = (4.0, 6.0, 10.0, 15.0, 25.0)
-_WIDTHS = ((), (0.3,), (0.1, 0.3, 0.6))
-_DEGREES = (1, 2, 3)
-_RIDGES = (1e-6, 1e-4, 1e-2)
+_ALL_FILTER_RATES = (4.0, 6.0, 10.0, 15.0, 25.0)
+_PLAY_WIDTHS = ((), (0.3,), (0.1, 0.3, 0.6))
+_POLYNOMIAL_DEGREES = (1, 2, 3)
+_RIDGE_WEIGHTS = (1e-6, 1e-4, 1e-2)
 # Of forms whose fits on the hold-out differ by less than this [points], that with the fewest terms is taken.
-_ALIKE = 0.1
+_FIT_TOLERANCE_PCT = 0.1
 # A held input is forgotten after this: the slowest filter by far is that of the load, some 1.
-_MEMORY = 15.0
+_MEMORY_S = 15.0
 # f is kept within the range of the training outputs, widened by half of it to either side.
-_BEYOND = 0.5
+_OUTPUT_MARGIN = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -256,9 +256,11 @@ class Play:
         drive, T = scaled.drive, scaled.directions.all_inputs(scaled.data.set_points)
         data = Data.of(scaled.data, drive, T)
         extra = None if hold_out is None else Data.of(scaled.scale(hold_out), drive, T)
-        settings = self._scaled(scaled.scaling)
+        settings = self._scale_settings(scaled.scaling)
         known = scaled.recording.robot.time_constant_s is not None
-        form, weight, fit, tried = settings._choose(data, extra, _RATES if known else _MORE_RATES, progress)
+        form, weight, fit, tried = settings._choose(
+            data, extra, _FILTER_RATES if known else _ALL_FILTER_RATES, progress
+        )
         progress(0.95, "all rows")
         arrays = _arrays(data, drive, form, weight, self.echo)
         findings = {
@@ -275,7 +277,7 @@ class Play:
         progress(1.0, "done")
         return scaled.model("play", self, _in_si, arrays=arrays, findings=findings)
 
-    def _scaled(self, scaling: Scaling) -> Play:
+    def _scale_settings(self, scaling: Scaling) -> Play:
         """Return these settings in scaled quantities."""
         widths = None if self.widths is None else tuple(width / scaling.motor_unit for width in self.widths)
         return replace(self, rate=None if self.rate is None else self.rate * scaling.second, widths=widths)
@@ -288,8 +290,8 @@ class Play:
         forms = [
             PlayStructure(rate, self.order, widths, degree, inputs, tilts)
             for rate in (rates if self.rate is None else (self.rate,))
-            for widths in (_WIDTHS if self.widths is None else (self.widths,))
-            for degree in (_DEGREES if self.degree is None else (self.degree,))
+            for widths in (_PLAY_WIDTHS if self.widths is None else (self.widths,))
+            for degree in (_POLYNOMIAL_DEGREES if self.degree is None else (self.degree,))
         ]
         # Two thirds of the rows at least must say something that the terms do not already.
         rows = int(data.settled.sum())
@@ -297,7 +299,7 @@ class Play:
         if not fitting:
             least = min(len(form.table) for form in forms)
             raise DataError(f"{rows} settled rows are too few for {least} terms; record longer or lower `order`.")
-        ridges = _RIDGES if self.ridge is None else (self.ridge,)
+        ridges = _RIDGE_WEIGHTS if self.ridge is None else (self.ridge,)
         scored: list[tuple[float, PlayStructure, float]] = []
         for number, form in enumerate(fitting):
             best = f"best fit {max(score for score, _, _ in scored):.1f} %" if scored else "forms"
@@ -307,7 +309,7 @@ class Play:
         top = max(score for score, _, _ in scored)
         if not np.isfinite(top):
             raise DataError("no form has a finite error on the hold-out; does it move at all?")
-        alike = [entry for entry in scored if entry[0] > top - _ALIKE]
+        alike = [entry for entry in scored if entry[0] > top - _FIT_TOLERANCE_PCT]
         fit, form, weight = max(alike, key=lambda entry: (-len(entry[1].table), entry[0]))
         return form, weight, fit, len(scored)
 
@@ -318,7 +320,7 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
     both = np.concatenate([data.terms(form)[good], data.terms(form, measured=True)[good]])
     W = ridge(both, np.tile(data.outputs[good], (2, 1)), weight)
     lowest, highest = data.outputs[good].min(axis=0), data.outputs[good].max(axis=0)
-    wider = _BEYOND * (highest - lowest)
+    wider = _OUTPUT_MARGIN * (highest - lowest)
     limits = np.column_stack([lowest - wider, highest + wider])
     # What is measured beside the outputs are the motors: the errors of one step are those along them.
     errors = data.outputs - np.clip(data.terms(form, measured=True) @ W.T, limits[:, 0], limits[:, 1])
@@ -340,7 +342,7 @@ def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, 
         "weights": W,
         "range": limits,
         "echo": echo,
-        "memory": memory_array(_MEMORY, data.sample_time),
+        "memory": memory_array(_MEMORY_S, data.sample_time),
     }
 
 

@@ -42,15 +42,15 @@ from ._measured import (
     judge_records,
     measured_responses,
     middle_model,
-    raised,
-    unheard,
+    raise_weight,
+    recordings_without_response,
 )
 
 # An envelope of 100 points is smooth; the cover is checked and mended on a grid this much finer.
-_FINER = 8
-_HALVINGS = 28
+_FINE_GRID_FACTOR = 8
+_BISECTIONS = 28
 # What lies below this part of the largest error is covered no more closely: it costs orders and buys nothing.
-_FLOOR = 0.02
+_MIN_ENVELOPE_RATIO = 0.02
 
 
 def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Vector, Vector]:
@@ -71,11 +71,11 @@ def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Ve
     e = np.asarray(envelope, dtype=np.float64)
     if not np.isfinite(e).all() or e.max() <= 0.0:
         raise SettingsError("the envelope must be finite and not zero; the family's samples are all alike.")
-    e = np.maximum(e, _FLOOR * e.max())
+    e = np.maximum(e, _MIN_ENVELOPE_RATIO * e.max())
     middle = float(np.sqrt(frequency[0] * frequency[-1]))
     x = (frequency / middle) ** 2
     low, high, found = 0.0, np.log(e.max() / e.min()) + 1e-3, None
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTIONS):
         tried = 0.5 * (low + high)
         coefficients = _feasible(x, e, order, np.exp(tried))
         if coefficients is None:
@@ -87,7 +87,7 @@ def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Ve
         return np.array([e.max()]), np.array([1.0])
     above, below = (_factor(part, middle) for part in np.split(found, 2))
     size = np.sqrt(found[order] / found[2 * order + 1])
-    fine = np.geomspace(frequency[0], frequency[-1], _FINER * frequency.size)
+    fine = np.geomspace(frequency[0], frequency[-1], _FINE_GRID_FACTOR * frequency.size)
     wanted = np.exp(np.interp(np.log(fine), np.log(frequency), np.log(e)))
     covered = size * np.abs(np.polyval(above, 1j * fine) / np.polyval(below, 1j * fine))
     return size * max(1.0, float(np.max(wanted / covered))) * above, below
@@ -177,16 +177,16 @@ def cross_gains(
     return gains, stds
 
 
-_FREQUENCIES = 100
+_FREQUENCY_COUNT = 100
 # [s] of a window: Eq. 22 goes through several of its waves.
-_WINDOW = 8.0
+_WINDOW_S = 8.0
 # Of a window [scaled s]: 5 time constants hold a response, 5,000 several operating points.
-_SHORTEST, _LONGEST = 1.0, 1000.0
+_MIN_WINDOW_S, _MAX_WINDOW_S = 1.0, 1000.0
 # From a tenth of the neck's slowest time constants.
-_LOWEST = 0.05
+_LOWEST_RAD_S = 0.05
 # Local models faster than this are stopped, not found: 40 1/s are 25 ms.
-_FASTEST = 40.0
-_CAUTION = (
+_FASTEST_POLE = 40.0
+_CAUTION_TEXT = (
     "each local model is linear and of one pole; what lies between them or beyond the recordings is not covered, "
     "and hysteresis shows as dead time and pole"
 )
@@ -252,9 +252,9 @@ class FamilySettings:
         data = ScaledData.of(whole)
         scaling = data.scaling
         if self.window is not None:
-            ends = scaling.unscale_seconds(_SHORTEST), scaling.unscale_seconds(_LONGEST)
+            ends = scaling.unscale_seconds(_MIN_WINDOW_S), scaling.unscale_seconds(_MAX_WINDOW_S)
             require_between("window", self.window, *ends, "s")
-        times = {"window": data.seconds(self.window, _WINDOW), "max_delay": data.seconds(self.max_delay, MAX_DELAY)}
+        times = {"window": data.seconds(self.window, _WINDOW_S), "max_delay": data.seconds(self.max_delay, MAX_DELAY)}
         named = list(names) if names is not None else [f"recording {k + 1}" for k in range(len(parts))]
         if len(named) != len(parts):
             raise DataError(f"{len(named)} names were given for {len(parts)} recordings; give one for each.")
@@ -277,10 +277,10 @@ class FamilySettings:
     def _scaled_family(self, parts: list[Recording], data: ScaledData, names: list[str], progress: Progress) -> Family:
         """Return the family in scaled quantities."""
         directions, Ts, source = data.directions, parts[0].sample_time, self.source
-        length, lead = self.window or _WINDOW, self.max_delay or MAX_DELAY
+        length, lead = self.window or _WINDOW_S, self.max_delay or MAX_DELAY
         upright = data.recording.robot.outputs.rest is not None and len(directions.names) <= 2
-        frequency = np.geomspace(_LOWEST, np.pi / Ts, _FREQUENCIES)
-        search = SrivcFitOptions(sample_time=Ts, offset=True, max_delay=lead, fastest=_FASTEST)
+        frequency = np.geomspace(_LOWEST_RAD_S, np.pi / Ts, _FREQUENCY_COUNT)
+        search = SrivcFitOptions(sample_time=Ts, offset=True, max_delay=lead, fastest=_FASTEST_POLE)
         cut = [
             window
             for number, part in enumerate(parts)
@@ -296,7 +296,7 @@ class FamilySettings:
         cross, cross_std = cross_gains(parts, nominal, directions, self.source)
         squeezed = fit_compression(parts, SrivcFitOptions(sample_time=Ts, offset=True), directions, self.source)
         progress(0.9, "frequency responses")
-        measured, tested = self._measured(search, parts, directions, nominal, names)
+        measured, tested = self._measure_responses(search, parts, directions, nominal, names)
         return Family(
             sample_time=Ts,
             axes=axes,
@@ -309,7 +309,7 @@ class FamilySettings:
                 "recordings": len(parts),
                 "windows": len(cut),
                 "windows_that_said_too_little": dropped,
-                "caution": _CAUTION,
+                "caution": _CAUTION_TEXT,
                 "tested": tested,
             },
             robot=parts[0].robot,
@@ -317,7 +317,7 @@ class FamilySettings:
             measured=measured,
         )
 
-    def _measured(
+    def _measure_responses(
         self,
         search: SrivcFitOptions,
         parts: list[Recording],
@@ -330,7 +330,9 @@ class FamilySettings:
         found, silent_ones = {}, {}
         for axis, name in enumerate(directions.names):
             points = axis_points(responses, axis, directions, self.confidence)
-            silent_ones[name] = unheard(points, axis_runs(parts, directions, self.source, axis), named)
+            silent_ones[name] = recordings_without_response(
+                points, axis_runs(parts, directions, self.source, axis), named
+            )
             # One frequency is no band.
             if points.size and points[:, 1].max() > 1.1 * points[:, 1].min():
                 found[name] = self._measured_axis(search, parts, directions, axis, points, nominal[axis])
@@ -364,7 +366,7 @@ class FamilySettings:
             model=model, held_out=held_out, points=points, frequency=frequency, weight=weight, borders=borders,
             needed=np.zeros((0, borders.size - 1)),
         )  # fmt: skip
-        cover = raised(replace(first, needed=judge_records(runs, first, points, Ts)))
+        cover = raise_weight(replace(first, needed=judge_records(runs, first, points, Ts)))
         return replace(cover, needed=judge_records(runs, cover, points, Ts))
 
     def _local_models(

@@ -139,7 +139,7 @@ class FrequencyResponse(ReprMixin):
 
     def summary(self) -> str:
         """Return a few lines, in the robot's display unit."""
-        scale, per_input, unit = self.shown()
+        scale, per_input, unit = self.display_factors()
         lines = [
             f"frequency response, {METHODS[self.method]}; {self.frequency.size} frequencies, "
             f"{self.frequency[0]:.3g} to {self.frequency[-1]:.3g} rad/s"
@@ -172,7 +172,7 @@ class FrequencyResponse(ReprMixin):
         output = self.outputs[0] if output is None else output
         source = self.own_input(output)
         i, a = self._entry(output, source)
-        scale, _, unit = self.shown()
+        scale, _, unit = self.display_factors()
         return chart_figure(frequency_response_chart(
             self.frequency, scale * self.response[:, i, a], scale * np.nan_to_num(self.radius()[:, i, a]),
             self.coherence[:, i], f"{source} to {output}", unit=unit,
@@ -193,7 +193,7 @@ class FrequencyResponse(ReprMixin):
                 raise SettingsError(f"unknown channel `{name}`; use one of {', '.join(names)}.")
         return self.outputs.index(output), self.inputs.index(source)
 
-    def shown(self) -> tuple[float, float, str]:
+    def display_factors(self) -> tuple[float, float, str]:
         """Return what a response and an input in SI are multiplied by for people, and the unit of the response."""
         outputs, motors = self.robot.outputs.display_unit, self.robot.motors.unit
         per_input = to_si(motors)[0]
@@ -221,15 +221,15 @@ class FrequencyResponse(ReprMixin):
 
 
 # Runs shorter than this have too few frequencies for a window of the local polynomials.
-_ROWS = 200
+_MIN_ROWS = 200
 # Samples that the sensor missed are filled by straight lines; more of them than this would be inventing an answer.
-_MISSED = 0.1
+_MAX_MISSED_SHARE = 0.1
 # An input that moves less than this part of the largest is at rest.
-_MOVES = 1e-3
+_MIN_MOTION_RATIO = 1e-3
 # Realisations are of one class of input where their sizes agree within this factor.
-_ALIKE = 1.5
-_FREQUENCIES = 100
-_STILL = 1e-9
+_MAX_SIZE_RATIO = 1.5
+_FREQUENCY_COUNT = 100
+_REST_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -317,15 +317,20 @@ def _run(run: Recording, transform: Matrix, source: str) -> _Run:
     motors = run.motor_positions if source == "positions" else run.set_points
     lost = ~np.isfinite(np.hstack([motors, run.outputs]))
     worst = float(lost.mean(axis=0).max())
-    if worst > _MISSED:
+    if worst > _MAX_MISSED_SHARE:
         raise DataError(
             f"run {int(run.run[0])}: {100 * worst:.0f} % of a channel's samples are missing, more than "
-            f"{100 * _MISSED:.0f} %; record again."
+            f"{100 * _MAX_MISSED_SHARE:.0f} %; record again."
         )
-    return _Run(_filled(motors) @ transform.T, _filled(run.outputs), _references(run), int(lost.any(axis=1).sum()))
+    return _Run(
+        _interpolate_missing(motors) @ transform.T,
+        _interpolate_missing(run.outputs),
+        _references(run),
+        int(lost.any(axis=1).sum()),
+    )
 
 
-def _filled(values: Matrix) -> Matrix:
+def _interpolate_missing(values: Matrix) -> Matrix:
     """Return (time, n) with straight lines where samples are missing."""
     rows, filled = np.arange(values.shape[0]), values.copy()
     for column in filled.T:
@@ -350,17 +355,17 @@ def _references(run: Recording) -> Matrix | None:
             )
         return None
     r = np.column_stack([run.channels[name] for name in logged])
-    if np.ptp(r, axis=0).max() <= _STILL:
+    if np.ptp(r, axis=0).max() <= _REST_TOLERANCE:
         raise DataError("recorded in a closed loop whose reference rests: nothing drives it; let the reference move.")
-    return r[:, np.ptp(r, axis=0) > _STILL]
+    return r[:, np.ptp(r, axis=0) > _REST_TOLERANCE]
 
 
 def _moving(runs: Sequence[_Run], names: Sequence[str]) -> np.ndarray:
     """Return which inputs move (q,)."""
     size = np.sqrt(np.mean([run.inputs.var(axis=0) for run in runs], axis=0))
-    if size.max() <= _STILL:
+    if size.max() <= _REST_TOLERANCE:
         raise DataError(f"no input moves ({', '.join(names)} rest); there is nothing to see a response by.")
-    return size > _MOVES * size.max()
+    return size > _MIN_MOTION_RATIO * size.max()
 
 
 def _estimate(runs: Sequence[_Run], sample_time: float) -> tuple[Response, str]:
@@ -409,21 +414,21 @@ def _grid(runs: Sequence[_Run], sample_time: float) -> Vector:
     """Return the frequencies at which local polynomials answer: from two cycles in the longest run to nine tenths of
     the Nyquist frequency, beyond which little of a held input is left."""
     longest = max(run.inputs.shape[0] for run in runs) * sample_time
-    return np.geomspace(4.0 * np.pi / longest, 0.9 * np.pi / sample_time, _FREQUENCIES)
+    return np.geomspace(4.0 * np.pi / longest, 0.9 * np.pi / sample_time, _FREQUENCY_COUNT)
 
 
 def _check_length(runs: Sequence[_Run]) -> None:
     for number, run in enumerate(runs):
-        if run.inputs.shape[0] < _ROWS:
+        if run.inputs.shape[0] < _MIN_ROWS:
             raise DataError(
                 f"run {number} has {run.inputs.shape[0]} rows; a frequency response of what is not periodic needs "
-                f"{_ROWS} at least."
+                f"{_MIN_ROWS} at least."
             )
 
 
 def _check_alike(runs: Sequence[Periods]) -> None:
     sizes = [float(np.sqrt((np.abs(run.inputs) ** 2).sum())) for run in runs]
-    if max(sizes) > _ALIKE * min(sizes):
+    if max(sizes) > _MAX_SIZE_RATIO * min(sizes):
         raise DataError(
             f"the multisines' sizes differ by a factor of {max(sizes) / min(sizes):.2g}: a nonlinear robot answers "
             "small and large ones differently; make one response of each size."

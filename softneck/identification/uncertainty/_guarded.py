@@ -51,7 +51,7 @@ class Job:
     arguments: tuple[Any, ...]
 
 
-def done(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Any]:
+def run_jobs(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Any]:
     """Return what each job returns; in so many processes, or here for 1.
 
     Raises whatever a job raises; the others are ended then, as they are by Ctrl-C.
@@ -83,7 +83,7 @@ def _begin_worker() -> None:
 
 
 # What is left of a run is worth training on, or judging by, from here on [rows].
-_LEAST = 3 * WARM_UP
+_MIN_BLOCK_ROWS = 3 * WARM_UP
 
 
 def left_out(recording: Recording, parts: int) -> list[tuple[Recording, Recording]]:
@@ -105,8 +105,8 @@ def _block(runs: Sequence[Recording], i: int, parts: int) -> tuple[Recording, Re
     rest, part = [], []
     for run in runs:
         low, high = (round(len(run) * edge / parts) for edge in (i, i + 1))
-        rest += [run.rows(a, b) for a, b in ((0, low), (high, len(run))) if b - a >= _LEAST]
-        if high - low >= _LEAST:
+        rest += [run.rows(a, b) for a, b in ((0, low), (high, len(run))) if b - a >= _MIN_BLOCK_ROWS]
+        if high - low >= _MIN_BLOCK_ROWS:
             part.append(run.rows(low, high))
     # Too short to be cut: trained on and judged by all of it, as the kinds do themselves.
     return concatenate(rest or list(runs)), concatenate(part or list(runs))
@@ -114,11 +114,11 @@ def _block(runs: Sequence[Recording], i: int, parts: int) -> tuple[Recording, Re
 
 def left_out_error(fit: Callable[[Recording], Model], parts: Sequence[tuple[Recording, Recording]]) -> Vector:
     """Return the rms error (outputs,) of free runs over parts that were left out in turn; inf where one diverges."""
-    errors = np.concatenate([_missed(fit(rest), part) for rest, part in parts])
+    errors = np.concatenate([_simulation_errors(fit(rest), part) for rest, part in parts])
     return np.sqrt(np.nanmean(errors**2, axis=0))
 
 
-def _missed(model: Model, recording: Recording) -> Matrix:
+def _simulation_errors(model: Model, recording: Recording) -> Matrix:
     """Return the errors (rows, outputs) of a free run, without the samples that set its initial state."""
     Y = model.simulate(recording)[:, : recording.outputs.shape[1]]
     errors = np.where(np.isfinite(Y), recording.outputs - Y, np.where(np.isfinite(recording.outputs), np.inf, np.nan))
@@ -129,9 +129,9 @@ def _missed(model: Model, recording: Recording) -> Matrix:
 # What a base may be where none is named: equations where they fit, else a line.
 BASES = ("greybox", "oe")
 # Of so many parts these are left out in turn to judge a base by: two say how much it misses, five would take longer.
-_PARTS, _JUDGED = 5, (1, 3)
+_BLOCKS, _TEST_BLOCKS = 5, (1, 3)
 # Of the outputs' spread: a base that misses more than this of it saves nothing.
-_POOR = 0.3
+_POOR_ERROR_RATIO = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +151,7 @@ class Base:
     @property
     def remark(self) -> str:
         """Return a warning about a poor base, or nothing."""
-        if self.fit.min() >= 100.0 * (1.0 - _POOR):
+        if self.fit.min() >= 100.0 * (1.0 - _POOR_ERROR_RATIO):
             return ""
         return (
             f"the base `{self.model.kind}` itself reaches {self.fit.min():.0f} % only on rows left out: where the "
@@ -167,10 +167,10 @@ def fitted_base(kind: str, recording: Recording, settings: Any = None) -> Base:
     """
     settings = resolve(KINDS[kind].settings)() if settings is None else settings
     model = settings.fit(recording)
-    parts = left_out(recording, _PARTS)
+    parts = left_out(recording, _BLOCKS)
     # Its dead time is a property of the sensor: known once, it need not be searched for again.
     again = replace(settings, sensor_delay=int(model.findings["sensor_delay"])) if kind == "greybox" else settings
-    error = left_out_error(again.fit, [parts[i] for i in _JUDGED])
+    error = left_out_error(again.fit, [parts[i] for i in _TEST_BLOCKS])
     spread = np.nanstd(recording.outputs, axis=0)
     return Base(model, error, 100.0 * (1.0 - error / spread))
 
@@ -185,11 +185,11 @@ def base_or_reason(kind: str, recording: Recording) -> Base | str:
 
 OF = ("nn", "play", "nlsm")
 # Weight decays of `nn`, one after the other over the members, as over the starts of one network.
-_DECAYS = (0.03, 0.1, 0.01)
+_WEIGHT_DECAYS = (0.03, 0.1, 0.01)
 # Scaled seconds from members to base: one and a half time constants.
-_FADE = 0.3
+_FADE_S = 0.3
 # Motor positions that stand for all that were seen.
-_SEEN = 200
+_MAX_COVERING_POINTS = 200
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -253,7 +253,7 @@ class Guarded:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         # The others are trained sooner than processes start.
         workers = min(self.workers or cores, len(jobs)) if self.of == "nn" else 1
-        found = done(jobs, workers, progress)
+        found = run_jobs(jobs, workers, progress)
         model = self.around(_least_missing(found[:wanted]), found[wanted:], recording)
         progress(1.0, "done")
         return model
@@ -263,9 +263,9 @@ class Guarded:
         robot, Ts = recording.robot, recording.sample_time
         outputs, motors = len(robot.outputs.names), len(robot.motors.names)
         M = base.model.simulate(recording)[:, outputs : outputs + motors]
-        seen, reach = covering(M, _SEEN)
+        seen, reach = covering(M, _MAX_COVERING_POINTS)
         seconds = time_constant_of(recording) or NECK_SECONDS
-        fade = _FADE * (seconds / NECK_SECONDS) if self.fade is None else self.fade
+        fade = _FADE_S * (seconds / NECK_SECONDS) if self.fade is None else self.fade
         parts = [base.model, *members]
         arrays = {
             "history": np.array([1.0] if (outputs, motors) == (2, 3) else [1.0, outputs, motors]),
@@ -301,7 +301,9 @@ def _member(kind: str, seed: int, rest: Recording, part: Recording) -> Model:
     if kind == "nn":
         # The members are each other's starts: one of its own costs each a third of what a network alone takes.
         # No prior: where nothing was recorded they are to part.
-        settings = Network(seed=seed, starts=1, iterations=20, decay=_DECAYS[seed % len(_DECAYS)], prior=0.0)
+        settings = Network(
+            seed=seed, starts=1, iterations=20, decay=_WEIGHT_DECAYS[seed % len(_WEIGHT_DECAYS)], prior=0.0
+        )
         return settings.fit(rest, hold_out=part)
     return (Play() if kind == "play" else SetMembership(form="residual")).fit(rest)
 

@@ -20,7 +20,7 @@ _OUTPUT_SPREAD = 0.2
 # A local model is kept where these are known to better than these parts of themselves.
 _WORST_GAIN, _WORST_POLE = 0.3, 0.6
 _LEAST_FIT = 50.0
-_POLES = (5.0, 1.5, 15.0)
+_START_POLES = (5.0, 1.5, 15.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -54,7 +54,7 @@ class Local:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Window:
-    """A stretch of one run, with rows before it whose outputs are not judged.
+    """A segment of one run, with rows before it whose outputs are not judged.
 
     Attributes:
         recording: index.
@@ -75,7 +75,7 @@ class Window:
         """Return input and output of an axis."""
         return np.ascontiguousarray(self.inputs[:, axis]), np.ascontiguousarray(self.outputs[:, axis])
 
-    def excited(self, axis: int) -> bool:
+    def is_excited(self, axis: int) -> bool:
         """Return whether the axis is driven and measured in it."""
         y = self.outputs[:, axis]
         return float(self.inputs[:, axis].std()) > _LEAST_INPUT and int(np.isfinite(y).sum()) > 0.5 * y.size
@@ -167,11 +167,11 @@ def fit_local(
         scope: of the result.
         near: model to start from as well.
     """
-    chosen = [window for window in group if window.excited(axis)]
+    chosen = [window for window in group if window.is_excited(axis)]
     if not chosen:
         return None
     runs: Runs = [window.run(axis) for window in chosen]
-    fits = [search.start(runs, pole, delay) for pole in _POLES for delay in (0.3 * search.max_delay,)]
+    fits = [search.start(runs, pole, delay) for pole in _START_POLES for delay in (0.3 * search.max_delay,)]
     if near is not None:
         fits.append(search.improve(runs, near, [np.zeros(2) for _ in runs]))
     there = [fit for fit in fits if fit is not None]

@@ -36,14 +36,14 @@ class Response:
 
 
 # Degree of the polynomials of response and transient over a window of frequencies (Pintelon and Schoukens 2012, 7.2).
-_DEGREE = 2
+_POLYNOMIAL_DEGREE = 2
 # Equations beyond the unknowns in each window: what is left over tells the noise, and so few tell it within 30 %.
-_SPARE = 10
+_EXTRA_EQUATIONS = 10
 # Windows of the least number of bins, and of so many times more; none reaches further than this part of the frequency.
-_WIDENINGS = (1, 3, 9, 27)
-_WIDEST = 0.5
+_WIDTH_FACTORS = (1, 3, 9, 27)
+_MAX_RELATIVE_WIDTH = 0.5
 # Inputs, and ways to combine them, excited by less than this part of what is usual are not excited: rounding.
-_EXCITED = 1e-6
+_MIN_EXCITATION = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,14 +115,14 @@ def _at(runs: Sequence[Spectrum], w: float, q: int, answers: int) -> _Fit:
 
     A window too wide for its polynomials leaves over more, which the variance shows as well.
     """
-    count = (_DEGREE + 1) * (q + len(runs)) + _SPARE
+    count = (_POLYNOMIAL_DEGREE + 1) * (q + len(runs)) + _EXTRA_EQUATIONS
     best = None
-    for widening in _WIDENINGS:
+    for widening in _WIDTH_FACTORS:
         near = _nearest(runs, w, widening * count)
         reach = max(
             float(np.abs(run.frequency[rows] - w).max(initial=0.0)) for run, rows in zip(runs, near, strict=True)
         )
-        if widening > 1 and reach > _WIDEST * w:
+        if widening > 1 and reach > _MAX_RELATIVE_WIDTH * w:
             break
         found = _fit(runs, near, w, reach, q)
         if found is not None and (best is None or found.variance < best.variance):
@@ -137,10 +137,10 @@ def _fit(runs: Sequence[Spectrum], near: Sequence[np.ndarray], w: float, reach: 
     """Return the least-squares fit over the bins `near` w, None where some input is not excited there."""
     blocks, Z = [], []
     for number, (run, rows) in enumerate(zip(runs, near, strict=True)):
-        powers = ((run.frequency[rows] - w) / reach)[:, None] ** np.arange(_DEGREE + 1)
+        powers = ((run.frequency[rows] - w) / reach)[:, None] ** np.arange(_POLYNOMIAL_DEGREE + 1)
         # Columns: G of every input, then its slope and its bend; the transient of each run by itself.
         response = (powers[:, :, None] * run.driven[rows][:, None, :]).reshape(rows.size, -1)
-        transient = np.zeros((rows.size, len(runs), _DEGREE + 1), dtype=complex)
+        transient = np.zeros((rows.size, len(runs), _POLYNOMIAL_DEGREE + 1), dtype=complex)
         transient[:, number] = powers
         blocks.append(np.hstack([response, transient.reshape(rows.size, -1)]))
         Z.append(run.answered[rows])
@@ -148,16 +148,16 @@ def _fit(runs: Sequence[Spectrum], near: Sequence[np.ndarray], w: float, reach: 
     freedom = A.shape[0] - A.shape[1]
     scale = np.linalg.norm(A, axis=0)
     usual = max(float(np.sqrt((np.abs(run.driven) ** 2).mean())) for run in runs)
-    if freedom < 1 or scale[:q].min() < _EXCITED * usual * np.sqrt(A.shape[0]):
+    if freedom < 1 or scale[:q].min() < _MIN_EXCITATION * usual * np.sqrt(A.shape[0]):
         return None
     left, s, right = np.linalg.svd(A / scale, full_matrices=False)
-    if s[-1] < _EXCITED * s[0]:
+    if s[-1] < _MIN_EXCITATION * s[0]:
         return None
     inverse = (right.conj().T / s) @ left.conj().T / scale[:, None]
     theta = inverse @ Y
     e = Y - A @ theta
     # What the inputs explain beside the transients.
-    bare = A[:, (_DEGREE + 1) * q :]
+    bare = A[:, (_POLYNOMIAL_DEGREE + 1) * q :]
     without = Y - bare @ np.linalg.lstsq(bare, Y)[0]
     return _Fit(
         response=theta[:q].T,
@@ -197,13 +197,13 @@ def _behind_the_loop(
 
 
 # Lines that carry less than this part of the strongest line's amplitude are not excited: rounding of a text file.
-_LINE = 1e-4
+_MIN_LINE_RATIO = 1e-4
 # Experiments whose inputs are nearer to dependence than this are no set of orthogonal ones.
-_CONDITION = 1e3
+_MAX_CONDITION = 1e3
 # The first third of the periods, one at least, holds the transient.
-_LOST = 3
+_TRANSIENT_DIVISOR = 3
 # A sine: all of the rest of its power is below this part.
-_PURE = 1e-6
+_SINE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,13 +224,13 @@ class Periods:
     def excited(self) -> np.ndarray:
         """(lines,) whether an input has this line."""
         size = np.abs(self.inputs).max(axis=1)
-        return size > _LINE * size.max()
+        return size > _MIN_LINE_RATIO * size.max()
 
     @property
     def is_sine(self) -> bool:
         """Whether all inputs move at one frequency."""
         power = (np.abs(self.inputs) ** 2).sum(axis=1)
-        return bool(power.sum() - power.max() < _PURE * power.max())
+        return bool(power.sum() - power.max() < _SINE_TOLERANCE * power.max())
 
 
 def period_of(inputs: Matrix) -> int | None:
@@ -251,7 +251,7 @@ def period_of(inputs: Matrix) -> int | None:
 def periods(inputs: Matrix, outputs: Matrix, period: int, sample_time: float) -> Periods:
     """Return a periodic run's transforms; rows are time, what follows the last whole period is left out."""
     count = inputs.shape[0] // period
-    lost = max(1, count // _LOST)
+    lost = max(1, count // _TRANSIENT_DIVISOR)
     keep = slice(lost * period, count * period)
     lines = np.arange(1, period // 2 + 1)
 
@@ -307,7 +307,7 @@ def _realisation(
 ) -> tuple[ComplexArray, Vector | None, tuple[Vector, Vector]] | None:
     """Return G (lines, m, q), its variance by noise, the powers of outputs and inputs; None where U is singular."""
     U = np.stack([run.inputs[lines] for run in runs], axis=2)
-    if np.linalg.cond(U).max() > _CONDITION:
+    if np.linalg.cond(U).max() > _MAX_CONDITION:
         return None
     count = min(run.outputs.shape[0] for run in runs)
     Y = np.stack([run.outputs[:count, lines] for run in runs], axis=3)

@@ -27,16 +27,16 @@ from ._local_polynomial import ComplexArray
 
 ORDERS = (1, 2, 3)
 # The last part of each run is held out, as `softneck identify --train 0.7` does.
-_TRAINED = 0.7
-# Stretches of what is held out of each run: their scatter is the standard error of a difference.
-_STRETCHES = 5
+_TRAIN_SHARE = 0.7
+# Segments of what is held out of each run: their scatter is the standard error of a difference.
+_SEGMENTS_PER_RUN = 5
 
 
 def choose_order(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[Continuous | None, Vector]:
     """Return the model of the order chosen, fitted to all rows, and the rms errors of each order on what is held out.
 
     The lowest order whose error is within one standard error of the least is taken (Breiman et al. 1984, 3.4.3), as
-    stretches of the runs differ: one pole more must be worth it on all of them.
+    segments of the runs differ: one pole more must be worth it on all of them.
 
     Args:
         search: how to fit; its order is overridden.
@@ -64,11 +64,11 @@ def _as_good(worse: Vector) -> bool:
 
 
 def _held_out(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[SrivcFit, Vector] | None:
-    """Return a fit and its mean squared errors in free run over stretches that it did not see; None without a fit."""
+    """Return a fit and its mean squared errors in free run over segments that it did not see; None without a fit."""
     trained = []
     for u, y in runs:
         seen = y.copy()
-        seen[round(_TRAINED * y.size) :] = np.nan
+        seen[round(_TRAIN_SHARE * y.size) :] = np.nan
         trained.append((u, seen))
     # As many poles of n times the speed lag as much as one; others leave valleys where dead time is a pole.
     speeds = (1.0, 0.3, 3.0) if search.order > 1 else (1.0,)
@@ -79,14 +79,14 @@ def _held_out(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[Sr
     fit = min(there, key=lambda fit: fit.cost)
     squares = []
     for (_, y), simulated in zip(runs, fit.simulated, strict=True):
-        late = slice(round(_TRAINED * y.size), None)
-        squares += [float(np.nanmean(part)) for part in np.array_split((y - simulated)[late] ** 2, _STRETCHES)
+        late = slice(round(_TRAIN_SHARE * y.size), None)
+        squares += [float(np.nanmean(part)) for part in np.array_split((y - simulated)[late] ** 2, _SEGMENTS_PER_RUN)
                     if np.isfinite(part).any()]  # fmt: skip
     return fit, np.array(squares)
 
 
 # Time constants after which a run's start is forgotten: exp(-5) is below 1 %.
-_FORGOTTEN = 5.0
+_SETTLING_TIME_CONSTANTS = 5.0
 # The noise is white, and seen above this part of the Nyquist frequency, where nothing else is.
 _NOISE_ABOVE = 0.7
 
@@ -113,7 +113,7 @@ def least_uncertainty(
     """
     left, noise, allowed, lines = 0.0, 0.0, 0.0, 0
     for u, y in runs:
-        w, E, Y0, floor = _transformed(u, y, model, sample_time)
+        w, E, Y0, floor = _transform_errors(u, y, model, sample_time)
         there = (w >= band[0]) & (w <= band[1])
         W = np.interp(np.log(np.maximum(w[there], 1e-9)), np.log(frequency), weight)
         left += float(np.sum(np.abs(E[there]) ** 2))
@@ -125,7 +125,7 @@ def least_uncertainty(
     return max(0.0, float(np.sqrt(left) - np.sqrt(noise))) / float(np.sqrt(allowed))
 
 
-def _transformed(
+def _transform_errors(
     u: Vector, y: Vector, model: Continuous, sample_time: float
 ) -> tuple[Vector, ComplexArray, ComplexArray, float]:
     """Return frequencies [rad/s], transforms of what the nominal leaves over and of its output, power of the noise."""
@@ -135,7 +135,7 @@ def _transformed(
     there = np.isfinite(y)
     y = np.interp(np.arange(y.size), np.flatnonzero(there), y[there])
     slowest = float(-np.roots(np.concatenate([[1.0], model.a])).real.max())
-    first = min(round((_FORGOTTEN / slowest + model.delay) / sample_time), u.size // 3)
+    first = min(round((_SETTLING_TIME_CONSTANTS / slowest + model.delay) / sample_time), u.size // 3)
     window = np.hanning(u.size - first)
     E, Y0, Y = (np.fft.rfft(window * detrend(part[first:], type="constant")) for part in (y - y0, y0, y))
     w = 2.0 * np.pi * np.fft.rfftfreq(window.size, sample_time)
@@ -154,7 +154,7 @@ def nominal_output(model: Continuous, u: Vector, sample_time: float) -> Vector:
 
 # Frequencies of the weight, and the ratio of the ends of each band that whole records are judged in; by definition.
 _FREQUENCIES, _BAND_RATIO = 60, 1.5
-_ARRAYS = ("a", "b", "delay", "held_out", "points", "frequency", "weight", "borders", "needed")
+_ARRAY_NAMES = ("a", "b", "delay", "held_out", "points", "frequency", "weight", "borders", "needed")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -191,7 +191,7 @@ class AxisMeasured:
     def arrays(self) -> dict[str, np.ndarray]:
         """Return what a file keeps."""
         model = {"a": self.model.a, "b": self.model.b, "delay": np.array([self.model.delay])}
-        return {name: model[name] if name in model else getattr(self, name) for name in _ARRAYS}
+        return {name: model[name] if name in model else getattr(self, name) for name in _ARRAY_NAMES}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], recordings: int) -> AxisMeasured:
@@ -216,7 +216,7 @@ class AxisMeasured:
             or np.roots(np.concatenate([[1.0], model.a])).real.max() >= 0.0
         ):  # fmt: skip
             raise FileFormatError("its measured band, weight or nominal model is none of ours.")
-        return cls(model=model, **{name: arrays[name] for name in _ARRAYS if name not in ("a", "b", "delay")})
+        return cls(model=model, **{name: arrays[name] for name in _ARRAY_NAMES if name not in ("a", "b", "delay")})
 
 
 def response_of(model: Continuous, frequency: Vector, sample_time: float) -> np.ndarray:
@@ -273,7 +273,9 @@ def axis_points(
     return np.concatenate(rows) if rows else np.zeros((0, 5))
 
 
-def unheard(points: Matrix, runs: Sequence[Sequence[tuple[Vector, Vector]]], names: Sequence[str]) -> list[str]:
+def recordings_without_response(
+    points: Matrix, runs: Sequence[Sequence[tuple[Vector, Vector]]], names: Sequence[str]
+) -> list[str]:
     """Return the names of recordings that move an axis and show no response of it: no weight can speak for them.
 
     Friction, or tendons that a payload has made slack, hide what a loop that pulls them taut then meets.
@@ -395,7 +397,7 @@ def judge_records(
     return needed
 
 
-def raised(measured: AxisMeasured) -> AxisMeasured:
+def raise_weight(measured: AxisMeasured) -> AxisMeasured:
     """Return it with the weight raised where a whole record needs more than its response does.
 
     What a nonlinear robot adds is in the record and in no linear response of it.

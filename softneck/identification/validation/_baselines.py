@@ -5,7 +5,7 @@ Persistence repeats what was measured. At 20 ms it fits 97 %, so nothing below i
 The best linear one is the best that any linear time-invariant model of the set-points could have done on the very rows
 that are judged: least squares with hindsight, so an upper bound and no model to use. The response to each set-point is
 free over the first 0.3 s and a sum of orthonormal lags (a ladder of real poles from 0.0125 to 6.4 s) after that; the
-initial state of each stretch decays freely. A model that stays below has its error elsewhere than in its nonlinearity;
+initial state of each segment decays freely. A model that stays below has its error elsewhere than in its nonlinearity;
 one above has learnt something no linear model can. k steps ahead, measured outputs are known as well. Sources:
 Wahlberg 1991 (Laguerre), Ninness and Gustafsson 1997 (several poles).
 """
@@ -22,7 +22,7 @@ from softneck.robot import TIME_CONSTANT
 from softneck.signals import Recording
 
 from ..models._scores import nrmse_fit
-from ._scored_rows import Rows, ScoredStretch
+from ._score_tables import Rows, ScoredSegment
 
 
 def persistence(run: Recording, horizon: int) -> Matrix:
@@ -44,31 +44,31 @@ def held_outputs(run: Recording) -> Matrix:
 _FREE_SECONDS = 0.3
 # Beyond, each octave of scaled time constants has its own pole: a lag between two of them is met to 1e-3.
 _TIME_CONSTANTS = 0.0125 * 2.0 ** np.arange(10)
-# So does the initial state of a stretch; what is faster has gone before its first row is judged.
+# So does the initial state of a segment; what is faster has gone before its first row is judged.
 _DECAYS = _TIME_CONSTANTS[3:]
 # Measured samples of both outputs that a prediction k steps ahead may use.
-_PAST = 10
+_PAST_SAMPLES = 10
 # With fewer rows for each parameter the fit would flatter by more than 5 of what is left to 100.
 _ROWS_PER_PARAMETER = 10
 
 
 def best_linear(
-    stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | None]
+    segments: Sequence[ScoredSegment], rows: Rows, horizons: Sequence[int | None]
 ) -> list[list[float | None]]:
     """Return for each horizon (None: free run) the fit [%] of pitch and roll; None where rows are too few.
 
     For a finite horizon persistence and, in free run, every stable linear model of the set-points lies below.
     """
-    Ts = stretches[0].recording.sample_time * TIME_CONSTANT / (rows.robot.time_constant_s or np.nan)
-    inputs = np.concatenate([_response_columns(stretch.recording.set_points, Ts) for stretch in stretches])
-    columns = np.column_stack([np.ones(len(inputs)), inputs, _decay_columns(stretches, Ts)])
+    Ts = segments[0].recording.sample_time * TIME_CONSTANT / (rows.robot.time_constant_s or np.nan)
+    inputs = np.concatenate([_response_columns(segment.recording.set_points, Ts) for segment in segments])
+    columns = np.column_stack([np.ones(len(inputs)), inputs, _decay_columns(segments, Ts)])
     result: list[list[float | None]] = []
     for horizon in horizons:
         if horizon is None:
             result.append(_fits(columns, rows.measured))
             continue
-        past = np.concatenate([_past_columns(stretch.recording, horizon) for stretch in stretches])
-        result.append(_fits(np.column_stack([columns, past]), rows.judged(horizon)))
+        past = np.concatenate([_past_columns(segment.recording, horizon) for segment in segments])
+        result.append(_fits(np.column_stack([columns, past]), rows.outputs_at(horizon)))
     return result
 
 
@@ -101,13 +101,13 @@ def _response_columns(u: Matrix, Ts: float) -> Matrix:
     for number, p in enumerate(np.exp(-Ts / _TIME_CONSTANTS)):
         # Orthonormal by an all-pass of the pole before (Takenaka-Malmquist); the first has none.
         numerator = [0.0, 1.0] if number == 0 else [-p_before, 1.0]
-        stage = _filtered(numerator, [1.0, -p], stage)
+        stage = _filter_first_order(numerator, [1.0, -p], stage)
         columns.append(np.sqrt(1.0 - p**2) * stage)
         p_before = p
     return np.column_stack(columns)
 
 
-def _filtered(numerator: list[float], denominator: list[float], x: Matrix) -> Matrix:
+def _filter_first_order(numerator: list[float], denominator: list[float], x: Matrix) -> Matrix:
     """Return a first-order filter of x (time, 3) that had stood at x(0) before."""
     from scipy.signal import lfilter
 
@@ -117,12 +117,12 @@ def _filtered(numerator: list[float], denominator: list[float], x: Matrix) -> Ma
     return np.asarray(lfilter(numerator, denominator, x, axis=0, zi=z)[0])
 
 
-def _decay_columns(stretches: Sequence[ScoredStretch], Ts: float) -> Matrix:
-    """Return decaying exponentials (time, 7 for each stretch), each zero outside its stretch."""
-    columns = np.zeros((sum(len(s.recording) for s in stretches), len(_DECAYS) * len(stretches)))
+def _decay_columns(segments: Sequence[ScoredSegment], Ts: float) -> Matrix:
+    """Return decaying exponentials (time, 7 for each segment), each zero outside its segment."""
+    columns = np.zeros((sum(len(s.recording) for s in segments), len(_DECAYS) * len(segments)))
     row = 0
-    for number, stretch in enumerate(stretches):
-        n = len(stretch.recording)
+    for number, segment in enumerate(segments):
+        n = len(segment.recording)
         t = np.arange(n) * Ts
         for i, seconds in enumerate(_DECAYS):
             columns[row : row + n, len(_DECAYS) * number + i] = np.exp(-t / seconds)
@@ -133,7 +133,7 @@ def _decay_columns(stretches: Sequence[ScoredStretch], Ts: float) -> Matrix:
 def _past_columns(run: Recording, horizon: int) -> Matrix:
     """Return both outputs at t-k, t-k-1, ... (time, 20), a missed sample by the one before."""
     held = np.nan_to_num(held_outputs(run))
-    return np.column_stack([_late(held, horizon + back) for back in range(_PAST)])
+    return np.column_stack([_late(held, horizon + back) for back in range(_PAST_SAMPLES)])
 
 
 def _late(x: Matrix, lag: int) -> Matrix:
@@ -150,8 +150,8 @@ class Baselines:
     best_linear: dict[str, dict[str, float | None]]
 
 
-def baselines(stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence[int | str]) -> Baselines:
-    """Return the baselines of the stretches judged.
+def baselines(segments: Sequence[ScoredSegment], rows: Rows, horizons: Sequence[int | str]) -> Baselines:
+    """Return the baselines of the segments judged.
 
     The best linear model has poles about the robot's time constant; there is none where its file does not give one.
     """
@@ -159,12 +159,12 @@ def baselines(stretches: Sequence[ScoredStretch], rows: Rows, horizons: Sequence
     nothing: list[float | None] = [None] * len(axes)
     names = [str(h) for h in horizons]
     steps = [None if h == "inf" else int(h) for h in horizons]
-    bounds = best_linear(stretches, rows, steps) if rows.robot.time_constant_s else [nothing for _ in steps]
+    bounds = best_linear(segments, rows, steps) if rows.robot.time_constant_s else [nothing for _ in steps]
     held: dict[str, dict[str, float | None]] = {}
     for name, k in zip(names, steps, strict=True):
         if k is not None:
-            predicted = np.concatenate([persistence(stretch.recording, k) for stretch in stretches])
-            pairs = zip(rows.judged(k).T, predicted.T, strict=True)
+            predicted = np.concatenate([persistence(segment.recording, k) for segment in segments])
+            pairs = zip(rows.outputs_at(k).T, predicted.T, strict=True)
             held[name] = _by_axis(axes, [nrmse_fit(y, yhat) for y, yhat in pairs])
     return Baselines(
         persistence=held,

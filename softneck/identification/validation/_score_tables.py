@@ -1,4 +1,6 @@
-"""The tables of scores that a `Validation` holds; and when a free run predicts nothing any more.
+"""Which rows are judged: segments of rows that the model was not trained on, less those that set its start.
+
+The tables of scores that a `Validation` holds; and when a free run predicts nothing any more.
 
 How sure a fit is: bootstrap over blocks of rows, as errors and motions of a neck last many samples.
 
@@ -11,31 +13,228 @@ is drawn equally often and no block joins two runs. A fit needs only sums over r
 
 from __future__ import annotations
 
+import itertools
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector, to_si
+from softneck.core import DataError, Matrix, Vector, to_si
 from softneck.robot import Robot, Scaling
+from softneck.runtime import Block, State
+from softneck.signals import Recording
 
 from ..models._arrays import BOUNDED, trained_range
-from ..models._model import Model
+from ..models._fitting import known_rows
+from ..models._model import WARM_UP, Model, _input_rows
 from ..models._scores import nrmse_fit, r_squared, rmse, worst_error
 from ..set_membership._set_membership import can_detect_extrapolation, is_extrapolating
-from ._scored_rows import Rows, ScoredStretch
+
+# Far predictions cost `horizon` steps for each row, and neighbours err alike: so many steps are enough. 3,000 rows,
+# the paper's validation, are all predicted 25 samples ahead; of 30,000 every tenth one, which is 0.2 s after the last.
+_MOST_STEPS = 75_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoredSegment:
+    """Rows of one run that follow each other.
+
+    Attributes:
+        recording: those rows alone.
+        scored: (time,) which of them are judged; never the first 25, a row that the model was trained on, or one
+            where neither angle was measured.
+        run: number of the run, as the recording counts.
+    """
+
+    recording: Recording
+    scored: np.ndarray
+    run: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The rows of all segments, one segment after the other.
+
+    Attributes:
+        time: (time,) [s].
+        segment: (time,) number of the segment.
+        since: (time,) samples since its start.
+        measured: (time, 2) [rad]; NaN where missed or not scored.
+        set_points: (time, 3) [rad].
+        robot: whose rows they are; another than the neck has its own numbers of motors and outputs, in SI.
+    """
+
+    time: Vector
+    segment: np.ndarray
+    since: np.ndarray
+    measured: Matrix
+    set_points: Matrix
+    robot: Robot
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the outputs."""
+        return self.robot.outputs.names
+
+    def to_display_unit(self, value: float) -> float:
+        """Return an error in the unit in which scores show it: a neck's degrees, else the robot's `display_unit`."""
+        unit = self.robot.outputs.display_unit
+        return float(np.degrees(value)) if unit == "deg" else value / to_si(unit)[0]
+
+    def outputs_at(self, horizon: int | None) -> Matrix:
+        """Return `measured`, NaN as well where there are not `horizon` samples of past; None is the free run."""
+        if horizon is None:
+            return self.measured
+        # A row with less past than the horizon was not predicted from that far back.
+        past = self.since - horizon
+        return np.where(((past >= 0) & (past % self.stride(horizon) == 0))[:, None], self.measured, np.nan)
+
+    def stride(self, horizon: int) -> int:
+        """Return n where only every n-th row is predicted `horizon` samples ahead: of more than 75,000 steps."""
+        steps = int((self.since >= horizon).sum()) * horizon
+        return 1 if horizon == 1 else max(-(-steps // _MOST_STEPS), 1)
+
+
+def unseen_segments(recording: Recording, hashes: np.ndarray) -> tuple[list[ScoredSegment], int]:
+    """Return the segments of rows whose hash is not in `hashes`, and how many rows were left out.
+
+    Raises:
+        DataError: nothing is left to judge.
+    """
+    segments: list[ScoredSegment] = []
+    left_out = longest = 0
+    for run in recording.runs():
+        seen = known_rows(run, hashes) if hashes.size else np.zeros(len(run), dtype=bool)
+        left_out += int(seen.sum())
+        longest = max(longest, len(run))
+        for start, stop in _unseen(seen):
+            mask = ~seen[start:stop]
+            mask[:WARM_UP] = False
+            part = run.rows(start, stop)
+            mask &= np.isfinite(part.outputs).any(axis=1)
+            if mask.any():
+                segments.append(ScoredSegment(part, mask, int(run.run[0])))
+    if not segments:
+        raise DataError(f"nothing is left to judge: {_why(len(recording), left_out, longest)}")
+    return segments, left_out
+
+
+def join_segments(segments: list[ScoredSegment]) -> Rows:
+    """Return the rows of all segments."""
+    outputs = [np.where(s.scored[:, None], s.recording.outputs, np.nan) for s in segments]
+    return Rows(
+        time=np.concatenate([s.recording.time for s in segments]),
+        segment=np.repeat(np.arange(len(segments)), [len(s.recording) for s in segments]),
+        since=np.concatenate([np.arange(len(s.recording)) for s in segments]),
+        measured=np.concatenate(outputs),
+        set_points=np.concatenate([s.recording.set_points for s in segments]),
+        robot=segments[0].recording.robot,
+    )
+
+
+def _why(rows: int, left_out: int, longest: int) -> str:
+    if longest <= WARM_UP:
+        return (
+            f"{longest} rows are too few, as the first {WARM_UP} of each run set the initial state and are not "
+            "scored; record longer runs."
+        )
+    if left_out == rows:
+        return f"all {left_out} rows were used to train the model; use another recording or --include-training."
+    return (
+        f"{left_out} of {rows} rows were used to train the model and no {WARM_UP + 1} others follow each other; "
+        "use another recording or --include-training."
+    )
+
+
+def _unseen(seen: np.ndarray) -> list[tuple[int, int]]:
+    """Return the borders of segments between long parts that were seen; a few rows seen do not break one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
+    long = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a > WARM_UP]
+    starts = [0, *(b for _, b in long)]
+    stops = [*(a for a, _ in long), seen.size]
+    return [(a, b) for a, b in zip(starts, stops, strict=True) if b - a > WARM_UP]
+
+
+# Below this many steps a second thread costs more than it saves.
+_WORTH_A_THREAD = 50_000
+
+
+def predict(model: Model, recordings: Sequence[Recording], horizon: int, *, motors: str, stride: int = 1) -> Matrix:
+    """Return `model.predict(recording, horizon)` of each recording, one after the other.
+
+    Far predictions cost `horizon` steps for each row. Every row is predicted apart from the others, so the rows of a
+    run are shared out in parts, each from the state that the measured rows before it lead to. Where `stride` is above
+    1, only the rows `horizon + n stride` of each run are predicted and the others are NaN.
+    """
+    runs = [run for recording in recordings for run in recording.runs()]
+    return np.concatenate([_predict(model, run, horizon, motors, stride) for run in runs])
+
+
+def _predict(model: Model, run: Recording, horizon: int, motors: str, stride: int) -> Matrix:
+    workers = os.cpu_count() or 1
+    if stride == 1 and (horizon == 1 or workers == 1 or len(run) * horizon < _WORTH_A_THREAD):
+        return model.predict(run, horizon, motors=motors)
+    block, start = model.block(), model.initial_state(run)
+    rows = (_input_rows(run, "measured"), _input_rows(run, motors, outputs=False))
+    # Whole strides in each part.
+    borders = (np.linspace(0, len(run) // stride, workers + 1).astype(int) * stride).tolist()
+    borders[-1] = len(run)
+    states = [start]
+    for begin, end in itertools.pairwise(borders[:-1]):
+        states.append(block.run(states[-1], rows[0][begin:end])[0])
+    # The first call compiles; two threads compiling the same function would do it twice.
+    block.run_horizon(start, rows[0][:1], rows[1][:1], horizon)
+
+    def part(number: int) -> Matrix:
+        span = (borders[number], borders[number + 1])
+        if stride > 1:
+            return _predict_with_stride(block, states[number], rows, span, (horizon, stride))
+        return _part(block, states[number], rows, span, horizon)
+
+    with ThreadPoolExecutor(workers) as pool:
+        predicted = np.concatenate(list(pool.map(part, range(workers))))
+    if stride > 1:
+        # Row k of it was predicted from row k.
+        return np.vstack([np.full((horizon, predicted.shape[1]), np.nan), predicted])[: len(run)]
+    return np.vstack([start.outputs, predicted[: len(run) - 1]])
+
+
+def _part(block: Block, state: State, rows: tuple[Matrix, Matrix], span: tuple[int, int], horizon: int) -> Matrix:
+    """Return the predictions made from rows `span`; the first part has those with too little past as well."""
+    begin, end = span
+    reach = slice(begin, end + horizon - 1)
+    predicted = block.run_horizon(state, rows[0][reach], rows[1][reach], horizon)
+    return predicted if begin == 0 else predicted[horizon - 1 :]
+
+
+def _predict_with_stride(
+    block: Block, state: State, rows: tuple[Matrix, Matrix], span: tuple[int, int], steps: tuple[int, int]
+) -> Matrix:
+    """Return what every `stride`-th row of `span` predicts for `horizon` samples later; NaN for the others."""
+    horizon, stride = steps
+    measured, free = rows
+    predicted = np.full((span[1] - span[0], len(block.outputs)), np.nan)
+    for k in range(span[0], min(span[1], len(free) - horizon), stride):
+        ahead = np.vstack([measured[k : k + 1], free[k + 1 : k + horizon]])
+        predicted[k - span[0]] = block.run(state, ahead)[1][-1]
+        state, _ = block.run(state, measured[k : k + stride])
+    return predicted
+
 
 RESAMPLES = 1000
 # Blocks are at least so many time constants long, 1 s of the neck, ...
 _LEAST_TIME_CONSTANTS = 5.0
 # ... and so many correlation times, so that what joins two blocks is little of each (5 and 8 covered no better); ...
-_TIMES = 3.0
+_BLOCK_CORRELATION_TIMES = 3.0
 # ... but fewer blocks than this say nothing about how blocks differ.
 _FEWEST_BLOCKS = 8
 
 
 def fit_intervals(
-    measured: list[Matrix], predicted: list[Matrix], stretch: np.ndarray, time_constant: float
+    measured: list[Matrix], predicted: list[Matrix], segment: np.ndarray, time_constant: float
 ) -> list[list[list[float] | None]]:
     """Return for each prediction and axis the 95 % interval [low, high] of its fit [%].
 
@@ -43,17 +242,17 @@ def fit_intervals(
 
     Args:
         measured, predicted: one pair of (time, 2) for each horizon; NaN in `measured` where not judged.
-        stretch: (time,) number of the stretch of rows; sorted.
+        segment: (time,) number of the segment of rows; sorted.
         time_constant: [samples]; 0 where the robot gives none.
     """
     from scipy.sparse import csr_array
 
     errors = [y - yhat for y, yhat in zip(measured, predicted, strict=True)]
-    length = block_length(np.column_stack([*errors, measured[0]]), stretch, time_constant)
+    length = block_length(np.column_stack([*errors, measured[0]]), segment, time_constant)
     if length is None:
         return [[None] * measured[0].shape[1] for _ in measured]
     table = np.column_stack([_terms(y, e) for y, e in zip(measured, errors, strict=True)])
-    sums = _block_sums(table, stretch, length)
+    sums = _block_sums(table, segment, length)
     if not len(sums):  # no error is a number: the predictions are beyond all bounds
         return [[None] * measured[0].shape[1] for _ in measured]
     axes = measured[0].shape[1]
@@ -65,7 +264,7 @@ def fit_intervals(
     return [[_interval(totals[:, h, axis]) for axis in range(axes)] for h in range(len(measured))]
 
 
-def block_length(signals: Matrix, stretch: np.ndarray, time_constant: float) -> int | None:
+def block_length(signals: Matrix, segment: np.ndarray, time_constant: float) -> int | None:
     """Return the samples of a block: three correlation times of the slowest of the signals (time, n).
 
     The correlation time is the first lag at which the autocorrelation is below 1/e. At least five time constants
@@ -75,18 +274,18 @@ def block_length(signals: Matrix, stretch: np.ndarray, time_constant: float) -> 
     least, most = round(_LEAST_TIME_CONSTANTS * time_constant), rows // _FEWEST_BLOCKS
     if most < max(least, 1):
         return None
-    slowest = max(_correlation_time(e, stretch, most) for e in signals.T)
-    return int(min(max(_TIMES * slowest, least, 1), most))
+    slowest = max(_correlation_time(e, segment, most) for e in signals.T)
+    return int(min(max(_BLOCK_CORRELATION_TIMES * slowest, least, 1), most))
 
 
-def _correlation_time(signal: Vector, stretch: np.ndarray, most: int) -> int:
+def _correlation_time(signal: Vector, segment: np.ndarray, most: int) -> int:
     there = np.isfinite(signal)
     if not there.any():
         return 0
     # Rows between those that are judged hold what is around them.
     e = np.interp(np.arange(signal.size), np.flatnonzero(there), signal[there] - signal[there].mean())
     covariance = np.zeros(most + 1)
-    for part in np.split(e, np.flatnonzero(np.diff(stretch)) + 1):
+    for part in np.split(e, np.flatnonzero(np.diff(segment)) + 1):
         spectrum = np.abs(np.fft.rfft(part, 2 * part.size)) ** 2
         c = np.fft.irfft(spectrum)[: min(part.size, most + 1)]
         covariance[: c.size] += c
@@ -104,10 +303,10 @@ def _terms(measured: Matrix, errors: Matrix) -> Matrix:
     return np.column_stack(columns)
 
 
-def _block_sums(table: Matrix, stretch: np.ndarray, length: int) -> Matrix:
-    """Return the sums over the block that starts at each row (rows, n), of the stretches with anything judged."""
+def _block_sums(table: Matrix, segment: np.ndarray, length: int) -> Matrix:
+    """Return the sums over the block that starts at each row (rows, n), of the segments with anything judged."""
     parts = []
-    for part in np.split(table, np.flatnonzero(np.diff(stretch)) + 1):
+    for part in np.split(table, np.flatnonzero(np.diff(segment)) + 1):
         # Rows at its ends that no horizon judges (the warm-up) belong to no block.
         judged = np.flatnonzero((part != 0.0).any(axis=1))
         if not judged.size:
@@ -147,7 +346,7 @@ def divergence(rows: Rows, simulated: Matrix) -> list[float | None]:
     turn = np.pi if to_si(rows.robot.outputs.unit)[1] == "rad" else np.inf
     inside = (np.abs(simulated / unit - middle) <= RANGES * width) & (np.abs(simulated) < turn)
     gone = ~inside.all(axis=1)
-    first = [np.flatnonzero(gone & (rows.stretch == number)) for number in range(int(rows.stretch[-1]) + 1)]
+    first = [np.flatnonzero(gone & (rows.segment == number)) for number in range(int(rows.segment[-1]) + 1)]
     return [float(rows.time[found[0]]) if found.size else None for found in first]
 
 
@@ -162,7 +361,7 @@ def _range(measured: Matrix) -> tuple[Vector, float]:
 
 
 # A set-point so much of the trained range beyond it [1] is the same to any model, and to the rounding of a file.
-_BEYOND = 1e-6
+_RANGE_TOLERANCE = 1e-6
 
 #: The name of the free run among the horizons of a validation.
 INFINITE = "inf"
@@ -189,24 +388,24 @@ def score_tables(
             pair = (y[:, i], predicted[h][:, i])
             worst, row = worst_error(*pair)
             tables["fits"][h][axis] = _number(nrmse_fit(*pair))
-            tables["rmse_deg"][h][axis] = _number(rows.shown(rmse(*pair)))
+            tables["rmse_deg"][h][axis] = _number(rows.to_display_unit(rmse(*pair)))
             tables["r2"][h][axis] = _number(r_squared(*pair))
-            tables["worst_deg"][h][axis] = _number(rows.shown(worst))
+            tables["worst_deg"][h][axis] = _number(rows.to_display_unit(worst))
             tables["worst_time"][h][axis] = float(time[row]) if row >= 0 else None
     return tables
 
 
 def run_tables(
-    stretches: Sequence[ScoredStretch],
+    segments: Sequence[ScoredSegment],
     rows_of_all: Rows,
     measured: dict[str, Matrix],
     predicted: dict[str, Matrix],
     lost: list[float | None],
 ) -> list[dict[str, Any]]:
-    """Return the same tables for each stretch by itself, beside what tells it apart."""
+    """Return the same tables for each segment by itself, beside what tells it apart."""
     entries = []
-    for number, stretch in enumerate(stretches):
-        rows = rows_of_all.stretch == number
+    for number, segment in enumerate(segments):
+        rows = rows_of_all.segment == number
         scores = score_tables(
             rows_of_all,
             rows_of_all.time[rows],
@@ -218,9 +417,9 @@ def run_tables(
         entries.append(
             {
                 "stretch": number,
-                "run": stretch.run,
-                "start_s": float(stretch.recording.time[0]),
-                "rows_scored": int(stretch.scored.sum()),
+                "run": segment.run,
+                "start_s": float(segment.recording.time[0]),
+                "rows_scored": int(segment.scored.sum()),
                 "diverged": lost[number],
                 **scores,
             }
@@ -236,7 +435,7 @@ def interval_tables(
     kept = [h for h in measured if not (lost and h == INFINITE)]
     if kept:
         time_constant = (rows.robot.time_constant_s or 0.0) / sample_time
-        found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.stretch, time_constant)
+        found = fit_intervals([measured[h] for h in kept], [predicted[h] for h in kept], rows.segment, time_constant)
         result |= {h: dict(zip(rows.names, pair, strict=True)) for h, pair in zip(kept, found, strict=True)}
     return result
 
@@ -265,7 +464,7 @@ def coverage_tables(
     count = np.maximum(there.sum(axis=0), 1)
     width = np.where(there, upper - lower, 0.0).sum(axis=0) / count
     coverage = 100.0 * inside.sum(axis=0) / count
-    widths = [rows.shown(value) for value in width]
+    widths = [rows.to_display_unit(value) for value in width]
     return dict(zip(rows.names, coverage.tolist(), strict=True)), dict(zip(rows.names, widths, strict=True))
 
 
@@ -284,7 +483,7 @@ def outside_table(model: Model, rows: Rows, free: Matrix) -> dict[str, float] | 
         if trained is None or not there.any():
             return None
         least, most = trained
-        slack = _BEYOND * (most - least)
+        slack = _RANGE_TOLERANCE * (most - least)
         beyond = (rows.set_points < least - slack) | (rows.set_points > most + slack)
         flagged = np.repeat(beyond.any(axis=1, keepdims=True), there.shape[1], axis=1)
     share = 100.0 * (flagged & there).sum(axis=0) / np.maximum(there.sum(axis=0), 1)

@@ -27,19 +27,29 @@ from softneck.signals import Recording, RecordingLike, open_recording
 from ..models._model import Model
 from ..models._validity import with_tolerance
 from ._baselines import Baselines, baselines
-from ._bounds import calibrated_bounds, judged_bounds, judged_validity, useful_parts
-from ._residual_tests import ResidualTests, residual_tests
+from ._error_statistics import (
+    ResidualTests,
+    calibrated_bounds,
+    judged_bounds,
+    judged_validity,
+    residual_tests,
+    useful_parts,
+)
 from ._score_tables import (
     INFINITE,
+    Rows,
+    ScoredSegment,
     coverage_tables,
     divergence,
     free_run_bounds,
     interval_tables,
+    join_segments,
     outside_table,
+    predict,
     run_tables,
     score_tables,
+    unseen_segments,
 )
-from ._scored_rows import Rows, ScoredStretch, pooled, predict, unseen_stretches
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +57,7 @@ if TYPE_CHECKING:
 
 _HORIZONS = (1, 5, 25, INFINITE)
 # Kinds whose bounds are guaranteed under an assumption.
-_PROMISING = ("nlsm",)
+_GUARANTEED_KINDS = ("nlsm",)
 
 Scores = dict[str, dict[str, float | None]]
 
@@ -68,7 +78,7 @@ class Validation(ReprMixin):
         worst_deg, worst_time: largest absolute error [deg] and when it was [s].
         intervals: 95 % interval [low, high] of `fits` by a bootstrap over blocks.
         best_linear: fit [%] that no linear model of the set-points beats on these rows (see `best_linear`).
-        per_run: the same scores for each stretch of rows that follow each other, with its `stretch`, `run`,
+        per_run: the same scores for each segment of rows that follow each other, with its `stretch`, `run`,
             `start_s`, `rows_scored` and `diverged`.
         cold_fits: fit [%] of a free run that knows the first row only, as an FMU starts, on the same rows; None where
             it diverged.
@@ -77,13 +87,13 @@ class Validation(ReprMixin):
         coverage_pct, mean_width_deg: of kinds with bounds in free run: axis -> measured samples within them [%], and
             their mean distance [deg], None where that is more than the range of the data; None for other kinds.
         bounds_remarks: where these bounds are of no use or do not hold what they promise.
-        calibrated_bounds: of every kind, from nine or more stretches: see `_bounds`; else why there are none.
+        calibrated_bounds: of every kind, from nine or more segments: see `_error_statistics`; else why there are none.
         outside_pct: axis -> measured samples [%] outside what the model has seen: of set membership where its bounds
             are wider than training's usually are (see `is_extrapolating`), of other kinds where a set-point lies beyond
             those that it was trained on; None where the model does not know.
         validity: least and mean of the model's own in free run, and how well it foretold errors within its tolerance
             (see `judged_validity`); None where the model has none.
-        time, run: (time,) [s] and the number of the stretch, for plots: no line joins two of them.
+        time, run: (time,) [s] and the number of the segment, for plots: no line joins two of them.
         measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
         lower, upper: (time, 2) [rad] bounds of the free run, NaN where none is narrower than the data.
         robot: whose outputs these are; of another than the neck they have its number and SI unit.
@@ -222,7 +232,7 @@ def validate(
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
 
-    Each stretch of unseen rows starts from 25 measured samples, which are not scored. A free run then has the
+    Each segment of unseen rows starts from 25 measured samples, which are not scored. A free run then has the
     set-points alone, or the logged motor positions as well (`motors="measured"`). `cold_fits` are of a free run that
     had the first row only.
 
@@ -238,7 +248,7 @@ def validate(
     Raises:
         FileFormatError: no such file, or not one of ours.
         DataError: nothing is left to judge, another sample time, no motor positions to measure, or a horizon longer
-            than every stretch.
+            than every segment.
 
     Example:
         >>> import softneck
@@ -264,7 +274,7 @@ def validate(
 class Parts:
     """What of a recording is judged, and what stands beside any model on it."""
 
-    stretches: list[ScoredStretch]
+    segments: list[ScoredSegment]
     left_out: int
     rows: Rows
     baselines: Baselines
@@ -273,7 +283,7 @@ class Parts:
 def judged_parts(
     model: Model, recording: Recording, rules: Rules, known: dict[bytes, Baselines] | None = None
 ) -> Parts:
-    """Return the stretches that a model has not seen; `known` keeps baselines for models that saw the same rows."""
+    """Return the segments that a model has not seen; `known` keeps baselines for models that saw the same rows."""
     model.check(recording)  # its sample time, before anything is computed
     if rules.motors == "measured" and not recording.has_motor_positions:
         raise DataError(
@@ -283,20 +293,20 @@ def judged_parts(
         names = " nor ".join(recording.robot.outputs.names)
         raise DataError(f"neither {names} was ever measured; there is nothing to judge.")
     hashes = np.zeros(0, dtype=np.uint64) if rules.include_training else model.training_rows
-    stretches, left_out = unseen_stretches(recording, hashes)
-    longest = max(len(s.recording) for s in stretches)
+    segments, left_out = unseen_segments(recording, hashes)
+    longest = max(len(s.recording) for s in segments)
     finite = [int(h) for h in rules.horizons if h != INFINITE]
     if finite and max(finite) >= longest:
         raise DataError(
-            f"a horizon of {max(finite)} samples is longer than what is judged: the longest stretch of rows that the "
+            f"a horizon of {max(finite)} samples is longer than what is judged: the longest segment of rows that the "
             f"model was not trained on has {longest}."
         )
-    rows = pooled(stretches)
-    key = np.isfinite(rows.measured).tobytes() + rows.stretch.tobytes() + rows.time.tobytes()
+    rows = join_segments(segments)
+    key = np.isfinite(rows.measured).tobytes() + rows.segment.tobytes() + rows.time.tobytes()
     known = {} if known is None else known
     if key not in known:
-        known[key] = baselines(stretches, rows, rules.horizons)
-    return Parts(stretches, left_out, rows, known[key])
+        known[key] = baselines(segments, rows, rules.horizons)
+    return Parts(segments, left_out, rows, known[key])
 
 
 def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -> Validation:
@@ -306,28 +316,28 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
     rows, horizons = parts.rows, [str(h) for h in rules.horizons]
     axes = len(rows.names)
     outputs = _predictions(model, parts, rules)
-    lost: list[float | None] = [None] * len(parts.stretches)
+    lost: list[float | None] = [None] * len(parts.segments)
     if INFINITE in outputs:
         lost = divergence(rows, outputs[INFINITE][:, :axes])
     first = min((t for t in lost if t is not None), default=None)
-    measured = {h: rows.judged(None if h == INFINITE else int(h)) for h in horizons}
+    measured = {h: rows.outputs_at(None if h == INFINITE else int(h)) for h in horizons}
     predicted = {h: outputs[h][:, :axes] for h in horizons}
     scores = score_tables(rows, rows.time, measured, predicted, lost=first is not None)
-    tests = residual_tests(rows.measured - outputs["1"][:, :axes], rows.set_points, rows.stretch)
+    tests = residual_tests(rows.measured - outputs["1"][:, :axes], rows.set_points, rows.segment)
     free = outputs.get(INFINITE, np.full((rows.time.size, axes), np.nan))
     lower, upper = free_run_bounds(model.kind, free, rows.robot)
     coverage, width = coverage_tables(rows, rows.measured, lower, upper)
-    useful_width, said = judged_bounds(rows, coverage, width, promised=model.kind in _PROMISING)
+    useful_width, said = judged_bounds(rows, coverage, width, promised=model.kind in _GUARANTEED_KINDS)
     if first is None and INFINITE in outputs:
         calibrated = calibrated_bounds(rows, rows.measured - free[:, :axes])
     else:
         calibrated = {"reason": "there is no free run, or it diverged"}
     lower, upper = useful_parts(rows, lower, upper)
-    per_run = run_tables(parts.stretches, rows, measured, predicted, lost)
+    per_run = run_tables(parts.segments, rows, measured, predicted, lost)
     return Validation(
         model=names[0],
         data=names[1],
-        rows_scored=int(sum(stretch.scored.sum() for stretch in parts.stretches)),
+        rows_scored=int(sum(segment.scored.sum() for segment in parts.segments)),
         rows_left_out=parts.left_out,
         rows_by_horizon={h: int(np.isfinite(y).any(axis=1).sum()) for h, y in measured.items()},
         persistence=parts.baselines.persistence,
@@ -345,7 +355,7 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
         outside_pct=outside_table(model, rows, free),
         validity=judged_validity(model, rows, free),
         time=rows.time,
-        run=rows.stretch,
+        run=rows.segment,
         measured=rows.measured,
         free_run=free[:, :axes],
         one_step=outputs["1"][:, :axes],
@@ -356,9 +366,9 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
 
 
 def _cold_fits(model: Model, parts: Parts, rules: Rules) -> dict[str, float | None]:
-    """Return the fit [%] of each output in free run from the first row of each stretch; None where it diverged."""
+    """Return the fit [%] of each output in free run from the first row of each segment; None where it diverged."""
     rows = parts.rows
-    free = np.concatenate([model.simulate(s.recording, motors=rules.motors, warm_up=0) for s in parts.stretches])
+    free = np.concatenate([model.simulate(s.recording, motors=rules.motors, warm_up=0) for s in parts.segments])
     free = free[:, : len(rows.names)]
     lost = divergence(rows, free)
     measured = {INFINITE: rows.measured}
@@ -367,8 +377,8 @@ def _cold_fits(model: Model, parts: Parts, rules: Rules) -> dict[str, float | No
 
 
 def _predictions(model: Model, parts: Parts, rules: Rules) -> dict[str, Matrix]:
-    """Return horizon -> outputs (time, n_out) of all stretches; one step ahead always, for the residual tests."""
-    runs = [stretch.recording for stretch in parts.stretches]
+    """Return horizon -> outputs (time, n_out) of all segments; one step ahead always, for the residual tests."""
+    runs = [segment.recording for segment in parts.segments]
     result: dict[str, Matrix] = {}
     for horizon in dict.fromkeys((1, *rules.horizons)):
         if horizon == INFINITE:
@@ -399,14 +409,14 @@ class Comparison(ReprMixin):
         import pandas as pd
 
         rows = [row for v in self.validations for row in _rows(v)]
-        return pd.DataFrame(rows).astype(dict.fromkeys(_NUMBERS, float))
+        return pd.DataFrame(rows).astype(dict.fromkeys(_NUMERIC_COLUMNS, float))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the JSON of the public face."""
         return {"models": [validation.as_dict() for validation in self.validations]}
 
 
-_NUMBERS = (
+_NUMERIC_COLUMNS = (
     "fit", "low", "high", "persistence", "best_linear", "rmse_deg", "worst_deg", "worst_time_s", "r2",
     "diverged_s",
 )  # fmt: skip
@@ -432,8 +442,8 @@ def compare(
         DataError: as `validate`.
     """
     rules = Rules() if rules is None else rules
-    named_models = _named(models, [m.kind for m in models] if not isinstance(models, Mapping) else [])
-    named_data = _named(recordings, [f"data {i + 1}" for i in range(len(recordings))])
+    named_models = _name_all(models, [m.kind for m in models] if not isinstance(models, Mapping) else [])
+    named_data = _name_all(recordings, [f"data {i + 1}" for i in range(len(recordings))])
     if not named_models or not named_data:
         raise SettingsError("`compare` needs at least one model and one recording.")
     known: dict[str, dict[bytes, Baselines]] = {name: {} for name, _ in named_data}
@@ -449,7 +459,7 @@ def compare(
     return Comparison(tuple(results))
 
 
-def _named(things: Mapping[str, Any] | Sequence[Any], names: list[str]) -> list[tuple[str, Any]]:
+def _name_all(things: Mapping[str, Any] | Sequence[Any], names: list[str]) -> list[tuple[str, Any]]:
     if isinstance(things, Mapping):
         return list(things.items())
     # Two of a kind are told apart by their number.

@@ -19,7 +19,14 @@ from softneck.identification import (
     load_model,
     nrmse_fit,
 )
-from softneck.identification.adaptation._adapt import ADAPTING, Adaptation, Free, derivatives, free_run, reference
+from softneck.identification._adapt import (
+    ADAPTING,
+    Adaptation,
+    FreeParameters,
+    derivatives,
+    reference,
+    simulate_outputs,
+)
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, signal
 
@@ -191,9 +198,10 @@ def test_a_stronger_prior_leaves_more_of_what_the_window_does_not_move(old: Trai
     # One motor alone: what the others do stays, the more the stronger the prior.
     run = loaded("steps", 1.0, 5, 9.0)
     motion = reference(old["play"])
-    before = free_run(old["play"], motion)
+    before = simulate_outputs(old["play"], motion)
     moved = [
-        float(np.abs(free_run(Adaptation(strength=s).of(old["play"], run), motion) - before).mean()) for s in (0.1, 100)
+        float(np.abs(simulate_outputs(Adaptation(strength=s).of(old["play"], run), motion) - before).mean())
+        for s in (0.1, 100)
     ]
     assert moved[1] < moved[0]
 
@@ -202,21 +210,23 @@ def test_a_stronger_prior_leaves_more_of_what_the_window_does_not_move(old: Trai
 def test_numbers_that_move_together_have_the_derivatives_they_have_alone(
     old: Trained, window: Recording, kind: str
 ) -> None:
-    free, run = Free.of(old[kind]), window.rows(0, 200)
-    J = derivatives(free, free.start(), lambda model: free_run(model, run))
+    free, run = FreeParameters.of(old[kind]), window.rows(0, 200)
+    J = derivatives(free, free.start(), lambda model: simulate_outputs(model, run))
     for place in (0, J.shape[0] // 2, J.shape[0] - 1):
         x = free.start()
         x[place] += 1e-4 * free.sizes()[place]
-        alone = (free_run(free.at(x), run) - free_run(old[kind], run)) / 1e-4
+        alone = (simulate_outputs(free.at(x), run) - simulate_outputs(old[kind], run)) / 1e-4
         # Differences of the same step: only rounding over the step is left, 1e-16 / 1e-4 with a margin of 1e4.
         np.testing.assert_allclose(J[place], alone, atol=1e-8)
 
 
 def test_the_numbers_are_those_of_the_model(old: Trained, window: Recording) -> None:
     for kind in ("oe", "play", "greybox"):
-        free = Free.of(old[kind])
+        free = FreeParameters.of(old[kind])
         # Logarithms of the grey box go there and back: rounding.
-        np.testing.assert_allclose(free_run(free.at(free.start()), window), free_run(old[kind], window), atol=1e-9)
+        np.testing.assert_allclose(
+            simulate_outputs(free.at(free.start()), window), simulate_outputs(old[kind], window), atol=1e-9
+        )
 
 
 def test_a_weak_prior_ends_where_the_estimator_does(window: Recording, old: Trained) -> None:

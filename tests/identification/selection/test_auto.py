@@ -16,9 +16,9 @@ from softneck.identification.selection._auto import (
     EXAM,
     HOLD_OUT,
     KindTrial,
+    _explain_guarded,
     _Race,
     best_others,
-    guarded_why,
     kinds_to_try,
     numbers_of,
 )
@@ -192,7 +192,7 @@ def race() -> _Race:
     """A race that `play` has won before `oe`."""
     race = _Race(TRAIN, OTHER, [], 0)
     for model, fit in ((Play().fit(TRAIN), 85.0), (OutputError(delay=0.06).fit(TRAIN), 80.0)):
-        judged = race._judged(model.kind, model)
+        judged = race._validate(model.kind, model)
         race.tried[model.kind] = KindTrial(model.kind, 1.0, model, judged, left_out={"largest motions": fit})
         race.short[model.kind] = model
     return race
@@ -213,17 +213,17 @@ def test_the_guarded_form_of_a_learned_winner_is_taken(race: _Race, monkeypatch:
     best = race.tried["play"]
     # Not its own: to compile each combination of kinds takes half a minute.
     monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
-    chosen = race.guarded(best, silent)
+    chosen = race.guard_best(best, silent)
     assert (asked[0].of, asked[0].base) == ("play", "oe")
     assert chosen.kind == "guarded"
     # It is ranked by what its kind was worth elsewhere.
     assert chosen.scores["largest motions"] == 85.0
     assert set(chosen.scores) == {"largest motions", HOLD_OUT, COLD}
-    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in guarded_why(best, chosen)
+    assert "Its guarded form is taken: 5 models of play that fade to `oe`" in _explain_guarded(best, chosen)
     # A guarded form that costs more than two points on the rows held out is none.
     monkeypatch.setattr(KindTrial, "hold_out_fit", property(lambda one: {"guarded": 90.0, "play": 92.5}[one.kind]))
-    assert race.guarded(best, silent) is best
-    assert guarded_why(best, best) == ""
+    assert race.guard_best(best, silent) is best
+    assert _explain_guarded(best, best) == ""
 
 
 def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -236,7 +236,7 @@ def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypa
     # Not its own: to compile each combination of kinds takes half a minute.
     monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
     monkeypatch.setattr(_guarded, "with_validity_region", lambda model, _: model)
-    model = race.guarded(best, silent).model
+    model = race.guard_best(best, silent).model
     assert model is not None
     held = members(model.arrays)
     assert [kind for kind, _ in held] == ["oe", "play", "play"]
@@ -246,10 +246,10 @@ def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypa
 
 
 def test_a_line_or_equations_are_not_guarded_and_no_base_is_no_guard(race: _Race) -> None:
-    assert race.guarded(race.tried["oe"], silent) is race.tried["oe"]
+    assert race.guard_best(race.tried["oe"], silent) is race.tried["oe"]
     alone = _Race(TRAIN, OTHER, [], 0)
     alone.tried = {"play": race.tried["play"]}
-    assert alone.guarded(alone.tried["play"], silent) is alone.tried["play"]
+    assert alone.guard_best(alone.tried["play"], silent) is alone.tried["play"]
 
 
 def test_a_guarded_form_that_cannot_be_trained_is_listed_with_its_reason(
@@ -259,5 +259,5 @@ def test_a_guarded_form_that_cannot_be_trained_is_listed_with_its_reason(
         raise DataError("there is no base to fall back to")
 
     monkeypatch.setattr(Guarded, "fit", fit)
-    assert race.guarded(race.tried["play"], silent) is race.tried["play"]
+    assert race.guard_best(race.tried["play"], silent) is race.tried["play"]
     assert race.tried["guarded"].failure == "there is no base to fall back to"

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from softneck.core import DataError, SettingsError
 from softneck.identification import PAPER_EQ21, Model, SetMembership, is_extrapolating
 from softneck.identification.models._regressors import regression
-from softneck.identification.set_membership._regressor import all_pairs_gammas, least_gammas
-from softneck.identification.set_membership._set_membership import noise_level
-from softneck.identification.set_membership._trees import (
+from softneck.identification.set_membership._regressor import (
     LEAF,
+    all_pairs_gammas,
     is_frame,
+    least_gammas,
     slant_frames,
     slant_nodes,
     slant_order,
@@ -24,6 +24,7 @@ from softneck.identification.set_membership._trees import (
     tree_order,
     usual_width,
 )
+from softneck.identification.set_membership._set_membership import noise_level
 from softneck.runtime import load_functions
 
 from ...data import TS, neck_recording, recording_from, short_neck
@@ -78,7 +79,7 @@ def test_the_tree_gives_the_bounds_of_algorithm_1(
         expected = algorithm_1(x, omega, y, gamma, epsilon)
         # Squares by ** or *, roots by ** or sqrt: some ulp of cones up to 50 * 6 * sqrt(11) = 1,000.
         np.testing.assert_allclose((low - epsilon, high + epsilon), expected, rtol=1e-12, atol=1e-12)
-        # And those of all points in one stretch, to the bit: the tree leaves nothing out.
+        # And those of all points in one segment, to the bit: the tree leaves nothing out.
         best = np.array([-np.inf, np.inf])
         SLANT.slant_leaf(points, values, 0, len(y), gamma, x, np.empty(len(y)), best)
         assert tuple(best) == (low, high)

@@ -21,7 +21,7 @@ from softneck.signals.recording._channels import MOTOR_POSITIONS
 
 from ...data import TS, neck_recording
 
-FUNCTIONS = load_functions("softneck.identification.structured._greybox_fit_runtime")
+FUNCTIONS = load_functions("softneck.identification.structured._neck_equations_runtime")
 GUESS = np.array([number.guess for number in PARAMETERS])
 NAMES = [number.name for number in PARAMETERS]
 DELAY = np.full(3, 3.0)

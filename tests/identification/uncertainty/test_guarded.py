@@ -19,10 +19,10 @@ from softneck.identification.uncertainty._guarded import (
     _least_missing,
     base_or_reason,
     covering,
-    done,
     fitted_base,
     left_out,
     left_out_error,
+    run_jobs,
 )
 from softneck.plant import VirtualNeck
 from softneck.robot import Robot
@@ -220,7 +220,7 @@ def test_play_is_guarded_by_name_and_a_robot_may_have_it() -> None:
 @pytest.mark.slow
 def test_processes_change_no_result() -> None:
     jobs = [Job(kind, fitted_base, (kind, short_neck())) for kind in ("rls", "oe")]
-    here, there = done(jobs, 1, silent), done(jobs, 2, silent)
+    here, there = run_jobs(jobs, 1, silent), run_jobs(jobs, 2, silent)
     for one, other in zip(here, there, strict=True):
         assert (one.error == other.error).all()
         assert all((one.model.arrays[name] == array).all() for name, array in other.model.arrays.items())

@@ -26,9 +26,9 @@ from softneck.identification.uncertainty._measured import (
     middle_model,
     needed_lines,
     nominal_output,
-    raised,
+    raise_weight,
+    recordings_without_response,
     response_of,
-    unheard,
 )
 from softneck.signals import SET_POINTS, Recording, concatenate, multisine_experiments, redefinition_matrix
 
@@ -64,7 +64,7 @@ def measured(recordings: list[Recording], start: Continuous, *, cover: bool = Tr
         borders=band_borders(float(w[0]), float(w[-1])), needed=np.zeros((0, 0)),
     )  # fmt: skip
     found = replace(found, needed=judge_records(axis_runs(recordings, DIRECTIONS, "set_points", 0), found, points, TS))
-    return (raised(found) if cover else found), points
+    return (raise_weight(found) if cover else found), points
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_where_a_record_needs_more_the_weight_is_raised() -> None:
     found, _ = measured([played(TWO)], TWO, cover=False)
     needs = np.full((1, found.borders.size - 1), 0.5)
     needs[0, 1] = 3.0
-    more = raised(replace(found, needed=needs))
+    more = raise_weight(replace(found, needed=needs))
     inside = (found.frequency > found.borders[1]) & (found.frequency < found.borders[2])
     np.testing.assert_allclose(more.weight[inside], 3.0 * found.weight[inside])
     np.testing.assert_allclose(more.weight[-5:], found.weight[-5:])
@@ -191,10 +191,10 @@ def test_a_recording_that_moves_an_axis_and_shows_nothing_is_named() -> None:
     for axis in (0, 1):
         points = axis_points(responses, axis, DIRECTIONS, 0.95)
         runs = axis_runs(parts, DIRECTIONS, "set_points", axis)
-        assert unheard(points, runs, names) == ["slack"]
+        assert recordings_without_response(points, runs, names) == ["slack"]
         # What never moved the axis need not show anything of it.
         others = points[points[:, 0] != 2.0]
-        assert unheard(others, [*runs[:2], *still], names) == ["slack"]
+        assert recordings_without_response(others, [*runs[:2], *still], names) == ["slack"]
     family = replace(_family(), findings={"tested": {"names": ["a"], "unheard": {"pitch": ["slack"]}}})
     assert "pitch: slack moves it and shows no response known within 30 %" in family.summary()
 

@@ -10,7 +10,7 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import WARM_UP, Model, Rls, nrmse_fit, validate
 from softneck.identification.models._fitting import row_hashes
 from softneck.identification.models._scores import r_squared, rmse, worst_error
-from softneck.identification.validation._scored_rows import predict
+from softneck.identification.validation._score_tables import predict
 from softneck.signals import concatenate, signal
 
 from ...data import neck_recording, recording_from, short_neck
@@ -67,7 +67,7 @@ def test_rows_shared_out_to_threads_are_predicted_as_by_one(
     run = neck_recording(90, seed=77)
     for workers in (2, 3, 7):
         monkeypatch.setattr("os.cpu_count", lambda n=workers: n)
-        monkeypatch.setattr("softneck.identification.validation._scored_rows._WORTH_A_THREAD", 0)
+        monkeypatch.setattr("softneck.identification.validation._score_tables._WORTH_A_THREAD", 0)
         for horizon in (2, 25, 60):
             shared = predict(models[kind], [run, run], horizon, motors="simulated")
             alone = models[kind].predict(run, horizon)
@@ -92,7 +92,7 @@ def test_of_a_long_record_every_nth_row_is_predicted_as_before(
 def test_rows_of_a_long_record_are_judged_alike_for_model_and_baselines(monkeypatch: pytest.MonkeyPatch) -> None:
     recording, model = neck_recording(1500, seed=8, noise=2e-3), perfect()
     whole = validate(model, recording)
-    monkeypatch.setattr("softneck.identification.validation._scored_rows._MOST_STEPS", 7500)
+    monkeypatch.setattr("softneck.identification.validation._score_tables._MOST_STEPS", 7500)
     some = validate(model, recording)
     assert whole.rows_by_horizon == {"1": 1475, "5": 1475, "25": 1475, "inf": 1475}
     assert some.rows_by_horizon == {"1": 1475, "5": 1475, "25": 295, "inf": 1475}

@@ -9,8 +9,13 @@ import pytest
 
 from softneck.core import Matrix
 from softneck.identification import WARM_UP, Model, SetMembership, validate
-from softneck.identification.validation._bounds import LEAST_RECORDS, calibrated_bounds, judged_bounds, useful_parts
-from softneck.identification.validation._scored_rows import Rows
+from softneck.identification.validation._error_statistics import (
+    LEAST_RECORDS,
+    calibrated_bounds,
+    judged_bounds,
+    useful_parts,
+)
+from softneck.identification.validation._score_tables import Rows
 from softneck.robot import Robot
 from softneck.signals import SET_POINTS, concatenate
 
@@ -19,9 +24,9 @@ from ...data import neck_recording, short_neck
 
 def rows_of(measured: Matrix, records: int = 1) -> Rows:
     n = len(measured)
-    stretch = np.arange(n) * records // n
+    segment = np.arange(n) * records // n
     return Rows(
-        time=np.arange(n) * 0.02, stretch=stretch, since=np.arange(n), measured=measured,
+        time=np.arange(n) * 0.02, segment=segment, since=np.arange(n), measured=measured,
         set_points=np.zeros((n, 3)), robot=Robot.preset(),
     )  # fmt: skip
 

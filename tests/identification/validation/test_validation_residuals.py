@@ -10,7 +10,7 @@ from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.tsa.stattools import acf, ccf
 
 from softneck.identification import Rls, validate
-from softneck.identification.validation._residual_tests import LAGS, ResidualTests, residual_tests
+from softneck.identification.validation._error_statistics import LAGS, ResidualTests, residual_tests
 from softneck.signals import concatenate
 
 from ...data import neck_recording
@@ -45,15 +45,15 @@ def test_one_run_without_gaps_is_as_in_statsmodels(pole: float) -> None:
 def test_no_product_joins_two_runs() -> None:
     """Sums over two runs are the sums of each: against the plain double loop."""
     errors, inputs = noise(130, 2)
-    stretch = np.repeat([0, 1], [57, 73])
-    ours = residual_tests(errors, inputs, stretch)
+    segment = np.repeat([0, 1], [57, 73])
+    ours = residual_tests(errors, inputs, segment)
     e, U = errors - errors.mean(axis=0), inputs - inputs.mean(axis=0)
     auto, cross = np.zeros(LAGS + 1), np.zeros(2 * LAGS + 1)
     for s in range(130):
         for t in range(130):
-            if stretch[s] == stretch[t] and 0 <= t - s <= LAGS:
+            if segment[s] == segment[t] and 0 <= t - s <= LAGS:
                 auto[t - s] += e[t, 0] * e[s, 0]
-            if stretch[s] == stretch[t] and abs(t - s) <= LAGS:
+            if segment[s] == segment[t] and abs(t - s) <= LAGS:
                 cross[LAGS + t - s] += e[t, 1] * U[s, 2]
     np.testing.assert_allclose(ours.autocorrelation[0], auto / auto[0], atol=1e-13)
     scale = np.linalg.norm(e[:, 1]) * np.linalg.norm(U[:, 2])
@@ -128,8 +128,8 @@ def test_validation_tests_each_run_by_itself() -> None:
     runs = [neck_recording(200, seed=s, noise=2e-3) for s in (5, 6)]
     model = Rls(delay=0.06).fit(neck_recording(600, seed=7))
     result = validate(model, concatenate(runs))
-    errors, stretch = result.measured - result.one_step, result.run
+    errors, segment = result.measured - result.one_step, result.run
     inputs = np.vstack([run.set_points for run in runs])
-    again = residual_tests(errors, inputs, stretch)
+    again = residual_tests(errors, inputs, segment)
     np.testing.assert_array_equal(result.residual_tests.cross_correlation, again.cross_correlation)
     assert result.as_dict()["residuals"]["p_value"]["roll"] == again.p_value[1]

@@ -78,7 +78,7 @@ def test_a_model_that_memorises_is_not_scored_on_what_it_has_seen() -> None:
     assert flattered.rows_left_out == 0
 
 
-def test_rows_seen_inside_a_run_are_left_out_and_the_rest_stays_two_stretches() -> None:
+def test_rows_seen_inside_a_run_are_left_out_and_the_rest_stays_two_segments() -> None:
     run = neck_recording(900, seed=44, noise=2e-3)
     model = memoriser(run.rows(300, 600))
     result = validate(model, run)

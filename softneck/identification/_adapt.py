@@ -28,23 +28,23 @@ import numpy as np
 from softneck.core import FileFormatError, Matrix, SettingsError, Vector, one_blas_thread, require_positive
 from softneck.signals import Recording, concatenate, signal
 
-from ..models._arrays import check_arrays, trained_range, trained_set_points
-from ..models._directions import NECK_SECONDS, on_motors, time_constant_of
-from ..models._fitting import row_hashes
-from ..models._model import WARM_UP, Model
-from ..models._scores import nrmse_fit
-from ..models._validity import limit_validity
-from ..structured._greybox import PARAMETERS
+from .models._arrays import check_arrays, trained_range, trained_set_points
+from .models._directions import NECK_SECONDS, on_motors, time_constant_of
+from .models._fitting import row_hashes
+from .models._model import WARM_UP, Model
+from .models._scores import nrmse_fit
+from .models._validity import limit_validity
+from .structured._greybox import PARAMETERS
 
 # Kind -> the arrays that are moved; entries that are zero are structure and stay.
-_MOVED = {
+_ADAPTED_ARRAYS = {
     "oe": ("a", "b", "A", "B", "offset"),
     "play": ("weights",),
     "nn": ("w3", "b3"),
     "greybox": ("neck",),
 }
 #: Kinds that can adapt.
-ADAPTING = tuple(_MOVED)
+ADAPTING = tuple(_ADAPTED_ARRAYS)
 
 
 def require_adapting(model: Model) -> None:
@@ -56,7 +56,7 @@ def require_adapting(model: Model) -> None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Free:
+class FreeParameters:
     """The numbers of one model as one vector.
 
     Attributes:
@@ -68,12 +68,12 @@ class Free:
     places: tuple[tuple[str, np.ndarray], ...]
 
     @classmethod
-    def of(cls, model: Model) -> Free:
+    def of(cls, model: Model) -> FreeParameters:
         """Find them."""
         if model.kind == "greybox":
             mask = np.arange(model.arrays["neck"].size) < len(PARAMETERS)  # its tendons stand behind its numbers
             return cls(model, (("neck", mask),))
-        found = [(name, model.arrays[name]) for name in _MOVED[model.kind] if name in model.arrays]
+        found = [(name, model.arrays[name]) for name in _ADAPTED_ARRAYS[model.kind] if name in model.arrays]
         return cls(model, tuple((name, array != 0.0) for name, array in found))
 
     def start(self) -> Vector:
@@ -128,7 +128,7 @@ class Free:
     def _with(self, moved: Mapping[str, Matrix]) -> Model:
         return replace(self.model, arrays={**self.model.arrays, **moved})
 
-    def sound(self, x: Vector) -> bool:
+    def is_valid(self, x: Vector) -> bool:
         """Return whether the numbers make a model that a file may hold, and one that does not drift."""
         try:
             model = self.at(x)
@@ -145,15 +145,15 @@ class Free:
 
 
 # A derivative by differences: far above rounding, far below what bends.
-_STEP = 1e-4
+_DIFFERENCE_STEP = 1e-4
 # Of each number against the reference [parts of its size]: what moves nothing at all stays where it is.
-_STAY = 1e-6
+_MIN_INFORMATION = 1e-6
 _STEPS, _MOST_DAMPING, _ENOUGH = 8, 1e4, 0.01
 # Derivatives cost a free run for each number: so many in all, which bounds the time whatever the kind.
-_RUNS = 160
+_MAX_SIMULATIONS = 160
 # The reference lasts so long [s of a neck]: all of `mixed`'s motions, each for two seconds.
-_REFERENCE = 20.0
-_RAMP = 1.0
+_REFERENCE_S = 20.0
+_RAMP_S = 1.0
 
 
 def reference(model: Model) -> Recording:
@@ -161,13 +161,13 @@ def reference(model: Model) -> Recording:
     trained, Ts = trained_range(model.findings), model.sample_time
     motors, outputs = len(model.robot.motors.names), model.robot.outputs.names
     low, high = trained if trained is not None else (np.full(motors, -1.0), np.full(motors, 1.0))
-    own = signal("mixed", duration=_REFERENCE, seed=0)
+    own = signal("mixed", duration=_REFERENCE_S, seed=0)
     P = on_motors(own.set_points, motors)
     P = low + (P - P.min(axis=0)) / np.ptp(P, axis=0) * (high - low)
     # As many samples for another robot, each of its own time constant.
-    at = np.arange(0.0, len(P) - 1.0, max(Ts / (own.sample_time * _scaled(1.0, model)), 0.2))
+    at = np.arange(0.0, len(P) - 1.0, max(Ts / (own.sample_time * _scale_seconds(1.0, model)), 0.2))
     P = np.column_stack([np.interp(at, np.arange(len(P)), column) for column in P.T])
-    P *= np.minimum(1.0, np.arange(len(P)) / max(_RAMP * len(P) / _REFERENCE, 1.0))[:, None]
+    P *= np.minimum(1.0, np.arange(len(P)) / max(_RAMP_S * len(P) / _REFERENCE_S, 1.0))[:, None]
     Y = np.full((len(P), len(outputs)), np.nan)
     Y[0] = model.block().initial_state().outputs[: len(outputs)]
     channels = dict(zip((*model.robot.set_points, *outputs), (*P.T, *Y.T), strict=True))
@@ -187,7 +187,7 @@ class Problem:
         strength: of the prior.
     """
 
-    free: Free
+    free: FreeParameters
     window: Recording
     learnt: np.ndarray
     target: Matrix
@@ -196,7 +196,7 @@ class Problem:
 
     def errors(self, z: Vector) -> Vector:
         """Return the errors that count, by numbers counted from the old ones in their sizes."""
-        return (self.target - free_run(self.free.at(self.numbers(z)), self.window))[self.learnt]
+        return (self.target - simulate_outputs(self.free.at(self.numbers(z)), self.window))[self.learnt]
 
     def numbers(self, z: Vector) -> Vector:
         """Return the numbers."""
@@ -216,8 +216,10 @@ class Problem:
         z = np.zeros(self.free.start().size)
         e = self.errors(z)
         cost, damping = self.cost(z, e), 1e-3
-        for _ in range(int(np.clip(_RUNS // len(self.free.groups()), 1, _STEPS))):
-            J = derivatives(self.free, self.numbers(z), lambda model: free_run(model, self.window))[:, self.learnt].T
+        for _ in range(int(np.clip(_MAX_SIMULATIONS // len(self.free.groups()), 1, _STEPS))):
+            J = derivatives(self.free, self.numbers(z), lambda model: simulate_outputs(model, self.window))[
+                :, self.learnt
+            ].T
             A, g = J.T @ J / e.size + self.prior, J.T @ e / e.size - self.prior @ z
             found = self._step(z, cost, damping, A, g)
             if found is None:
@@ -234,7 +236,7 @@ class Problem:
         """Return the step that lowers the cost, None where none does."""
         while damping < _MOST_DAMPING:
             trial = z + np.linalg.solve(A + damping * np.diag(np.diag(A)), g)
-            if self.free.sound(self.numbers(trial)):
+            if self.free.is_valid(self.numbers(trial)):
                 e = self.errors(trial)
                 value = self.cost(trial, e)
                 if value < cost:
@@ -243,28 +245,28 @@ class Problem:
         return None
 
 
-def information(free: Free, motion: Recording) -> Matrix:
+def information(free: FreeParameters, motion: Recording) -> Matrix:
     """Return J'J (n, n) / entries of the old free run along `motion`, by sizes of the numbers, positive definite."""
-    J = derivatives(free, free.start(), lambda model: free_run(model, motion))
+    J = derivatives(free, free.start(), lambda model: simulate_outputs(model, motion))
     J = J.reshape(len(J), -1)
     H = J @ J.T / J.shape[1]
-    return H + _STAY * max(np.trace(H) / len(H), 1e-12) * np.eye(len(H))
+    return H + _MIN_INFORMATION * max(np.trace(H) / len(H), 1e-12) * np.eye(len(H))
 
 
-def free_run(model: Model, recording: Recording) -> Matrix:
+def simulate_outputs(model: Model, recording: Recording) -> Matrix:
     """Return the free run (time, outputs)."""
     return model.simulate(recording)[:, : recording.outputs.shape[1]]
 
 
-def derivatives(free: Free, numbers: Vector, run: Callable[[Model], Matrix]) -> np.ndarray:
+def derivatives(free: FreeParameters, numbers: Vector, run: Callable[[Model], Matrix]) -> np.ndarray:
     """Return the derivatives (n, time, outputs) of a free run by each number over its size."""
     now, sizes = run(free.at(numbers)), free.sizes()
     J = np.zeros((numbers.size, *now.shape))
     for group in free.groups():
         moved = numbers.copy()
         for place, _ in group:
-            moved[place] += _STEP * sizes[place]
-        change = (run(free.at(moved)) - now) / _STEP
+            moved[place] += _DIFFERENCE_STEP * sizes[place]
+        change = (run(free.at(moved)) - now) / _DIFFERENCE_STEP
         for place, axis in group:
             if axis is None:
                 J[place] = change
@@ -273,30 +275,30 @@ def derivatives(free: Free, numbers: Vector, run: Callable[[Model], Matrix]) -> 
     return np.nan_to_num(J, posinf=0.0, neginf=0.0)
 
 
-def scored(recording: Recording) -> np.ndarray:
+def _scored_entries(recording: Recording) -> np.ndarray:
     """Return (time, outputs) which entries say something: measured, and not among those that align a run."""
     late = np.concatenate([np.arange(len(run)) > WARM_UP for run in recording.runs()])
     return np.isfinite(recording.outputs) & late[:, None]
 
 
 # The latest data that are looked at, scaled [s].
-_WINDOW = 30.0
+_WINDOW_S = 30.0
 # Weight of a change along the reference beside an error over the window.
-_STRENGTH = 0.1
+_PRIOR_STRENGTH = 0.1
 # Held out: the last of every so many blocks, so long [scaled s]; between them the window is learnt from.
-_EVERY, _BLOCK = 3, 2.0
+_HOLD_OUT_PERIOD, _BLOCK_S = 3, 2.0
 # Set-points that move less than this part of what they do along the reference teach nothing.
 _LEAST_MOTION = 0.1
 # Fewer entries of an output than this on either side decide nothing.
 _LEAST_ROWS = 50
 # Parts of the way that are tried until no output is worse.
-_PARTS = (1.0, 0.5, 0.25)
+_STEP_FRACTIONS = (1.0, 0.5, 0.25)
 # Rows of the window that a set's bounds are to hold.
 _COVERED = 0.99
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Judged:
+class AdaptationResult:
     """What became of an adaptation.
 
     Attributes:
@@ -335,7 +337,7 @@ class Adaptation:
     """
 
     window: float | None = None
-    strength: float = _STRENGTH
+    strength: float = _PRIOR_STRENGTH
     block: float | None = None
 
     def __post_init__(self) -> None:
@@ -354,26 +356,28 @@ class Adaptation:
         """
         require_adapting(model)
         model.check(recording)
-        window = _latest(recording, self.window or _scaled(_WINDOW, model))
+        window = _latest(recording, self.window or _scale_seconds(_WINDOW_S, model))
         if window is None:
             least = (WARM_UP + 1) * recording.sample_time
             why = f"no run of the window goes on for more than {least:.3g} s after all outputs were first measured"
-            return _kept(model, Judged(adapted=False, why=why, seconds=0.0))
-        known, held = _split(window, self.block or _scaled(_BLOCK, model))
+            return _keep_model(model, AdaptationResult(adapted=False, why=why, seconds=0.0))
+        known, held = _split(window, self.block or _scale_seconds(_BLOCK_S, model))
         seconds = len(window) * window.sample_time
         if min(known.sum(axis=0).min(), held.sum(axis=0).min()) < _LEAST_ROWS:
             why = "an output was measured in too few of its rows"
-            return _kept(model, Judged(adapted=False, why=why, seconds=seconds))
+            return _keep_model(model, AdaptationResult(adapted=False, why=why, seconds=seconds))
         motion = reference(model)
-        if not _moved(window.set_points, motion.set_points):
+        if not _has_motion(window.set_points, motion.set_points):
             why = "the window hardly moves the neck, so that it teaches nothing"
-            return _kept(model, Judged(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum())))
-        free = Free.of(model)
+            return _keep_model(
+                model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum()))
+            )
+        free = FreeParameters.of(model)
         problem = Problem(free, window, known, window.outputs, information(free, motion), self.strength)
-        return _accepted(model, window, problem, problem.solve(), held)
+        return _accept_if_better(model, window, problem, problem.solve(), held)
 
 
-def _scaled(seconds: float, model: Model) -> float:
+def _scale_seconds(seconds: float, model: Model) -> float:
     """Return so many seconds of a neck for a model [s]."""
     return seconds * ((time_constant_of(model) or NECK_SECONDS) / NECK_SECONDS)
 
@@ -383,25 +387,29 @@ def adapt_model(model: Model, recording: Recording, window: float | None) -> Mod
     return Adaptation(window=window).of(model, recording)
 
 
-def _accepted(model: Model, window: Recording, problem: Problem, z: Vector, held: np.ndarray) -> Model:
+def _accept_if_better(model: Model, window: Recording, problem: Problem, z: Vector, held: np.ndarray) -> Model:
     """Return the adapted model if no output is worse over the rows held out, else the old one."""
     seconds, rows = len(window) * window.sample_time, int(held.any(axis=1).sum())
-    before = _fits(window.outputs, free_run(model, window), held)
+    before = _fits(window.outputs, simulate_outputs(model, window), held)
     best: tuple[float, Model, tuple[float, ...]] | None = None
-    for part in _PARTS:
+    for part in _STEP_FRACTIONS:
         numbers = problem.numbers(part * z)
-        if not (part * z).any() or not problem.free.sound(numbers):
+        if not (part * z).any() or not problem.free.is_valid(numbers):
             continue
         trial = problem.free.at(numbers)
-        after = _fits(window.outputs, free_run(trial, window), held)
+        after = _fits(window.outputs, simulate_outputs(trial, window), held)
         no_worse = all(new >= old for new, old in zip(after, before, strict=True))
         if no_worse and sum(after) > sum(before) and (best is None or sum(after) > sum(best[2])):
             best = (part, trial, after)
     if best is None:
         why = "no adapted model is better on the rows held out"
-        return _kept(model, Judged(adapted=False, why=why, seconds=seconds, rows=rows, before=before, after=before))
-    said = Judged(adapted=True, why="", seconds=seconds, rows=rows, before=before, after=best[2], part=best[0])
-    new = _widened(best[1], window)
+        return _keep_model(
+            model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=rows, before=before, after=before)
+        )
+    said = AdaptationResult(
+        adapted=True, why="", seconds=seconds, rows=rows, before=before, after=best[2], part=best[0]
+    )
+    new = _update_validity(best[1], window)
     findings = {
         **model.findings,
         **trained_set_points(window, model.findings),
@@ -411,7 +419,7 @@ def _accepted(model: Model, window: Recording, problem: Problem, z: Vector, held
     return replace(new, findings=findings, training_rows=rows_seen)
 
 
-def _kept(model: Model, said: Judged) -> Model:
+def _keep_model(model: Model, said: AdaptationResult) -> Model:
     return replace(model, findings={**model.findings, "adaptation": said.as_dict()})
 
 
@@ -429,13 +437,13 @@ def _latest(recording: Recording, seconds: float) -> Recording | None:
 
 def _split(window: Recording, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the entries (time, outputs) to learn from and those held out: blocks in turn."""
-    there = scored(window)
+    there = _scored_entries(window)
     block = np.arange(len(window)) // max(round(seconds / window.sample_time), 1)
-    held = (block % _EVERY == _EVERY - 1)[:, None]
+    held = (block % _HOLD_OUT_PERIOD == _HOLD_OUT_PERIOD - 1)[:, None]
     return there & ~held, there & held
 
 
-def _moved(window: Matrix, motion: Matrix) -> bool:
+def _has_motion(window: Matrix, motion: Matrix) -> bool:
     """Return whether a motor moves over the window by a part of what it does along the reference."""
     return bool((window.std(axis=0) > _LEAST_MOTION * motion.std(axis=0)).any())
 
@@ -445,9 +453,9 @@ def _fits(measured: Matrix, free: Matrix, held: np.ndarray) -> tuple[float, ...]
     return tuple(float(fit) if np.isfinite(fit) else -np.inf for fit in fits)
 
 
-def _widened(model: Model, window: Recording) -> Model:
+def _update_validity(model: Model, window: Recording) -> Model:
     """Return the model with a doubt that holds for what was seen in the window."""
-    there = scored(window)
+    there = _scored_entries(window)
     run = model.simulate(window)[:, : len(model.robot.outputs.names)]
     errors = np.where(there, window.outputs - run, np.nan)
     return limit_validity(model, errors)
