@@ -297,7 +297,7 @@ _GAP_PERIOD, _GAP_LENGTH = 25, 5
 def look_ahead_error(
     observer: KalmanObserver | NonlinearObserver, recording: Recording, late: float | None = None
 ) -> float:
-    """Return the RMS [SI] between the estimates and what the late sensor measures of the same instants.
+    """Return the RMS [SI] between the estimates and later measurements of the same instants.
 
     Five of every 25 samples are withheld from the filter. Likelihood favours levels that trust every measurement where
     the model is wrong; the gaps and the prediction over the sensor's delay show the price. Outliers are not compared.

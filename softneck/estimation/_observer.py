@@ -182,7 +182,7 @@ def _project_motor_positions(observer: AnyObserver, run: Recording) -> Matrix | 
 
 
 def _estimate_lag(pairs: Sequence[tuple[Matrix, Matrix]], period: float) -> float | None:
-    """Return the lag of the angles' changes behind the reference's [s]; None if it explains too little."""
+    """Return the lag of the angles' changes [s] after the reference's; None if it explains too little."""
     lags = np.arange(0, round(_MAX_DELAY_S / period * _STEPS_PER_SAMPLE) + 1) / _STEPS_PER_SAMPLE
     missed = [_unexplained_share(pairs, float(lag)) for lag in lags]
     best = int(np.argmin(missed))

@@ -212,7 +212,7 @@ class Problem:
         return self.strength * self.information
 
     def solve(self) -> Vector:
-        """Return z of the least cost near zero: Gauss-Newton, damped where a step does not help."""
+        """Return z of the lowest cost near zero by damped Gauss-Newton steps."""
         z = np.zeros(self.free.start().size)
         e = self.errors(z)
         cost, damping = self.cost(z, e), 1e-3
@@ -276,7 +276,7 @@ def derivatives(free: FreeParameters, numbers: Vector, run: Callable[[Model], Ma
 
 
 def _scored_entries(recording: Recording) -> np.ndarray:
-    """Return (time, outputs) which entries say something: measured, and not among those that align a run."""
+    """Return (time, outputs) whether an entry is scored: measured, and after the warm-up of its run."""
     late = np.concatenate([np.arange(len(run)) > WARM_UP for run in recording.runs()])
     return np.isfinite(recording.outputs) & late[:, None]
 
@@ -293,13 +293,11 @@ _LEAST_MOTION = 0.1
 _LEAST_ROWS = 50
 # Parts of the way that are tried until no output is worse.
 _STEP_FRACTIONS = (1.0, 0.5, 0.25)
-# Rows of the window that a set's bounds are to hold.
-_COVERED = 0.99
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptationResult:
-    """What became of an adaptation.
+    """The result of an adaptation.
 
     Attributes:
         adapted: whether anything changed.
@@ -319,7 +317,7 @@ class AdaptationResult:
     part: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what findings and JSON say."""
+        """Return the entry of findings and JSON."""
         return {
             "adapted": self.adapted, "why": self.why, "window_s": self.seconds, "rows_held_out": self.rows,
             "fit_before": list(self.before), "fit_after": list(self.after), "part": self.part,
@@ -348,7 +346,7 @@ class Adaptation:
 
     @one_blas_thread
     def of(self, model: Model, recording: Recording) -> Model:
-        """Return the adapted model, or the old one where that is no worse; findings say which, under `adaptation`.
+        """Return the adapted model, or the old one if it is no worse; findings hold the reason under `adaptation`.
 
         Raises:
             SettingsError: a kind that cannot adapt.
@@ -444,7 +442,7 @@ def _split(window: Recording, seconds: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _has_motion(window: Matrix, motion: Matrix) -> bool:
-    """Return whether a motor moves over the window by a part of what it does along the reference."""
+    """Return whether a motor moves enough over the window, compared with the reference motion."""
     return bool((window.std(axis=0) > _LEAST_MOTION * motion.std(axis=0)).any())
 
 
@@ -454,7 +452,7 @@ def _fits(measured: Matrix, free: Matrix, held: np.ndarray) -> tuple[float, ...]
 
 
 def _update_validity(model: Model, window: Recording) -> Model:
-    """Return the model with a doubt that holds for what was seen in the window."""
+    """Return the model with a validity that includes its errors over the window."""
     there = _scored_entries(window)
     run = model.simulate(window)[:, : len(model.robot.outputs.names)]
     errors = np.where(there, window.outputs - run, np.nan)

@@ -1,4 +1,4 @@
-"""Compare the kinds by what they were not shown, train the best on all rows, and say why it is taken."""
+"""Compare the kinds on data left out of their training, train the best on all rows, and give the reason."""
 
 from __future__ import annotations
 
@@ -66,19 +66,19 @@ class KindTrial:
 
     @property
     def scores(self) -> dict[str, float]:
-        """What it is judged by -> mean free-run fit of the outputs [%]; -inf where it failed or diverged."""
+        """Name of each test -> mean simulation fit of the outputs [%]; -inf if it failed or diverged."""
         if self.model is None or self.judged is None:
             return dict(self.left_out)
         return {**self.left_out, HOLD_OUT: _mean(self.judged.fits[INFINITE]), COLD: _mean(self.judged.cold_fits)}
 
     @property
     def fit(self) -> float:
-        """The least of `scores` [%], by which kinds are ranked; -inf where it failed or diverged."""
+        """The lowest of `scores` [%], which ranks the kinds; -inf if it failed or diverged."""
         return min(self.scores.values(), default=float("-inf"))
 
     @property
     def worst(self) -> str:
-        """The name of the least score; empty where there is none."""
+        """The name of the lowest score; empty without scores."""
         return min(self.scores, key=lambda name: self.scores[name], default="")
 
     @property
@@ -93,7 +93,7 @@ class KindTrial:
 
 
 def numbers_of(model: Model) -> int:
-    """Return how many numbers of a model were found from data; a set's points are, what finds them is not."""
+    """Return the number of parameters found from data; the points of a set count, its tree does not."""
     parts = members(model.arrays)
     inner = [Model(kind=kind, sample_time=model.sample_time, arrays=part) for kind, part in parts]
     own = sum(values.size for name, values in model.arrays.items() if name not in _NOT_FOUND and "." not in name)
@@ -122,7 +122,7 @@ def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
 
 
 def _progress_text(kind: str, tried: list[KindTrial]) -> str:
-    """Return what is tried, and the best so far."""
+    """Return the kind being tried and the best so far."""
     best = max(tried, key=lambda one: one.fit, default=None)
     return kind if best is None or best.fit == float("-inf") else f"{kind} (best so far {best.kind}, {best.fit:.1f} %)"
 
@@ -140,7 +140,7 @@ def _explain_choice(chosen: KindTrial, alike: list[KindTrial]) -> str:
 
 
 def _explain_guarded(best: KindTrial, chosen: KindTrial) -> str:
-    """Return what the guarded form of the best is, where it was taken."""
+    """Return the description of the guarded form; empty if it was not taken."""
     if chosen is best or chosen.model is None:
         return ""
     settings = chosen.model.settings
@@ -152,7 +152,7 @@ def _explain_guarded(best: KindTrial, chosen: KindTrial) -> str:
 
 
 def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[str, ...]:
-    """Return what to be wary of in a ranking."""
+    """Return the warnings on a ranking."""
     remarks = []
     if not other_excitation:
         remarks.append(
@@ -190,7 +190,7 @@ _MOST_TRAINED = 2
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Choice(ReprMixin):
-    """The outcome of `choose`: all kinds by the least of their scores, and the one that was taken.
+    """The outcome of `choose`: all kinds by their lowest scores, and the chosen one.
 
     Attributes:
         ranking: all kinds, best first.
@@ -220,7 +220,7 @@ def choose(
     seed: int = 0,
     progress: Progress = silent,
 ) -> Choice:
-    """Compare every kind by its free run over what was left out, train the best on all of `train`, and choose.
+    """Compare every kind by simulation of data left out, train the best on all of `train`, and choose.
 
     Each kind is identified in a short form on a part of the rows without their largest and fastest motions, later
     without one run or recording after the other, and judged on these, on `hold_out` and by how well it agrees with the
@@ -294,7 +294,7 @@ class _Race:
         return tuple(sorted(self.tried.values(), key=lambda one: -one.fit))
 
     def screen(self, kind: str) -> None:
-        """Identify a kind in its short form, and judge it on what the first fold leaves out and on the hold-out."""
+        """Identify a kind in its short form, and score it on the parts left out and on the hold-out."""
         fold, begin = self.folds[0], time.perf_counter()
         try:
             model = self.short[kind] = self._short(kind, fold.train)
@@ -306,7 +306,7 @@ class _Race:
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
     def examine(self) -> None:
-        """Add to the scores how well the kinds agree on motions that nobody recorded."""
+        """Add the agreement of the kinds on unrecorded motions to the scores."""
         if not self.folds[0].judged:
             return
         self._motions = self._motions or exams(self.folds[0].train)
@@ -341,7 +341,7 @@ class _Race:
         self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin), found)
 
     def train_best(self, progress: Progress) -> KindTrial:
-        """Train the best on all rows, and the next one where the best then falls behind it; return the one to take."""
+        """Train the best kinds on all rows until the best one is trained; return it."""
         trained = 0
         while True:
             best = self._simplest_of_the_best()
@@ -382,7 +382,7 @@ class _Race:
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
 
     def train_other(self, chosen: KindTrial) -> None:
-        """Train on all rows what `best_others` finds beside the chosen one."""
+        """Train the result of `best_others` on all rows."""
         for other in best_others(self.ranking(), chosen).values():
             if not other.whole:
                 self.whole(other.kind)

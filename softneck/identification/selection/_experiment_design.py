@@ -1,4 +1,4 @@
-"""What to record next: the motions on which members of a model part, or which lead where nothing was seen.
+"""The next experiment: motions on which the members disagree, or which leave the training range.
 
 Where several models that were trained alike part, most of them are wrong, and a record there would tell which. Each
 motion is scored by what it would make known of all of them: a sample's doubt,
@@ -55,7 +55,7 @@ RAMP = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Bounds:
-    """What set-points may do, in SI.
+    """The limits of set-points, in SI.
 
     Attributes:
         lowest, highest: (motors,) set-points.
@@ -88,7 +88,7 @@ class Bounds:
 
     @property
     def rest(self) -> Vector:
-        """Where motors begin and end (motors,): zero, or what is nearest to it."""
+        """Set-points at start and end (motors,): zero, or the nearest within the limits."""
         return np.clip(0.0, self.lowest, self.highest)
 
     def within(self, P: Matrix, sample_time: float) -> Matrix:
@@ -102,7 +102,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """One motion: a signal, how large and how fast of what it is by itself, and its set-points (time, motors)."""
+    """One motion: a signal, its size and speed factors, and its set-points (time, motors)."""
 
     signal: str
     size: float
@@ -150,7 +150,7 @@ _KERNEL_LENGTH = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Known:
-    """What is there before the experiment.
+    """The models and data before the experiment.
 
     Attributes:
         models: members that run free.
@@ -172,7 +172,7 @@ class Known:
 
     @classmethod
     def of_model(cls, model: Model) -> Known:
-        """Return what a model with members knows.
+        """Return the members and the training set-points of a guarded model.
 
         Raises:
             SettingsError: a model of one piece.
@@ -219,7 +219,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class NextExperiment(ReprMixin):
-    """What to record next.
+    """The next experiment.
 
     Attributes:
         recording: its set-points, and as outputs what the members expect.
@@ -235,7 +235,7 @@ class NextExperiment(ReprMixin):
     said: str
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what JSON holds, in the unit in which people see the outputs."""
+        """Return the JSON entry, in the display unit of the outputs."""
         robot, unit = self.recording.robot, self.recording.robot.outputs.display_unit
         shown = in_display_unit(robot, np.array([self.before, self.after]))
         parts = []
@@ -257,7 +257,7 @@ class NextExperiment(ReprMixin):
 def next_experiment(
     known: Known, *, duration: float, seed: int = 0, bounds: Bounds | None = None, progress: Progress = silent
 ) -> NextExperiment:
-    """Choose motions one after the other, each for what it makes known beside those before.
+    """Choose motions one after the other, each for the doubt that it removes beside those before.
 
     Motions that would lead an output beyond the robot's range are left out.
 
@@ -348,7 +348,7 @@ class _Candidate:
 
 
 def _coverage(features: Sequence[Matrix]) -> Matrix:
-    """Return (samples, motions): what part of each sample's doubt a record of each motion would remove."""
+    """Return (samples, motions): the share of each sample's doubt that a record of each motion would remove."""
     from scipy.spatial import KDTree
 
     every = np.vstack(features)

@@ -1,4 +1,4 @@
-"""What a kind is judged by before it is chosen: trainings with something left out, each judged on what was.
+"""Cross-validation of kinds: trainings with a part left out, each scored on that part.
 
 Of the record that kinds begin with, the largest and the fastest motions are blanked, and what follows the rows they are
 trained on is held out: a block in time says how a kind interpolates, blocks by *region of the inputs* how it goes on
@@ -48,7 +48,7 @@ def free_runs(model: Model, motions: Sequence[Recording]) -> list[Matrix]:
 
 
 def agreement(runs: Mapping[str, Sequence[Matrix]], worth: Mapping[str, float]) -> dict[str, float]:
-    """Return for each model how well it fits the weighted median, on the motion on which it fits least [%].
+    """Return the lowest fit of each model to the weighted median over all motions [%].
 
     Args:
         runs: name -> `free_runs`.
@@ -123,7 +123,7 @@ class Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fold:
-    """One training, and what it is judged on."""
+    """One training, and the rows that score it."""
 
     train: Recording
     judged: tuple[Judged, ...]
@@ -153,7 +153,7 @@ def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> l
 
 
 def _first_rows(recording: Recording) -> tuple[Recording, Recording | None]:
-    """Return the beginnings of all runs, `SCREENED_ROWS` in all, and what follows; None where that is too little."""
+    """Return the first `SCREENED_ROWS` rows over all runs, and the rest; None if the rest is too short."""
     share = SCREENED_ROWS / len(recording)
     if share >= 1.0:
         return recording, None
@@ -181,7 +181,7 @@ def all_rows(name: str, recording: Recording) -> Judged:
 
 
 def _scored_rows(recording: Recording) -> np.ndarray:
-    """Return (time,) without what aligns each run."""
+    """Return (time,) whether a row is after the warm-up of its run."""
     return np.concatenate([np.arange(len(run)) >= WARM_UP for run in recording.runs()])
 
 

@@ -1,4 +1,4 @@
-"""The least gamma that a data set allows (Eq. 16-20; Milanese and Novara 2004), by branch and bound over pairs."""
+"""The smallest gamma that a data set allows (Eq. 16-20; Milanese and Novara 2004), by branch and bound."""
 
 import math
 
@@ -48,7 +48,7 @@ def gamma_leaves(
     gammas: np.ndarray,
     pairs: np.ndarray,
 ) -> None:
-    """Raise the gammas to what the pairs between two nodes of the last level need."""
+    """Raise the gammas to the need of all pairs between two leaves."""
     rows = values.shape[0]
     n = points.shape[0]
     # The second half of `nodes` is the last level; its leaves share the columns evenly (see `borders` in `_regressor`).
@@ -91,7 +91,7 @@ def gamma_leaves(
 def gamma_search(
     points: np.ndarray, values: np.ndarray, nodes: np.ndarray, slacks: np.ndarray, gammas: np.ndarray, pairs: np.ndarray
 ) -> None:
-    """Find the least gammas with `|y_j - y_k| <= slack + gamma |w_j - w_k|` for all pairs.
+    """Find the smallest gammas with `|y_j - y_k| <= slack + gamma |w_j - w_k|` for all pairs.
 
     Args:
         points: (n, N) in tree order.

@@ -25,7 +25,7 @@ NLSM_ROUNDING = 1e-12
 
 
 class NlsmArrays(NarxArrays):
-    """The set, then its base, which is empty where the set stands alone."""
+    """The set, then its linear base, which is empty without one."""
 
     table = array("n, 3", "regressors: source, channel and lag of each (see `narx_regressor`)")
     scale = array("n", "what each regressor is multiplied by")
@@ -75,14 +75,14 @@ def nlsm_query(p: NlsmArrays, axis: int, epsilon: float, w: np.ndarray) -> tuple
 def nlsm_query_slopes(
     p: NlsmArrays, axis: int, epsilon: float, w: np.ndarray, low: float, high: float, slopes: np.ndarray
 ) -> None:
-    """Fill `slopes` (2, n) with what w moves the bounds `low` and `high` of `nlsm_query` by."""
+    """Fill `slopes` (2, n) with the derivatives of the bounds `low` and `high` of `nlsm_query`."""
     near = np.empty(2)
     nlsm_near(low, high, epsilon, near)
     slant_slopes(p.points[axis], p.values[axis], p.nodes[axis], p.frame[axis], p.bounds[axis, 0], w, near, slopes)
 
 
 def nlsm_near(low: float, high: float, epsilon: float, near: np.ndarray) -> None:
-    """Fill `near` with bounds that lie beyond those of the cones alone: by more than what rounding does to angles."""
+    """Fill `near` with bounds that are looser than those of the cones by more than rounding."""
     near[0] = low + epsilon - NLSM_ROUNDING * (1.0 + abs(low) + epsilon)
     near[1] = high - epsilon + NLSM_ROUNDING * (1.0 + abs(high) + epsilon)
 

@@ -37,7 +37,7 @@ def tree_cones(points: np.ndarray, first: int, count: int, gamma: float, x: np.n
 def slant_children(
     nodes: np.ndarray, node: int, at: np.ndarray, plane: np.ndarray
 ) -> tuple[float, float, float, float]:
-    """Return below and above what no cone of a node's children is: least y + gamma d and largest y - gamma d of each.
+    """Return bounds on y + gamma d from below and on y - gamma d from above, for both children of a node.
 
     Args:
         nodes: rows (along low, along high, rmin, rmax, low of all other sides, high of them).
@@ -116,7 +116,7 @@ def slant_slopes(
     points: np.ndarray, values: np.ndarray, nodes: np.ndarray, frame: np.ndarray, gamma: float, x: np.ndarray,
     near: np.ndarray, slopes: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill `slopes` (2, n) with what x moves `slant_bounds` by: the slopes of the two cones that are the bounds at x.
+    """Fill `slopes` (2, n) with the derivatives of `slant_bounds`: the slopes of the two active cones.
 
     The bounds are piecewise smooth: where two cones meet, the first in the tree's order counts, and a cone's tip is
     moved by nothing.
@@ -152,7 +152,7 @@ def slant_search(
     points: np.ndarray, values: np.ndarray, nodes: np.ndarray, frame: np.ndarray, gamma: float, x: np.ndarray,
     best: np.ndarray,
 ) -> None:  # fmt: skip
-    """Tighten `best` (low, high) by the cones of all points; behind them the leaf that each was found in."""
+    """Tighten `best` (low, high) by the cones of all points; the next two entries are their leaves."""
     at = np.dot(frame, x)
     # The slope m and the size of points and values stand in the row that is no node.
     m = nodes[0, 0]
@@ -174,7 +174,7 @@ def slant_descend(
     points: np.ndarray, values: np.ndarray, nodes: np.ndarray, at: np.ndarray, plane: np.ndarray, gamma: float,
     x: np.ndarray, best: np.ndarray,
 ) -> None:  # fmt: skip
-    """Do what `slant_search` does, with `at` and `plane` of `slant_children`; in C by hand."""
+    """Search the tree for `slant_search`, with `at` and `plane` of `slant_children`; written by hand in C."""
     rows = values.shape[0]
     leaves = nodes.shape[0] // 2
     best[2] = leaves

@@ -76,12 +76,12 @@ def tree_nodes(points: Matrix, values: Vector) -> Matrix:
 
 
 def borders(rows: int, level: int) -> np.ndarray:
-    """Return the first column of each node of a level, and `rows` behind them."""
+    """Return the first column of each node of a level, then `rows`."""
     return (np.arange((1 << level) + 1) * rows) >> level
 
 
 def low_high(row: Vector, borders: np.ndarray) -> Matrix:
-    """Return the least and the largest number (2, nodes) of each segment."""
+    """Return the minimum and maximum (2, nodes) of each segment."""
     return np.array([np.minimum.reduceat(row, borders[:-1]), np.maximum.reduceat(row, borders[:-1])])
 
 
@@ -251,7 +251,7 @@ _TREE_SEARCH = "softneck.identification.set_membership._gamma_runtime"
 
 
 def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector, np.ndarray]:
-    """Return for each slack the least gamma (m,) with `|y_j - y_k| <= slack + gamma |w_j - w_k|`, and its pair (m, 2).
+    """Return the smallest gamma (m,) of a slack with `|y_j - y_k| <= slack + gamma |w_j - w_k|`, and its pair (m, 2).
 
     Compiled by branch and bound; without numba over all pairs by numpy, some hundred times slower.
     A gamma beyond 1e200 says that equal regressors have outputs further apart than the slack.
@@ -270,7 +270,7 @@ def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector
 
 
 def all_pairs_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector, np.ndarray]:
-    """Return what `least_gammas` does, by numpy."""
+    """Return `least_gammas` by numpy."""
     n, worst = values.shape[0], np.zeros((slacks.size, 2), dtype=np.int64)
     gammas = np.zeros(slacks.shape[0])
     for i in range(n - 1):
@@ -324,7 +324,7 @@ def require_feasible(
 
 
 def _rows_of(recording: Recording, table: Matrix, axis: int, count: int) -> np.ndarray | None:
-    """Return the recording's row (count,) of each sample of the set, or None where that cannot be told."""
+    """Return the recording's row (count,) of each sample of the set, or None if unknown."""
     lags = table[:, 2].astype(int)
     # Form `residual` (source 3) waits for its base to settle.
     skip = (2 if (table[:, 0] == 3).any() else 1) * int(lags.max())
@@ -476,7 +476,7 @@ def set_in_si(arrays: Mapping[str, Matrix], scaling: Scaling) -> dict[str, Matri
 
 
 def gammas(data: Data, scale: Vector, epsilons: Sequence[Vector]) -> list[Vector]:
-    """Return the least gamma (outputs,) for each epsilon (outputs,), by the paper's rule."""
+    """Return the smallest gamma (outputs,) for each epsilon (outputs,), by the paper's rule."""
     columns = [
         least_gammas(apply_scale(X, scale), y, np.array([epsilon[axis] for epsilon in epsilons]))[0]
         for axis, (X, y) in enumerate(data)
@@ -485,7 +485,7 @@ def gammas(data: Data, scale: Vector, epsilons: Sequence[Vector]) -> list[Vector
 
 
 def double_epsilon_until_feasible(data: Data, scale: Vector, epsilon: Vector) -> tuple[Vector, Vector]:
-    """Return epsilon (outputs,), doubled until a function fits the data where none did, and its least gamma.
+    """Return epsilon (outputs,), doubled until a function fits the data, and its smallest gamma.
 
     Rows of several payloads have equal regressors and unequal outputs: what parts them counts as noise.
     """
@@ -497,7 +497,7 @@ def double_epsilon_until_feasible(data: Data, scale: Vector, epsilon: Vector) ->
 
 
 def widening(chosen: Vector, taken: Vector, training: ScaledData) -> dict[str, str]:
-    """Return the finding that says where epsilon (outputs,) was widened; empty where it was not."""
+    """Return the finding on an increased epsilon (outputs,); empty if it is unchanged."""
     if np.array_equal(chosen, taken):
         return {}
     wide, narrow = (

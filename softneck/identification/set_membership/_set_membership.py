@@ -60,7 +60,7 @@ def grouped_scale(table: Matrix, output_weight: float, motor_weight: float = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleTrial:
-    """One scale and epsilon (outputs,), and what the free run over the hold-out says of them.
+    """One scale and epsilon (outputs,), with their simulation scores on the hold-out.
 
     Attributes:
         output_weight, motor_weight: of the scale, or None.
@@ -306,7 +306,7 @@ class SetMembership:
     def _choose(
         self, ground: Ground, training: ScaledData, noise: Vector, asked: Vector | None, progress: Progress
     ) -> tuple[ScaleTrial, list[ScaleTrial]]:
-        """Return the chosen scale and epsilon (`asked` where it is set), and all candidates."""
+        """Return the chosen scale and epsilon (`asked` if given), and all candidates."""
         sigmas = _RESIDUAL_SIGMAS if self.form == "residual" else _EPSILON_SIGMAS
         epsilons = [factor * noise for factor in sigmas] if asked is None else [asked]
         if asked is not None and self.output_weight is not None:

@@ -59,11 +59,11 @@ class Parameter:
         return self.unit in ("1/s", "1/(rad s)", "1/(rad^2 s)", "1/(s kg)")
 
     def encode(self, value: float) -> float:
-        """Return what the search moves."""
+        """Return the search variable of a value."""
         return float(np.log(value)) if self.positive else value
 
     def decode(self, value: float) -> float:
-        """Return the number of what the search moved."""
+        """Return the value of a search variable."""
         return float(np.exp(value)) if self.positive else value
 
 
@@ -219,12 +219,12 @@ class _FitProblem:
         return tuple(dict.fromkeys(round(delay * samples) for delay in _SENSOR_DELAYS))
 
     def decode(self, x: Vector) -> Vector:
-        """Return all numbers of what the search moved, then the tendons."""
+        """Return all parameters for the search variables, then the tendons."""
         found = self._found(x)
         return np.array([*(found.get(number.name, number.guess) for number in PARAMETERS), *self.tendons])
 
     def load(self, x: Vector) -> Vector:
-        """Return least and most payload [kg], and what they change; nothing where there is but one."""
+        """Return the lowest and highest payload [kg] and their parameters; empty for one payload."""
         found = [self._found(x)[number.name] for number in PAYLOAD_PARAMETERS if number in self.numbers]
         return np.array([min(self.payloads), max(self.payloads), *found]) if found else np.zeros(0)
 
@@ -232,7 +232,7 @@ class _FitProblem:
         return {number.name: number.decode(value) for number, value in zip(self.numbers, x, strict=True)}
 
     def simulate(self, x: Vector, delay: int) -> list[tuple[Matrix, Matrix]]:
-        """Return motors and outputs of all runs under what the search moved."""
+        """Return the motors and outputs of all runs for the search variables."""
         settle = round(_SETTLING_S / self.sample_time)
         numbers, load = self.decode(x), self.load(x)
         parts = []
@@ -281,7 +281,7 @@ class _FitProblem:
 
 
 def _tendons(robot: Robot) -> Vector:
-    """Return share, cosines and sines of the tendons as the equations read them; nothing of three 120 deg apart."""
+    """Return share, cosines and sines of the tendons for the equations; empty for three 120 deg apart."""
     axes, angles = len(robot.outputs.names), robot.directions.angles_deg
     if axes == 2 and len(angles) == 3 and np.allclose(np.mod(angles, 360.0), [0.0, 120.0, 240.0]):
         return np.zeros(0)
@@ -361,7 +361,7 @@ def _table(problem: _FitProblem, x: Vector, delay: int, errors: Sequence[Matrix]
 
 
 def _correlation_time(errors: Sequence[Matrix]) -> float:
-    """Return how many samples of the errors say as much as one of white noise: `1 + 2 sum r(k)` to its first zero."""
+    """Return the samples of one independent error: `1 + 2 sum r(k)` to the first zero of r."""
     e = np.nan_to_num(np.concatenate(errors))[:, 0]
     e = e - e.mean()
     power = max(float(e @ e), 1e-300)

@@ -11,7 +11,7 @@ from softneck.identification.structured._neck_equations_runtime import (
 
 
 def initialise(p: GreyBoxArrays, parameters: np.ndarray, x: GreyBoxState, outputs: np.ndarray) -> None:
-    """Rest: motors at zero, the neck settled; what the start is above that is remembered as measured."""
+    """Rest: motors at zero, the neck settled; the start's difference to the equations is kept as a measured error."""
     greybox_rest(p, p.neck, parameters, x, outputs)
 
 

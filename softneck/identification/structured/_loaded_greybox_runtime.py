@@ -1,4 +1,4 @@
-"""Grey box of several payloads: what hangs on the platform changes two numbers of the equations, in proportion to it.
+"""Grey box of several payloads: the payload changes two parameters of the equations in proportion.
 
 Its moment takes from the stiffness, in both directions alike and against the vertical, so that the link's own rest and
 asymmetry pull as they did; its weight takes from the stretch of the tendons at rest. Both are lines through the
@@ -27,7 +27,7 @@ LOAD_PRETENSION = 3
 
 
 class LoadedGreyBoxArrays(GreyBoxArrays):
-    """Behind those of one payload, whose numbers are of none."""
+    """The arrays of one payload, with the parameters at zero payload, and the payload's."""
 
     payload = array("4", "least and most payload of the recordings [kg], stiffness [1/(s kg)], pretension [rad/kg]")
 

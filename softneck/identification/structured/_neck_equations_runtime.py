@@ -1,4 +1,4 @@
-"""The equations of kind `greybox`: a bent link between tendons, whose drives stall, seen by a slow sensor.
+"""The equations of kind `greybox`: a bent link between tendons, stalling drives and a slow sensor.
 
 Lengths of tendon are in radians of motor, tensions in radians of stretch, so that no stiffness appears twice.
 
@@ -57,7 +57,7 @@ _LARGEST_BEND = 1.2
 
 
 class NeckState(StateVector):
-    """What the equations remember."""
+    """The state of the equations."""
 
     b = cells("2", "bend [rad]")
     z = cells("2", "hysteresis [rad]")
@@ -144,7 +144,7 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
 
 
 def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
-    """Push the tilt of now into the dead time's line behind the states, and move the sensor on."""
+    """Push the present tilt into the delay line, and step the sensor."""
     size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
     part = math.sin(size) / size if size > 1e-9 else 1.0  # sin x / x: the straight neck divides by nothing
     line = x.tilts
@@ -203,7 +203,7 @@ def neck_run(
 
 
 class GreyBoxArrays(NarxArrays):
-    """The numbers of the equations, and what stands around them."""
+    """The parameters of the equations and the arrays around them."""
 
     neck = array("numbers", "of the equations, in the order of NECK_*; of another robot its tendons behind them")
     sensor = array("2", "dead time [samples], and sample time in the time of a neck [s]")
@@ -221,7 +221,7 @@ class GreyBoxState(NarxState):
 def greybox_rest(
     p: GreyBoxArrays, neck: np.ndarray, parameters: np.ndarray, x: GreyBoxState, outputs: np.ndarray
 ) -> None:
-    """Rest: motors at zero, the neck settled; what the start is above that is remembered as measured."""
+    """Rest: motors at zero, the neck settled; the start's difference to the equations is kept as a measured error."""
     narx_rest(p, parameters, x, outputs)
     m = np.zeros(p.motors)
     for _ in range(int(p.memory[0])):
@@ -233,7 +233,7 @@ def greybox_rest(
 
 
 def greybox_angle(neck: NeckState, axis: int) -> float:
-    """Return what the sensor of the equations says."""
+    """Return the angle at the equations' sensor."""
     return neck.sensor[axis]
 
 

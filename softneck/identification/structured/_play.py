@@ -49,7 +49,7 @@ class PlayStructure:
 
     @property
     def table(self) -> Matrix:
-        """(n, 3) signals of which each term is the product; -1 stands for 1. The constant comes first."""
+        """(n, 3) signals whose product is each term, with -1 for 1; the constant comes first."""
         chains = 1 + len(self.widths)
         rows = [[-1, -1, -1]] + [[i, -1, -1] for i in range(self.inputs * chains * self.order)]
         # The last filter but one: late enough for the neck's statics, whose curvature this is.
@@ -130,7 +130,7 @@ def _groups(lengths: list[int]) -> list[np.ndarray]:
 
 
 def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
-    """Return W (outputs, n) of the least `|Y - X W'|^2 / rows + weight |w|^2`, w of standardised terms, no constant."""
+    """Return W (outputs, n) that minimises `|Y - X W'|^2 / rows + weight |w|^2`, w of standardised terms."""
     mean, scale = X.mean(axis=0), X.std(axis=0)
     mean[0], scale[0] = 0.0, 1.0
     scale = np.where(scale > 1e-9, scale, 1.0)

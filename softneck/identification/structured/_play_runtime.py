@@ -1,4 +1,4 @@
-"""Play operators and low-pass filters, polynomials of them, and a linear echo of what was measured.
+"""Play operators and low-pass filters, polynomials of them, and a linear noise model of measured errors.
 
 The histories hold the measured output less the feed-forward part f, else the echo itself: y(k+1) = f(k+1) +
 sum_i echo_i (y - f)(k+1-i). f has no feedback at all and is kept within `range`; the echo is a stable filter that
@@ -51,7 +51,7 @@ def play_output(p: PlayArrays, bank: np.ndarray, axis: int) -> float:
 
 
 def initialise(p: PlayArrays, parameters: np.ndarray, x: PlayState, outputs: np.ndarray) -> None:
-    """Rest: motors at zero, the output at its start value; what that is above f is remembered as measured."""
+    """Rest: motors at zero, the output at its start value; its difference to f is kept as a measured error."""
     narx_rest(p, parameters, x, outputs)
     for axis in range(p.outputs):
         echo_rest(p, x, axis, play_output(p, x.bank, axis))

@@ -45,7 +45,7 @@ SCOPES = ("window", "point", "recording")
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisFamily:
-    """What one axis may be.
+    """The uncertainty of one axis.
 
     Attributes:
         samples: (n, 3) static gain [rad/rad], pole [1/s], dead time [s] of every local model.
@@ -136,7 +136,7 @@ class Family(ReprMixin):
         return float(np.max(errors / W))
 
     def band(self, output: str) -> tuple[float, float] | None:
-        """Return the least and largest frequency that the data support [rad/s]; None where they were not asked."""
+        """Return the lowest and highest frequency that the data support [rad/s]; None if untested."""
         self._axis(output)
         found = self.measured.get(output)
         return None if found is None else found.band
@@ -223,7 +223,7 @@ class Family(ReprMixin):
         return ", ".join(parts) or "none"
 
     def _measured_lines(self) -> list[str]:
-        """Return what the recordings themselves say, or that they were not asked."""
+        """Return the lines on the measured responses, or the reason for their absence."""
         told = self.findings.get("tested", {})
         lines = []
         for name in self.axes:

@@ -122,7 +122,7 @@ def _feasible(x: Vector, e: Vector, order: int, closeness: float) -> Vector | No
 
 
 def _positive(coefficients: Vector, order: int) -> bool:
-    """Return whether N and D are positive on a grid far beyond the data's: no root lies on the imaginary axis."""
+    """Return whether N and D are positive on a grid far beyond the data's: they have no imaginary roots."""
     x = np.geomspace(1e-8, 1e8, 2001)
     powers = x[:, None] ** np.arange(order + 1)
     return bool((powers @ coefficients[: order + 1] > 0).all() and (powers @ coefficients[order + 1 :] > 0).all())

@@ -80,7 +80,7 @@ class FrequencyResponse(ReprMixin):
         return diagonal.reshape(self.response.shape)
 
     def radius(self, confidence: float = 0.95) -> Vector:
-        """Return (k, m, q): each entry lies within this circle about `response` with that confidence.
+        """Return (k, m, q): the radius of each entry's circle about `response` at that confidence.
 
         `|error|^2 / variance` has an F distribution of 2 and 2 `freedom` degrees (Pintelon and Schoukens 2012, 2.4).
 
@@ -194,7 +194,7 @@ class FrequencyResponse(ReprMixin):
         return self.outputs.index(output), self.inputs.index(source)
 
     def display_factors(self) -> tuple[float, float, str]:
-        """Return what a response and an input in SI are multiplied by for people, and the unit of the response."""
+        """Return the display factors of a response and of an input in SI, and the unit of the response."""
         outputs, motors = self.robot.outputs.display_unit, self.robot.motors.unit
         per_input = to_si(motors)[0]
         return per_input / to_si(outputs)[0], 1.0 / per_input, f"{outputs}/{motors}"

@@ -1,4 +1,4 @@
-"""Kind `guarded`: several models of one kind, and a base that takes over where they part or know nothing."""
+"""Kind `guarded`: several models of one kind, and a base that takes over where they disagree or extrapolate."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_TH
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Job:
-    """A function of a module and what to call it with; `name` is for people."""
+    """A module's function and its arguments; `name` is for progress."""
 
     name: str
     function: Callable[..., Any]
@@ -52,7 +52,7 @@ class Job:
 
 
 def run_jobs(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Any]:
-    """Return what each job returns; in so many processes, or here for 1.
+    """Run the jobs in `workers` processes, or here for 1; return their results in order.
 
     Raises whatever a job raises; the others are ended then, as they are by Ctrl-C.
     """
@@ -136,7 +136,7 @@ _POOR_ERROR_RATIO = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """A base and what it misses.
+    """A base and its errors.
 
     Attributes:
         model: trained on all rows.
@@ -150,7 +150,7 @@ class Base:
 
     @property
     def remark(self) -> str:
-        """Return a warning about a poor base, or nothing."""
+        """A warning about a poor base; empty for a good one."""
         if self.fit.min() >= 100.0 * (1.0 - _POOR_ERROR_RATIO):
             return ""
         return (
@@ -194,7 +194,7 @@ _MAX_COVERING_POINTS = 200
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Guarded:
-    """Members of one learned kind that fade to a base where they part, or where the motors leave what was seen.
+    """Members of one learned kind that fade to a base where they disagree, or where motors leave the training range.
 
     Each member starts differently, with one start of its own, and leaves out another block of the recordings, on which
     it is chosen. The base is trained on all rows, and its error judged on blocks left out. All run free by themselves;
@@ -297,7 +297,7 @@ class Guarded:
 
 
 def _member(kind: str, seed: int, rest: Recording, part: Recording) -> Model:
-    """Return one member; `part` is what it is chosen on, or left out."""
+    """Return one member; `part` is its hold-out."""
     if kind == "nn":
         # The members are each other's starts: one of its own costs each a third of what a network alone takes.
         # No prior: where nothing was recorded they are to part.
@@ -309,7 +309,7 @@ def _member(kind: str, seed: int, rest: Recording, part: Recording) -> Model:
 
 
 def _least_missing(found: list[Base | str]) -> Base:
-    """Return the base of the least error on rows left out."""
+    """Return the base of the lowest error on rows left out."""
     bases = [base for base in found if isinstance(base, Base) and np.isfinite(base.error).all()]
     if not bases:
         reasons = "; ".join(base if isinstance(base, str) else f"{base.model.kind} diverges" for base in found)

@@ -1,4 +1,4 @@
-"""Several models of one kind, and a base that takes over where they part or the motors leave what was seen.
+"""Several models of one kind, and a base that takes over where they disagree or the motors leave the training range.
 
     y = (1 - w) base + w median(members)
     w -> sigma^2 / (sigma^2 + agreement s^2 + (slope d)^2)
@@ -57,7 +57,7 @@ def guarded_validity(p: GroundArrays, motors: np.ndarray, slow: np.ndarray, spre
 
 
 class GuardedState(StateVector):
-    """What a blend goes by; the base's and the members' states follow, in their order."""
+    """The state of the blend; the base's and the members' states follow, in their order."""
 
     random = cells("6", "generator of the output noise")
     weight = cells("", "w of the members now")
@@ -96,7 +96,7 @@ def initialise(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, output
 
 
 def guarded_distance(seen: np.ndarray, reach: float, motors: np.ndarray) -> float:
-    """Return how far motors (motors,) are beyond the reach of all points that were seen [rad]."""
+    """Return the distance of motors (motors,) from the training range [rad]."""
     least = math.inf
     for i in range(seen.shape[0]):
         total = 0.0
@@ -121,7 +121,7 @@ def guarded_weight(
 
 
 def step(p: GuardedArrays, parameters: np.ndarray, x: GuardedState, inputs: np.ndarray, outputs: np.ndarray) -> None:
-    """Advance by one sample; the base, member 0, says where the motors are."""
+    """Advance by one sample; the base, member 0, gives the motor positions."""
     # Behind `use_measurement` stands `noise_std`: noise comes once, on the blend, from this kind's generator.
     quiet = parameters.copy()
     quiet[p.outputs + 1] = 0.0

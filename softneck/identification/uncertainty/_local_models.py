@@ -111,7 +111,7 @@ def _place(outputs: Matrix, recording: Recording, upright: bool) -> tuple[Vector
 def windows(
     recording: Recording, number: int, directions: Directions, *, length: float, lead: float, source: str, upright: bool
 ) -> list[Window]:
-    """Cut every run into half-overlapping windows of `length` [s], a shorter run of at least half of it into one.
+    """Cut every run into half-overlapping windows of `length` [s]; a run of half that length is one window.
 
     Args:
         recording: to cut.
@@ -158,7 +158,7 @@ def fit_local(
     scope: str,
     near: Continuous | None = None,
 ) -> Local | None:
-    """Fit one model to all windows of a group, each with its own start and offset; None where they say too little.
+    """Fit one model to all windows of a group, each with its own start and offset; None if they are not informative.
 
     Args:
         search: how to fit.

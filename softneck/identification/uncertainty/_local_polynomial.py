@@ -111,7 +111,7 @@ class _Fit:
 
 
 def _at(runs: Sequence[Spectrum], w: float, q: int, answers: int) -> _Fit:
-    """Return the fit around w with the least variance over windows of growing width.
+    """Return the fit around w with the lowest variance over windows of growing width.
 
     A window too wide for its polynomials leaves over more, which the variance shows as well.
     """
@@ -249,7 +249,7 @@ def period_of(inputs: Matrix) -> int | None:
 
 
 def periods(inputs: Matrix, outputs: Matrix, period: int, sample_time: float) -> Periods:
-    """Return a periodic run's transforms; rows are time, what follows the last whole period is left out."""
+    """Return the transforms of a periodic run's whole periods; rows are time."""
     count = inputs.shape[0] // period
     lost = max(1, count // _TRANSIENT_DIVISOR)
     keep = slice(lost * period, count * period)

@@ -33,7 +33,7 @@ _SEGMENTS_PER_RUN = 5
 
 
 def choose_order(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[Continuous | None, Vector]:
-    """Return the model of the order chosen, fitted to all rows, and the rms errors of each order on what is held out.
+    """Return the model of the chosen order, fitted to all rows, and the rms error of each order on held-out rows.
 
     The lowest order whose error is within one standard error of the least is taken (Breiman et al. 1984, 3.4.3), as
     segments of the runs differ: one pole more must be worth it on all of them.
@@ -99,7 +99,7 @@ def least_uncertainty(
     band: tuple[float, float],
     sample_time: float,
 ) -> float:
-    """Return the least norm of the uncertainty, in parts of the weight, that a record needs in a band.
+    """Return the smallest norm of the uncertainty, relative to the weight, that explains a record in a band.
 
     Args:
         runs: input (time,) and output (time,) of each; missing outputs are filled by straight lines.
@@ -128,7 +128,7 @@ def least_uncertainty(
 def _transform_errors(
     u: Vector, y: Vector, model: Continuous, sample_time: float
 ) -> tuple[Vector, ComplexArray, ComplexArray, float]:
-    """Return frequencies [rad/s], transforms of what the nominal leaves over and of its output, power of the noise."""
+    """Return frequencies [rad/s], transforms of the nominal model's error and output, and the noise power."""
     from scipy.signal import detrend
 
     y0 = nominal_output(model, u, sample_time)
@@ -143,7 +143,7 @@ def _transform_errors(
 
 
 def nominal_output(model: Continuous, u: Vector, sample_time: float) -> Vector:
-    """Return what the model answers to `u` (time,), which was held at its first value before."""
+    """Return the model's response to `u` (time,), constant before its start."""
     from scipy.signal import lfilter
 
     a, b, d = model.discretize(sample_time)
@@ -159,7 +159,7 @@ _ARRAY_NAMES = ("a", "b", "delay", "held_out", "points", "frequency", "weight", 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisMeasured:
-    """What the recordings show of one axis; gains in SI of output over its own input.
+    """Measured responses of one axis; gains in SI of output over its own input.
 
     Attributes:
         model: nominal of one, two or three poles behind a dead time, in the middle of the measured responses.
@@ -181,7 +181,7 @@ class AxisMeasured:
 
     @property
     def band(self) -> tuple[float, float]:
-        """Least and largest frequency that the data support [rad/s]."""
+        """Lowest and highest frequency that the data support [rad/s]."""
         return float(self.frequency[0]), float(self.frequency[-1])
 
     def weight_at(self, frequency: Vector) -> Vector:
@@ -189,13 +189,13 @@ class AxisMeasured:
         return np.interp(np.log(frequency), np.log(self.frequency), self.weight)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return what a file keeps."""
+        """Return the arrays of a file."""
         model = {"a": self.model.a, "b": self.model.b, "delay": np.array([self.model.delay])}
         return {name: model[name] if name in model else getattr(self, name) for name in _ARRAY_NAMES}
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], recordings: int) -> AxisMeasured:
-        """Return what `arrays` gave.
+        """Return the object of `arrays`.
 
         Raises:
             FileFormatError: shapes that do not fit, or numbers that are none.
@@ -254,7 +254,7 @@ def axis_runs(
 def axis_points(
     responses: Sequence[FrequencyResponse | None], axis: int, directions: Directions, confidence: float
 ) -> Matrix:
-    """Return the supported points (p, 5) of the responses of one axis, between the ends of what each supports."""
+    """Return the supported points (p, 5) of the responses of one axis."""
     rows = []
     for number, found in enumerate(responses):
         seen = None if found is None else _own_response(found, axis, directions, confidence)
@@ -411,7 +411,7 @@ def raise_weight(measured: AxisMeasured) -> AxisMeasured:
 
 
 def digest(recording: Recording) -> str:
-    """Return the SHA-256 of what a recording shows: times, set-points, outputs."""
+    """Return the SHA-256 of a recording's times, set-points and outputs."""
     parts = (recording.time, recording.set_points, recording.outputs, recording.run)
     return hashlib.sha256(b"".join(np.ascontiguousarray(part, dtype="<f8").tobytes() for part in parts)).hexdigest()
 

@@ -1,4 +1,4 @@
-"""What stands beside every model: persistence and the best linear one.
+"""Baselines of every model: persistence and the best linear model.
 
 Persistence repeats what was measured. At 20 ms it fits 97 %, so nothing below it has predicted anything.
 
@@ -26,7 +26,7 @@ from ._score_tables import Rows, ScoredSegment
 
 
 def persistence(run: Recording, horizon: int) -> Matrix:
-    """Repeat what was measured `horizon` samples before (time, 2), the last sample that was not missed."""
+    """Repeat the measurement `horizon` samples before (time, 2), or the last one before a gap."""
     y = held_outputs(run)
     return np.vstack([np.repeat(y[:1], min(horizon, len(y)), axis=0), y[:-horizon]])
 

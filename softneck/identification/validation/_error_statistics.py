@@ -33,7 +33,7 @@ LEVEL, LAGS = 0.99, 25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualTests:
-    """What the one-step errors say about what the model has missed.
+    """Whiteness of the one-step errors, and their correlation with the inputs.
 
     Attributes:
         lags: (26,) 0 to 25 samples.
@@ -152,7 +152,7 @@ _PROMISED_COVERAGE_PCT = 99.0
 
 
 def useful_parts(rows: Rows, lower: Matrix, upper: Matrix) -> tuple[Matrix, Matrix]:
-    """Return the bounds (time, outputs), NaN where they are wider than the range of what was measured."""
+    """Return the bounds (time, outputs), NaN where they are wider than the measured range."""
     too_wide = ~(upper - lower <= _range(rows))
     return np.where(too_wide, np.nan, lower), np.where(too_wide, np.nan, upper)
 
@@ -160,7 +160,7 @@ def useful_parts(rows: Rows, lower: Matrix, upper: Matrix) -> tuple[Matrix, Matr
 def judged_bounds(
     rows: Rows, coverage: dict[str, float] | None, width: dict[str, float] | None, *, promised: bool
 ) -> tuple[dict[str, float | None] | None, list[str]]:
-    """Return the mean widths without those that nobody can use, and what there is to say, one line each.
+    """Return the mean widths, None for useless ones, and the remarks, one line each.
 
     Args:
         rows: those judged.
@@ -193,7 +193,7 @@ def judged_bounds(
 
 
 def calibrated_bounds(rows: Rows, errors: Matrix) -> dict[str, Any]:
-    """Return half-widths at 90 % around a free run, from whole segments, and what each held on segments left out.
+    """Return 90 % half-widths around a simulation from whole segments, and their coverage of segments left out.
 
     `pointwise` is for any one sample of a further record of this kind, `path` for all of its samples at once.
 
@@ -238,14 +238,14 @@ def calibrated_bounds(rows: Rows, errors: Matrix) -> dict[str, Any]:
 
 
 def _path(parts: Sequence[Vector]) -> float:
-    """Return what the largest error of a further record stays below with 90 %."""
+    """Return the 90 % bound on the largest error of a further record."""
     largest = np.sort([part.max() for part in parts])
     rank = int(np.ceil(BOUND_LEVEL * (len(parts) + 1) - 1e-9))
     return float(largest[rank - 1]) if rank <= len(parts) else float("inf")
 
 
 def _pointwise(parts: Sequence[Vector]) -> float:
-    """Return what one error of a further record stays below with 90 %: each record weighs alike, a further one too."""
+    """Return the 90 % bound on one error of a further record, with equal weights for all records."""
     values = np.concatenate(parts)
     weights = np.concatenate([np.full(part.size, 1.0 / (part.size * (len(parts) + 1))) for part in parts])
     order = np.argsort(values)
@@ -254,7 +254,7 @@ def _pointwise(parts: Sequence[Vector]) -> float:
 
 
 def _left_out(parts: Sequence[Vector], known: Sequence[np.ndarray], half_width: Any, what: str) -> float | None:
-    """Return what share [%] of each record, or of records as a whole, the bound of all the others holds.
+    """Return the share [%] of each record, or of all records, within the bound of the others.
 
     Only where there is one: `known` says which samples lie within their domain; a whole path takes all of them.
     """
@@ -269,7 +269,7 @@ def _left_out(parts: Sequence[Vector], known: Sequence[np.ndarray], half_width: 
 
 
 def _range_of(motors: Sequence[Matrix]) -> tuple[Vector, Vector]:
-    """Return the least and the largest set-point of each motor (motors,) over records (time, motors)."""
+    """Return the lowest and the highest set-point of each motor (motors,) over records (time, motors)."""
     return np.min([own.min(axis=0) for own in motors], axis=0), np.max([own.max(axis=0) for own in motors], axis=0)
 
 
@@ -281,7 +281,7 @@ def _within(own: Matrix, others: Sequence[Matrix]) -> np.ndarray:
 
 
 def _range(rows: Rows) -> Vector:
-    """Return the range of what was measured (outputs,); NaN where nothing was."""
+    """Return the measured range (outputs,); NaN without measurements."""
     return np.array([np.ptp(y[np.isfinite(y)]) if np.isfinite(y).any() else np.nan for y in rows.measured.T])
 
 
@@ -289,7 +289,7 @@ _RELIABILITY_BINS = 10
 
 
 def judged_validity(model: Model, rows: Rows, free: Matrix) -> dict[str, Any] | None:
-    """Return what the validity of a free run was, and how that compares with how often the error stayed within.
+    """Return the validity over a simulation, compared with the share of errors within tolerance.
 
     The Brier score is the mean squared distance between the probability and what happened, 0 at best (Brier 1950);
     `brier_base_rate` is that of who knows how often these rows stay within the tolerance and nothing else.

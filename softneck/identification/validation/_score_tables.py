@@ -150,7 +150,7 @@ def _why(rows: int, left_out: int, longest: int) -> str:
 
 
 def _unseen(seen: np.ndarray) -> list[tuple[int, int]]:
-    """Return the borders of segments between long parts that were seen; a few rows seen do not break one."""
+    """Return the borders of segments between long training parts; a few training rows do not split a segment."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
     long = [(a, b) for a, b in edges.reshape(-1, 2).tolist() if b - a > WARM_UP]
     starts = [0, *(b for _, b in long)]
@@ -213,7 +213,7 @@ def _part(block: Block, state: State, rows: tuple[Matrix, Matrix], span: tuple[i
 def _predict_with_stride(
     block: Block, state: State, rows: tuple[Matrix, Matrix], span: tuple[int, int], steps: tuple[int, int]
 ) -> Matrix:
-    """Return what every `stride`-th row of `span` predicts for `horizon` samples later; NaN for the others."""
+    """Predict `horizon` samples ahead from every `stride`-th row of `span`; NaN for the others."""
     horizon, stride = steps
     measured, free = rows
     predicted = np.full((span[1] - span[0], len(block.outputs)), np.nan)
@@ -294,7 +294,7 @@ def _correlation_time(signal: Vector, segment: np.ndarray, most: int) -> int:
 
 
 def _terms(measured: Matrix, errors: Matrix) -> Matrix:
-    """Return what a fit is made of, per row: 1, y, y^2 and e^2 of each axis (time, 8); 0 where not judged."""
+    """Return the terms of a fit per row: 1, y, y^2 and e^2 of each axis (time, 8); 0 for rows not scored."""
     columns = []
     for y, e in zip(measured.T, errors.T, strict=True):
         there = np.isfinite(y) & np.isfinite(e)
@@ -402,7 +402,7 @@ def run_tables(
     predicted: dict[str, Matrix],
     lost: list[float | None],
 ) -> list[dict[str, Any]]:
-    """Return the same tables for each segment by itself, beside what tells it apart."""
+    """Return the score tables of each segment, with its number, run and start."""
     entries = []
     for number, segment in enumerate(segments):
         rows = rows_of_all.segment == number
@@ -469,7 +469,7 @@ def coverage_tables(
 
 
 def outside_table(model: Model, rows: Rows, free: Matrix) -> dict[str, float] | None:
-    """Return how many measured samples [%] lie outside what a model has seen; None where it does not know.
+    """Return the share of measured samples [%] outside the training range; None if it is unknown.
 
     Set membership says so by its bounds; of any other kind those count whose set-points were not trained on.
     """

@@ -64,7 +64,7 @@ Scores = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Validation(ReprMixin):
-    """What one model is worth on one recording.
+    """The scores of one model on one recording.
 
     Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
     nothing was measured or moved; all but `per_run` are over the rows of all runs together.
@@ -132,13 +132,13 @@ class Validation(ReprMixin):
     robot: Robot = field(default_factory=Robot.preset)
 
     def summary(self) -> str:
-        """Return two lines: what was judged on what, and the fits of the free run."""
+        """Return two lines: model, data and rows, and the simulation fits."""
         fits = self.fits.get("inf", {})
         said = ", ".join(f"{axis} {'-' if fit is None else f'{fit:.1f} %'}" for axis, fit in fits.items())
         return f"{self.model} on {self.data}, {self.rows_scored} rows judged\nfree run: {said or 'not asked for'}"
 
     def plot(self, title: str = "") -> Figure:
-        """Return a matplotlib figure of what was measured, the free run and one step ahead, with bounds and errors."""
+        """Return a matplotlib figure of measurement, simulation and one-step prediction, with bounds and errors."""
         bounds = (self.lower, self.upper) if np.isfinite(self.lower).any() else None
         draw = resolve("softneck.plots:validation_figure")
         return draw(
@@ -272,7 +272,7 @@ def validate(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """What of a recording is judged, and what stands beside any model on it."""
+    """The scored part of a recording, with its baselines."""
 
     segments: list[ScoredSegment]
     left_out: int
@@ -283,7 +283,7 @@ class Parts:
 def judged_parts(
     model: Model, recording: Recording, rules: Rules, known: dict[bytes, Baselines] | None = None
 ) -> Parts:
-    """Return the segments that a model has not seen; `known` keeps baselines for models that saw the same rows."""
+    """Return the segments without training rows; `known` keeps the baselines of equal rows."""
     model.check(recording)  # its sample time, before anything is computed
     if rules.motors == "measured" and not recording.has_motor_positions:
         raise DataError(
