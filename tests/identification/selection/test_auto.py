@@ -212,7 +212,7 @@ def test_the_guarded_form_of_a_learned_winner_is_taken(race: _Race, monkeypatch:
     monkeypatch.setattr(Guarded, "fit", fit)
     best = race.tried["play"]
     # Not its own: to compile each combination of kinds takes half a minute.
-    monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
+    monkeypatch.setattr(_Race, "_validate", lambda *_: best.judged)
     chosen = race.guard_best(best, silent)
     assert (asked[0].of, asked[0].base) == ("play", "oe")
     assert chosen.kind == "guarded"
@@ -234,7 +234,7 @@ def test_over_greybox_the_members_are_those_that_are_there(race: _Race, monkeypa
     monkeypatch.setitem(race.tried, "greybox", KindTrial("greybox", 1.0, line, best.judged))
     monkeypatch.setattr(_auto, "fitted_base", lambda *_: base)
     # Not its own: to compile each combination of kinds takes half a minute.
-    monkeypatch.setattr(_Race, "_judged", lambda *_: best.judged)
+    monkeypatch.setattr(_Race, "_validate", lambda *_: best.judged)
     monkeypatch.setattr(_guarded, "with_validity_region", lambda model, _: model)
     model = race.guard_best(best, silent).model
     assert model is not None
