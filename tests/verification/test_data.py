@@ -180,7 +180,7 @@ def test_what_a_family_cannot_speak_of_is_not_supported_and_not_held() -> None:
     rows = {row["metric"]: row for row in found.contents()["requirements"]}
     for metric in ("axes.gain_margin", "robust.mu", "stability.radius", "step.overshoot_pct"):
         assert rows[metric]["holds"] is False
-        assert "not supported by the data: 1kg.csv moves pitch and shows no response" in rows[metric]["note"]
+        assert "not supported by the data: pitch does not respond in 1kg.csv" in rows[metric]["note"]
     assert not found.holds
 
 

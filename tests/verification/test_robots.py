@@ -92,7 +92,7 @@ def test_a_verified_robot_holds_on_its_own_virtual_plant_and_says_who_it_is(tmp_
     table = {**FEW, "sim": {"necks": 1, "payloads_kg": [0.0]}}
     found = verify(controller, model, make_requirements(table, robot=robot))
     assert found.holds, found.failed
-    assert [run.name for run in found.evidence.necks] == ["paper, 0 kg, 0 deg"]
+    assert [run.name for run in found.evidence.necks] == ["paper, 0 kg"]
     contents = found.contents()
     assert contents["robot"] == {"name": "antagonist", "hash": robot.hash}
     values = {row["metric"]: row["value"] for row in contents["requirements"]}
