@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from .varying._adaptive import VaryingController
 
 # [%] Free run over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
-_LEAST_FIT = 30.0
+_MIN_FIT_PCT = 30.0
 
 
 @overload
@@ -84,7 +84,7 @@ def design_controller(
 
 
 def linear_plant(thing: Any, *, any_fit: bool, robot: Robot | str | Path | None = None) -> Any:
-    """Return what is designed on: a model or family, or that of a file.
+    """Return the model or family to design on, read from a file if it is a path.
 
     Raises:
         SettingsError: neither, or a model that does not fit the rows held out (and not `any_fit`).
@@ -97,10 +97,10 @@ def linear_plant(thing: Any, *, any_fit: bool, robot: Robot | str | Path | None 
         held_out = getattr(plant, "findings", {}).get("hold_out", {})
         diverged = held_out.get("diverged") is not None
         least = min((fit for fit in held_out.get("fit", {}).values() if fit is not None), default=100.0)
-    if (diverged or least < _LEAST_FIT) and not any_fit:
+    if (diverged or least < _MIN_FIT_PCT) and not any_fit:
         what = "diverges" if diverged else f"fits {percent(least)} %"
         raise SettingsError(
-            f"{path and path + ': '}its free run over the rows held out {what}; {_LEAST_FIT:g} % is the least to "
+            f"{path and path + ': '}its free run over the rows held out {what}; {_MIN_FIT_PCT:g} % is the least to "
             "design on. Identify a better model, or go on by --any-fit (`any_fit=True`)."
         )
     return plant

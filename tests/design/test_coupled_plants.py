@@ -14,7 +14,14 @@ from softneck.core import FileFormatError, SettingsError, load, read_archive
 from softneck.design import CustomSettings, LqgSettings, MpcController, MpcSettings, PidSettings, makeweight, mixsyn
 from softneck.design.linear._axis_loop import rise_time
 from softneck.design.linear._linear_parts_runtime import LinearArrays
-from softneck.design.plants._coupled import CoupledPlant, _coupled, closed, coupled_plant, responses, times
+from softneck.design.plants._coupled import (
+    CoupledPlant,
+    _plant_from_system,
+    close_loop,
+    coupled_plant,
+    responses,
+    scale_gains,
+)
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.identification import Rls
 from softneck.plant import NeckParameters, VirtualNeck, record
@@ -48,7 +55,7 @@ def within(inputs: int, outputs: int) -> Robot:
     })  # fmt: skip
 
 
-def taken(G: Any, **more: Any) -> CoupledPlant:
+def list_assumptions(G: Any, **more: Any) -> CoupledPlant:
     found = coupled_plant(G, **more)
     assert found is not None
     return found
@@ -63,7 +70,7 @@ def neck(gains: tuple[float, float] = (1.0, 0.8), across: float = 0.0) -> Any:
 @pytest.mark.parametrize(("inputs", "outputs"), [size for size in SIZES if size != (2, 2)])
 def test_a_plants_rows_answer_as_it_does(inputs: int, outputs: int) -> None:
     G = plant(inputs, outputs)
-    found = taken(G)
+    found = list_assumptions(G)
     w = np.array([0.1, 1.0, 10.0, 100.0])
     each = np.array([G(np.exp(1j * x * TS), squeeze=False) for x in w]) @ found.redefinition[1][:, :outputs]
     # An orthogonal change of at most 17 states.
@@ -79,7 +86,10 @@ def test_plants_that_are_not_coupled_get_what_each_axis_gets() -> None:
     """One filter and one regulator for two axes that do not touch are those of each axis."""
     gains = (1.0, 1.0)  # so that both axes of the searches end at the same filter
     settings = LqgSettings(reference_time=0.2)
-    each, whole = settings.design(exact(neck(gains))), settings._whole(_coupled(neck(gains), NECK, NECK.weights()))
+    each, whole = (
+        settings.design(exact(neck(gains))),
+        settings._design_coupled(_plant_from_system(neck(gains), NECK, NECK.weights())),
+    )
     z = np.exp(1j * np.array([0.3, 3.0, 30.0]) * TS)
     # Riccati equations of twice the order.
     np.testing.assert_allclose(whole.ss()(z), each.ss()(z), rtol=1e-7, atol=1e-9)
@@ -148,7 +158,7 @@ def test_steps_are_as_they_were_asked_for(more: dict[str, Any]) -> None:
     G = plant(3, 2, seed=2)
     controller = LqgSettings(**more).design(G, robot=within(3, 2))
     late = 2 if "order" in more else 0
-    asked = [step_of(controller, taken(G), gain, late) for gain in (1.0, 0.8, 1.2)]
+    asked = [step_of(controller, list_assumptions(G), gain, late) for gain in (1.0, 0.8, 1.2)]
     if "rise_s" in more:
         # The filter is found to a millionth.
         assert max(rise_time(y, TS) for y in asked[0].T) == pytest.approx(1.2, rel=1e-3)
@@ -159,7 +169,7 @@ def test_steps_are_as_they_were_asked_for(more: dict[str, Any]) -> None:
 def step_of(controller: Any, G: CoupledPlant, gain: float, late: int) -> np.ndarray:
     """Return each output (rows, outputs) after a unit step of its reference alone, over the filter of its file."""
     made, count = controller.ss(), len(G.rows)
-    A, B, C = closed((made.A, made.B, made.C, made.D), times(G.rows, gain), late)
+    A, B, C = close_loop((made.A, made.B, made.C, made.D), scale_gains(G.rows, gain), late)
     x, y = np.zeros((len(A), count)), np.zeros((600, count))
     for k in range(600):
         x = A @ x + B
@@ -169,7 +179,7 @@ def step_of(controller: Any, G: CoupledPlant, gain: float, late: int) -> np.ndar
 
 def test_a_controller_of_ones_own_is_taken_with_its_plant() -> None:
     G = plant(3, 2, seed=1)
-    found = taken(G)
+    found = list_assumptions(G)
     # K of u = K e in the plant's inputs is T K in its redefined ones.
     K: Any = mixsyn(G, makeweight(10.0, 1.0, 0.5), 0.5).controller
     K = control.StateSpace(K.A, K.B, found.redefinition[0][:2] @ K.C, found.redefinition[0][:2] @ K.D, TS)
@@ -193,10 +203,10 @@ def mimo() -> Any:
 @pytest.mark.parametrize("settings", [LqgSettings(), MpcSettings(bandwidth=5.0)], ids=["lqg", "mpc"])
 def test_an_identified_model_is_taken_with_what_it_says_between_its_axes(settings: Any, mimo: Any) -> None:
     controller = settings.design(mimo.ss())
-    plants = taken(mimo.ss()).own_rows
+    plants = list_assumptions(mimo.ss()).own_rows
     late = tuple(row.with_min_delay(0.08 if isinstance(settings, LqgSettings) else 0.1) for row in plants)
     made = controller.ss()
-    A, B, C = closed((made.A, made.B, made.C, made.D), late, 0)
+    A, B, C = close_loop((made.A, made.B, made.C, made.D), late, 0)
     assert np.abs(np.linalg.eigvals(A)).max() < 1.0
     at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
     # Integral action; the slowest modes that nothing shows are within 1e-3 of the border.

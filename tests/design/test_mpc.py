@@ -87,7 +87,7 @@ def test_the_runtimes_solver_equals_daqp(kind: str, request: pytest.FixtureReque
 def test_without_limits_and_blocking_it_is_the_lqr(plain: MpcController) -> None:
     settings = MpcNumbers(bandwidth=8.0, moves=30)
     plant = scaled_plant(uncertain_plant(bake_off_neck()))
-    resolved = settings.resolved(plant)
+    resolved = settings.fill_defaults(plant)
     problem, controller = resolved.problem(plant, 8.0), settings.design(bake_off_neck())
     assert resolved.starts == tuple(range(30))
     T, w = problem.T, problem.move_weight

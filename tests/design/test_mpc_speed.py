@@ -54,7 +54,7 @@ def test_an_identified_neck_is_taken_to_be_taut() -> None:
     """Its slowest pole and its gain are at least what is asked and what any sample has; one's own is as it is."""
     model = identified()
     plant = scaled_plant(uncertain_plant(model), identified=True)
-    settings: Any = MpcNumbers().resolved(plant)
+    settings: Any = MpcNumbers().fill_defaults(plant)
     plants = predicted_plants(settings, plant)
     for plant, name in zip(plants, ("pitch", "roll"), strict=True):
         # Rounding of a root.
@@ -63,17 +63,17 @@ def test_an_identified_neck_is_taken_to_be_taut() -> None:
         assert plant.static_gain == pytest.approx(largest, rel=1e-9)
         assert plant.delay * TS >= settings.least_delay - 1e-9
     own = scaled_plant(uncertain_plant(bake_off_neck()))
-    assert MpcNumbers().resolved(own).minimum_tautness is None
-    believed = predicted_plants(MpcNumbers().resolved(own), own)
+    assert MpcNumbers().fill_defaults(own).minimum_tautness is None
+    believed = predicted_plants(MpcNumbers().fill_defaults(own), own)
     assert believed[0].static_gain == pytest.approx(float(np.real(bake_off_neck().pitch.dcgain())))
-    given = MpcNumbers(taut_pole=7.0, minimum_tautness=0.1).resolved(own)
+    given = MpcNumbers(taut_pole=7.0, minimum_tautness=0.1).fill_defaults(own)
     assert (given.taut_pole, given.minimum_tautness) == (7.0, 0.1)  # what is asked stays
 
 
 def test_the_default_tautness_is_a_wish_and_a_given_one_a_limit() -> None:
     plant, slackest = scaled_plant(uncertain_plant(identified()), identified=True), []
     for settings in (MpcNumbers(bandwidth=6.0), MpcNumbers(bandwidth=6.0, minimum_tautness=0.5)):
-        problem = settings.resolved(plant).problem(plant, 6.0)
+        problem = settings.fill_defaults(plant).problem(plant, 6.0)
         slackest.append(problem.tautness_weight / problem.slack_weight)
     assert slackest == [pytest.approx(3e-4), 1.0]
 

@@ -10,7 +10,7 @@ import pytest
 from softneck.core import SettingsError
 from softneck.design import MpcSettings, NmpcSettings
 from softneck.design.predictive._nmpc import NmpcNumbers
-from softneck.design.predictive._plant import _gain, taut_from
+from softneck.design.predictive._plant import _mean_gain, least_taut_cocontraction
 from softneck.design.predictive._settings import MpcNumbers
 from softneck.estimation import KalmanSettings
 from softneck.identification import GreyBox, Model
@@ -37,18 +37,18 @@ def observer(model: Model) -> Any:
 
 
 def test_tendons_are_as_taut_as_small_moves_need(model: Model) -> None:
-    found = taut_from(model, 1.0)
-    gains = {c: _gain(model, 1.0, c) for c in np.arange(0.0, 4.01, 0.25)}
+    found = least_taut_cocontraction(model, 1.0)
+    gains = {c: _mean_gain(model, 1.0, c) for c in np.arange(0.0, 4.01, 0.25)}
     assert gains[found] >= 0.9 * max(gains.values())
     assert all(gains[c] < 0.9 * max(gains.values()) for c in gains if c < found)
     # A payload slackens the tendons of this neck.
-    assert taut_from(model, 0.0) < found
+    assert least_taut_cocontraction(model, 0.0) < found
 
 
 def test_what_the_observer_says_is_taken_where_nobody_says_other(model: Model, observer: Any) -> None:
     found = MpcSettings().over(observer)
     assert (found.look_ahead, observer.lead) == (pytest.approx(0.05), pytest.approx(0.05))
-    assert found.payload_tautness == taut_from(model, 1.0)
+    assert found.payload_tautness == least_taut_cocontraction(model, 1.0)
     mine = MpcNumbers(look_ahead=0.0, payload_tautness=0.7).over(observer)
     assert (mine.look_ahead, mine.payload_tautness) == (0.0, 0.7)
     assert MpcSettings(minimum_tautness=None).over(observer).payload_tautness is None

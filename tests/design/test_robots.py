@@ -223,11 +223,11 @@ def test_what_predictive_control_has_for_tendons_and_angles_only_is_refused(sett
 def test_a_predictive_controller_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     """The same rows are the same problem, however long a sample takes."""
     slow = scaled_plant(uncertain_plant(replace(plant(BELLOWS), sample_time=sample_time)))
-    asked = MpcNumbers().resolved(slow)
+    asked = MpcNumbers().fill_defaults(slow)
     # Three time constants of -1 / log(0.9) = 9.5 samples.
     assert (asked.horizon, asked.moves) == (28, 10)
     assert asked.reference_time == pytest.approx(-sample_time / math.log(POLE))
-    given = MpcNumbers(horizon=20, moves=5).resolved(slow)
+    given = MpcNumbers(horizon=20, moves=5).fill_defaults(slow)
     assert (given.horizon, given.moves) == (20, 5)
 
 

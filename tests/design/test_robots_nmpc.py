@@ -118,12 +118,12 @@ def test_it_looks_as_far_as_its_robot_is_slow(sample_time: float) -> None:
     found = {"pitch": {"static_gain": 0.16, "pole": 0.1 / sample_time, "delay": 3}}
     model: Any = replace(lag(Robot.preset("antagonist")), sample_time=sample_time)
     plant = near_rest(model, found)
-    asked = NmpcNumbers().resolved(plant)
+    asked = NmpcNumbers().fill_defaults(plant)
     # 10 samples to the pole, as of a neck at 20 ms.
     assert (asked.horizon, asked.moves, asked.window) == (20, 10, 8)
     assert asked.reference_time == pytest.approx(10.0 * sample_time)
     assert asked.bandwidth == pytest.approx(8.0 * 0.2 / (10.0 * sample_time))
-    given = NmpcNumbers(horizon=12, bandwidth=3.0).resolved(plant)
+    given = NmpcNumbers(horizon=12, bandwidth=3.0).fill_defaults(plant)
     assert (given.horizon, given.bandwidth) == (12, 3.0)
 
 

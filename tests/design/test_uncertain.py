@@ -11,7 +11,7 @@ import pytest
 
 from softneck.core import DataError, SettingsError
 from softneck.design import makeweight, uncertain_plant
-from softneck.design.robust._weights import drawn_out, to_continuous, to_discrete
+from softneck.design.robust._weights import to_continuous, to_discrete, warp_frequency
 from softneck.estimation import LinearNeck
 from softneck.robot import Robot
 
@@ -117,7 +117,7 @@ def test_the_bilinear_map_is_exact_both_ways() -> None:
     w = np.geomspace(0.1, 150.0, 40)
     at = np.asarray(G(np.exp(1j * w * TS)))
     # Linear solves of order 5; the response falls to 1e-3 of its size.
-    np.testing.assert_allclose(image(1j * drawn_out(w, TS)), at, rtol=1e-9)
+    np.testing.assert_allclose(image(1j * warp_frequency(w, TS)), at, rtol=1e-9)
     back: Any = to_discrete(image, TS)
     np.testing.assert_allclose(back(np.exp(1j * w * TS)), at, rtol=1e-9)
     with pytest.raises(SettingsError, match="pole at z = -1"):

@@ -17,7 +17,7 @@ from .worlds import PACES, PLANTS, UNITS, View, World, orders, without_limits, w
 _VIEWS = [(name, view) for name in PLANTS for view in (*UNITS[name], *PACES, *orders(name))]
 
 
-def timed(seen: World) -> World:
+def set_dead_time(seen: World) -> World:
     """Return the world with a robot that gives its time constant."""
     plant = seen.plant
     seconds = plant.time_constant * plant.robot["sample_time_s"] * seen.view.pace
@@ -42,7 +42,7 @@ def findings(seen: World) -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize(("name", "view"), _VIEWS)
 def test_findings_are_the_same_in_every_view(name: str, view: View) -> None:
-    plain, seen = (damaged(timed(world(name, v))) for v in (View(), view))
+    plain, seen = (damaged(set_dead_time(world(name, v))) for v in (View(), view))
     assert findings(seen) == findings(plain)
     found, expected = assess_quality(seen.recording), assess_quality(plain.recording)
     assert found.directions == expected.directions
@@ -55,7 +55,7 @@ def test_findings_are_the_same_in_every_view(name: str, view: View) -> None:
 
 @pytest.mark.parametrize("name", PLANTS)
 def test_outliers_and_dropouts_are_found(name: str) -> None:
-    topics = {topic for severity, topic in findings(damaged(timed(world(name)))) if severity != "ok"}
+    topics = {topic for severity, topic in findings(damaged(set_dead_time(world(name)))) if severity != "ok"}
     assert {"dropouts", "outliers"} <= topics
 
 
@@ -73,7 +73,7 @@ def test_what_motors_explain_is_the_same_without_limits_too(name: str, view: Vie
 @pytest.mark.parametrize("name", signal_names())
 def test_a_signal_is_the_same_at_the_pace_of_its_robot(name: str) -> None:
     for pace in (0.1, 1000.0):
-        first, other = (_played(name, timed(world("arm", View(pace=p)))) for p in (1.0, pace))
+        first, other = (_played(name, set_dead_time(world("arm", View(pace=p)))) for p in (1.0, pace))
         assert other.time.size == first.time.size
         np.testing.assert_allclose(other.time, pace * first.time, rtol=1e-12)
         # Instants on the border between two levels move by rounding: a row in a thousand may differ.

@@ -13,7 +13,7 @@ import numpy as np
 
 from softneck.core import DataError, SettingsError, Vector, require_one_of
 from softneck.design.plants._uncertain import (
-    Doubts,
+    ModelUncertainty,
     StepAndLoad,
     StepAndLoadResult,
     UncertainPlant,
@@ -72,7 +72,7 @@ def bake_off_neck() -> LinearNeck:
 
 def exact(source: Any, *, robot: Robot | None = None, spread: float = 0.2) -> UncertainPlant:
     """Return a plant as it is: no dead time and no pole of the paper's neck are allowed for besides."""
-    return replace(uncertain_plant(source, robot), doubts=Doubts(0.0, 0.0, spread))
+    return replace(uncertain_plant(source, robot), uncertainty=ModelUncertainty(0.0, 0.0, spread))
 
 
 def neck_within(position: float = 6.0, slew: float = 12.5, *, lowest: float = -6.0) -> Robot:

@@ -91,7 +91,7 @@ def allocate_tendons(
 
 
 def allocate_floor(low: float, least: float, share: float, taut: bool) -> float:
-    """Return how far down a motor may go; one with a negative `share` of co-contraction has no least position."""
+    """Return the lower bound of a motor; a motor with a negative `share` of co-contraction has no least position."""
     return max(low, least) if taut and share >= 0.0 else low
 
 

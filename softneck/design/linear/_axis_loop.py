@@ -76,10 +76,10 @@ def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> M
     sensitivity = float(np.abs(1.0 / (1.0 + response)).max())
     angle = math.radians(float(phase))
     delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
-    return Margins(nearer_gain(float(gain), response[-1]), angle, sensitivity, float(crossover), delay)
+    return Margins(nearest_gain_margin(float(gain), response[-1]), angle, sensitivity, float(crossover), delay)
 
 
-def nearer_gain(gain: float, last: complex) -> float:
+def nearest_gain_margin(gain: float, last: complex) -> float:
     """Return the nearer of a gain margin and of that at the Nyquist frequency, which python-control leaves out.
 
     Args:
@@ -91,14 +91,14 @@ def nearer_gain(gain: float, last: complex) -> float:
 
 
 # Samples are judged on a coarser grid than margins: 4 % apart, a peak of |S| changes by less than 2e-3 between two.
-_COARSE = 4
+_SAMPLE_DECIMATION = 4
 # Besides the reference, the state is disturbed by this part of it everywhere: it keeps the conditioning's poles
 # off the border where a zero of the controller lies on it.
-_SPREAD = 1e-3
+_STATE_NOISE_RATIO = 1e-3
 # Hanus' gain is taken where it forgets within a second or so.
-_FORGETS = 0.98
+_MAX_CONDITIONING_POLE = 0.98
 # Noise ascribed to the output, in units of what the reference does to it at once (squared).
-_NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
+_OUTPUT_NOISE_RATIOS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
 def error_feedback(K: Any) -> AxisController:
@@ -117,7 +117,7 @@ def conditioning_gain(A: Matrix, B: Matrix, C: Matrix, D: float) -> Matrix:
     """
     if abs(D) > 1e-9:
         L = B / D
-        if float(np.abs(np.linalg.eigvals(A - L @ C)).max(initial=0.0)) <= _FORGETS:
+        if float(np.abs(np.linalg.eigvals(A - L @ C)).max(initial=0.0)) <= _MAX_CONDITIONING_POLE:
             return L
     return innovations_gain(A, B, C, np.array([[D]]))
 
@@ -133,9 +133,9 @@ def innovations_gain(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
     n, m = A.shape[0], C.shape[0]
     # In units of what a reference does, so that the spread is relative.
     size = max(float(np.linalg.norm(B)), 1e-12)
-    Q = B @ B.T + (_SPREAD * size) ** 2 * np.eye(n)
+    Q = B @ B.T + (_STATE_NOISE_RATIO * size) ** 2 * np.eye(n)
     v = max(float(np.linalg.norm(D, 2)), 1e-3 * float(np.abs(C @ B).max(initial=0.0)), 1e-9)
-    R, S = v * v * (1.0 + _SPREAD) * np.eye(m), B @ D.T
+    R, S = v * v * (1.0 + _STATE_NOISE_RATIO) * np.eye(m), B @ D.T
     try:
         P = solve_discrete_are(A.T, C.T, Q, R, s=S)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -155,17 +155,20 @@ def conditioning_candidates(axis: AxisController) -> list[Matrix]:
 
     n = axis.A.shape[0]
     size = max(float(np.linalg.norm(axis.Br)), 1e-12)
-    Q = axis.Br @ axis.Br.T + (_SPREAD * size) ** 2 * np.eye(n)
+    Q = axis.Br @ axis.Br.T + (_STATE_NOISE_RATIO * size) ** 2 * np.eye(n)
     v = max(abs(axis.Dr), 1e-3 * float(np.abs(axis.C @ axis.Br).max(initial=0.0)), 1e-9)
     found = []
-    for noise in _NOISES:
+    for noise in _OUTPUT_NOISE_RATIOS:
         R = np.array([[noise * v * v]])
         try:
             P = solve_discrete_are(axis.A.T, axis.C.T, Q, R)
         except (np.linalg.LinAlgError, ValueError):
             continue
         L = np.asarray(axis.A @ P @ axis.C.T / (axis.C @ P @ axis.C.T + R))
-        if np.isfinite(L).all() and float(np.abs(np.linalg.eigvals(axis.A - L @ axis.C)).max(initial=0.0)) < _FORGETS:
+        if (
+            np.isfinite(L).all()
+            and float(np.abs(np.linalg.eigvals(axis.A - L @ axis.C)).max(initial=0.0)) < _MAX_CONDITIONING_POLE
+        ):
             found.append(L)
     return found
 
@@ -216,21 +219,21 @@ def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Ma
     gain, phase, _, _, crossover, _ = (float(value) for value in control.stability_margins(data))
     angle = math.radians(phase)
     delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
-    gain = nearer_gain(gain, loop[-1])
+    gain = nearest_gain_margin(gain, loop[-1])
     return Margins(gain, angle, float(np.max(1.0 / np.abs(1.0 + loop))), crossover, delay)
 
 
 def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> Vector:
     """Return Ms of every plant (plants,); the loops are taken to be stable."""
-    w = coarse(plants[0])
+    w = coarse_frequencies(plants[0])
     K = feedback_response(axis, np.exp(1j * w * plants[0].sample_time))
     loops = np.array([K * plant.response(w, extra_delay=extra_delay) for plant in plants])
     return np.max(1.0 / np.abs(1.0 + loops), axis=1)
 
 
-def coarse(plant: AxisPlant) -> Vector:
+def coarse_frequencies(plant: AxisPlant) -> Vector:
     """Return frequencies [rad/s] for many samples, 4 % apart, the Nyquist frequency among them."""
-    return frequencies(plant.sample_time, lowest=LOWEST / plant.second)[::-_COARSE][::-1]
+    return frequencies(plant.sample_time, lowest=LOWEST / plant.second)[::-_SAMPLE_DECIMATION][::-1]
 
 
 def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:
@@ -238,7 +241,7 @@ def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_de
     return [i for i, plant in enumerate(plants) if closed_radius(axis, plant, extra_delay) >= 1.0]
 
 
-_RUNTIME = "softneck.design.linear._sweep_runtime"
+_SWEEP_RUNTIME = "softneck.design.linear._sweep_runtime"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,7 +269,7 @@ class Sweep:
             led.jump,
         ])  # fmt: skip
         angles = np.zeros((self.delays.size, test.rows))
-        functions: Any = load_functions(_RUNTIME)
+        functions: Any = load_functions(_SWEEP_RUNTIME)
         functions.sweep_run(
             np.ascontiguousarray(axis.A),
             np.ascontiguousarray(np.hstack([axis.Br, axis.By])),
@@ -295,12 +298,12 @@ def make_sweep(plants: Sequence[AxisPlant], *, extra_delay: int = 0, test: StepA
 # A lag of time constant T rises from 10 to 90 % in ln(9) T.
 LAG = math.log(9.0)
 # The lead over the lag: beyond it a step asks the motors for little but their limits.
-_MOST_LEAD = 6.0
+_MAX_LEAD_RATIO = 6.0
 # A step is looked at for so many times what is asked, or the loop's own time.
-_LONG = 12.0
-_HALVINGS = 30
+_RISE_WINDOW_RATIO = 12.0
+_BISECTION_STEPS = 30
 # No limit acts on a linear loop.
-_FAR = 1e9
+_NO_LIMIT = 1e9
 
 
 def check_rise(rise: float, plant: AxisPlant, test: StepAndLoad) -> None:
@@ -330,7 +333,7 @@ def least_rise(plant: AxisPlant, test: StepAndLoad, size: float | None = None) -
     from scipy.signal import lfilter
 
     dt = plant.sample_time
-    rows = math.ceil(_LONG * max(plant.time_constant, test.position_limit / test.slew_limit * dt) / dt)
+    rows = math.ceil(_RISE_WINDOW_RATIO * max(plant.time_constant, test.position_limit / test.slew_limit * dt) / dt)
     u = np.minimum(test.slew_limit * np.arange(1, rows + 1), test.position_limit)
     y = np.asarray(lfilter(np.append(0.0, plant.numerator), plant.denominator, u)) * math.copysign(
         1.0, plant.static_gain
@@ -360,19 +363,21 @@ def filter_for(rise: float, axis: AxisController, plant: AxisPlant, extra_delay:
     Raises:
         SettingsError: the loop is too slow to be led.
     """
-    alone = _rise_with(ReferenceFilter(0.0), rise, axis, plant, extra_delay)
+    alone = _rise_time_with(ReferenceFilter(0.0), rise, axis, plant, extra_delay)
     if rise >= alone:
         guess = math.sqrt(max(rise**2 - alone**2, 0.0)) / LAG
-        return _solved(lambda T: ReferenceFilter(T), 2.0 * guess + plant.sample_time, rise, axis, plant, extra_delay)
+        return _bisect_filter(
+            lambda T: ReferenceFilter(T), 2.0 * guess + plant.sample_time, rise, axis, plant, extra_delay
+        )
     T2 = rise / LAG
-    most = ReferenceFilter(T2, _MOST_LEAD * T2)
-    if not math.isfinite(alone) or _rise_with(most, rise, axis, plant, extra_delay) > rise:
+    most = ReferenceFilter(T2, _MAX_LEAD_RATIO * T2)
+    if not math.isfinite(alone) or _rise_time_with(most, rise, axis, plant, extra_delay) > rise:
         own = "does not rise by itself" if not math.isfinite(alone) else f"rises in {alone:.2g} s by itself"
         raise SettingsError(
             f"`rise_s` = {rise:g}: the loop {own}, and no reference filter leads it so far; ask for more, or let the "
             "feedback be faster (`max_sensitivity`)."
         )
-    return _solved(lambda T: ReferenceFilter(T2, most.lead - T), most.lead, rise, axis, plant, extra_delay)
+    return _bisect_filter(lambda T: ReferenceFilter(T2, most.lead - T), most.lead, rise, axis, plant, extra_delay)
 
 
 def leading_filter(
@@ -385,7 +390,7 @@ def leading_filter(
     """
     if lead == 0.0:
         return ReferenceFilter(time)
-    alone = _rise_with(ReferenceFilter(0.0), time, axis, plant, extra_delay)
+    alone = _rise_time_with(ReferenceFilter(0.0), time, axis, plant, extra_delay)
     if not math.isfinite(alone):
         raise SettingsError(
             "the lead of `reference_time`: the loop does not rise by itself; raise `max_sensitivity`, or leave it out."
@@ -402,28 +407,34 @@ def filter_for_lag(rise: float, lag: float) -> ReferenceFilter:
     return ReferenceFilter(math.sqrt(rise**2 - own**2) / LAG)
 
 
-def _solved(
+def _bisect_filter(
     make: Callable[[float], ReferenceFilter], most: float, rise: float, axis: AxisController, plant: AxisPlant,
     extra_delay: int,
 ) -> ReferenceFilter:  # fmt: skip
     """Return make(T) for the T in 0..most with that rise, by halves: it rises the slower the larger T is."""
     low, high = 0.0, most
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        if _rise_with(make(middle), rise, axis, plant, extra_delay) > rise:
+        if _rise_time_with(make(middle), rise, axis, plant, extra_delay) > rise:
             high = middle
         else:
             low = middle
     return make(0.5 * (low + high))
 
 
-def _rise_with(
+def _rise_time_with(
     reference: ReferenceFilter, asked: float, axis: AxisController, plant: AxisPlant, extra_delay: int
 ) -> float:
     dt = plant.sample_time
-    long = _LONG * max(asked, plant.time_constant, (plant.delay + extra_delay) * dt)
+    long = _RISE_WINDOW_RATIO * max(asked, plant.time_constant, (plant.delay + extra_delay) * dt)
     test = StepAndLoad(
-        reference=1.0, position_limit=_FAR, slew_limit=_FAR, load=0.0, load_at=long, duration=long + dt, sample_time=dt
+        reference=1.0,
+        position_limit=_NO_LIMIT,
+        slew_limit=_NO_LIMIT,
+        load=0.0,
+        load_at=long,
+        duration=long + dt,
+        sample_time=dt,
     )
     sweep = make_sweep([plant], extra_delay=extra_delay, test=test)
     with np.errstate(over="ignore", invalid="ignore"):

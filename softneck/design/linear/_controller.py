@@ -16,7 +16,7 @@ from softneck.identification import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import Block, State, sized_name
 
-from ..plants._uncertain import held_line
+from ..plants._uncertain import sampling_line
 from ._linear_parts_runtime import LinearArrays
 from ._ports import ControllerLimits, controller_inputs, controller_outputs
 
@@ -64,7 +64,7 @@ class AxisController:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceFilter:
-    """`(1 + T1 s)/(1 + T2 s)` before the reference; what is asked now acts now.
+    """The reference filter `(1 + T1 s)/(1 + T2 s)`, without a sample of delay.
 
     Attributes:
         time: T2 [s]; 0 for none.
@@ -80,7 +80,7 @@ class ReferenceFilter:
 
     @property
     def jump(self) -> float:
-        """T1/T2, the part of a step that passes at once beside what the lag passes."""
+        """T1/T2, the part of a step that passes the filter at once."""
         return self.lead / self.time if self.time > 0.0 else 0.0
 
 
@@ -125,10 +125,10 @@ def assemble(
         )
     )
     Dr, Dy = np.diag([axis.Dr for axis in axes]), np.diag([axis.Dy for axis in axes])
-    return assemble_whole((A, Br, By, C, Dr, Dy, L), filters=filters, redefinition=redefinition, constants=constants)
+    return assemble_law((A, Br, By, C, Dr, Dy, L), filters=filters, redefinition=redefinition, constants=constants)
 
 
-def assemble_whole(
+def assemble_law(
     law: tuple[Matrix, ...],
     *,
     filters: Sequence[ReferenceFilter],
@@ -165,7 +165,7 @@ def _alignment(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> Matrix:
     return np.linalg.lstsq(np.vstack([top, bottom]), right, rcond=None)[0][:n]
 
 
-_RUNTIME = "softneck.design.linear._linear_controller_runtime"
+_RUNTIME_MODULE = "softneck.design.linear._linear_controller_runtime"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
@@ -198,7 +198,7 @@ class LinearController(ReprMixin):
         return Block(
             kind=self.kind,
             role="controller",
-            runtime=sized_name(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            runtime=sized_name(_RUNTIME_MODULE, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=self.arrays,
             inputs=controller_inputs(self.robot),
@@ -254,7 +254,7 @@ class LinearController(ReprMixin):
             f"{self.kind} controller, {self.sample_time * 1e3:g} ms, {self.order} order, "
             f"{self.design.get('extra_delay', 0)} samples of delay added to the plant for it",
             *self.limits.lines(self.sample_time),
-            *held_line(self.design),
+            *sampling_line(self.design),
             *assumed_lines(self.design.get("assumed", {})),
         ]
         for axis in self.robot.outputs.names:
@@ -304,12 +304,12 @@ class LinearController(ReprMixin):
 
 
 def robot_in(header: Mapping[str, Any]) -> Robot:
-    """Return whose controller a file's header is of; one that does not say is a neck's."""
+    """Return the robot of a file's header; the neck if it names none."""
     return Robot.from_dict(header["robot"]) if "robot" in header else Robot.preset("neck")
 
 
 def assumed_lines(values: Mapping[str, float]) -> list[str]:
-    """Return a line on what was taken from the paper's neck, none where nothing was."""
+    """Return a line on the values assumed from the paper's neck, if any."""
     words = {"least_delay": "a dead time of at least {:g} s", "small_move_pole": "small moves as fast as {:g} 1/s",
              "taut_pole": "a neck with taut tendons as fast as {:g} 1/s"}  # fmt: skip
     told = [words[name].format(value) for name, value in values.items()]
@@ -331,7 +331,7 @@ def _findings(item: Mapping[str, Any]) -> list[str]:
 
 
 def _margins(values: Mapping[str, float | None]) -> str:
-    """Return margins as text; None stands for infinity, which JSON does not have."""
+    """Return margins as text; None means infinity, which JSON lacks."""
     units = (("gain margin", "gain", 1.0, ""), ("phase margin", "phase", math.degrees(1.0), " deg"),
              ("Ms", "sensitivity", 1.0, ""), ("crossover", "crossover", 1.0, " rad/s"),
              ("delay margin", "delay", 1e3, " ms"))  # fmt: skip

@@ -13,11 +13,11 @@ from softneck.core import DataError, Matrix, SettingsError
 from softneck.robot import Robot
 
 from ..plants._coupled import AnyAxes, coupled_plant
-from ..plants._uncertain import UncertainAxis, UncertainPlant, doubts_of
-from ._axis_loop import coarse, conditioning_gain, error_feedback, feedback_response, innovations_gain
+from ..plants._uncertain import UncertainAxis, UncertainPlant, default_uncertainty
+from ._axis_loop import coarse_frequencies, conditioning_gain, error_feedback, feedback_response, innovations_gain
 from ._controller import AxisController, LinearController
+from ._multivariable import MultivariableDesign, multivariable_controller
 from ._settings import AxisDesign, AxisSettings
-from ._whole import WholeDesign, whole_controller
 
 # A loop slower than a hundredth of its plant's pole hardly acts: gains in deg or kPa make it 57 or 1,000 times slower.
 _SLOWEST_LOOP = 0.01
@@ -50,71 +50,73 @@ class CustomSettings(AxisSettings):
         else:
             _require_system(self.controller, getattr(self.controller, "noutputs", 1))
 
-    def _designed(self, uncertain: UncertainPlant) -> LinearController:
+    def _design_axes(self, uncertain: UncertainPlant) -> LinearController:
         names = uncertain.names
         if isinstance(self.controller, Mapping) and set(self.controller) != set(names):
             given = ", ".join(map(str, self.controller)) or "none"
             raise SettingsError(f"`controller` must be given for {' and '.join(names)}; got {given}.")
-        if self._is_whole():
-            axes = [self._prepared(uncertain.axis(name)).samples for name in names]
+        if self._is_multivariable():
+            axes = [self._prepare_axis(uncertain.axis(name)).samples for name in names]
             count = max(len(samples) for samples in axes)
             plants = [tuple(samples[min(k, len(samples) - 1)] for samples in axes) for k in range(count)]
-            return self._whole(uncertain.robot, plants, uncertain.redefinition)
-        return AxisSettings._designed(self, uncertain)
+            return self._design_multivariable(uncertain.robot, plants, uncertain.redefinition)
+        return AxisSettings._design_axes(self, uncertain)
 
-    def _around(self, plant: Any, robot: Robot | None) -> LinearController:
+    def _design_plant(self, plant: Any, robot: Robot | None) -> LinearController:
         whole: Any = coupled_plant(plant, robot=robot)
-        if whole is None or (whole.robot.directions.names and not self._is_whole()):
-            return AxisSettings._around(self, plant, robot)
+        if whole is None or (whole.robot.directions.names and not self._is_multivariable()):
+            return AxisSettings._design_plant(self, plant, robot)
         if isinstance(self.controller, Mapping):
             raise SettingsError(
                 f"outputs that answer to each other need one `controller` of {' and '.join(whole.names)}."
             )
-        samples = [tuple(row.with_min_delay(doubts_of(whole.robot).least_delay) for row in whole.own_rows)]
-        return self.of_robot(whole)._whole(whole.robot, samples, whole.own_redefinition)
+        samples = [tuple(row.with_min_delay(default_uncertainty(whole.robot).least_delay) for row in whole.own_rows)]
+        return self.of_robot(whole)._design_multivariable(whole.robot, samples, whole.own_redefinition)
 
     def _period(self, robot: Robot | None) -> float:  # noqa: ARG002
         # It says itself how often it runs.
         one = next(iter(self.controller.values())) if isinstance(self.controller, Mapping) else self.controller
         return float(one.dt)
 
-    def _is_whole(self) -> bool:
+    def _is_multivariable(self) -> bool:
         return not isinstance(self.controller, Mapping) and self.controller.noutputs > 1
 
-    def _whole(self, robot: Robot, samples: Sequence[AnyAxes], redefinition: tuple[Matrix, Matrix]) -> LinearController:
+    def _design_multivariable(
+        self, robot: Robot, samples: Sequence[AnyAxes], redefinition: tuple[Matrix, Matrix]
+    ) -> LinearController:
         """Return the controller of all outputs at once."""
         names, K = robot.outputs.names, self.controller
         if K.noutputs != len(names):
             raise SettingsError(f"`controller` has {K.noutputs} outputs; {' and '.join(names)} ask for {len(names)}.")
         _require_sample_time(K, samples[0][0].sample_time)
-        made = WholeDesign(
+        made = MultivariableDesign(
             law=_law(K, names), samples=samples, redefinition=redefinition, gains={}, notes={"imported": True}
         )
-        return whole_controller(self, made, robot, filtered=False)
+        return multivariable_controller(self, made, robot, filtered=False)
 
-    def _of(self, name: str) -> Any:
+    def _controller_of(self, name: str) -> Any:
         return self.controller[name] if isinstance(self.controller, Mapping) else self.controller
 
-    def _shared(self) -> bool:
+    def _is_shared(self) -> bool:
         return not isinstance(self.controller, Mapping)
 
-    def _stored(self) -> dict[str, Any]:
-        stored = AxisSettings._stored(self)
+    def _settings_json(self) -> dict[str, Any]:
+        stored = AxisSettings._settings_json(self)
         return {key: value for key, value in stored.items() if key != "controller"}
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
         import control
 
-        K = self._of(name)
+        K = self._controller_of(name)
         _require_sample_time(K, axis.sample_time)
-        made = error_feedback(control.ss(K)) if K.ninputs == 1 else _of_two(K, name)
-        return AxisDesign(made, {}, {"imported": True, **_weak(made, axis)})
+        made = error_feedback(control.ss(K)) if K.ninputs == 1 else _two_input_axis(K, name)
+        return AxisDesign(made, {}, {"imported": True, **_remark_slow_loop(made, axis)})
 
 
-def _weak(controller: AxisController, axis: UncertainAxis) -> dict[str, str]:
+def _remark_slow_loop(controller: AxisController, axis: UncertainAxis) -> dict[str, str]:
     """Return a remark on a loop far slower than its plant, as gains in another unit than SI make it."""
     plant = axis.nominal
-    w = coarse(plant)
+    w = coarse_frequencies(plant)
     loop = np.abs(feedback_response(controller, np.exp(1j * w * plant.sample_time)) * plant.response(w))
     crossover = float(w[loop >= 1.0].max(initial=0.0))
     if crossover * plant.time_constant > _SLOWEST_LOOP:
@@ -153,7 +155,7 @@ def _require_system(K: Any, outputs: int) -> None:
         raise DataError("`controller` has entries that are not finite.")
 
 
-def _of_two(K: Any, name: str) -> AxisController:
+def _two_input_axis(K: Any, name: str) -> AxisController:
     """Return the axis of a system from reference and angle, found by name where it has names."""
     import control
 

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 # Integration orders that are searched; the ends are 0 and 2, where the realisation would lose its integrator.
 _ORDERS = np.linspace(0.05, 1.95, 96)
 # Relative step of the slopes of phases: the error of a central difference is its square.
-_STEP = 1e-4
+_PHASE_SLOPE_STEP = 1e-4
 # The band of the approximation: three decades to both sides of the crossover, 13 poles and zeros; from a tenth to
 # five times the crossover the error stays below 0.5 %.
-_DECADES = 3.0
-_SECTIONS = 13
+_HALF_BAND_DECADES = 3.0
+_POLE_COUNT = 13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,13 +54,13 @@ class FopiSettings(AxisSettings):
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.crossover is not None:
-            return self._built(axis, self.crossover)
+            return self._design_at(axis, self.crossover)
         lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
-            lambda speed: self._built(axis, speed), axis, low=0.2 / lag, high=5.0 / lag, what="crossover"
+            lambda speed: self._design_at(axis, speed), axis, low=0.2 / lag, high=5.0 / lag, what="crossover"
         )
 
-    def _built(self, axis: UncertainAxis, crossover: float) -> AxisDesign:
+    def _design_at(self, axis: UncertainAxis, crossover: float) -> AxisDesign:
         plant = _DelayedPlant(axis.nominal, self.extra_delay)
         found = fopi(plant, crossover=crossover, phase_margin=self.phase_margin)
         K = found.controller(axis.sample_time)
@@ -112,8 +112,8 @@ class FractionalPi:
 
         require_positive("dt", dt, "s")
         order, crossover = 1.0 - self.integral_order, self.crossover
-        low, span, k = crossover * 10.0**-_DECADES, 100.0**_DECADES, np.arange(_SECTIONS)
-        corners = [low * span ** ((k + 0.5 + side * order) / _SECTIONS) for side in (-0.5, 0.5)]
+        low, span, k = crossover * 10.0**-_HALF_BAND_DECADES, 100.0**_HALF_BAND_DECADES, np.arange(_POLE_COUNT)
+        corners = [low * span ** ((k + 0.5 + side * order) / _POLE_COUNT) for side in (-0.5, 0.5)]
         zeros, poles = ((2.0 - dt * corner) / (2.0 + dt * corner) for corner in corners)
         if abs(order) < 1e-9:
             zeros, poles = np.zeros(0), np.zeros(0)
@@ -142,7 +142,7 @@ def fopi(G: Any, *, crossover: float, phase_margin: float = math.radians(60.0)) 
     """
     require_positive("crossover", crossover, "rad/s")
     require_between("phase_margin", phase_margin, 0.1, 2.5, "rad")
-    w = crossover * np.array([1.0 - _STEP, 1.0, 1.0 + _STEP])
+    w = crossover * np.array([1.0 - _PHASE_SLOPE_STEP, 1.0, 1.0 + _PHASE_SLOPE_STEP])
     g = _response(G, w)
     flat = _FlatPhase(w=w, theta=phase_margin - math.pi - float(np.angle(g[1])), slope=-float(np.angle(g[2] / g[0])))
     order = flat.order()
@@ -184,20 +184,20 @@ class _FlatPhase:
         return 1.0 + self.integral(order) * (1j * self.w) ** -order
 
     def excess(self, order: float) -> float:
-        """Return what its phase gains too much [rad]."""
+        """Return the excess of the phase [rad]."""
         C = self.response(order)
         return float(np.angle(C[2] / C[0])) - self.slope
 
-    def right(self, order: float) -> bool:
+    def is_feasible(self, order: float) -> bool:
         """Return whether Ki is positive, and the phase is theta rather than theta + pi."""
         C = self.response(order)[1]
         return self.integral(order) > 0.0 and float(np.real(C * np.exp(-1j * self.theta))) > 0.0
 
     def order(self) -> float | None:
-        """Return the least order at which the loop's phase is flat."""
+        """Return the smallest order for which the loop's phase is flat at crossover."""
         from scipy.optimize import brentq
 
-        usable = [float(order) for order in _ORDERS if self.right(float(order))]
+        usable = [float(order) for order in _ORDERS if self.is_feasible(float(order))]
         step = float(_ORDERS[1] - _ORDERS[0])
         for low, high in itertools.pairwise(usable):
             if high - low < 1.5 * step and self.excess(low) * self.excess(high) <= 0.0:

@@ -61,7 +61,7 @@ class LinearArrays(FilterArrays):
 
 
 class LinearState(StateVector):
-    """What every linear controller remembers; kinds add what else they do."""
+    """State of every linear controller; kinds add their own."""
 
     xf = cells("m", "state of the reference filter")
     x = cells("n", "state of the controller")
@@ -113,7 +113,7 @@ def linear_control(p: LinearArrays, parameters: np.ndarray, x: LinearState, inpu
 
 
 def linear_limits(p: LinearArrays, parameters: np.ndarray) -> np.ndarray:
-    """Return what `allocate` takes: lead, move in one sample, least position, lowest and highest set-points."""
+    """Return the limits for `allocate`: lead, move in one sample, lower bound, lowest and highest set-points."""
     limits = np.empty(3 + 2 * p.motors)
     limits[0], limits[1], limits[2] = parameters[2], parameters[1] * p.constants[0], parameters[3]
     for j in range(p.motors):
@@ -126,7 +126,7 @@ def linear_limits(p: LinearArrays, parameters: np.ndarray) -> np.ndarray:
 
 
 def linear_asked(p: FilterArrays, constants: np.ndarray, parameters: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-    """Return the references (outputs + 1,) within what may be asked for."""
+    """Return the references (outputs + 1,) within their limits."""
     r = np.empty(p.outputs + 1)
     low, high, least, most = -LINEAR_REFERENCE_LIMIT, LINEAR_REFERENCE_LIMIT, -LINEAR_MOTOR_LIMIT, LINEAR_MOTOR_LIMIT
     # Of another robot the last constants: lowest, then highest of each reference.

@@ -58,7 +58,7 @@ class OwnController(ReprMixin):
         return self.step.__name__ if isinstance(self.step, ModuleType) else str(self.step)
 
     def block(self) -> Block:
-        """Return what is stepped."""
+        """Return the block that is stepped."""
         return Block(
             kind=self._name.rpartition(".")[2], role="controller", runtime=self._name, sample_time=self.sample_time,
             arrays=tuple(self.arrays), inputs=controller_inputs(self.robot), outputs=controller_outputs(self.robot),
@@ -66,7 +66,7 @@ class OwnController(ReprMixin):
         )  # fmt: skip
 
     def summary(self) -> str:
-        """Return a line on what it is."""
+        """Return one line on the controller."""
         return f"{self._name}: a controller of one's own, {1e3 * self.sample_time:g} ms"
 
 
@@ -106,11 +106,11 @@ class ObjectController(ReprMixin):
         )  # fmt: skip
 
     def block(self) -> Block:
-        """Return what is stepped."""
+        """Return the block that is stepped."""
         return self._block
 
     def summary(self) -> str:
-        """Return a line on what it is."""
+        """Return one line on the controller."""
         return f"{self._block.kind}: a controller of one's own, {1e3 * self._block.sample_time:g} ms"
 
 

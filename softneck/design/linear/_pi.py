@@ -14,7 +14,7 @@ from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._axis_loop import LOWEST, coarse, frequencies, loop_margins, sensitivities, unstable_samples
+from ._axis_loop import LOWEST, coarse_frequencies, frequencies, loop_margins, sensitivities, unstable_samples
 from ._controller import AxisController, ReferenceFilter, pi_axis
 from ._settings import PLANT, AxisDesign, AxisSettings, margins_json
 
@@ -61,12 +61,12 @@ class PiSettings(AxisSettings):
         usual = {"reference_time": slowest} if self.reference_time == PLANT else {}
         return {**AxisSettings._defaults(self, plant), **usual}
 
-    def _prepared(self, axis: UncertainAxis) -> UncertainAxis:
-        return axis.prepared()
+    def _prepare_axis(self, axis: UncertainAxis) -> UncertainAxis:
+        return axis.apply_assumptions()
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
-        small, extra = self._small(axis), self.extra_delay
-        gains = tune_pi(self._family(axis), extra, self.max_sensitivity, self.phase_margin)
+        small, extra = self._nominal_plants(axis), self.extra_delay
+        gains = tune_pi(self._tuning_plants(axis), extra, self.max_sensitivity, self.phase_margin)
         controller, lowest = pi_axis(gains.gain, gains.integral_time, axis.sample_time), LOWEST / axis.nominal.second
         margins = [margins_json(loop_margins(open_loop(plant, extra, gains), lowest=lowest)) for plant in small]
         lost = unstable_samples(controller, axis.samples, extra)
@@ -78,42 +78,47 @@ class PiSettings(AxisSettings):
         }
         return AxisDesign(controller, {"K": gains.gain, "Ti_s": gains.integral_time}, notes)
 
-    def _hold(self, controller: AxisController, axis: UncertainAxis) -> None:
+    def _require_stable(self, controller: AxisController, axis: UncertainAxis) -> None:
         if self.tuning == "samples" and unstable_samples(controller, axis.samples, self.extra_delay):
             raise SettingsError("not every sample is stable; lower `max_sensitivity`.")
 
-    def _reference_time(self, controller: AxisController, axis: UncertainAxis) -> float:
-        gains, family = Gains(controller.Dr, axis.sample_time / float(controller.Br[0, 0])), self._family(axis)
+    def _least_filter_time(self, controller: AxisController, axis: UncertainAxis) -> float:
+        gains, family = Gains(controller.Dr, axis.sample_time / float(controller.Br[0, 0])), self._tuning_plants(axis)
         # Samples say themselves how the gain spreads.
-        spread = 0.0 if self.tuning == "samples" and len(family) > 2 else axis.doubts.gain_spread
+        spread = 0.0 if self.tuning == "samples" and len(family) > 2 else axis.uncertainty.gain_spread
         return reference_time(family, self.extra_delay, gains, gain_spread=spread, overshoot=self.OVERSHOOT_PCT / 100.0)
 
-    def _conditioned(self, controller: AxisController, led: ReferenceFilter, axis: UncertainAxis) -> AxisController:  # noqa: ARG002
-        # Hanus' is right for one integral, and what a step is asked for stays what `reference_time` makes of it.
+    def _choose_conditioning(
+        self,
+        controller: AxisController,
+        led: ReferenceFilter,  # noqa: ARG002
+        axis: UncertainAxis,  # noqa: ARG002
+    ) -> AxisController:
+        # Hanus' is right for one integral, and steps keep the filter of `reference_time`.
         return controller
 
-    def _family(self, plant: UncertainAxis) -> Plants:
-        """Return what the gains must hold on."""
-        return plant.samples if self.tuning == "samples" else self._small(plant)
+    def _tuning_plants(self, plant: UncertainAxis) -> Plants:
+        """Return the plants that must keep the bounds."""
+        return plant.samples if self.tuning == "samples" else self._nominal_plants(plant)
 
-    def _small(self, plant: UncertainAxis) -> Plants:
+    def _nominal_plants(self, plant: UncertainAxis) -> Plants:
         """Return the plant as identified, and faster where it is slow; the samples of its own come after those."""
-        pole = plant.doubts.small_move_pole
+        pole = plant.uncertainty.small_move_pole
         faster = plant.nominal.with_faster_pole(pole) if pole > 0.0 else plant.nominal
         return plant.samples[: 1 if faster is plant.nominal else 2]
 
 
 # Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
 _SIZES = np.geomspace(1e-2, 1e2, 190)
-_REFINEMENTS = 6
+_REFINEMENT_STEPS = 6
 # Integral times that are tried, in units of the plant's lag and delay together.
 _TIMES = np.geomspace(0.2, 3.0, 40)
 # A step response is judged over this long [s]; slower than any neck settles.
-_HORIZON = 4.0
+_STEP_WINDOW_S = 4.0
 # Up to so many plants are judged on the fine grid and all at once; more of them 4 % apart, the deciding ones alone.
-_FEW = 3
+_FINE_GRID_PLANTS = 3
 # A reference filter slower than this [s] would be no answer to overshoot.
-_SLOWEST_FILTER = 2.0
+_SLOWEST_FILTER_S = 2.0
 
 Plants = tuple[AxisPlant, ...]
 
@@ -141,18 +146,18 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
         SettingsError: none do.
     """
     plant = plants[0]
-    fine = len(plants) <= _FEW
-    w = frequencies(plant.sample_time, lowest=LOWEST / plant.second) if fine else coarse(plant)
+    fine = len(plants) <= _FINE_GRID_PLANTS
+    w = frequencies(plant.sample_time, lowest=LOWEST / plant.second) if fine else coarse_frequencies(plant)
     z = np.exp(1j * w * plant.sample_time)
     # (plants, frequencies)
     G = np.array([item.response(w, extra_delay=extra_delay) for item in plants]) / plant.static_gain
-    if len(plants) <= _FEW:
-        return _tuned(G, z, plant, extra_delay, (max_sensitivity, phase_margin))
+    if len(plants) <= _FINE_GRID_PLANTS:
+        return _maximise_integral_gain(G, z, plant, extra_delay, (max_sensitivity, phase_margin))
     # A bound kept between frequencies too: the coarse grid misses 0.2 % of a peak.
     bounds = (max_sensitivity / 1.002, phase_margin)
     deciding = [0]
     while True:
-        found = _tuned(G[deciding], z, plant, extra_delay, bounds)
+        found = _maximise_integral_gain(G[deciding], z, plant, extra_delay, bounds)
         loops = found.gain * plant.static_gain * G * (1.0 + plant.sample_time / found.integral_time / (z - 1.0))
         broken = [
             i
@@ -164,14 +169,16 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
         deciding.append(min(broken, key=lambda i: float(np.min(np.abs(1.0 + loops[i])))))
 
 
-def _tuned(G: np.ndarray, z: np.ndarray, plant: AxisPlant, extra_delay: int, bounds: tuple[float, float]) -> Gains:
+def _maximise_integral_gain(
+    G: np.ndarray, z: np.ndarray, plant: AxisPlant, extra_delay: int, bounds: tuple[float, float]
+) -> Gains:
     """Return the best gains for the responses G (plants, frequencies) at z, in units of the plant's static gain."""
     max_sensitivity, phase_margin = bounds
     lag = plant.time_constant + (plant.delay + 1 + extra_delay) * plant.sample_time
     best, best_rate = Gains(0.0, lag), 0.0
     for integral_time in lag * _TIMES:
         shape = G * (1.0 + plant.sample_time / integral_time / (z - 1.0))
-        size = _largest(shape, max_sensitivity, phase_margin)
+        size = _largest_size(shape, max_sensitivity, phase_margin)
         if size / integral_time > best_rate:
             best, best_rate = Gains(size / plant.static_gain, float(integral_time)), size / integral_time
     if best_rate == 0.0:
@@ -183,7 +190,7 @@ def _tuned(G: np.ndarray, z: np.ndarray, plant: AxisPlant, extra_delay: int, bou
 
 
 def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_spread: float, overshoot: float) -> float:
-    """Return the least time constant [s] of a reference filter with which no plant overshoots by more.
+    """Return the smallest time constant [s] of a reference filter that keeps the overshoot of all plants.
 
     Args:
         plants: what the axis may be.
@@ -198,10 +205,10 @@ def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_sprea
     from scipy.signal import lfilter
 
     sample_time, second = plants[0].sample_time, plants[0].second
-    rows = math.ceil(_HORIZON * second / sample_time)
+    rows = math.ceil(_STEP_WINDOW_S * second / sample_time)
     scales = (1.0 - gain_spread, 1.0, 1.0 + gain_spread) if gain_spread > 0.0 else (1.0,)
     steps = [_step_response(plant, extra_delay, gains, rows, scale) for plant in plants for scale in scales]
-    for samples in range(1 + math.ceil(_SLOWEST_FILTER * second / sample_time)):
+    for samples in range(1 + math.ceil(_SLOWEST_FILTER_S * second / sample_time)):
         a = math.exp(-1.0 / samples) if samples else 0.0
         peak = max(float(np.max(lfilter([1.0 - a], [1.0, -a], step))) for step in steps)
         if peak <= 1.0 + overshoot:
@@ -218,7 +225,7 @@ def open_loop(plant: AxisPlant, extra_delay: int, gains: Gains) -> control.Trans
     return pi * plant.tf(extra_delay=extra_delay)
 
 
-def _largest(shape: Matrix, max_sensitivity: float, phase_margin: float) -> float:
+def _largest_size(shape: Matrix, max_sensitivity: float, phase_margin: float) -> float:
     """Return the largest size up to which all loops size * shape (plants, frequencies) keep both bounds, or 0.
 
     A small loop around a stable plant is stable, and one that keeps Ms all the way up has never crossed -1;
@@ -232,7 +239,7 @@ def _largest(shape: Matrix, max_sensitivity: float, phase_margin: float) -> floa
     else:
         return low
     high = float(size)
-    for _ in range(_REFINEMENTS if low > 0.0 else 0):
+    for _ in range(_REFINEMENT_STEPS if low > 0.0 else 0):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if _keeps(middle * shape, max_sensitivity, phase_margin) else (low, middle)
     return low

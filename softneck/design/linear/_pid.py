@@ -12,20 +12,20 @@ import numpy as np
 from softneck.core import SettingsError, Vector, require_between
 
 from ..plants._uncertain import UncertainAxis
-from ._axis_loop import Sweep, coarse, conditioning_gain
+from ._axis_loop import Sweep, coarse_frequencies, conditioning_gain
 from ._controller import AxisController
 from ._settings import AxisDesign, AxisSettings
 
 # While gains are searched the reference is filtered this slowly [s]: only the load is judged.
-_WHILE_SEARCHING = 0.3
-_STARTS = (1.0, 2.0)
+_SEARCH_FILTER_S = 0.3
+_SPEED_FACTORS = (1.0, 2.0)
 # Nelder-Mead ends where neither the gains nor the load's rms move by more than 0.2 %.
-_OPTIONS = {"xatol": 2e-3, "fatol": 1e-3, "maxfev": 220}
+_SEARCH_OPTIONS = {"xatol": 2e-3, "fatol": 1e-3, "maxfev": 220}
 # How much a broken bound weighs against rms [deg]: every bound is met to 1 % and then kept by scaling back.
-_PENALTY = 10.0
-_SCALINGS = 60
+_BOUND_PENALTY = 10.0
+_MAX_SCALING_STEPS = 60
 # So many samples are simulated during the search; its end is judged on all.
-_HARDEST = 12
+_SEARCH_SAMPLES = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class PidGains:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PidSettings(AxisSettings):
-    """PID on the exact-delay plant: the gains with the least load error on the worst sample of all.
+    """PID on the exact-delay plant: the gains that minimise the load error of the worst sample.
 
     They are taken among those whose loops all keep `max_sensitivity` and `noise_gain`.
 
@@ -83,30 +83,30 @@ class PidSettings(AxisSettings):
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         dt = axis.sample_time
-        gains = self._tuned(axis, dt)
+        gains = self._search_gains(axis, dt)
         named = {
             "K": gains.gain, "Ti_s": gains.integral_time, "Td_s": gains.derivative_time, "Tf_s": gains.filter_time,
         }  # fmt: skip
         return AxisDesign(gains.axis(dt), named, {})
 
-    def _tuned(self, axis: UncertainAxis, dt: float) -> PidGains:
+    def _search_gains(self, axis: UncertainAxis, dt: float) -> PidGains:
         """Return the gains that do best on the worst sample, by Nelder and Mead from gains that surely hold."""
         from scipy.optimize import minimize
 
         gain = axis.nominal.static_gain
         lag = axis.nominal.time_constant
         dead = (axis.nominal.delay + 1 + self.extra_delay) * dt
-        judge = _Judge.of(self, axis)
+        judge = _WorstCase.of(self, axis)
         # The search sees scaled gains and seconds: its first simplex would differ by the units else.
         size = judge.sweep.test.gain_unit
         units = np.array([math.copysign(size, gain), *[axis.nominal.second] * 3])
         best: PidGains | None = None
-        for slow in _STARTS:
+        for slow in _SPEED_FACTORS:
             guess = np.array([lag / (2.0 * slow * dead) / abs(gain), lag + 0.5 * dead, 0.3 * dead, 0.3 * dt])
             start = np.log(guess / np.abs(units))
-            few = judge.hardest(_gains(start, units))
-            result = minimize(partial(_cost, few, units), start, method="Nelder-Mead", options=_OPTIONS)
-            found = judge.kept(_gains(result.x, units))
+            few = judge.select_hardest(_gains(start, units))
+            result = minimize(partial(_cost, few, units), start, method="Nelder-Mead", options=_SEARCH_OPTIONS)
+            found = judge.scale_to_bounds(_gains(result.x, units))
             if found is not None and (best is None or judge.load(found) < judge.load(best)):
                 best = found
         if best is None:
@@ -123,8 +123,8 @@ def _gains(x: Vector, units: Vector) -> PidGains:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Judge:
-    """The worst of all samples under gains: what the search minimises, and its bounds."""
+class _WorstCase:
+    """Cost and bounds of gains on the worst sample."""
 
     settings: PidSettings
     sweep: Sweep
@@ -135,17 +135,17 @@ class _Judge:
     second: float
 
     @classmethod
-    def of(cls, settings: PidSettings, axis: UncertainAxis) -> _Judge:
+    def of(cls, settings: PidSettings, axis: UncertainAxis) -> _WorstCase:
         dt = axis.sample_time
-        w = coarse(axis.nominal)
+        w = coarse_frequencies(axis.nominal)
         loops = np.array([plant.response(w, extra_delay=settings.extra_delay) for plant in axis.samples])
         return cls(settings, settings._sweep(axis), np.exp(1j * w * dt), loops, dt, axis.nominal.static_gain,
                    axis.nominal.second)  # fmt: skip
 
-    def hardest(self, gains: PidGains) -> _Judge:
+    def select_hardest(self, gains: PidGains) -> _WorstCase:
         """Return the judge of the samples on which a load is worst under `gains`: the others do not decide."""
         loads = np.nan_to_num(self._loads(gains), nan=np.inf)
-        chosen = np.argsort(loads)[::-1][:_HARDEST]
+        chosen = np.argsort(loads)[::-1][:_SEARCH_SAMPLES]
         few = replace(self.sweep, plants=self.sweep.plants[chosen].copy(), delays=self.sweep.delays[chosen])
         return replace(self, sweep=few)
 
@@ -157,29 +157,29 @@ class _Judge:
     def _loads(self, gains: PidGains) -> Vector:
         axis = gains.axis(self.sample_time)
         with np.errstate(over="ignore", invalid="ignore"):
-            return self.sweep.run(axis, _WHILE_SEARCHING * self.second, axis.conditioning()).load_rms
+            return self.sweep.run(axis, _SEARCH_FILTER_S * self.second, axis.conditioning()).load_rms
 
     def excess(self, gains: PidGains) -> float:
-        """Return how far the bounds are broken, 0 if they are kept."""
+        """Return how far the bounds are broken, 0 if they hold."""
         K = gains.response(self.z, self.sample_time)
         sensitivity = float(1.0 / np.abs(1.0 + K * self.loops).min())
         noise = abs(float(np.real(gains.response(np.array([-1.0 + 0.0j]), self.sample_time)[0])) * self.static_gain)
         bounds = self.settings
         return max(sensitivity / bounds.max_sensitivity - 1.0, 0.0) + max(noise / bounds.noise_gain - 1.0, 0.0)
 
-    def kept(self, gains: PidGains) -> PidGains | None:
-        """Return the gains, scaled back until every bound is kept and every sample is stable; None if none are."""
-        for _ in range(_SCALINGS):
+    def scale_to_bounds(self, gains: PidGains) -> PidGains | None:
+        """Return the gains, scaled back until all bounds hold and all samples are stable; None if none are."""
+        for _ in range(_MAX_SCALING_STEPS):
             if self.excess(gains) == 0.0 and self.load(gains) < 1e3:
                 return gains
             gains = replace(gains, gain=0.995 * gains.gain)
         return None
 
 
-def _cost(judge: _Judge, units: Vector, x: Vector) -> float:
+def _cost(judge: _WorstCase, units: Vector, x: Vector) -> float:
     """Return the cost that the search minimises."""
     gains = _gains(x, units)
     try:
-        return judge.load(gains) + _PENALTY * judge.excess(gains)
+        return judge.load(gains) + _BOUND_PENALTY * judge.excess(gains)
     except SettingsError:
         return 1e6

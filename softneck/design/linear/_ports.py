@@ -1,4 +1,4 @@
-"""The ports that all controllers share, and what set-points may do: limits, and tendons that stay taut."""
+"""Ports of all controllers, and limits of set-points, among them tautness of tendons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from softneck.runtime import Port
 MAX_SLEW = 1000.0
 _NECK = Robot.preset("neck")
 # A reference that nobody limits: beyond any number in SI that a robot's output has, and a number in files still.
-_UNLIMITED = 1e12
+_NO_LIMIT = 1e12
 
 
 def limit_ports(starts: tuple[float, float, float, float, float], robot: Robot = _NECK) -> tuple[Port, ...]:
@@ -60,7 +60,7 @@ def controller_inputs(robot: Robot = _NECK) -> tuple[Port, ...]:
     ranges = motor_ranges(robot, None)
     references = tuple(
         Port(name=f"{name}_reference", unit=unit, description=f"wanted {name}", display_unit=shown,
-             minimum=None if low <= -_UNLIMITED else low, maximum=None if high >= _UNLIMITED else high)
+             minimum=None if low <= -_NO_LIMIT else low, maximum=None if high >= _NO_LIMIT else high)
         for name, low, high in zip(robot.outputs.names, map(float, lowest), map(float, highest), strict=True)
     )  # fmt: skip
     cocontraction = Port(
@@ -104,7 +104,7 @@ def nominal_ends(robot: Robot) -> float | None:
 
 
 def motor_ranges(robot: Robot, position: float | None) -> tuple[Vector, Vector] | None:
-    """Return the lowest and highest set-points (motors,) in SI; None where neither the robot nor `position` says."""
+    """Return the lowest and highest set-points (motors,) in SI; None if neither robot nor `position` gives them."""
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     if (largest := nominal_ends(robot)) is not None:
         most = np.full(len(motors.names), largest)
@@ -117,19 +117,19 @@ def motor_ranges(robot: Robot, position: float | None) -> tuple[Vector, Vector] 
 
 
 def reference_ranges(robot: Robot) -> tuple[Vector, Vector]:
-    """Return the lowest and highest references (outputs,) in SI: what the robot's outputs may be."""
+    """Return the lowest and highest references (outputs,) in SI: the range of the robot's outputs."""
     outputs, factor, size = robot.outputs, to_si(robot.outputs.unit)[0], len(robot.outputs.names)
     if outputs.nominal is not None:
         most = MAX_REFERENCE * Scaling.of(robot).output_unit
         return -most, most
-    low = np.full(size, -_UNLIMITED) if outputs.min is None else factor * np.array(outputs.min)
-    high = np.full(size, _UNLIMITED) if outputs.max is None else factor * np.array(outputs.max)
+    low = np.full(size, -_NO_LIMIT) if outputs.min is None else factor * np.array(outputs.min)
+    high = np.full(size, _NO_LIMIT) if outputs.max is None else factor * np.array(outputs.max)
     return low, high
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerLimits:
-    """What set-points may do; the runtime shares each limit among the motors.
+    """Limits of set-points; the runtime shares each limit among the motors.
 
     Attributes:
         position_limit: of each motor [rad].
@@ -172,7 +172,7 @@ class ControllerLimits:
 
     @classmethod
     def from_header(cls, header: Mapping[str, Any], robot: Robot) -> ControllerLimits:
-        """Return the limits of a file; those of the first version do not know the rules for taut tendons."""
+        """Return the limits of a file; files of the first version lack the limits of tautness."""
         return cls(robot=robot, **{name: float(header[name]) for name in LIMITS if name in header})
 
     def constants(self, sample_time: float) -> Vector:
@@ -208,11 +208,11 @@ class ControllerLimits:
 
 LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "least_cocontraction")
 # Of scaled set-points, where a file with nominal ones allows more: 0.25 in 20 ms.
-_SLEW = 12.5
+_NOMINAL_SLEW = 12.5
 
 
 def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: float | None) -> ControllerLimits:
-    """Return the limits of a robot: what its file says of its motors, and two of a controller's own.
+    """Return the limits of a robot's motors, and the two limits of the controller.
 
     Args:
         robot: whose motors they are.
@@ -236,7 +236,7 @@ def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: fl
         most = min((largest, *(factor * high for high in motors.setpoint_max or ())))
         # Down to the same limit there is no need of a rule.
         least = max((-largest, *(factor * low for low in motors.setpoint_min or () if factor * low > -most)))
-        rates.append(_SLEW * scaling.motor_unit / scaling.second)
+        rates.append(_NOMINAL_SLEW * scaling.motor_unit / scaling.second)
     return ControllerLimits(
         robot=robot, position_limit=most, slew_limit=min(rates), least_position=least,
         lead_limit=2.0 * most if lead_limit is None else factor * lead_limit,

@@ -24,7 +24,14 @@ from softneck.estimation import ORDERS, AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
 from softneck.robot import Robot, Scaling, find_robot
 
-from ..plants._uncertain import USUAL_PERIOD, StepAndLoad, UncertainAxis, UncertainPlant, discrete, uncertain_plant
+from ..plants._uncertain import (
+    DEFAULT_SAMPLE_TIME_S,
+    StepAndLoad,
+    UncertainAxis,
+    UncertainPlant,
+    discretize_zoh,
+    uncertain_plant,
+)
 from ._axis_loop import (
     Margins,
     Sweep,
@@ -111,7 +118,7 @@ class LoopSettings:
 
 
 def reference_numbers(given: Any) -> tuple[float | None, float]:
-    """Return T2 [s] and lead of a `reference_time`, which says both or T2 alone.
+    """Return T2 [s] and lead of a `reference_time`, which gives both or T2 alone.
 
     Raises:
         SettingsError: no such filter.
@@ -129,14 +136,14 @@ def reference_numbers(given: Any) -> tuple[float | None, float]:
 
 
 # A reference filter slower than this [samples] would be no answer to overshoot.
-_SLOWEST = 100
+_MAX_FILTER_SAMPLES = 100
 # Another conditioning than Hanus' must overshoot less by this [%].
-_WORTH_IT = 0.5
+_MIN_IMPROVEMENT_PCT = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AxisDesign:
-    """What a synthesis made of one axis.
+    """The result of a synthesis for one axis.
 
     Attributes:
         controller: of the axis.
@@ -186,33 +193,33 @@ class AxisSettings(LoopSettings, ABC):
             SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
         """
         whose = None if robot is None else find_robot(robot)
-        period, taken = discrete(plant, self._period(whose))
-        made = self._around(taken, whose)
+        period, taken = discretize_zoh(plant, self._period(whose))
+        made = self._design_plant(taken, whose)
         return made if period is None else replace(made, design={**made.design, "held_s": period})
 
     def _period(self, robot: Robot | None) -> float:
         """Sample time [s] at which a continuous plant is held."""
-        return (robot and robot.sample_time_s) or USUAL_PERIOD
+        return (robot and robot.sample_time_s) or DEFAULT_SAMPLE_TIME_S
 
-    def _around(self, plant: Any, robot: Robot | None) -> LinearController:
-        """Return the controller for what `uncertain_plant` takes; `lqg` and `custom` take coupled plants as well."""
+    def _design_plant(self, plant: Any, robot: Robot | None) -> LinearController:
+        """Return the controller for any source of `uncertain_plant`; `lqg` and `custom` also take coupled plants."""
         uncertain = uncertain_plant(plant, robot)
-        return self.of_robot(uncertain)._designed(uncertain)
+        return self.of_robot(uncertain)._design_axes(uncertain)
 
-    def _designed(self, uncertain: UncertainPlant) -> LinearController:
+    def _design_axes(self, uncertain: UncertainPlant) -> LinearController:
         limits, redefinition = self.limits(uncertain.robot), uncertain.redefinition
-        axes = {name: self._prepared(uncertain.axis(name)) for name in uncertain.names}
+        axes = {name: self._prepare_axis(uncertain.axis(name)) for name in uncertain.names}
         axes = {
             name: replace(axis, test=axis_test(axis.nominal, limits, redefinition[1])) for name, axis in axes.items()
         }
         made: dict[str, tuple[AxisController, ReferenceFilter, dict[str, Any]]] = {}
         for name, axis in axes.items():
-            same = next((other for other in made if self._shared() and axis.same_as(axes[other])), None)
+            same = next((other for other in made if self._is_shared() and axis.same_as(axes[other])), None)
             if same is not None:
                 made[name] = made[same]
                 continue
             try:
-                made[name] = self._made(axis, name)
+                made[name] = self._design_axis(axis, name)
             except SettingsError as error:
                 raise SettingsError(f"{name}: {error}") from error
         filters = [made[name][1] for name in axes]
@@ -221,16 +228,16 @@ class AxisSettings(LoopSettings, ABC):
             sample_time=uncertain.sample_time,
             arrays=assemble(
                 [made[name][0] for name in axes],
-                filters=(*filters, slowest(filters)),
+                filters=(*filters, cocontraction_filter(filters)),
                 redefinition=redefinition,
                 constants=limits.constants(uncertain.sample_time),
             ),
             limits=limits,
             order=self.order,
             design={
-                "settings": self._stored(),
+                "settings": self._settings_json(),
                 "extra_delay": self.extra_delay,
-                "assumed": uncertain.assumed(),
+                "assumed": uncertain.assumptions(),
                 **{name: item[2] for name, item in made.items()},
             },
         )
@@ -239,25 +246,25 @@ class AxisSettings(LoopSettings, ABC):
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:
         """Return the controller of one axis, named by its output."""
 
-    def _shared(self) -> bool:
+    def _is_shared(self) -> bool:
         """Return whether equal axes get the same controller."""
         return True
 
-    def _stored(self) -> dict[str, Any]:
+    def _settings_json(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
         return asdict(self)
 
-    def _prepared(self, axis: UncertainAxis) -> UncertainAxis:
+    def _prepare_axis(self, axis: UncertainAxis) -> UncertainAxis:
         """Return the axis as it is designed for."""
-        return axis.spread()
+        return axis.spread_gain()
 
-    def _made(self, axis: UncertainAxis, name: str) -> tuple[AxisController, ReferenceFilter, dict[str, Any]]:
+    def _design_axis(self, axis: UncertainAxis, name: str) -> tuple[AxisController, ReferenceFilter, dict[str, Any]]:
         found = self._synthesise(axis, name)
         controller = found.controller
         margins = axis_margins(controller, axis.nominal, self.extra_delay)
-        self._hold(controller, axis)
-        led = self._reference(controller, axis)
-        controller = self._conditioned(controller, led, axis)
+        self._require_stable(controller, axis)
+        led = self._choose_filter(controller, axis)
+        controller = self._choose_conditioning(controller, led, axis)
         worst = float(sensitivities(controller, axis.samples, self.extra_delay).max())
         findings = {
             "gains": {**found.gains, **filter_numbers(led)},
@@ -270,7 +277,7 @@ class AxisSettings(LoopSettings, ABC):
         }
         return controller, led, findings
 
-    def _hold(self, controller: AxisController, axis: UncertainAxis) -> None:
+    def _require_stable(self, controller: AxisController, axis: UncertainAxis) -> None:
         """Raise unless the loop is stable around every sample, its delay exact."""
         lost = unstable_samples(controller, axis.samples, self.extra_delay)
         if lost:
@@ -279,8 +286,8 @@ class AxisSettings(LoopSettings, ABC):
                 f"{lost[0]}); ask for less speed, or lower `max_sensitivity`."
             )
 
-    def _reference(self, controller: AxisController, axis: UncertainAxis) -> ReferenceFilter:
-        """Return the reference filter: for `rise_s`, of `reference_time`, or the least that keeps the overshoot."""
+    def _choose_filter(self, controller: AxisController, axis: UncertainAxis) -> ReferenceFilter:
+        """Return the reference filter: for `rise_s`, of `reference_time`, or the fastest that keeps the overshoot."""
         if self.rise_s is not None:
             if axis.test is not None:
                 check_rise(self.rise_s, axis.nominal, axis.test)
@@ -288,16 +295,16 @@ class AxisSettings(LoopSettings, ABC):
         time, lead = reference_numbers(self.reference_time)
         if time is not None:
             return leading_filter(time, lead, controller, axis.nominal, self.extra_delay)
-        return ReferenceFilter(self._reference_time(controller, axis))
+        return ReferenceFilter(self._least_filter_time(controller, axis))
 
-    def _reference_time(self, controller: AxisController, axis: UncertainAxis) -> float:
-        """Return the least time [s] with which no sample overshoots by more, by halving in whole samples."""
+    def _least_filter_time(self, controller: AxisController, axis: UncertainAxis) -> float:
+        """Bisect the smallest filter time [s], in whole samples, that keeps the overshoot of all plants."""
         sweep, L = self._sweep(axis), controller.conditioning()
 
         def keeps(samples: int) -> bool:
             return bool(sweep.run(controller, samples * axis.sample_time, L).overshoot.max() <= self.OVERSHOOT_PCT)
 
-        low, high = _first_filter(axis.nominal), _slowest_filter(axis.nominal)
+        low, high = _fastest_filter(axis.nominal), _slowest_filter(axis.nominal)
         if keeps(low):
             return low * axis.sample_time
         if not keeps(high):
@@ -310,8 +317,10 @@ class AxisSettings(LoopSettings, ABC):
             low, high = (low, middle) if keeps(middle) else (middle, high)
         return high * axis.sample_time
 
-    def _conditioned(self, controller: AxisController, led: ReferenceFilter, axis: UncertainAxis) -> AxisController:
-        """Return the controller with the conditioning that overshoots least where limits matter.
+    def _choose_conditioning(
+        self, controller: AxisController, led: ReferenceFilter, axis: UncertainAxis
+    ) -> AxisController:
+        """Return the controller with the conditioning of the smallest overshoot under limits.
 
         Of Hanus' (what a limit took away is taken from the reference) and of predictors that follow the limited output
         faster, on the worst sample in a step of 20 deg and in one with half the slew.
@@ -325,7 +334,7 @@ class AxisSettings(LoopSettings, ABC):
                 peaks = [float(sweep.run(controller, led, L).overshoot.max()) for sweep in (large, slow)]
             return max(peaks) if np.isfinite(peaks).all() else math.inf
 
-        best, least = controller.conditioning(), worst(controller.conditioning()) - _WORTH_IT
+        best, least = controller.conditioning(), worst(controller.conditioning()) - _MIN_IMPROVEMENT_PCT
         for L in conditioning_candidates(controller):
             found = worst(L)
             # What is asked for within the limits must not suffer.
@@ -337,7 +346,7 @@ class AxisSettings(LoopSettings, ABC):
         """Return the samples ready for steps within the limits of the motors."""
         return make_sweep(axis.samples, extra_delay=self.extra_delay, test=axis.test)
 
-    def _keeps_all(self, controller: AxisController, axis: UncertainAxis) -> bool:
+    def _keeps_sensitivity(self, controller: AxisController, axis: UncertainAxis) -> bool:
         """Return whether every sample is stable and keeps `max_sensitivity`."""
         worst = sensitivities(controller, axis.samples, self.extra_delay).max()
         return bool(worst <= self.max_sensitivity) and not unstable_samples(controller, axis.samples, self.extra_delay)
@@ -345,15 +354,15 @@ class AxisSettings(LoopSettings, ABC):
     def _fastest(
         self, build: Callable[[float], AxisDesign], axis: UncertainAxis, *, low: float, high: float, what: str
     ) -> AxisDesign:
-        """Return what `build(speed)` gives at the largest speed [rad/s] whose loops all keep `max_sensitivity`.
+        """Return the result of `build(speed)` for the largest speed [rad/s] at which all loops keep `max_sensitivity`.
 
         Raises:
             SettingsError: not even the lowest does.
         """
         best: AxisDesign | None = None
         tried = low
-        found = _attempt(build, tried)
-        if found is not None and self._keeps_all(found.controller, axis):
+        found = _try_build(build, tried)
+        if found is not None and self._keeps_sensitivity(found.controller, axis):
             best = found
         if best is None:
             raise SettingsError(
@@ -363,8 +372,8 @@ class AxisSettings(LoopSettings, ABC):
         # Two decades to 3 %.
         for _ in range(math.ceil(math.log2(math.log(high / low) / 0.03))):
             tried = math.sqrt(low * high)
-            found = _attempt(build, tried)
-            if found is not None and self._keeps_all(found.controller, axis):
+            found = _try_build(build, tried)
+            if found is not None and self._keeps_sensitivity(found.controller, axis):
                 low, best = tried, found
             else:
                 high = tried
@@ -390,8 +399,8 @@ def axis_test(plant: AxisPlant, limits: ControllerLimits, inverse: Matrix) -> St
     return replace(test, reference=asked, load=-0.5 / 9.0 * test.position_limit, size=test.reference / asked)
 
 
-def slowest(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:
-    """Return what filters the reference of co-contraction: as slow as the slowest, and never led."""
+def cocontraction_filter(filters: Sequence[ReferenceFilter]) -> ReferenceFilter:
+    """Return the filter of the co-contraction reference: the slowest of `filters`, without lead."""
     return ReferenceFilter(max(item.time for item in filters))
 
 
@@ -400,18 +409,18 @@ def filter_numbers(led: ReferenceFilter) -> dict[str, float]:
     return {"reference_time_s": led.time, **({"reference_lead_s": led.lead} if led.lead else {})}
 
 
-def _first_filter(plant: AxisPlant) -> int:
+def _fastest_filter(plant: AxisPlant) -> int:
     """Return half the plant's lag [samples]: a reference that is faster only runs into the motors' limits."""
     return min(round(0.5 * plant.time_constant / plant.sample_time), _slowest_filter(plant) // 2)
 
 
 def _slowest_filter(plant: AxisPlant) -> int:
     """Return the slowest reference filter that is tried [samples]: 2 s of a neck at 20 ms."""
-    return max(_SLOWEST, math.ceil(2.0 * plant.second / plant.sample_time))
+    return max(_MAX_FILTER_SAMPLES, math.ceil(2.0 * plant.second / plant.sample_time))
 
 
-def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign | None:
-    """Return what `build` makes, or None where the synthesis has no solution there."""
+def _try_build(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign | None:
+    """Return the result of `build`, or None if the synthesis has no solution."""
     try:
         return build(speed)
     except SettingsError:
@@ -419,5 +428,5 @@ def _attempt(build: Callable[[float], AxisDesign], speed: float) -> AxisDesign |
 
 
 def margins_json(margins: Margins) -> dict[str, float | None]:
-    """Return margins as JSON values; None stands for infinity."""
+    """Return margins as JSON values; None means infinity."""
     return {name: value if math.isfinite(value) else None for name, value in asdict(margins).items()}

@@ -1,4 +1,4 @@
-"""One axis of a linear controller, limited and conditioned, on every plant of a family at once: what tuning runs."""
+"""One axis of a linear controller with limits and conditioning, simulated on every plant of a family."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ def sweep_run(
     delays: np.ndarray,
     angles: np.ndarray,
 ) -> None:
-    """Fill `angles` (plants, time) with what `run_bake_off` finds.
+    """Fill `angles` (plants, time) with the outputs of `run_bake_off`.
 
     A (n, n); B (n, 2) from filtered reference and angle; C (n,); D (2,); L (n,) conditioning.
     test: reference, filter's pole, position limit, slew limit per sample, load, load's first row, filter's jump.

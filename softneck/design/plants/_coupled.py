@@ -68,7 +68,7 @@ class CoupledAxis:
         return states[:, 0, :] * z[:, None] ** (-(self.delay + extra_delay))
 
     def with_min_delay(self, least: float) -> CoupledAxis:
-        """Return the same plant with a dead time of at least `least` [s], in whole samples."""
+        """Return the same plant with a minimum dead time `least` [s], in whole samples."""
         return replace(self, delay=max(self.delay, round(least / self.sample_time)))
 
     def lag(self) -> AxisPlant:
@@ -87,7 +87,7 @@ AnyAxis = AxisPlant | CoupledAxis
 AnyAxes = tuple[AnyAxis, ...]
 
 
-def times(plants: AnyAxes, factor: float) -> AnyAxes:
+def scale_gains(plants: AnyAxes, factor: float) -> AnyAxes:
     """Return all plants with their gains times `factor`."""
     return tuple(
         replace(plant, B=factor * plant.B)
@@ -97,7 +97,7 @@ def times(plants: AnyAxes, factor: float) -> AnyAxes:
     )
 
 
-def inputs_of(plant: AnyAxis, axis: int, outputs: int) -> Matrix:
+def input_matrix(plant: AnyAxis, axis: int, outputs: int) -> Matrix:
     """Return B (n, outputs) from the redefined inputs of all axes: of a plant of its own one column."""
     if isinstance(plant, CoupledAxis):
         return plant.B
@@ -106,17 +106,19 @@ def inputs_of(plant: AnyAxis, axis: int, outputs: int) -> Matrix:
     return B
 
 
-def realised(plants: AnyAxes, extra_delay: int) -> tuple[Matrix, Matrix, Matrix]:
+def realise(plants: AnyAxes, extra_delay: int) -> tuple[Matrix, Matrix, Matrix]:
     """Return A, B (states, outputs), C of all axes, inputs on their way as states."""
     from scipy.linalg import block_diag
 
-    sides = [_behind(plant, inputs_of(plant, axis, len(plants)), extra_delay) for axis, plant in enumerate(plants)]
+    sides = [
+        _realise_axis(plant, input_matrix(plant, axis, len(plants)), extra_delay) for axis, plant in enumerate(plants)
+    ]
     A, C = (np.asarray(block_diag(*items)) for items in ([side[0] for side in sides], [side[2] for side in sides]))
     return A, np.vstack([side[1] for side in sides]), C
 
 
-def _behind(plant: AnyAxis, B0: Matrix, extra_delay: int) -> tuple[Matrix, Matrix, Matrix]:
-    """Return A, B, C (1, states) of one output behind a chain of samples of the inputs that act on it."""
+def _realise_axis(plant: AnyAxis, B0: Matrix, extra_delay: int) -> tuple[Matrix, Matrix, Matrix]:
+    """Return A, B, C (1, states) of one output with a delay chain of its inputs."""
     n, delay = plant.order, plant.delay + extra_delay
     acting = np.flatnonzero(np.abs(B0).max(axis=0) > 0.0)
     k = acting.size
@@ -143,7 +145,7 @@ def responses(plants: AnyAxes, frequency: Vector, extra_delay: int) -> Matrix:
     return G
 
 
-def closed(
+def close_loop(
     parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: AnyAxes, extra_delay: int
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Return A, B (from all references) and C (to all outputs) of the loop with its dead time in full.
@@ -155,7 +157,7 @@ def closed(
     """
     A, B, C, D = parts
     m = len(plants)
-    Ap, Bp, Cp = realised(plants, extra_delay)
+    Ap, Bp, Cp = realise(plants, extra_delay)
     top = np.hstack([Ap + Bp @ D[:, m:] @ Cp, Bp @ C])
     bottom = np.hstack([B[:, m:] @ Cp, A])
     return (
@@ -167,7 +169,7 @@ def closed(
 
 def radius(parts: tuple[Matrix, Matrix, Matrix, Matrix], plants: AnyAxes, extra_delay: int) -> float:
     """Return the spectral radius of the loop."""
-    return float(np.abs(np.linalg.eigvals(closed(parts, plants, extra_delay)[0])).max())
+    return float(np.abs(np.linalg.eigvals(close_loop(parts, plants, extra_delay)[0])).max())
 
 
 def sensitivity(
@@ -194,7 +196,7 @@ def sensitivity(
 
 
 # Of the largest number of its kind: what rounding leaves of a dead time, of a state that no output shows, of a gain.
-_ROUNDING = 1e-10
+_ZERO_TOLERANCE = 1e-10
 _NECK_INPUTS = ("theta_i", "phi_i")
 
 
@@ -232,7 +234,7 @@ class CoupledPlant:
     @property
     def own_redefinition(self) -> tuple[Matrix, Matrix]:
         """T of the robot's own redefined inputs, and its inverse."""
-        return _turned(self.redefinition, np.linalg.inv(self.turn))
+        return _rotate_redefinition(self.redefinition, np.linalg.inv(self.turn))
 
     @property
     def axes(self) -> Mapping[str, UncertainAxis]:
@@ -242,7 +244,7 @@ class CoupledPlant:
 
 
 def coupled_plant(source: Any, *, robot: Robot | None = None) -> CoupledPlant | None:
-    """Return the coupled plant of a `control` system of any size; None for what is a plant for each axis.
+    """Return the coupled plant of a `control` system of any size; None if each axis is a plant of its own.
 
     Args:
         source: a discrete system from motors, or a neck's redefined inputs, to outputs; else whatever a design takes.
@@ -256,15 +258,15 @@ def coupled_plant(source: Any, *, robot: Robot | None = None) -> CoupledPlant | 
 
     if isinstance(source, control.StateSpace | control.TransferFunction):
         system: Any = control.ss(source)
-        neck = _is_necks(system) if robot is None else robot.input_names == _NECK_INPUTS
-        if neck and (system.ninputs == 1 or not _crosses(system)):
+        neck = _is_neck(system) if robot is None else robot.input_names == _NECK_INPUTS
+        if neck and (system.ninputs == 1 or not _is_coupled(system)):
             return None
-        whose = robot or (Robot.preset() if neck else _robot(system))
-        return _coupled(system, whose, whose.weights(), named=robot is None and not neck)
+        whose = robot or (Robot.preset() if neck else _make_robot(system))
+        return _plant_from_system(system, whose, whose.weights(), takes_directions=robot is None and not neck)
     return None
 
 
-def _is_necks(system: Any) -> bool:
+def _is_neck(system: Any) -> bool:
     """Return whether a system is of a neck: without names scalar or of two inputs and outputs, else by its names."""
     size, inputs, outputs = (system.ninputs, system.noutputs), set(system.input_labels), set(system.output_labels)
     if size == (1, 1):
@@ -276,18 +278,20 @@ def _is_necks(system: Any) -> bool:
     return outputs == set(AXES) and (inputs in known or size == (2, 2))
 
 
-def _crosses(system: Any) -> bool:
+def _is_coupled(system: Any) -> bool:
     """Return whether a neck's system has more than a plant for each axis."""
     labels = list(system.input_labels)
     if not set(labels) <= {*_NECK_INPUTS, *(label for label in labels if label.startswith("u["))}:
         return system.ninputs > len(AXES)
-    A, B, C = _sorted(system, Robot.preset())
+    A, B, C = _order_signals(system, Robot.preset())
     across = [np.array([C[i] @ np.linalg.matrix_power(A, k) @ B for k in range(len(A))]) for i in range(len(AXES))]
     largest = max(float(np.abs(part).max(initial=0.0)) for part in across)
-    return any(float(np.abs(part[:, 1 - i]).max(initial=0.0)) > _ROUNDING * largest for i, part in enumerate(across))
+    return any(
+        float(np.abs(part[:, 1 - i]).max(initial=0.0)) > _ZERO_TOLERANCE * largest for i, part in enumerate(across)
+    )
 
 
-def _sorted(system: Any, robot: Robot) -> tuple[Matrix, Matrix, Matrix]:
+def _order_signals(system: Any, robot: Robot) -> tuple[Matrix, Matrix, Matrix]:
     """Return A, B, C of a system, inputs and outputs found by name where it has the robot's names."""
     A, B, C = (np.asarray(part, dtype=np.float64) for part in (system.A, system.B, system.C))
     inputs, outputs = list(system.input_labels), list(system.output_labels)
@@ -299,37 +303,39 @@ def _sorted(system: Any, robot: Robot) -> tuple[Matrix, Matrix, Matrix]:
     return A, B, C
 
 
-def _robot(system: Any) -> Robot:
+def _make_robot(system: Any) -> Robot:
     """Return a robot of so many motors and outputs, named as the system's signals are."""
 
-    def named(labels: list[str], what: str) -> tuple[str, ...]:
+    def choose_names(labels: list[str], what: str) -> tuple[str, ...]:
         plain = all(label.isidentifier() for label in labels)
         return tuple(labels) if plain else tuple(f"{what}_{i + 1}" for i in range(len(labels)))
 
     return Robot(
         name="plant",
-        motors=Motors(names=named(list(system.input_labels), "motor"), unit="1"),
-        outputs=Outputs(names=named(list(system.output_labels), "output"), unit="1"),
+        motors=Motors(names=choose_names(list(system.input_labels), "motor"), unit="1"),
+        outputs=Outputs(names=choose_names(list(system.output_labels), "output"), unit="1"),
         directions=Directions(kind="identified"),
     )
 
 
-def _turned(redefinition: tuple[Matrix, Matrix], turn: Matrix) -> tuple[Matrix, Matrix]:
-    """Return T and its inverse with `turn` behind the redefined inputs of all axes."""
+def _rotate_redefinition(redefinition: tuple[Matrix, Matrix], turn: Matrix) -> tuple[Matrix, Matrix]:
+    """Return T and its inverse after the rotation `turn` of the redefined inputs."""
     (T, inverse), m = redefinition, len(turn)
     return np.vstack([turn @ T[:m], T[m:]]), np.hstack([inverse[:, :m] @ np.linalg.inv(turn), inverse[:, m:]])
 
 
-def _coupled(system: Any, robot: Robot, weights: Matrix | None, *, named: bool = False) -> CoupledPlant:
-    """Return the plant of a system; `named`: the robot has nothing but the names of its signals."""
+def _plant_from_system(
+    system: Any, robot: Robot, weights: Matrix | None, *, takes_directions: bool = False
+) -> CoupledPlant:
+    """Return the plant of a system; `named`: the robot has only the names of its signals."""
     dt = system.dt
     if dt is None or isinstance(dt, bool) or not dt > 0.0:
         raise SettingsError(
             f"the plant must say its sample time; its dt is {dt}. Give dt in seconds, or 0: a continuous plant is held "
             "for the robot's `sample_time_s`."
         )
-    A, B, C = _sorted(system, robot)
-    _check(A, B, C, np.asarray(system.D, dtype=np.float64))
+    A, B, C = _order_signals(system, robot)
+    _require_valid(A, B, C, np.asarray(system.D, dtype=np.float64))
     outputs, motors = len(robot.outputs.names), len(robot.motors.names)
     if weights is not None and (B.shape[1], len(C)) == (outputs, outputs) != (motors, outputs):
         B = B @ weights
@@ -339,15 +345,15 @@ def _coupled(system: Any, robot: Robot, weights: Matrix | None, *, named: bool =
             f"{motors} motor(s) and {outputs}."
         )
     at_rest = C @ np.linalg.solve(np.eye(len(A)) - A, B)
-    _require_apart(at_rest, robot)
+    _require_independent(at_rest, robot)
     found: Any = at_rest / np.linalg.norm(at_rest, axis=1, keepdims=True) if weights is None else weights
-    if named:
+    if takes_directions:
         robot = replace(robot, directions=Directions(kind="matrix", matrix=tuple(map(tuple, found.tolist()))))
     own = robot.redefinition(found)
     gains = at_rest @ own[1][:, : len(C)]
     turn = gains / np.linalg.norm(gains, axis=1, keepdims=True)
-    T, inverse = _turned(own, turn)
-    rows = tuple(_row(A, B @ inverse[:, : len(C)], c, axis, float(dt)) for axis, c in enumerate(C))
+    T, inverse = _rotate_redefinition(own, turn)
+    rows = tuple(_extract_axis(A, B @ inverse[:, : len(C)], c, axis, float(dt)) for axis, c in enumerate(C))
     radius = max(float(np.abs(np.linalg.eigvals(row.A)).max()) for row in rows)
     slowest = -dt / math.log(radius) if radius > 0.0 else 0.0
     second = (robot.time_constant_s or max(slowest, float(dt))) / TIME_CONSTANT
@@ -355,8 +361,8 @@ def _coupled(system: Any, robot: Robot, weights: Matrix | None, *, named: bool =
     return CoupledPlant(rows, robot, (T, inverse), turn)
 
 
-def _check(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:
-    """Raise SettingsError for what no such controller is for."""
+def _require_valid(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:
+    """Raise SettingsError for a plant that these controllers do not support."""
     if not all(np.isfinite(part).all() for part in (A, B, C, D)):
         raise SettingsError("the plant has entries that are not finite.")
     if D.any():
@@ -369,10 +375,10 @@ def _check(A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> None:
         )
 
 
-def _require_apart(at_rest: Matrix, robot: Robot) -> None:
+def _require_independent(at_rest: Matrix, robot: Robot) -> None:
     outputs, motors = at_rest.shape
     sizes = np.linalg.norm(at_rest, axis=1)
-    dead = np.flatnonzero(sizes <= _ROUNDING * sizes.max(initial=0.0))
+    dead = np.flatnonzero(sizes <= _ZERO_TOLERANCE * sizes.max(initial=0.0))
     if motors < outputs or dead.size or sizes.max(initial=0.0) == 0.0:
         what = f"`{robot.outputs.names[dead[0]]}` answers to none of them at rest" if dead.size else "they are too few"
         raise SettingsError(
@@ -380,10 +386,10 @@ def _require_apart(at_rest: Matrix, robot: Robot) -> None:
         )
 
 
-def _row(A: Matrix, B: Matrix, c: Vector, axis: int, dt: float) -> CoupledAxis:
+def _extract_axis(A: Matrix, B: Matrix, c: Vector, axis: int, dt: float) -> CoupledAxis:
     """Return one output with its dead time split off, in states of which it shows each, itself the first."""
     delay, size, row = 0, float(np.abs(c).max()) * float(np.abs(B).max()), c
-    while delay < len(A) and float(np.abs(row @ B).max()) <= _ROUNDING * size:
+    while delay < len(A) and float(np.abs(row @ B).max()) <= _ZERO_TOLERANCE * size:
         row, delay = row @ A, delay + 1
     Q = [row / np.linalg.norm(row)]
     scale = max(1.0, float(np.linalg.norm(A, 2)))
@@ -393,7 +399,7 @@ def _row(A: Matrix, B: Matrix, c: Vector, axis: int, dt: float) -> CoupledAxis:
         further = A.T @ Q[-1]
         for _ in range(2):
             further = further - basis.T @ (basis @ further)
-        if np.linalg.norm(further) <= _ROUNDING * scale:
+        if np.linalg.norm(further) <= _ZERO_TOLERANCE * scale:
             break
         Q.append(further / np.linalg.norm(further))
     basis = np.array(Q)

@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     import control
 
 # Scaled [rad of theta_i].
-_LOAD = -0.5
+_SCALED_LOAD = -0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepAndLoad:
-    """What is asked of a controller on every plant.
+    """A step and a load as test of a controller on every plant.
 
     Attributes:
         reference: the step at t = 0 [rad].
@@ -48,7 +48,7 @@ class StepAndLoad:
     reference: float = math.radians(10.0)
     position_limit: float = 6.0
     slew_limit: float = 0.25
-    load: float = _LOAD
+    load: float = _SCALED_LOAD
     load_at: float = 3.5
     duration: float = 6.0
     sample_time: float = 0.02
@@ -63,7 +63,7 @@ class StepAndLoad:
     @property
     def gain_unit(self) -> float:
         """A scaled gain of 1 from output to input; of the neck 1."""
-        return self.size * self.load / _LOAD
+        return self.size * self.load / _SCALED_LOAD
 
     @property
     def rows(self) -> int:
@@ -78,7 +78,7 @@ class StepAndLoad:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StepAndLoadResult:
-    """What a controller did on every plant.
+    """The results of a step and a load on every plant.
 
     Attributes:
         settling: (plants,) time after which the angle stays within 5 % of the step, until the load [s]; inf if never.
@@ -124,13 +124,13 @@ def judge(angles: Matrix, inputs: Matrix, test: StepAndLoad, nominal: int) -> St
 
 
 # Coefficients below this part of the largest are rounding of a characteristic polynomial.
-_ROUNDING = 1e-11
+_COEFFICIENT_TOLERANCE = 1e-11
 _INPUTS = {"pitch": "theta_i", "roll": "phi_i"}
 
 
 @dataclass(frozen=True, slots=True)
-class Doubts:
-    """What a design allows for besides what was identified.
+class ModelUncertainty:
+    """Uncertainty that a design adds to the identified plants.
 
     Attributes:
         least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
@@ -148,32 +148,32 @@ class Doubts:
 # The dead time and the pole of the paper's neck (Eq. 31: 0.08 s, 5.293 1/s), of a robot with tendons whose file gives
 # its time constant in parts of that; nothing of the kind is known of others.
 _LEAST_DELAY, _SMALL_MOVE_POLE = 0.08, 5.293
-_NO_DOUBTS = Doubts(0.0, 0.0)
+_NO_UNCERTAINTY = ModelUncertainty(0.0, 0.0)
 
 
-def doubts_of(robot: Robot) -> Doubts:
-    """Return what a design allows for where nobody says otherwise."""
+def default_uncertainty(robot: Robot) -> ModelUncertainty:
+    """Return the default uncertainty of a design."""
     if robot.time_constant_s is None or robot.tendon_angles is None:
-        return _NO_DOUBTS
+        return _NO_UNCERTAINTY
     second = robot.time_constant_s / TIME_CONSTANT
-    return Doubts(_LEAST_DELAY * second, _SMALL_MOVE_POLE / second)
+    return ModelUncertainty(_LEAST_DELAY * second, _SMALL_MOVE_POLE / second)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainAxis:
-    """What one axis may be.
+    """The uncertain plant of one axis.
 
     Attributes:
         nominal: the plant that synthesis takes.
         samples: every plant that the controller must hold on; the nominal one is the first.
         test: what a controller is judged by on all of them; None where nobody judges.
-        doubts: what is allowed for besides.
+        uncertainty: what is allowed for besides.
     """
 
     nominal: AxisPlant
     samples: tuple[AxisPlant, ...]
     test: StepAndLoad | None = None
-    doubts: Doubts = _NO_DOUBTS
+    uncertainty: ModelUncertainty = _NO_UNCERTAINTY
 
     @property
     def sample_time(self) -> float:
@@ -190,38 +190,38 @@ class UncertainAxis:
             for a, b in zip(mine, its, strict=True)
         )
 
-    def prepared(self) -> UncertainAxis:
-        """Return it with the least nominal dead time, and the form of small moves as a sample; others stay."""
-        nominal = self.nominal.with_min_delay(self.doubts.least_delay)
-        pole = self.doubts.small_move_pole
+    def apply_assumptions(self) -> UncertainAxis:
+        """Return the axis with the minimum nominal dead time and the model of small moves as a sample."""
+        nominal = self.nominal.with_min_delay(self.uncertainty.least_delay)
+        pole = self.uncertainty.small_move_pole
         faster = nominal.with_faster_pole(pole) if pole > 0.0 else nominal
         more = () if faster is nominal else (faster,)
         return replace(self, nominal=nominal, samples=(nominal, *more, *self.samples[1:]))
 
-    def spread(self) -> UncertainAxis:
+    def spread_gain(self) -> UncertainAxis:
         """Return it with each plant at both ends of the gain's spread, unless it has samples of its own."""
-        taken, gain = self.prepared(), self.doubts.gain_spread
+        taken, gain = self.apply_assumptions(), self.uncertainty.gain_spread
         if len(self.samples) > 1 or gain == 0.0:
             return taken
-        more = (scaled(plant, scale) for plant in taken.samples for scale in (1.0 - gain, 1.0 + gain))
+        more = (scale_gain(plant, scale) for plant in taken.samples for scale in (1.0 - gain, 1.0 + gain))
         return replace(taken, samples=(*taken.samples, *more))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class UncertainPlant(ReprMixin):
-    """All axes of an uncertain robot, of a neck pitch and roll; what every design of this package works on.
+    """The uncertain plant of all axes, on which every design works; of a neck pitch and roll.
 
     Attributes:
         axes: output -> what its axis may be.
         robot: whose plant it is.
         weights: (outputs, motors) of the motors in the redefined input of each axis; None: those that the robot gives.
-        doubts: what a design allows for; None for what is usual of the robot.
+        uncertainty: what a design allows for; None for what is usual of the robot.
     """
 
     axes: Mapping[str, UncertainAxis]
     robot: Robot = field(default_factory=Robot.preset)
     weights: Matrix | None = None
-    doubts: Doubts | None = None
+    uncertainty: ModelUncertainty | None = None
 
     @property
     def sample_time(self) -> float:
@@ -236,20 +236,20 @@ class UncertainPlant(ReprMixin):
     def axis(self, name: str) -> UncertainAxis:
         """Return the axis of an output."""
         require_one_of("axis", name, self.names)
-        return replace(self.axes[name], doubts=self.doubts or doubts_of(self.robot))
+        return replace(self.axes[name], uncertainty=self.uncertainty or default_uncertainty(self.robot))
 
     @property
     def redefinition(self) -> tuple[Matrix, Matrix]:
         """T from motors to the redefined inputs of all axes and co-contraction (Eq. 9-11), and its inverse."""
         return self.robot.redefinition(self.weights)
 
-    def assumed(self) -> dict[str, float]:
+    def assumptions(self) -> dict[str, float]:
         """Return the dead time and the pole that a design assumes where the plant itself has less."""
-        if self.doubts is not None:
+        if self.uncertainty is not None:
             return {}
         found = {}
         for axis in map(self.axis, self.names):
-            delay, pole, plant = axis.doubts.least_delay, axis.doubts.small_move_pole, axis.nominal
+            delay, pole, plant = axis.uncertainty.least_delay, axis.uncertainty.small_move_pole, axis.nominal
             if plant.with_min_delay(delay).delay > plant.delay:
                 found["least_delay"] = delay
             if plant.with_faster_pole(pole) is not plant:
@@ -265,13 +265,13 @@ class UncertainPlant(ReprMixin):
         return [plant.tf() for plant in self.axis(output).samples]
 
 
-def scaled(plant: AxisPlant, factor: float) -> AxisPlant:
+def scale_gain(plant: AxisPlant, factor: float) -> AxisPlant:
     """Return the plant with its gain times `factor`."""
     return replace(plant, numerator=factor * plant.numerator)
 
 
 def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
-    """Return what a design works on.
+    """Return the uncertain plant of a model, family, system or mapping.
 
     Args:
         source: a family, an identified linear model, a discrete `control.StateSpace` or `TransferFunction`, a list
@@ -301,23 +301,23 @@ def uncertain_plant(source: Any, robot: Robot | None = None) -> UncertainPlant:
         for item in each[1:]:
             require_same_robot(item.robot, each[0].robot, "plants")
         joined = {axis: [s for item in each for s in item.axis(axis).samples] for axis in each[0].names}
-        return replace(_joined(joined), robot=each[0].robot, weights=each[0].weights)
+        return replace(_combine_axes(joined), robot=each[0].robot, weights=each[0].weights)
     if isinstance(source, control.StateSpace | control.TransferFunction):
-        return _joined({axis: [_plant(_of_system(source, axis), axis, "the plant")] for axis in AXES})
+        return _combine_axes({axis: [_axis_from_system(_of_system(source, axis), axis, "the plant")] for axis in AXES})
     if not hasattr(source, "tf"):
         raise SettingsError(
             f"a linear model is needed, one with `tf`; got {type(source).__name__}. "
             "Identify `rls`, or give a discrete control.TransferFunction."
         )
     robot = robot_of(source)
-    joined = _joined({axis: _of_model(source, axis) for axis in robot.outputs.names})
+    joined = _combine_axes({axis: _of_model(source, axis) for axis in robot.outputs.names})
     return replace(joined, robot=robot, weights=directions_of(source))
 
 
 def _of_model(model: Any, axis: str) -> list[AxisPlant]:
     nominal = axis_plant(model, axis)
     samples = model.samples(axis) if callable(getattr(model, "samples", None)) else []
-    plants = (_plant(item, axis, f"sample {i} of the family") for i, item in enumerate(samples))
+    plants = (_axis_from_system(item, axis, f"sample {i} of the family") for i, item in enumerate(samples))
     return [nominal, *(replace(plant, second=nominal.second) for plant in plants)]
 
 
@@ -332,13 +332,15 @@ def _of_mapping(source: Mapping[str, Any]) -> UncertainPlant:
         if not items:
             raise DataError(f"{axis} has no samples; the first is the nominal plant.")
         axes[axis] = [
-            item if isinstance(item, AxisPlant) else _plant(_scalar(item, axis), axis, f"sample {i} of {axis}")
+            item
+            if isinstance(item, AxisPlant)
+            else _axis_from_system(_scalar(item, axis), axis, f"sample {i} of {axis}")
             for i, item in enumerate(items)
         ]
-    return _joined(axes)
+    return _combine_axes(axes)
 
 
-def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
+def _combine_axes(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
     times = {axis: plants[0].sample_time for axis, plants in axes.items()}
     if max(times.values()) - min(times.values()) > 1e-9 * max(times.values()):
         raise SettingsError(
@@ -361,7 +363,7 @@ def _joined(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
     return UncertainPlant({axis: UncertainAxis(plants[0], tuple(plants)) for axis, plants in axes.items()})
 
 
-def _plant(system: Any, axis: str, what: str) -> AxisPlant:
+def _axis_from_system(system: Any, axis: str, what: str) -> AxisPlant:
     import control
 
     tf: Any = _polynomials(system) if isinstance(system, control.StateSpace) else system
@@ -374,13 +376,13 @@ def _plant(system: Any, axis: str, what: str) -> AxisPlant:
 
 
 def _polynomials(system: Any) -> control.TransferFunction:
-    """Return the transfer function of a state space, what rounding left of its dead time taken away."""
+    """Return the transfer function of a state space, without the rounding errors of its dead time."""
     import control
 
     found: Any = control.ss2tf(system)
     num, den = (np.asarray(part[0][0]) for part in (found.num, found.den))
     for part in (num, den):
-        part[np.abs(part) < _ROUNDING * np.abs(part).max(initial=0.0)] = 0.0
+        part[np.abs(part) < _COEFFICIENT_TOLERANCE * np.abs(part).max(initial=0.0)] = 0.0
     return control.TransferFunction(num, den, system.dt)
 
 
@@ -411,7 +413,7 @@ def _of_system(system: Any, axis: str) -> Any:
             raise SettingsError(f"the system is that of {label} alone; give both, as {{'pitch': ..., 'roll': ...}}.")
         return system
     inputs, outputs = list(system.input_labels), list(system.output_labels)
-    if len(inputs) == len(outputs) == 2 and all(_default(name) for name in (*inputs, *outputs)):
+    if len(inputs) == len(outputs) == 2 and all(_is_default_name(name) for name in (*inputs, *outputs)):
         i = AXES.index(axis)
         return system[i, i]
     if _INPUTS[axis] not in inputs or axis not in outputs:
@@ -423,15 +425,15 @@ def _of_system(system: Any, axis: str) -> Any:
     return system[outputs.index(axis), inputs.index(_INPUTS[axis])]
 
 
-def _default(label: str) -> bool:
+def _is_default_name(label: str) -> bool:
     return label.startswith(("u[", "y["))
 
 
 # Of the paper's loop [s].
-USUAL_PERIOD = 0.02
+DEFAULT_SAMPLE_TIME_S = 0.02
 
 
-def discrete(plant: Any, period: float) -> tuple[float | None, Any]:
+def discretize_zoh(plant: Any, period: float) -> tuple[float | None, Any]:
     """Return the plant with each continuous `control` system of it made discrete by a zero-order hold, and its period.
 
     At the samples both agree, as set-points are held in between. A plant that is discrete stays as it is, with None.
@@ -439,10 +441,10 @@ def discrete(plant: Any, period: float) -> tuple[float | None, Any]:
     Raises:
         SettingsError: a system that has no state space.
     """
-    return (period, _sampled(plant, period)) if _any_continuous(plant) else (None, plant)
+    return (period, _discretize(plant, period)) if _any_continuous(plant) else (None, plant)
 
 
-def held_line(design: Mapping[str, Any]) -> list[str]:
+def sampling_line(design: Mapping[str, Any]) -> list[str]:
     """Return a line on a continuous plant, none for another."""
     # Files before 0.3 have it among the settings.
     period = design.get("held_s", design.get("settings", {}).get("sample_time"))
@@ -461,13 +463,13 @@ def _is_continuous(plant: Any) -> bool:
     return isinstance(plant, control.StateSpace | control.TransferFunction) and control.isctime(plant, strict=True)
 
 
-def _sampled(plant: Any, period: float) -> Any:
+def _discretize(plant: Any, period: float) -> Any:
     import control
 
     if isinstance(plant, Mapping):
-        return {name: _sampled(item, period) for name, item in plant.items()}
+        return {name: _discretize(item, period) for name, item in plant.items()}
     if isinstance(plant, Sequence):
-        return [_sampled(item, period) for item in plant]
+        return [_discretize(item, period) for item in plant]
     if not _is_continuous(plant):
         return plant
     try:

@@ -13,23 +13,23 @@ from softneck.robot import Robot
 from softneck.runtime import load_runtime
 
 from . import _mpc_state_runtime as rt
-from ._plant import runtime_of, unbound, units_of
-from ._prediction import Matrices, Problem, disturbance_pole, padded, rest_states
+from ._plant import remove_limits, runtime_of, units_of
+from ._prediction import Matrices, Problem, disturbance_pole, pad_states, rest_states
 
 if TYPE_CHECKING:
     import control
 
 # Radians: a motor resolves 1.3e-4 rad, a soft limit is judged at 1e-6.
-_TOLERANCE = 1e-10
+_QP_TOLERANCE = 1e-10
 # Rows that the solver adds and drops in a sample; beyond them the plan of the sample before goes on.
-_BUDGET = 100
+_QP_ITERATIONS = 100
 # An estimated payload trembles: co-contraction follows it slowly. Without a measurement the motors hold after a while.
-_SEEN = _COAST = 0.5
+_PAYLOAD_FILTER_S = _COAST_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
-    """What the observer and the reference filters do, in scaled seconds.
+    """Tuning of observer and reference filters, in scaled seconds.
 
     Attributes:
         trust: of the output-disturbance observer in what is measured, see `observer_gains`.
@@ -55,17 +55,17 @@ def assemble(problem: Problem, found: Matrices, tuning: Tuning) -> tuple[Matrix,
     angle_at = 4.0
     constants = np.array([  # in the order of MPC_TS to MPC_NUMBERS
         Ts, p.rows, 1.0, n, p.dead_time, len(p.starts), p.slacks, tuning.preview,
-        min(round(tuning.reference_time / Ts), tuning.preview), float(told), _BUDGET, _TOLERANCE,
-        max(1, round(_COAST / Ts)), angle_at, angle_at + float(p.angles), 0.0, 0.0, *tuning.scale,
+        min(round(tuning.reference_time / Ts), tuning.preview), float(told), _QP_ITERATIONS, _QP_TOLERANCE,
+        max(1, round(_COAST_S / Ts)), angle_at, angle_at + float(p.angles), 0.0, 0.0, *tuning.scale,
     ])  # fmt: skip
     keep = math.exp(-Ts / tuning.reference_time) if tuning.reference_time > 0.0 else 0.0
-    payload = [*[0.0] * p.outputs, *([math.exp(-Ts / _SEEN), tuning.payload_tautness] if told else [0.0])]
+    payload = [*[0.0] * p.outputs, *([math.exp(-Ts / _PAYLOAD_FILTER_S), tuning.payload_tautness] if told else [0.0])]
     poles = np.array([disturbance_pole(plant) for plant in plants])
     made = {
         "constants": constants,
-        "model_A": np.vstack([padded(plant, n)[0] for plant in plants]),
+        "model_A": np.vstack([pad_states(plant, n)[0] for plant in plants]),
         # One input behind the other.
-        "model_B": np.array([padded(plant, n)[1].T.ravel() for plant in plants]),
+        "model_B": np.array([pad_states(plant, n)[1].T.ravel() for plant in plants]),
         "observer": observer_gains(poles, tuning.trust),
         "rest": np.array([rest_states(plant, n).T.ravel() for plant in plants]),
         "delays": np.array([float(plant.delay) for plant in plants]),
@@ -113,7 +113,7 @@ def observer_bandwidth(gains: Vector, sample_time: float) -> float:
 
 
 def with_gains(arrays: tuple[Matrix, ...], trust: float) -> tuple[Matrix, ...]:
-    """Return the arrays with another trust of the observer in what is measured."""
+    """Return the arrays with another observer gain."""
     poles = rt.MpcArrays(arrays).observer[:, 2]
     return _with(arrays, observer=observer_gains(poles, trust))
 
@@ -139,9 +139,9 @@ def _with(arrays: tuple[Matrix, ...], **changed: Matrix) -> tuple[Matrix, ...]:
 
 
 # Far beyond anything: no limit acts.
-_FREE = 1e12
+_NO_LIMIT = 1e12
 # Small against the reference's own bound, so that it stays linear; powers of two scale without rounding.
-_UNIT = 2.0**-10
+_UNIT_STEP = 2.0**-10
 
 
 def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> control.StateSpace:
@@ -166,7 +166,7 @@ def lti(arrays: tuple[Matrix, ...], robot: Robot, *, name: str = "mpc") -> contr
 
 
 def _to_own(arrays: tuple[Matrix, ...], robot: Robot) -> Matrix | None:
-    """Return what makes the redefined inputs of a coupled design those of its robot; None where they are."""
+    """Return the matrix from the redefined inputs of a coupled design to those of its robot; None if equal."""
     a = rt.MpcArrays(arrays)
     m, weights = a.T.shape[0] - 1, robot.weights()
     if a.model_B.shape[1] == a.model_A.shape[1] or weights is None:
@@ -177,7 +177,7 @@ def _to_own(arrays: tuple[Matrix, ...], robot: Robot) -> Matrix | None:
 
 def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Return A, B, C, D of `lti` in scaled quantities."""
-    arrays = unbound(arrays)
+    arrays = remove_limits(arrays)
     step = load_runtime(runtime_of(arrays)).step
     a = rt.MpcArrays(arrays)
     m, motors = a.T.shape[0] - 1, a.T.shape[1]
@@ -186,8 +186,8 @@ def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     numbers = np.arange(at["active"].stop)
     kept = np.concatenate([numbers[at[name]] for name in ("held", "filtered", "models", "offsets", "past", "coming")])
     # Tautness is the fifth where angles have no limit, else the sixth.
-    soft = [_FREE] * int(q[rt.MPC_TAUT_AT] - q[rt.MPC_ANGLE_AT])
-    parameters = np.array([_FREE, _FREE, _FREE, -_FREE, *soft, -_FREE])
+    soft = [_NO_LIMIT] * int(q[rt.MPC_TAUT_AT] - q[rt.MPC_ANGLE_AT])
+    parameters = np.array([_NO_LIMIT, _NO_LIMIT, _NO_LIMIT, -_NO_LIMIT, *soft, -_NO_LIMIT])
     ahead = m if q[rt.MPC_AHEAD] > 0 else 0
     ports = flags + 2 + ahead + int(q[rt.MPC_PAYLOAD])
 
@@ -196,14 +196,14 @@ def system(arrays: tuple[Matrix, ...]) -> tuple[Matrix, Matrix, Matrix, Matrix]:
         state[at["started"]] = 1.0
         u[flags : flags + 2] = 1.0
         if state_at >= 0:
-            state[state_at] = _UNIT
+            state[state_at] = _UNIT_STEP
         else:
-            u[input_at if input_at < m else input_at + 1] = _UNIT  # co-contraction stands between them
+            u[input_at if input_at < m else input_at + 1] = _UNIT_STEP  # co-contraction stands between them
             if input_at < m and ahead:
-                u[flags + 2 + input_at] = _UNIT
+                u[flags + 2 + input_at] = _UNIT_STEP
         out = np.zeros(motors)
         step(arrays, parameters, state, u, out)
-        return state[kept] / _UNIT, (a.T @ out)[:m] / _UNIT
+        return state[kept] / _UNIT_STEP, (a.T @ out)[:m] / _UNIT_STEP
 
     columns = [image(int(at), -1) for at in kept] + [image(-1, i) for i in range(2 * m)]
     states = np.array([state for state, _ in columns]).T

@@ -20,7 +20,7 @@ from softneck.runtime import Block, Port, State, load_functions
 
 from ..linear._controller import assumed_lines, robot_in
 from ..linear._ports import MAX_MOTOR, ControllerLimits, controller_inputs, controller_outputs, limit_ports
-from ..plants._uncertain import held_line
+from ..plants._uncertain import sampling_line
 from . import _mpc_state_runtime as rt
 from ._arrays import lti
 from ._plant import runtime_of, units_of
@@ -35,7 +35,7 @@ _OF_MOTORS = (rt.MPC_ROW_MOVE, rt.MPC_ROW_POSITION, rt.MPC_ROW_TAUT)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MpcInfo:
-    """What a sample's QP said.
+    """The result of a sample's QP.
 
     Attributes:
         status: "optimal", "softened" (a soft limit cannot be kept), "previous plan" (no answer in the budget),
@@ -64,7 +64,7 @@ class MpcInfo:
 
 
 def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = AXES) -> MpcInfo:
-    """Return what the sample that led to `state` decided; `names` are the outputs'."""
+    """Return the decision of the sample that led to `state`; `names` are the outputs'."""
     a = rt.MpcArrays(arrays)
     now = {name: state[place] for name, place in rt.MpcState.parts(a).items()}
     functions = load_functions(runtime_of(arrays))
@@ -78,7 +78,7 @@ def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = 
     functions.mpc_parameter(arrays, state, theta)
     # The state stands one sample on: what is held now was the plan's first move.
     set_points = now["held"] + np.cumsum(moves, axis=0)
-    angles, reference = _predicted(a, theta, set_points)
+    angles, reference = _predict_outputs(a, theta, set_points)
     active = tuple(
         f"{ROW_NAMES[int(kind)]} {('upper', 'lower')[int(sign < 0)]} "
         + (("motor " + str(int(which) + 1)) if kind in _OF_MOTORS else names[int(which)])
@@ -100,7 +100,7 @@ def explain(arrays: tuple[Matrix, ...], state: Vector, names: tuple[str, ...] = 
     )
 
 
-def _predicted(a: rt.MpcArrays, theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
+def _predict_outputs(a: rt.MpcArrays, theta: Vector, set_points: Matrix) -> tuple[Matrix, Matrix]:
     """Return predicted angles and references (N, outputs) of the nominal plant from theta on."""
     n, N, m = a.model_A.shape[1], set_points.shape[0], a.T.shape[0] - 1
     coupled = a.model_B.shape[1] > n
@@ -146,7 +146,7 @@ class PredictivePart(BlockPart):
 
     @property
     def info(self) -> Any:
-        """What the last sample decided."""
+        """The decision of the last sample."""
         return self._controller.explain(self._state)
 
 
@@ -230,7 +230,7 @@ class MpcController(ReprMixin):
         return self.ss()
 
     def info(self, state: State) -> MpcInfo:
-        """Return what the sample that led to `state` decided: prediction, active limits, iterations."""
+        """Return the decision of the sample that led to `state`: prediction, active limits, iterations."""
         return self.explain(state.values)
 
     def explain(self, values: Vector) -> MpcInfo:
@@ -242,7 +242,7 @@ class MpcController(ReprMixin):
         return PredictivePart(self)
 
     def review(self) -> list[str]:
-        """Return what is wrong or doubtful with this set-up, one line each; empty if nothing is."""
+        """Return one line on each doubtful setting; empty if there is none."""
         return _review(self)
 
     def summary(self) -> str:
@@ -266,12 +266,12 @@ class MpcController(ReprMixin):
         lines += _observer_line(settings)
         if d.get("worst_sensitivity") is not None:
             lines.append(f"  Ms at most {d['worst_sensitivity']:.3g} over samples of the family")
-        lines += [*held_line(d), *assumed_lines(d.get("assumed", {}))]
+        lines += [*sampling_line(d), *assumed_lines(d.get("assumed", {}))]
         return "\n".join(lines + [f"  review: {line}" for line in self.review()])
 
     def _limits_line(self) -> str:
         """Return a line on the limits, in the units of the robot's file."""
-        given = {name: getattr(self, name) for name in _LIMITS[:4]}
+        given = {name: getattr(self, name) for name in _LIMIT_NAMES[:4]}
         line = ControllerLimits(robot=self.robot, **given).lines(self.sample_time)[0]
         outputs, motors = self.robot.outputs.display_unit, self.robot.motors.unit
         if self.angle_limit is not None:
@@ -286,7 +286,7 @@ class MpcController(ReprMixin):
         header = {
             "kind": "mpc",
             "sample_time": self.sample_time,
-            **{name: getattr(self, name) for name in _LIMITS},
+            **{name: getattr(self, name) for name in _LIMIT_NAMES},
             "order": self.order,
             "design": dict(self.design),
             "inputs": [port.name for port in block.inputs],
@@ -302,7 +302,7 @@ class MpcController(ReprMixin):
         items = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in rt.MpcArrays.names()}
         if not all(np.isfinite(item).all() for item in items.values()):
             raise FileFormatError("the controller's arrays are not finite; design it again.")
-        if gone := _gone(items):
+        if gone := _removed_option(items):
             raise FileFormatError(
                 f"{gone} of `mpc` went after softneck 0.2.0, which still reads the file; design it again."
             )
@@ -312,15 +312,15 @@ class MpcController(ReprMixin):
         return cls(
             sample_time=float(header["sample_time"]),
             arrays=tuple(items.values()),
-            **{name: None if header[name] is None else float(header[name]) for name in _LIMITS},  # type: ignore[arg-type]
+            **{name: None if header[name] is None else float(header[name]) for name in _LIMIT_NAMES},  # type: ignore[arg-type]
             order=str(header["order"]),
             design=dict(header["design"]),
             robot=robot_in(header),
         )
 
 
-def _gone(arrays: Mapping[str, np.ndarray]) -> str:
-    """Return what of a file of an earlier version no controller does any more; "" if nothing."""
+def _removed_option(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return the unsupported part of a file of an earlier version; "" if there is none."""
     q, m = arrays["constants"].ravel(), arrays["T"].shape[0] - 1
     known = arrays["disturbances"]
     if q.size < rt.MPC_NUMBERS or known.ndim != 2 or known.shape[1] <= m:
@@ -340,7 +340,7 @@ def _observer_line(settings: Mapping[str, Any]) -> list[str]:
     return [f"  for an observer that {' and '.join(told)}"] if told else []
 
 
-_LIMITS = ("position_limit", "slew_limit", "lead_limit", "least_position", "angle_limit", "minimum_tautness")
+_LIMIT_NAMES = ("position_limit", "slew_limit", "lead_limit", "least_position", "angle_limit", "minimum_tautness")
 
 
 def _review(controller: MpcController) -> list[str]:

@@ -172,7 +172,7 @@ def mpc_residual(
 
 
 def mpc_move(p: MpcArrays, parameters: np.ndarray, x: MpcState, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Move `held` as the plan says for its age, within the bounds of now."""
+    """Move `held` to the planned value for its age, within the present bounds."""
     for j in range(p.motors):
         move = 0.0
         for b in range(p.moves):

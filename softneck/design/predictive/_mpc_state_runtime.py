@@ -1,4 +1,4 @@
-"""What a predictive controller knows and remembers, and how it moves on: models, disturbances, references, past inputs.
+"""State of a predictive controller and its update: models, disturbances, references, past inputs.
 
 Each axis has a model `x+ = A x + B v(k - d)`, `y = x[0] + o` that runs on the inputs alone; v is the redefined input of
 the axis, of a coupled plant those of all axes: B and `rest` have n columns for each. The output disturbance o follows
@@ -99,7 +99,7 @@ class MpcArrays(Arrays):
 
 
 class MpcState(StateVector):
-    """What is remembered from sample to sample."""
+    """The state between samples."""
 
     started = cells("", "1 after the first sample")
     iterations = cells("", "of the last answer")
@@ -150,7 +150,7 @@ def mpc_limits(p: MpcArrays, x: MpcState, parameters: np.ndarray) -> np.ndarray:
 
 
 def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
-    """Take in what is known now; return whether the motors may move."""
+    """Update measurements and motors; return whether the motors may move."""
     flags = 2 * p.outputs + 1 + p.motors
     if x.started == 0.0:
         for j in range(p.motors):
@@ -173,7 +173,7 @@ def mpc_begin(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> bool:
 
 
 def mpc_listen(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
-    """Take in references and the payload; one that is not finite leaves what was."""
+    """Update references and payload; a value that is not finite keeps the previous one."""
     scaled_listen(p.constants, p.motors, p.outputs, p.ahead, bool(x.started == 0.0), inputs, x.seen, x.coming)
     # Of the payload in `inputs`: behind the preview, where there is one.
     first = 2 * p.outputs + 3 + p.motors + (p.outputs if p.ahead > 0 else 0)
@@ -215,7 +215,7 @@ def mpc_correct(p: MpcArrays, x: MpcState, inputs: np.ndarray) -> None:
 
 
 def mpc_filter(p: MpcArrays, x: MpcState) -> None:
-    """Move the reference filters on: what is asked now acts now."""
+    """Step the reference filters, without a sample of delay."""
     for i in range(p.outputs + 1):
         a = p.filters[i]
         asked = x.seen[i]
@@ -226,7 +226,7 @@ def mpc_filter(p: MpcArrays, x: MpcState) -> None:
 
 
 def mpc_driven(p: MpcArrays, gains: np.ndarray, i: int, j: int, v: np.ndarray) -> float:
-    """Return what the inputs v do to state j of model i by `gains`: those of all axes where the plant is coupled."""
+    """Return the effect of the inputs v on state j of model i: of all axes if the plant is coupled."""
     if p.entries == p.n:
         return gains[i, j] * v[i]
     total = 0.0

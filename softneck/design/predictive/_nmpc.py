@@ -1,4 +1,4 @@
-"""Nonlinear model predictive control: what is asked, the controller that does it, and what its samples decided."""
+"""Nonlinear model predictive control: settings, controller, and decisions of its samples."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ from ._nmpc_problem import (
     BUDGET,
     SLACK_WEIGHT,
     NonlinearProblem,
+    apply_rise_time,
     controller_arrays,
+    identify_near_rest,
     plant_of,
-    probed,
     require_horizon,
-    risen,
 )
 from ._nmpc_state_runtime import NMPC_NUMBERS, NmpcArrays, NmpcState
 from ._plant import TAUTNESS_LEVER, ScaledPlant, over, predictive_limits, samples_ahead, scaled_plant
-from ._tuning import move_weight, require_given, require_solvable, spaced_starts
+from ._tuning import move_weight, require_positive_settings, require_solvable, spaced_starts
 
-_RUNTIME = "softneck.design.predictive._nmpc_runtime"
+_RUNTIME_MODULE = "softneck.design.predictive._nmpc_runtime"
 # Kinds of model whose derivatives the runtime has.
 NONLINEAR_KINDS = ("nn", "play", "greybox")
 # In scaled seconds: horizon and what of it is behind the dead time at least, in samples at most so many; window, time
 # constant of the reference filter; moves, and bandwidth.
-_HORIZON, _BEHIND, _LONGEST = 0.4, 0.2, 100
-_WINDOW, _REFERENCE_TIME, _MOVES, _BANDWIDTH = 0.16, 0.2, 10, 8.0
+_HORIZON_S, _LEAST_HORIZON_S, _MAX_SAMPLES = 0.4, 0.2, 100
+_WINDOW_S, _REFERENCE_TIME_S, _MOVE_COUNT, _BANDWIDTH_RAD_S = 0.16, 0.2, 10, 8.0
 # What earlier versions let set, and files of theirs may hold; none of it is another number here.
-_GONE = {
+_REMOVED_SETTINGS = {
     "converged": False, "disturbance_time": None, "cocontraction_weight": 1.0, "slack_weight": SLACK_WEIGHT,
     "budget": BUDGET, "tautness_lever": TAUTNESS_LEVER, "order": "sequential",
     "tendon_angles": TENDON_ANGLES.tolist(),
@@ -94,14 +94,14 @@ class NmpcSettings(ReprMixin):
     minimum_tautness: float | None = None
 
     def __post_init__(self) -> None:
-        require_given(self, {"bandwidth": "rad/s", "lead_limit": "", "angle_limit": "rad"})
+        require_positive_settings(self, {"bandwidth": "rad/s", "lead_limit": "", "angle_limit": "rad"})
         if self.rise_s is not None:
             require_between("rise_s", self.rise_s, 0.001, 1e6, "s")
         require_between("preview", self.preview, 0.0, 1e6, "s")
         if self.horizon is not None:
-            require_whole("horizon", self.horizon, 2, _LONGEST)
+            require_whole("horizon", self.horizon, 2, _MAX_SAMPLES)
         if self.moves is not None:
-            require_whole("moves", self.moves, 1, self.horizon or _LONGEST)
+            require_whole("moves", self.moves, 1, self.horizon or _MAX_SAMPLES)
         if self.minimum_tautness is not None:
             require_finite("minimum_tautness", self.minimum_tautness)
 
@@ -122,10 +122,10 @@ class NmpcSettings(ReprMixin):
                 "For a linear model use `softneck design mpc`."
             )
         robot = model.robot
-        found = probed(model, to_si(robot.motors.unit)[0] * max(0.0, self.minimum_tautness or 0.0))
+        found = identify_near_rest(model, to_si(robot.motors.unit)[0] * max(0.0, self.minimum_tautness or 0.0))
         plant = near_rest(model, found)
         limits = predictive_limits(self, plant)
-        own = risen(NmpcNumbers.of(self).resolved(plant))
+        own = apply_rise_time(NmpcNumbers.of(self).fill_defaults(plant))
         require_horizon(own, [plant_of(item, model.sample_time) for item in found.values()])
         require_solvable(own.moves or 1, len(robot.motors.names))
         return NmpcController(settings=own, limits=limits, model=model, found=found)
@@ -133,7 +133,7 @@ class NmpcSettings(ReprMixin):
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class NmpcNumbers(NmpcSettings):
-    """Settings, and the numbers that follow from plant and observer; None for what is usual.
+    """Settings with the numbers that follow from plant and observer; None for defaults.
 
     Attributes:
         window: samples over which the output disturbance is estimated.
@@ -150,21 +150,23 @@ class NmpcNumbers(NmpcSettings):
         """Return the settings with these numbers."""
         return cls(**{field.name: getattr(settings, field.name) for field in fields(settings)})
 
-    def resolved(self, plant: ScaledPlant) -> Self:
+    def fill_defaults(self, plant: ScaledPlant) -> Self:
         """Return the settings with the numbers that are usual for a plant."""
         second, Ts = plant.scaling.second, plant.axes[0].sample_time
         delay = max(item.delay for item in plant.axes)
-        horizon = self.horizon or min(max(3, round(_HORIZON / Ts), delay + round(_BEHIND / Ts)), _LONGEST)
+        horizon = self.horizon or min(
+            max(3, round(_HORIZON_S / Ts), delay + round(_LEAST_HORIZON_S / Ts)), _MAX_SAMPLES
+        )
         usual = {
-            "bandwidth": _BANDWIDTH / second, "reference_time": _REFERENCE_TIME * second, "look_ahead": 0.0,
-            "horizon": horizon, "moves": min(_MOVES, horizon),
-            "window": min(max(round(_WINDOW / Ts), 2), _LONGEST),
+            "bandwidth": _BANDWIDTH_RAD_S / second, "reference_time": _REFERENCE_TIME_S * second, "look_ahead": 0.0,
+            "horizon": horizon, "moves": min(_MOVE_COUNT, horizon),
+            "window": min(max(round(_WINDOW_S / Ts), 2), _MAX_SAMPLES),
         }  # fmt: skip
         return replace(self, **{name: value for name, value in usual.items() if getattr(self, name) is None})
 
 
 def near_rest(model: Model, found: Mapping[str, Mapping[str, float]]) -> ScaledPlant:
-    """Return what a model is near rest, in scaled quantities."""
+    """Return the linear model near rest, in scaled quantities."""
     plants = {name: plant_of(found[name], model.sample_time) for name in model.robot.outputs.names}
     axes = {name: UncertainAxis(plant, (plant,)) for name, plant in plants.items()}
     return scaled_plant(UncertainPlant(axes, model.robot, weights_of(model)), identified=True)
@@ -172,7 +174,7 @@ def near_rest(model: Model, found: Mapping[str, Mapping[str, float]]) -> ScaledP
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SampleSolution:
-    """What a sample decided.
+    """The decision of a sample.
 
     Attributes:
         status: "optimal", "softened", "previous plan", "holding" or "not started".
@@ -191,7 +193,7 @@ class SampleSolution:
 
 
 def explain(block: Block, values: Vector) -> SampleSolution:
-    """Return what the sample decided that led a controller's `block` to the state `values`."""
+    """Return the decision of the sample that led a controller's `block` to the state `values`."""
     a = NmpcArrays(block.arrays)
     parts = NmpcState.parts(a)
     # The motors' unit, before those of the outputs.
@@ -262,11 +264,11 @@ class NmpcController(ReprMixin):
 
     @cached_property
     def near_rest(self) -> ScaledPlant:
-        """What the model is near rest, in scaled quantities."""
+        """The linear model near rest, in scaled quantities."""
         return near_rest(self.model, self.found)
 
     def problem(self) -> NonlinearProblem:
-        """Return what is asked, in numbers."""
+        """Return the optimisation problem."""
         s: Any = self.settings
         plant = self.near_rest
         (T, inverse), scaling, plants = plant.redefinition, plant.scaling, plant.axes
@@ -298,7 +300,7 @@ class NmpcController(ReprMixin):
         return self._block.step(state, inputs)
 
     def info(self, state: State) -> SampleSolution:
-        """Return what the sample that led to `state` decided."""
+        """Return the decision of the sample that led to `state`."""
         return self.explain(state.values)
 
     def explain(self, values: Vector) -> SampleSolution:
@@ -306,7 +308,7 @@ class NmpcController(ReprMixin):
         return explain(self._block, values)
 
     def part(self) -> PredictivePart:
-        """Return the controller as a part of a loop that tells what each sample decided."""
+        """Return the controller as a part of a loop that reports the decision of each sample."""
         return PredictivePart(self)
 
     def block(self) -> Block:
@@ -317,7 +319,7 @@ class NmpcController(ReprMixin):
     def _block(self) -> Block:
         # How far it can be trusted is no part of a prediction, and takes time in each of its steps.
         plant, robot = replace(self.model, arrays=without_validity(self.model.arrays)).block(), self.robot
-        outer = sized_name(_RUNTIME, len(robot.motors.names), len(robot.outputs.names))
+        outer = sized_name(_RUNTIME_MODULE, len(robot.motors.names), len(robot.outputs.names))
         return Block(
             kind="nmpc",
             role="controller",
@@ -368,7 +370,7 @@ class NmpcController(ReprMixin):
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
         model = embedded_model(header["model"], arrays)
         settings, robot = dict(header["settings"]), model.robot
-        for name, usual in _GONE.items():
+        for name, usual in _REMOVED_SETTINGS.items():
             if (value := settings.pop(name, usual)) != usual:
                 raise FileFormatError(
                     f"`{name}` = {value} went after softneck 0.2.0, which still reads the file; design it again."
@@ -379,6 +381,6 @@ class NmpcController(ReprMixin):
         plant = near_rest(model, header["found"])
         return cls(
             # A file of an earlier version may not say all.
-            settings=NmpcNumbers(**settings).resolved(plant), limits=ControllerLimits.from_header(given, robot),
+            settings=NmpcNumbers(**settings).fill_defaults(plant), limits=ControllerLimits.from_header(given, robot),
             model=model, found=header["found"],
         )  # fmt: skip

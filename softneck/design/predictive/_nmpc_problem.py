@@ -21,16 +21,16 @@ from ._prediction import idle_moves
 
 # Scaled seconds after a step of one; where nobody says how fast a robot is, as many samples as that is of the neck, and
 # twice as many until nothing but this part changes in the last third.
-_PROBE_SECONDS, _ROWS, _MOST_ROWS, _AT_REST = 6.0, 300, 40_000, 1e-3
+_PROBE_S, _PROBE_ROWS, _MAX_PROBE_ROWS, _REST_TOLERANCE = 6.0, 300, 40_000, 1e-3
 # Of a scaled output: one that moves less does not follow.
-_LEAST = 1e-3
+_MIN_RESPONSE = 1e-3
 # Samples of a reference ahead, each a cell of the state.
-_MOST_PREVIEW = 100
+_MAX_PREVIEW_SAMPLES = 100
 
 S = TypeVar("S", bound=Any)
 
 
-def probed(model: Model, pulled: float = 0.0) -> dict[str, dict[str, float]]:
+def identify_near_rest(model: Model, pulled: float = 0.0) -> dict[str, dict[str, float]]:
     """Return static gain, pole [1/s] and dead time [samples] of each axis, as the model steps near rest.
 
     Args:
@@ -43,12 +43,12 @@ def probed(model: Model, pulled: float = 0.0) -> dict[str, dict[str, float]]:
     robot, weights, ends = model.robot, weights_of(model), motor_ranges(model.robot, None)
     scaling = Scaling.of(robot, set_points=None if ends is None else np.array(ends))
     sizes, inverse = scaling.input_units(weights), robot.redefinition(weights)[1][:, : len(weights)]
-    moved = [_answer(model, step, scaling.motor_rest + pulled) for step in (sizes * inverse).T]
+    moved = [_step_response(model, step, scaling.motor_rest + pulled) for step in (sizes * inverse).T]
     answers = [y[:, axis] for axis, y in enumerate(moved)]
     known = Scaling.of(robot, outputs=np.array([[min(0.0, *y), max(0.0, *y)] for y in answers]).T).output_unit
     found = {}
     for name, y, size, unit in zip(robot.outputs.names, answers, sizes.tolist(), known, strict=True):
-        if not np.isfinite(y).all() or abs(y[-1]) < _LEAST * unit or y[-1] == 0.0:
+        if not np.isfinite(y).all() or abs(y[-1]) < _MIN_RESPONSE * unit or y[-1] == 0.0:
             hint = " or ask for `minimum_tautness` if its tendons hang" if robot.tendon_angles is not None else ""
             raise SettingsError(
                 f"the model's {name} does not follow its input `{robot.input_names[len(found)]}`; identify it "
@@ -63,16 +63,16 @@ def probed(model: Model, pulled: float = 0.0) -> dict[str, dict[str, float]]:
 
 
 def plant_of(found: Mapping[str, float], sample_time: float) -> AxisPlant:
-    """Return the linear plant of what `probed` found."""
+    """Return the linear plant of the result of `identify_near_rest`."""
     a = math.exp(-found["pole"] * sample_time)
     numerator = np.array([found["static_gain"] * (1.0 - a)])
     return AxisPlant(numerator, np.array([1.0, -a]), int(found["delay"]), sample_time)
 
 
-def _answer(model: Model, step: Vector, middle: Vector) -> Matrix:
-    """Return what a step (motors,) of the set-points changes of the outputs (time, outputs), until they rest."""
+def _step_response(model: Model, step: Vector, middle: Vector) -> Matrix:
+    """Return the response (time, outputs) to a step (motors,) of the set-points, until rest."""
     block, seconds = model.block(), model.robot.time_constant_s
-    rows = _ROWS if seconds is None else round(_PROBE_SECONDS * (seconds / TIME_CONSTANT) / model.sample_time)
+    rows = _PROBE_ROWS if seconds is None else round(_PROBE_S * (seconds / TIME_CONSTANT) / model.sample_time)
     while True:
         u = np.full((rows, len(block.inputs)), np.nan)
         ends = []
@@ -81,12 +81,16 @@ def _answer(model: Model, step: Vector, middle: Vector) -> Matrix:
             ends.append(block.run(block.initial_state(use_measurement=0.0), u)[1][:, : len(model.robot.outputs.names)])
         y = ends[1] - ends[0]
         late = y[2 * rows // 3 :]
-        if seconds is not None or rows >= _MOST_ROWS or np.ptp(late, axis=0).max() <= _AT_REST * np.abs(y[-1]).max():
+        if (
+            seconds is not None
+            or rows >= _MAX_PROBE_ROWS
+            or np.ptp(late, axis=0).max() <= _REST_TOLERANCE * np.abs(y[-1]).max()
+        ):
             return y
         rows *= 2
 
 
-def risen(settings: S) -> S:
+def apply_rise_time(settings: S) -> S:
     """Return the settings with the filter, or the bandwidth, that their `rise_s` asks for."""
     if settings.rise_s is None:
         return settings
@@ -106,22 +110,22 @@ def require_horizon(settings: Any, plants: Sequence[AxisPlant]) -> None:
             f"`horizon` {settings.horizon} samples end within the model's dead time of {late}: no move would be seen "
             f"to do anything. Ask for {late + 10}."
         )
-    if settings.preview > _MOST_PREVIEW * Ts:
+    if settings.preview > _MAX_PREVIEW_SAMPLES * Ts:
         raise SettingsError(
-            f"`preview` {settings.preview:g} s is more than the {_MOST_PREVIEW} samples that are remembered, "
-            f"{_MOST_PREVIEW * Ts:g} s; ask for less, the horizon sees {settings.horizon} samples."
+            f"`preview` {settings.preview:g} s is more than the {_MAX_PREVIEW_SAMPLES} samples that are remembered, "
+            f"{_MAX_PREVIEW_SAMPLES * Ts:g} s; ask for less, the horizon sees {settings.horizon} samples."
         )
 
 
 # Scaled seconds without measurement until the motors hold, and after which a model has settled.
-_COAST, _SETTLE = 0.5, 4.0
+_COAST_S, _SETTLE_S = 0.5, 4.0
 # On violations of soft limits against errors of the angles, squared; iterations of the QP's solver.
 SLACK_WEIGHT, BUDGET = 1e3, 200
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class NonlinearProblem:
-    """What is asked, in numbers, condensed to the moves z of the motors (Bock 1983; Diehl et al. 2005, sec. 3).
+    """The problem condensed to the moves z of the motors (Bock 1983; Diehl et al. 2005, sec. 3).
 
         min  sum_i w_i |y_i(z) - t_i|^2 + lambda |z - a|^2 + rho sum_i (delta_i(z) - c)^2
 
@@ -151,12 +155,12 @@ class NonlinearProblem:
 
     @property
     def levels(self) -> Matrix:
-        """(kept, motors) co-contraction, and what else of the motors moves no output and is kept at zero."""
+        """(kept, motors) co-contraction, and other directions of the motors that move no output."""
         return np.vstack([self.T[-1:], idle_moves(self.T)])
 
 
 def estimate_gains(pole: float, window: int) -> Matrix:
-    """Return (2, window): level and rate of the disturbance of now from what the model missed, newest first.
+    """Return (2, window): gains from past model errors, newest first, to level and rate of the disturbance.
 
     Of all `o(k+1) = o(k) + r(k)`, `r(k+1) = a r(k)` the one nearest to the last `window` residuals, in least squares:
     with the model's inputs known and its state that of its free run the estimation over the horizon is linear.
@@ -173,13 +177,13 @@ def estimate_gains(pole: float, window: int) -> Matrix:
 
 
 def disturbance_ahead(pole: float, horizon: int) -> Matrix:
-    """Return (horizon, 2): what level and rate of now make of the next samples."""
+    """Return (horizon, 2): the predicted disturbance from its present level and rate."""
     i = np.arange(1, horizon + 1)
     return np.column_stack([np.ones(horizon), (1.0 - pole**i) / (1.0 - pole)])
 
 
 def reference_slopes(problem: NonlinearProblem, delay: int) -> Matrix:
-    """Return (moves, path): what makes references to come, over horizon and dead time, to moves that they ask for."""
+    """Return (moves, path): the map from future references, over horizon and dead time, to wanted moves."""
     p, L = problem, problem.horizon + delay + 1
     ends = (*p.starts[1:], p.horizon)
     middles = np.array([-0.5, *(0.5 * (a + b) for a, b in zip(p.starts, ends, strict=True))]) + delay
@@ -192,7 +196,7 @@ def reference_slopes(problem: NonlinearProblem, delay: int) -> Matrix:
 
 
 def controller_arrays(controller: Any) -> tuple[Matrix, ...]:
-    """Return the controller's own arrays, in the order of `_nmpc_runtime`; those of the model stand behind them."""
+    """Return the controller's own arrays, in the order of `_nmpc_runtime`; those of the model follow."""
     s, p, plant, Ts = controller.settings, controller.problem(), controller.near_rest, controller.sample_time
     block, m = controller.model.block(), len(plant.axes)
     start = block.initial_state(use_measurement=0.0, noise_std=0.0)
@@ -202,7 +206,7 @@ def controller_arrays(controller: Any) -> tuple[Matrix, ...]:
     slopes = reference_slopes(p, max(0, max(axis.delay for axis in plant.axes) - p.look))
     asked_at = np.minimum(np.arange(1, slopes.shape[1] + 1) + lead, max(ahead, 1)) - 1
     slack = 0.0 if s.angle_limit is None else SLACK_WEIGHT * float(p.weights[0].max())
-    coast, settle = (max(1, round(time / plant.axes[0].sample_time)) for time in (_COAST, _SETTLE))
+    coast, settle = (max(1, round(time / plant.axes[0].sample_time)) for time in (_COAST_S, _SETTLE_S))
     per = to_si(controller.robot.motors.unit)[0] / plant.scaling.motor_unit
     scale = scale_numbers(plant, controller.limits)
     constants = np.array([

@@ -40,8 +40,8 @@ from softneck.design.predictive._scaled_runtime import (
 )
 from softneck.runtime._members_runtime import member_initialise, member_size, member_step, member_tangent
 
-_TOLERANCE = 1e-10  # [rad] by which the QP's rows may be beyond their bounds
-_LARGEST_RESIDUAL = 1e-7  # 1000 times `_TOLERANCE`: beyond it the answer is none
+_QP_TOLERANCE = 1e-10  # [rad] by which the QP's rows may be beyond their bounds
+_LARGEST_RESIDUAL = 1e-7  # 1000 times `_QP_TOLERANCE`: beyond it the answer is none
 
 
 def state_size(p: NmpcArrays) -> int:
@@ -92,7 +92,7 @@ def step(p: NmpcArrays, parameters: np.ndarray, x: NmpcState, inputs: np.ndarray
 
 
 def nmpc_compare(p: NmpcArrays, x: NmpcState, inputs: np.ndarray, anew: bool) -> None:
-    """Push what the measurement is above the model into `missed`; `anew` as if it had always been that."""
+    """Push measurement minus model into `missed`; `anew` fills all of it."""
     missed, m = x.missed, p.outputs
     for i in range(missed.shape[0] - 1, m - 1, -1):
         missed[i] = missed[i - m]
@@ -117,7 +117,7 @@ def nmpc_model(p: NmpcArrays, model: np.ndarray, motors: np.ndarray, angles: np.
 
 
 def nmpc_look(p: NmpcArrays, x: NmpcState) -> None:
-    """Fill the model's `angles` of where the observer will be: its dead time is known, what is held does the rest."""
+    """Fill the model's `angles` after its dead time, from past inputs and the held ones."""
     if p.look > 0:
         later = x.model.copy()
         for _ in range(p.look):
@@ -166,7 +166,7 @@ def nmpc_quadratic(
     p: NmpcArrays, x: NmpcState, z: np.ndarray, missing: np.ndarray, S: np.ndarray, asked: np.ndarray, H: np.ndarray,
     f: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill the QP's H and f for absolute moves; `missing` (outputs N,) is what angles are above their targets."""
+    """Fill the QP's H and f for absolute moves; `missing` (outputs N,) is the excess of angles over their targets."""
     q, nz, N, starts, n = p.setup, z.shape[0], p.N, p.starts, p.motors
     rows = p.outputs * N
     weights = p.weights.reshape(rows)
@@ -303,7 +303,7 @@ def nmpc_solve(
     across = np.empty((n, m))
     for row in range(m):
         across[:, row] = X[row]
-    iterations = qp_solve(np.dot(X, across), np.dot(A, z), lower, upper, sign, lam, budget, _TOLERANCE, n)
+    iterations = qp_solve(np.dot(X, across), np.dot(A, z), lower, upper, sign, lam, budget, _QP_TOLERANCE, n)
     # H^-1 A' lambda = L'^-1 (X' lambda): half of a solve, as X has the other.
     change = np.dot(across, lam)
     for i in range(n - 1, -1, -1):

@@ -1,4 +1,4 @@
-"""What the nonlinear predictive controller remembers, what it is asked for, and what it expects its model to miss.
+"""State of the nonlinear predictive controller: inputs, references, and predicted model errors.
 
 All but the model's state is in scaled quantities (see `_scaled_runtime`).
 """
@@ -76,7 +76,7 @@ class NmpcArrays(Arrays):
 
 
 class NmpcState(StateVector):
-    """What is held, asked, missed and planned; the model's own state follows."""
+    """Held inputs, references, model errors and plan; the model's own state follows."""
 
     started = cells("", "whether a sample came yet")
     iterations = cells("", "of the QP solver in the last sample")
@@ -99,7 +99,7 @@ class NmpcState(StateVector):
 
 
 def nmpc_common(p: NmpcArrays, x: NmpcState) -> float:
-    """Return the co-contraction that is wanted [rad]: what was asked, or what keeps the loosest tendon taut.
+    """Return the wanted co-contraction [rad]: its reference, or more to keep the loosest tendon taut.
 
     Where the neck is asked to lean, not where it is measured: no noise goes into the tendons.
     """
@@ -141,7 +141,7 @@ def nmpc_asked(p: NmpcArrays, x: NmpcState, target: np.ndarray, asked: np.ndarra
 
 
 def nmpc_ahead(p: NmpcArrays, x: NmpcState, ahead: np.ndarray) -> None:
-    """Fill what the model will miss (outputs N,), from what it missed."""
+    """Fill the predicted model errors (outputs N,) from past ones."""
     for axis in range(p.outputs):
         # o and r of now, by least squares over the window (see `estimate_gains`).
         level = 0.0
@@ -170,7 +170,7 @@ def nmpc_take(p: NmpcArrays, x: NmpcState, z: np.ndarray, sign: np.ndarray, answ
 
 
 def nmpc_shift(starts: np.ndarray, plan: np.ndarray) -> None:
-    """Make the plan that of the next sample: what is planned for one sample later becomes first."""
+    """Shift the plan by one sample."""
     b = starts.shape[0]
     motors = plan.shape[0] // b
     before = plan.copy()

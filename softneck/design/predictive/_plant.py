@@ -15,8 +15,8 @@ from softneck.robot import MOTOR_RANGE, OUTPUT_RANGE, Robot, Scaling
 from softneck.runtime import sized_name
 
 from ..linear._ports import ControllerLimits, limits_of, motor_ranges, reference_ranges
-from ..plants._coupled import AnyAxes, AnyAxis, CoupledAxis, CoupledPlant, times
-from ..plants._uncertain import Doubts, UncertainPlant, doubts_of
+from ..plants._coupled import AnyAxes, AnyAxis, CoupledAxis, CoupledPlant, scale_gains
+from ..plants._uncertain import ModelUncertainty, UncertainPlant, default_uncertainty
 from . import _mpc_state_runtime as rt
 
 # Motor that one scaled output takes up: radius of the tendons' attachment over that of the winch, 52 mm / 7.5 mm (lab
@@ -24,14 +24,14 @@ from . import _mpc_state_runtime as rt
 TAUTNESS_LEVER = 6.93
 # How far a set-point may be from its motor: more than the drives of the neck fall behind at the paper's fastest
 # signals, 0.4 rad; and what the slew makes in so many scaled seconds.
-_LEAD, _LEADING = 1.0, 0.08
+_MIN_LEAD, _LEAD_TIME_S = 1.0, 0.08
 # Beyond all bounds.
-_FREE = 1e12
+_NO_LIMIT = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ScaledPlant:
-    """What a predictive design works on.
+    """The scaled plant of a predictive design.
 
     Attributes:
         axes: a nominal plant of each output, in scaled quantities and seconds.
@@ -40,7 +40,7 @@ class ScaledPlant:
         redefinition: T (outputs + 1, motors) to scaled redefined inputs, and its inverse.
         scaling: of the robot.
         inputs: (outputs,) units of the redefined inputs in SI.
-        doubts: what a design allows for besides.
+        uncertainty: what a design allows for besides.
         identified: whether recordings told the plant.
         sample_time: [s].
     """
@@ -51,7 +51,7 @@ class ScaledPlant:
     redefinition: tuple[Matrix, Matrix]
     scaling: Scaling
     inputs: Vector
-    doubts: Doubts
+    uncertainty: ModelUncertainty
     identified: bool
     sample_time: float
 
@@ -75,27 +75,27 @@ def scaled_plant(plant: UncertainPlant | CoupledPlant, *, identified: bool = Fal
     inverse[:, :m] *= inputs / scaling.motor_unit
     gains = inputs / scaling.output_unit[:, None]
 
-    def scaled(item: Any, axis: int) -> AnyAxis:
+    def to_scaled(item: Any, axis: int) -> AnyAxis:
         seconds = item.sample_time / scaling.second
         if isinstance(item, CoupledAxis):
             return replace(item, B=gains[axis] * item.B, sample_time=seconds)
         return replace(item, numerator=float(gains[axis, axis]) * item.numerator, sample_time=seconds)
 
     return ScaledPlant(
-        axes=tuple(scaled(axis.nominal, i) for i, axis in enumerate(axes)),
-        samples=tuple(tuple(scaled(item, i) for item in axis.samples[1:]) for i, axis in enumerate(axes)),
+        axes=tuple(to_scaled(axis.nominal, i) for i, axis in enumerate(axes)),
+        samples=tuple(tuple(to_scaled(item, i) for item in axis.samples[1:]) for i, axis in enumerate(axes)),
         robot=robot,
         redefinition=(T, inverse),
         scaling=scaling,
         inputs=inputs,
-        doubts=getattr(plant, "doubts", None) or doubts_of(robot),
+        uncertainty=getattr(plant, "doubts", None) or default_uncertainty(robot),
         identified=identified,
         sample_time=plant.sample_time,
     )
 
 
 def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
-    """Return the limits of a predictive controller: what the robot's file says, and the lead of its settings.
+    """Return the limits of a predictive controller: the robot's, and the lead of its settings.
 
     Raises:
         SettingsError: one that the robot does not have, that its file does not give, or that contradicts another.
@@ -105,7 +105,7 @@ def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
     limits = limits_of(robot, lead_limit=lead or 1.0, least_cocontraction=None)
     if lead is None:
         slew = limits.slew_limit * scaling.second / scaling.motor_unit
-        limits = replace(limits, lead_limit=max(_LEAD, _LEADING * slew) * scaling.motor_unit)
+        limits = replace(limits, lead_limit=max(_MIN_LEAD, _LEAD_TIME_S * slew) * scaling.motor_unit)
     if settings.angle_limit is not None:
         if to_si(robot.outputs.unit)[1] != "rad":
             raise SettingsError(
@@ -157,31 +157,31 @@ def units_of(arrays: tuple[Matrix, ...]) -> tuple[float, Vector, Vector]:
     return float(a.constants[-2 * m - 1]), a.constants[-2 * m : -m], a.constants[-m:]
 
 
-def unbound(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
+def remove_limits(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
     """Return the arrays with all units one and no bounds: the controller in scaled quantities."""
     a = rt.MpcArrays(arrays)
     if a.constants.size == rt.MPC_NUMBERS:
         return arrays
     m, motors = a.T.shape[0] - 1, a.T.shape[1]
-    free = [*[-_FREE] * motors, *[_FREE] * motors, *[-_FREE] * (m + 1), *[_FREE] * (m + 1)]
+    free = [*[-_NO_LIMIT] * motors, *[_NO_LIMIT] * motors, *[-_NO_LIMIT] * (m + 1), *[_NO_LIMIT] * (m + 1)]
     constants = np.concatenate([a.constants[: rt.MPC_NUMBERS], free, np.ones(2 * m + 1)])
     return tuple(constants if name == "constants" else item for name, item in zip(a.names(), arrays, strict=True))
 
 
 # That many samples of a family judge robustness; they are spread evenly over all.
-_JUDGES = 12
+_JUDGED_SAMPLES = 12
 # A fit of free runs hides more of the dead time than a plant of one's own has: by so much.
-HIDDEN = 1.25
+HIDDEN_DELAY_FACTOR = 1.25
 
 # Small moves that tell whether tendons hang, of a scaled redefined input, and the scaled seconds that a model settles.
-_MOVE, _SETTLED = 0.3, 3.0
+_PROBE_MOVE, _SETTLE_S = 0.3, 3.0
 # Tendons are taut where such a move does this part of the most that it does anywhere.
-_TAUT = 0.9
+_TAUT_GAIN_RATIO = 0.9
 # Scaled co-contractions that are tried, from rest on.
-_STEP, _MOST = 0.25, 4.0
+_COCONTRACTION_STEP, _MAX_COCONTRACTION = 0.25, 4.0
 
 # Part of `least_delay` that is a sensor's at most.
-_BEHIND = 0.5
+_SENSOR_DELAY_RATIO = 0.5
 
 S = TypeVar("S", bound=Any)
 
@@ -193,10 +193,10 @@ def samples_ahead(look_ahead: float, sample_time: float) -> int:
 
 def predicted_plants(settings: Any, plant: ScaledPlant) -> AnyAxes:
     """Return the plant of each output that is predicted, with settings in scaled seconds."""
-    return tuple(_predicted(settings, plant, axis) for axis in range(len(plant.axes)))
+    return tuple(_predicted_plant(settings, plant, axis) for axis in range(len(plant.axes)))
 
 
-def taken(settings: Any, asked: Any, plant: ScaledPlant) -> dict[str, float]:
+def list_assumptions(settings: Any, asked: Any, plant: ScaledPlant) -> dict[str, float]:
     """Return the assumed dead time and pole that change the plant, where the settings do not give their own."""
     found: dict[str, float] = {}
     for name in ("least_delay", "small_move_pole", "taut_pole"):
@@ -212,39 +212,42 @@ def taken(settings: Any, asked: Any, plant: ScaledPlant) -> dict[str, float]:
 
 
 def families(nominal: AnyAxes, small_move_pole: float) -> list[AnyAxes]:
-    """Return what the robot may be: as identified, and faster."""
+    """Return the plants of the robot: as identified, and faster."""
     if small_move_pole == 0.0:
         return [nominal]
     fast = tuple(plant.with_faster_pole(small_move_pole) for plant in nominal)
     return [nominal] if fast == nominal else [nominal, fast]
 
 
-def _predicted(settings: Any, whole: ScaledPlant, axis: int) -> AnyAxis:
-    plant = timed(whole.axes[axis], settings)
+def _predicted_plant(settings: Any, whole: ScaledPlant, axis: int) -> AnyAxis:
+    plant = set_dead_time(whole.axes[axis], settings)
     if settings.taut_pole == 0.0 or isinstance(plant, CoupledAxis):
         return plant
     # Recordings in which tendons hang say less than a taut neck does, none says more.
     ratios = [abs(sample.static_gain / plant.static_gain) for sample in whole.samples[axis]]
-    (taut,) = times((plant.with_faster_pole(settings.taut_pole),), max([1.0, *ratios]))
+    (taut,) = scale_gains((plant.with_faster_pole(settings.taut_pole),), max([1.0, *ratios]))
     return taut
 
 
-def timed(plant: AnyAxis, timing: Any) -> Any:
-    """Return a plant with the dead time that the controller sees: at least so much, less what the observer is ahead."""
+def set_dead_time(plant: AnyAxis, timing: Any) -> Any:
+    """Return a plant with the dead time after the observer's look-ahead, and a minimum."""
     late = plant.with_min_delay(timing.least_delay)
     return replace(late, delay=max(0, late.delay - samples_ahead(timing.look_ahead, plant.sample_time)))
 
 
 def sample_pairs(plant: ScaledPlant, timing: Any) -> list[AnyAxes]:
     """Return samples of a family, axes joined by the order of their static gains; none for a single model."""
-    axes = [sorted((timed(item, timing) for item in each), key=lambda item: item.static_gain) for each in plant.samples]
-    count = min(_JUDGES, *(len(plants) for plants in axes))
+    axes = [
+        sorted((set_dead_time(item, timing) for item in each), key=lambda item: item.static_gain)
+        for each in plant.samples
+    ]
+    count = min(_JUDGED_SAMPLES, *(len(plants) for plants in axes))
     picks = [np.linspace(0, len(plants) - 1, count).round().astype(int) for plants in axes]
     return [tuple(plants[i] for plants, i in zip(axes, chosen, strict=True)) for chosen in zip(*picks, strict=True)]
 
 
 def over(settings: S, observer: Any) -> S:
-    """Return settings for a loop with this observer; what was given stays.
+    """Return settings for a loop with this observer; given values stay.
 
     Args:
         settings: of `mpc` or `nmpc`.
@@ -260,21 +263,21 @@ def over(settings: S, observer: Any) -> S:
     if settings.look_ahead is None:
         # What `least_delay` adds stands for a dead time that recordings hide, and no sensor is later for that.
         least = getattr(settings, "least_delay", 0.0)
-        least = HIDDEN * doubts_of(observer.robot).least_delay if least is None else least
-        found["look_ahead"] = min(observer.lead, _BEHIND * least or math.inf)
+        least = HIDDEN_DELAY_FACTOR * default_uncertainty(observer.robot).least_delay if least is None else least
+        found["look_ahead"] = min(observer.lead, _SENSOR_DELAY_RATIO * least or math.inf)
     told, wished = getattr(observer, "payloads", None), settings.minimum_tautness is not None
     asks = getattr(settings, "payload_tautness", 0.0) is None
     if asks and wished and told is not None and told[1] > 0.0 and observer.robot.tendon_angles is not None:
         # On top of `minimum_tautness`: what is in reserve without payload is there with it.
-        found["payload_tautness"] = taut_from(observer.model, told[1]) / told[1]
+        found["payload_tautness"] = least_taut_cocontraction(observer.model, told[1]) / told[1]
     return replace(settings, **found)
 
 
-def taut_from(model: Model, payload: float) -> float:
-    """Return the least co-contraction [SI] from rest on at which small moves do under a payload what they can."""
-    tried = np.arange(0.0, _MOST + _STEP / 2, _STEP)
-    gains = np.array([_gain(model, payload, common) for common in tried])
-    return float(tried[np.argmax(gains >= _TAUT * gains.max())]) * _scaling(model).motor_unit
+def least_taut_cocontraction(model: Model, payload: float) -> float:
+    """Return the smallest co-contraction [SI] above rest at which small moves act fully under a payload."""
+    tried = np.arange(0.0, _MAX_COCONTRACTION + _COCONTRACTION_STEP / 2, _COCONTRACTION_STEP)
+    gains = np.array([_mean_gain(model, payload, common) for common in tried])
+    return float(tried[np.argmax(gains >= _TAUT_GAIN_RATIO * gains.max())]) * _scaling(model).motor_unit
 
 
 def _scaling(model: Model) -> Scaling:
@@ -285,12 +288,12 @@ def _scaling(model: Model) -> Scaling:
     return Scaling.of(model.robot, set_points=ends, time_constant=slowest_seconds(model))
 
 
-def _gain(model: Model, payload: float, common: float) -> float:
+def _mean_gain(model: Model, payload: float, common: float) -> float:
     """Return the mean static gain of small moves to both sides of a scaled co-contraction, of all axes."""
     block, weights, scaling = model.block(), weights_of(model), _scaling(model)
     inverse = model.robot.redefinition(weights)[1]
-    moves = _MOVE * scaling.input_units(weights)
-    rows, motors, found = round(_SETTLED * scaling.second / model.sample_time), inverse.shape[0], []
+    moves = _PROBE_MOVE * scaling.input_units(weights)
+    rows, motors, found = round(_SETTLE_S * scaling.second / model.sample_time), inverse.shape[0], []
     for axis in range(len(model.robot.outputs.names)):
         inputs = np.full((3 * rows, len(block.inputs)), np.nan)
         for part, side in enumerate((0.0, 1.0, -1.0)):

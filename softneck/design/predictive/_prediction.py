@@ -9,7 +9,7 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector
 
-from ..plants._coupled import AnyAxis, CoupledAxis, inputs_of
+from ..plants._coupled import AnyAxis, CoupledAxis, input_matrix
 from . import _mpc_state_runtime as rt
 
 # Rounding of a Cholesky factor; beyond it H has no inverse worth the name.
@@ -18,7 +18,7 @@ _LARGEST_CONDITION = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Problem:
-    """What is asked of the controller, in numbers.
+    """The optimisation problem of the controller.
 
     Attributes:
         axes: a plant for each output.
@@ -141,8 +141,8 @@ class Matrices:
     kinds: Matrix
 
 
-def padded(plant: AnyAxis, n: int) -> tuple[Matrix, Matrix]:
-    """Return A (n, n) and B (n, inputs) with the output first and states that nothing reaches behind its own.
+def pad_states(plant: AnyAxis, n: int) -> tuple[Matrix, Matrix]:
+    """Return A (n, n) and B (n, inputs) with the output as first state and unreachable states last.
 
     Of a plant that its own redefined input moves alone there is one input, of a coupled one those of all axes.
     """
@@ -155,7 +155,7 @@ def padded(plant: AnyAxis, n: int) -> tuple[Matrix, Matrix]:
 
 def rest_states(plant: AnyAxis, n: int) -> Matrix:
     """Return (n, inputs) the states at rest under inputs of one."""
-    A, B = padded(plant, n)
+    A, B = pad_states(plant, n)
     return np.linalg.solve(np.eye(n) - A, B)
 
 
@@ -194,8 +194,8 @@ def expression(problem: Problem) -> dict[str, Any]:
     cost = sum((p.move_weight * ca.sumsqr(move - own) for move, own in zip(moves, asked, strict=True)), ca.SX(0))
     ends, angles = [], []
     for axis, plant in enumerate(p.axes):
-        A, _ = padded(plant, n)
-        B = np.vstack([inputs_of(plant, axis, m), np.zeros((n - plant.order, m))])
+        A, _ = pad_states(plant, n)
+        B = np.vstack([input_matrix(plant, axis, m), np.zeros((n - plant.order, m))])
         level, rate = offset[axis]
         a = disturbance_pole(plant)
         x = theta[axis * n : (axis + 1) * n]
@@ -305,7 +305,7 @@ def terminal_matrix(p: Problem) -> Matrix:
     A, B = np.eye(at + M), np.zeros((at + M, M))
     Q = np.zeros_like(A)
     for axis, plant in enumerate(p.axes):
-        a, b = padded(plant, n)
+        a, b = pad_states(plant, n)
         place, moved = slice(axis * n, (axis + 1) * n), p.T[:m] if isinstance(plant, CoupledAxis) else p.T[[axis]]
         A[place, place], A[place, at:] = a, b @ moved
         B[place] = b @ moved

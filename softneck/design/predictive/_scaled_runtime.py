@@ -1,4 +1,4 @@
-"""What both predictive runtimes take in: inputs and limits in scaled quantities, references within their bounds.
+"""Inputs of both predictive runtimes: inputs and limits in scaled quantities, references within bounds.
 
 `q` are a controller's numbers. Behind the first SCALED_NUMBERS stand, where they are not ones, the lowest and highest
 set-points and references, scaled; then the units in SI, that of the motors and one for each output.
@@ -76,7 +76,7 @@ def scaled_listen(
     q: np.ndarray, motors: int, outputs: int, ahead: int, first: bool, inputs: np.ndarray, seen: np.ndarray,
     coming: np.ndarray,
 ) -> None:  # fmt: skip
-    """Take in references, and those ahead (outputs ahead,); one that is not finite leaves what was."""
+    """Update references, and those ahead (outputs ahead,); a value that is not finite keeps the previous one."""
     for i in range(outputs + 1):
         if math.isfinite(inputs[i]):
             seen[i] = scaled_reference(q, motors, outputs, i, float(inputs[i]))

@@ -1,4 +1,4 @@
-"""Linear model predictive control: what is asked, and the controller that does it."""
+"""Linear model predictive control: settings and design of the controller."""
 
 from __future__ import annotations
 
@@ -23,59 +23,59 @@ from softneck.robot import Robot, find_robot
 
 from ..linear._ports import LIMITS, ControllerLimits
 from ..plants._coupled import AnyAxes, coupled_plant, radius, sensitivity
-from ..plants._uncertain import USUAL_PERIOD, discrete, uncertain_plant
+from ..plants._uncertain import DEFAULT_SAMPLE_TIME_S, discretize_zoh, uncertain_plant
 from ._arrays import Tuning, assemble, observer_bandwidth, system, with_filter, with_gains, with_sample_time
 from ._controller import MpcController
 from ._mpc_state_runtime import MpcArrays
 from ._plant import (
-    HIDDEN,
+    HIDDEN_DELAY_FACTOR,
     TAUTNESS_LEVER,
     ScaledPlant,
     families,
+    list_assumptions,
     over,
     predicted_plants,
     predictive_limits,
     sample_pairs,
     scale_numbers,
     scaled_plant,
-    taken,
 )
 from ._prediction import Problem, matrices
 from ._tuning import (
     FULL_TRUST,
+    bisect,
     filter_for_rise,
     guard_samples,
-    halved,
     judged_frequencies,
     keeps_bounds,
     move_weight,
     observer_trust,
-    require_given,
+    require_positive_settings,
     require_solvable,
     rise,
     spaced_starts,
 )  # fmt: skip
 
 # All in scaled seconds. Bandwidths that are tried.
-_BANDWIDTHS = (1.0, 40.0)
+_BANDWIDTH_RANGE = (1.0, 40.0)
 # Behind the dead time, in samples at most so many; moves in it.
-_HORIZON, _LONGEST, _MOVES = 0.6, 200, 10
-_PREVIEW = 4.0
+_HORIZON_S, _MAX_HORIZON, _MOVE_COUNT = 0.6, 200, 10
+_MAX_PREVIEW_S = 4.0
 # Time constant of the reference filter: of what recordings told, and of a plant of one's own.
-_REFERENCE_TIMES = 0.05, 0.2
-# Of a robot with doubts on its small moves: its slowest pole where tendons are taut.
+_REFERENCE_TIMES_S = 0.05, 0.2
+# Of a robot with uncertainty on its small moves: its slowest pole where tendons are taut.
 _TAUT_POLE = 9.0
 # Bound on Ms on every sample of a family, where that on the nominal plant is not larger: samples are what a payload or
 # an inclination makes of it now and then.
 _WORST_SENSITIVITY = 2.5
 # On the error of co-contraction against that of the tilt's inputs, squared. Light: where tendons must be taut,
 # co-contraction gives way; at 1 the angles gave way by a quarter of a degree.
-_COCONTRACTION = 0.05
+_COCONTRACTION_WEIGHT = 0.05
 # On violations of soft limits against errors of the angles, squared.
-_SLACK = 1e3
+_SLACK_WEIGHT = 1e3
 # On a lack of tautness where it is a wish: a limit turns the noise of the angles into pulls of one sign, and tilts the
 # neck by 0.2 deg (`benchmarks/leave_one_neck_out.py mpc.tautness_weight`).
-_WISH = 0.3
+_WISH_WEIGHT = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
@@ -114,7 +114,7 @@ class MpcSettings(ReprMixin):
     order: str = "sequential"
 
     def __post_init__(self) -> None:
-        require_given(self, {"bandwidth": "rad/s", "lead_limit": "", "angle_limit": "rad"})
+        require_positive_settings(self, {"bandwidth": "rad/s", "lead_limit": "", "angle_limit": "rad"})
         require_between("max_sensitivity", self.max_sensitivity, 1.05, 4.0)
         if self.rise_s is not None:
             require_between("rise_s", self.rise_s, 0.001, 1e6, "s")
@@ -130,7 +130,7 @@ class MpcSettings(ReprMixin):
         return 0 if self.order == "sequential" else 2
 
     def over(self, observer: Any) -> MpcNumbers:
-        """Return the settings for a loop with this observer: its look-ahead, what tautness its payload wants."""
+        """Return the settings for a loop with this observer: its look-ahead, and tautness for its payload."""
         return over(MpcNumbers.of(self), observer)
 
     def design(self, model: Any, *, robot: Robot | str | Path | None = None) -> MpcController:
@@ -145,16 +145,16 @@ class MpcSettings(ReprMixin):
                 robustness that nothing keeps.
         """
         given = None if robot is None else find_robot(robot)
-        period, model = discrete(model, (given and given.sample_time_s) or USUAL_PERIOD)
+        period, model = discretize_zoh(model, (given and given.sample_time_s) or DEFAULT_SAMPLE_TIME_S)
         whole = coupled_plant(model, robot=given) or uncertain_plant(model, given)
         plant = scaled_plant(whole, identified=hasattr(model, "findings"))
-        made = MpcNumbers.of(self).designed(plant, predictive_limits(self, plant))
+        made = MpcNumbers.of(self).design_candidate(plant, predictive_limits(self, plant))
         return made if period is None else replace(made, design={**made.design, "held_s": period})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class MpcNumbers(MpcSettings):
-    """Settings, and the numbers that follow from plant and observer; None for what is usual.
+    """Settings with the numbers that follow from plant and observer; None for defaults.
 
     Attributes:
         reference_time: time constant of the reference filter [s].
@@ -192,41 +192,42 @@ class MpcNumbers(MpcSettings):
         """Samples of the horizon at which the motors move."""
         return spaced_starts(self.horizon or 1, self.moves or 1)
 
-    def resolved(self, plant: ScaledPlant) -> Self:
+    def fill_defaults(self, plant: ScaledPlant) -> Self:
         """Return the settings with the numbers that are usual for a plant."""
-        second, doubts, told = plant.scaling.second, plant.doubts, plant.identified
+        second, uncertainty, told = plant.scaling.second, plant.uncertainty, plant.identified
         taut = self.minimum_tautness
-        require_between("preview", self.preview, 0.0, _PREVIEW * second, "s")
+        require_between("preview", self.preview, 0.0, _MAX_PREVIEW_S * second, "s")
         if taut == "wish" and not (told and plant.has_tendons):
             taut = None
-        horizon = self.horizon or min(max(3, round(_HORIZON / plant.axes[0].sample_time)), _LONGEST)
+        horizon = self.horizon or min(max(3, round(_HORIZON_S / plant.axes[0].sample_time)), _MAX_HORIZON)
         usual = {
-            "horizon": horizon, "moves": min(_MOVES, horizon), "look_ahead": 0.0, "payload_tautness": 0.0,
-            "reference_time": second * _REFERENCE_TIMES[0 if told else 1],
-            "least_delay": (HIDDEN if told else 1.0) * doubts.least_delay, "small_move_pole": doubts.small_move_pole,
-            "taut_pole": _TAUT_POLE / second if told and doubts.small_move_pole > 0.0 else 0.0,
+            "horizon": horizon, "moves": min(_MOVE_COUNT, horizon), "look_ahead": 0.0, "payload_tautness": 0.0,
+            "reference_time": second * _REFERENCE_TIMES_S[0 if told else 1],
+            "least_delay": (HIDDEN_DELAY_FACTOR if told else 1.0) * uncertainty.least_delay,
+            "small_move_pole": uncertainty.small_move_pole,
+            "taut_pole": _TAUT_POLE / second if told and uncertainty.small_move_pole > 0.0 else 0.0,
         }  # fmt: skip
         found = {name: value for name, value in usual.items() if getattr(self, name) is None}
         # What a payload wants adds to a tautness that is wished for.
         found |= {"payload_tautness": 0.0} if taut is None else {}
         return replace(self, **found, minimum_tautness=taut)
 
-    def _scaled(self, second: float) -> Self:
+    def _to_scaled_time(self, second: float) -> Self:
         """Return resolved settings in scaled seconds."""
         times = {"rise_s", "preview", "reference_time", "least_delay", "look_ahead"}
         rates = {"bandwidth", "small_move_pole", "taut_pole"}
         given = {name: getattr(self, name) for name in (*times, *rates) if getattr(self, name) is not None}
         return replace(self, **{name: v / second if name in times else v * second for name, v in given.items()})
 
-    def designed(self, plant: ScaledPlant, limits: ControllerLimits) -> MpcController:
-        """Return the controller for what is predicted."""
-        asked, second = self.resolved(plant), plant.scaling.second
-        work = asked._scaled(second)
+    def design_candidate(self, plant: ScaledPlant, limits: ControllerLimits) -> MpcController:
+        """Return the controller of a scaled plant."""
+        asked, second = self.fill_defaults(plant), plant.scaling.second
+        work = asked._to_scaled_time(second)
         nominal, samples = predicted_plants(work, plant), sample_pairs(plant, work)
         bandwidth = work._fastest(plant, limits, nominal, samples) if work.bandwidth is None else work.bandwidth
         if work.rise_s is not None and work.bandwidth is None:
-            bandwidth = work._risen(plant, limits, nominal, bandwidth)
-        arrays, found = work._tuned(work._arrays(plant, limits, bandwidth), nominal, samples)
+            bandwidth = work._raise_bandwidth(plant, limits, nominal, bandwidth)
+        arrays, found = work._tune_observer(work._arrays(plant, limits, bandwidth), nominal, samples)
         found["bandwidth_rad_s"] = bandwidth
         for name, value in found.items():
             if name.endswith(("_rad_s", "_s")):
@@ -245,7 +246,7 @@ class MpcNumbers(MpcSettings):
             minimum_tautness=taut,
             order=self.order,
             design={"settings": asdict(asked), "extra_delay": self.extra_delay, **found,
-                    "assumed": taken(asked, self, plant)},
+                    "assumed": list_assumptions(asked, self, plant)},
         )  # fmt: skip
 
     def _fastest(self, plant: ScaledPlant, limits: ControllerLimits, nominal: AnyAxes, samples: list[AnyAxes]) -> float:
@@ -254,17 +255,17 @@ class MpcNumbers(MpcSettings):
         def keeps(bandwidth: float) -> bool:
             return keeps_bounds(self._arrays(plant, limits, bandwidth), bounds, self.extra_delay, w)
 
-        low, high = _BANDWIDTHS
+        low, high = _BANDWIDTH_RANGE
         if not keeps(low):
             raise SettingsError(
                 f"not even a bandwidth of {low / plant.scaling.second:g} rad/s keeps Ms <= {self.max_sensitivity:g} "
                 f"({max(_WORST_SENSITIVITY, self.max_sensitivity):g} on the samples of a family); raise "
                 "`max_sensitivity`, or give `bandwidth`, with which less of what is measured is believed."
             )
-        return halved(keeps, low, high)[0]
+        return bisect(keeps, low, high)[0]
 
-    def _risen(self, plant: ScaledPlant, limits: ControllerLimits, nominal: AnyAxes, least: float) -> float:
-        """Return the least bandwidth from `least` on with which a step rises as fast as asked without a filter.
+    def _raise_bandwidth(self, plant: ScaledPlant, limits: ControllerLimits, nominal: AnyAxes, least: float) -> float:
+        """Return the smallest bandwidth with which a step reaches the required rise time without a filter.
 
         Beyond `least` the observer believes less of what is measured, so that the loop stays as robust.
         """
@@ -273,13 +274,13 @@ class MpcNumbers(MpcSettings):
             unfiltered = with_filter(self._arrays(plant, limits, bandwidth), 0.0)
             return rise(unfiltered, nominal, self.extra_delay) <= self.rise_s  # type: ignore[operator]
 
-        low, high = least, _BANDWIDTHS[1]
+        low, high = least, _BANDWIDTH_RANGE[1]
         if rises(low):
             return low
         if not rises(high):
             asked = (self.rise_s or 0.0) * plant.scaling.second
             raise SettingsError(f"`rise_s` {asked:g} is faster than any plan of this plant rises; ask for more.")
-        return halved(lambda bandwidth: not rises(bandwidth), low, high)[1]
+        return bisect(lambda bandwidth: not rises(bandwidth), low, high)[1]
 
     def _arrays(self, plant: ScaledPlant, limits: ControllerLimits, bandwidth: float) -> tuple[Any, ...]:
         problem = self.problem(plant, bandwidth)
@@ -292,7 +293,7 @@ class MpcNumbers(MpcSettings):
         return assemble(problem, matrices(problem), tuning)
 
     def problem(self, plant: ScaledPlant, bandwidth: float) -> Problem:
-        """Return what is asked with that scaled bandwidth, in numbers, before observer and filter are tuned.
+        """Return the problem for a scaled bandwidth, before observer and filter are tuned.
 
         Of resolved settings in scaled seconds.
         """
@@ -301,7 +302,7 @@ class MpcNumbers(MpcSettings):
         weights: Vector = np.array([1.0 / plant.static_gain**2 for plant in nominal])
         # For symmetric tendons |P|^2 = 2/3 (theta^2 + phi^2) + 3 delta^2: the weight on an input becomes one on motors.
         on_input = max(move_weight(plant, bandwidth) for plant in nominal)
-        wish = _WISH if isinstance(self.minimum_tautness, str) else _SLACK
+        wish = _WISH_WEIGHT if isinstance(self.minimum_tautness, str) else _SLACK_WEIGHT
         return Problem(
             axes=tuple(replace(plant, delay=plant.delay + self.extra_delay) for plant in nominal),
             horizon=self.horizon or 1,
@@ -310,8 +311,8 @@ class MpcNumbers(MpcSettings):
             T_inverse=inverse,
             output_weight=weights,
             move_weight=1.5 * on_input,
-            cocontraction_weight=_COCONTRACTION,
-            slack_weight=_SLACK * float(weights.max()),
+            cocontraction_weight=_COCONTRACTION_WEIGHT,
+            slack_weight=_SLACK_WEIGHT * float(weights.max()),
             tautness_weight=wish * float(weights.max()),
             angles=self.angle_limit is not None,
             tautness=None if self.minimum_tautness is None else TAUTNESS_LEVER * T[:m].T,
@@ -323,10 +324,10 @@ class MpcNumbers(MpcSettings):
         bounds = [(pair, self.max_sensitivity) for pair in families(nominal, self.small_move_pole or 0.0)]
         return bounds + [(pair, worst) for pair in samples]
 
-    def _tuned(
+    def _tune_observer(
         self, arrays: tuple[Matrix, ...], nominal: AnyAxes, samples: list[AnyAxes]
     ) -> tuple[tuple[Matrix, ...], dict[str, Any]]:
-        """Return the arrays with observer and filter, and what was found."""
+        """Return the arrays with observer and filter, and the findings."""
         moved, w = families(nominal, self.small_move_pole or 0.0), judged_frequencies(nominal)
         arrays = with_gains(arrays, observer_trust(arrays, self._bounds(nominal, samples), self.extra_delay, w))
         time = self.reference_time or 0.0

@@ -12,43 +12,43 @@ from softneck.core import Matrix, SettingsError, Vector, require_positive
 from softneck.estimation import AxisPlant
 
 from ..linear._axis_loop import frequencies
-from ..plants._coupled import AnyAxes, AnyAxis, CoupledAxis, closed, radius, sensitivity
+from ..plants._coupled import AnyAxes, AnyAxis, CoupledAxis, close_loop, radius, sensitivity
 from ._arrays import system, with_filter, with_gains
 
 # One plant for each output.
 Pair = AnyAxes
 
 # Decades of the move weight that are searched, relative to errors of the input.
-_WEIGHTS = (-6.0, 6.0)
+_WEIGHT_DECADES = (-6.0, 6.0)
 # Trust of the observers that are tried.
-_LEAST, FULL_TRUST = 1e-4, 1e3
-_HALVINGS = 18
-_THINNING = 5
+_MIN_TRUST, FULL_TRUST = 1e-4, 1e3
+_BISECTION_STEPS = 18
+_FREQUENCY_DECIMATION = 5
 # Of a range of 40: to 2 %.
-_NARROWED = 7
+_BANDWIDTH_BISECTIONS = 7
 # A step response is judged over this long.
-_HORIZON = 4.0
+_STEP_WINDOW_S = 4.0
 # With 180 a sample of 20 ms was over before half of the answers came, with 90 none of them took a tenth of it.
-_MOST_UNKNOWNS = 120
+_MAX_UNKNOWNS = 120
 # Samples of the last hold: ten moves over thirty samples, dense where they matter.
-_SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
+_MOVE_SPACING = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20)
 
 
 def judged_frequencies(nominal: Pair) -> Vector:
     """Return the frequencies [rad/s] of Ms: 5 % apart, so that a peak is missed by less than 1 %."""
-    return frequencies(nominal[0].sample_time)[::_THINNING]
+    return frequencies(nominal[0].sample_time)[::_FREQUENCY_DECIMATION]
 
 
-def halved(keeps: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Return the range from `low`, which keeps something, to `high`, which does not, halved until it is 2 % wide."""
-    for _ in range(_NARROWED):
+def bisect(keeps: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """Bisect the range from `low`, which keeps something, to `high`, which does not, until it is 2 % wide."""
+    for _ in range(_BANDWIDTH_BISECTIONS):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if keeps(middle) else (low, middle)
     return low, high
 
 
-def require_given(settings: Any, units: Mapping[str, str]) -> None:
-    """Raise SettingsError for what is given and not positive, of these settings with their units."""
+def require_positive_settings(settings: Any, units: Mapping[str, str]) -> None:
+    """Raise SettingsError for a given setting that is not positive; `units` are for the message."""
     for name, unit in units.items():
         if getattr(settings, name) is not None:
             require_positive(name, getattr(settings, name), unit)
@@ -61,8 +61,8 @@ def move_weight(plant: AnyAxis, bandwidth: float) -> float:
     output hardly shows nothing is asked: no weight moves them.
     """
     plant = plant.lag() if isinstance(plant, CoupledAxis) else plant.remove_hidden_poles()
-    low, high = _WEIGHTS
-    for _ in range(_HALVINGS):
+    low, high = _WEIGHT_DECADES
+    for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
         if _slowest(plant, 10.0**middle) > math.exp(-bandwidth * plant.sample_time):
             high = middle
@@ -116,25 +116,25 @@ def observer_trust(
     def keeps(trust: float) -> bool:
         return keeps_bounds(with_gains(arrays, trust), families, extra_delay, frequency)
 
-    low, high = math.log(_LEAST), math.log(FULL_TRUST)
+    low, high = math.log(_MIN_TRUST), math.log(FULL_TRUST)
     if keeps(FULL_TRUST):
         return FULL_TRUST
-    if not keeps(_LEAST):
+    if not keeps(_MIN_TRUST):
         raise SettingsError(
             "no observer keeps the requested robustness; ask for less `bandwidth` or more `max_sensitivity`."
         )
-    for _ in range(_HALVINGS // 2 + 2):
+    for _ in range(_BISECTION_STEPS // 2 + 2):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if keeps(math.exp(middle)) else (low, middle)
     return math.exp(low)
 
 
 def rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int) -> float:
-    """Return in what time [s] a step of each reference alone rises from 10 to 90 %, no limit acting; of the slowest
+    """Return the rise time [s], 10 to 90 %, of a step of each reference alone without limits; of the slowest
     axis, infinite where one does not rise."""
     parts, m, Ts = system(arrays), len(pair), pair[0].sample_time
-    A, B, C = closed(parts, pair, extra_delay)
-    rows = math.ceil(_HORIZON / Ts)
+    A, B, C = close_loop(parts, pair, extra_delay)
+    rows = math.ceil(_STEP_WINDOW_S / Ts)
     x, y = np.zeros((A.shape[0], m)), np.zeros((rows, m))
     for k in range(rows):
         x = A @ x + B
@@ -153,12 +153,12 @@ def _crossed(path: Vector, level: float) -> float:
 
 
 def filter_for_rise(arrays: tuple[Matrix, ...], pair: Pair, extra_delay: int, asked: float) -> float:
-    """Return the time constant [s] of the reference filter with which the loop rises in `asked` [s]; 0 where it does
+    """Return the time constant [s] of the reference filter for the required rise time [s]; 0 where it does
     not even without."""
     low, high = 0.0, asked
     if rise(with_filter(arrays, 0.0), pair, extra_delay) >= asked:
         return 0.0
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
         # A filter that answers so late that nothing rises within what is looked at is too slow as well.
         quick = rise(with_filter(arrays, middle), pair, extra_delay) < asked
@@ -173,16 +173,16 @@ def guard_samples(bandwidth: float, sample_time: float) -> int:
 
 def require_solvable(moves: int, motors: int) -> None:
     """Raise SettingsError where a plan has more unknowns than the solver answers within a sample."""
-    if moves * motors > _MOST_UNKNOWNS:
+    if moves * motors > _MAX_UNKNOWNS:
         raise SettingsError(
             f"`moves` {moves} of {motors} motors are {moves * motors} unknowns, and the solver takes at most "
-            f"{_MOST_UNKNOWNS} within a sample; ask for at most {_MOST_UNKNOWNS // motors} moves, `horizon` may stay."
+            f"{_MAX_UNKNOWNS} within a sample; ask for at most {_MAX_UNKNOWNS // motors} moves, `horizon` may stay."
         )
 
 
 def spaced_starts(horizon: int, moves: int) -> tuple[int, ...]:
     """Return samples at which the motors move: dense at first, sparse later."""
-    places = np.interp(np.linspace(0.0, 9.0, moves), np.arange(10), np.array(_SPACING) * horizon / 30.0)
+    places = np.interp(np.linspace(0.0, 9.0, moves), np.arange(10), np.array(_MOVE_SPACING) * horizon / 30.0)
     starts = [0]
     for place in places[1:]:
         starts.append(max(starts[-1] + 1, round(float(place))))

@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     import control
 
 # The optimal controller has a pole near infinity (3e9 rad/s); a little above gamma it is an ordinary one.
-_ABOVE = 1.05
+_GAMMA_FACTOR = 1.05
 # |T_zw| found on a grid may exceed gamma by rounding of the synthesis, not more.
-_SLACK = 1e-3
+_NORM_TOLERANCE = 1e-3
 # A weight below this at infinity counts as strictly proper.
 _LEAST_DIRECT = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Synthesis:
-    """A controller and what it was found to do.
+    """A controller and the norms of its loop.
 
     Attributes:
         controller: K for negative feedback, `u = K (r - y)`, with the plant's dt and names.
@@ -46,7 +46,7 @@ def mixsyn(
     W2: Any = None,
     W3: Any = None,
     *,
-    above: float = _ABOVE,
+    above: float = _GAMMA_FACTOR,
 ) -> Synthesis:
     """Return the controller that keeps `|W1 S; W2 K S; W3 T|` small (Skogestad and Postlethwaite 2005, sec. 9.3.6).
 
@@ -72,13 +72,13 @@ def mixsyn(
             "the control effort is not weighted at high frequencies (D12 has not full rank), where the search for a "
             "controller hangs: give W2 a gain there, a number for example, or a W3 with as many zeros as poles."
         )
-    found = hinfsyn(_augmented(to_continuous(G), weights), outputs, inputs, above=above)
+    found = hinfsyn(_augment(to_continuous(G), weights), outputs, inputs, above=above)
     K = to_discrete(found.controller, dt) if dt else found.controller
-    return Synthesis(controller=_named(K, G, dt), gamma=found.gamma, achieved=found.achieved)
+    return Synthesis(controller=_name_signals(K, G, dt), gamma=found.gamma, achieved=found.achieved)
 
 
-def hinfsyn(P: Any, nmeas: int, ncon: int, *, above: float = _ABOVE) -> Synthesis:
-    """Return the H-infinity controller of the generalised plant P, built at `above` times the least gamma.
+def hinfsyn(P: Any, nmeas: int, ncon: int, *, above: float = _GAMMA_FACTOR) -> Synthesis:
+    """Return the H-infinity controller of the generalised plant P, built at `above` times the optimal gamma.
 
     What makes the search hang is refused (D12 or D21 of less than full rank), and what comes out is verified: a stable
     loop and its norm. A discrete P gives a controller of its dt.
@@ -102,11 +102,11 @@ def hinfsyn(P: Any, nmeas: int, ncon: int, *, above: float = _ABOVE) -> Synthesi
     return Synthesis(
         controller=to_discrete(K, dt) if dt else K,
         gamma=gamma,
-        achieved=_verified(closed, above * gamma),
+        achieved=_verify_norm(closed, above * gamma),
     )
 
 
-def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
+def _augment(G: Any, weights: list[Any]) -> control.StateSpace:
     """Return P from (r, u) to (W1 e, W2 u, W3 y, e) with e = r - G u (python-control's `augw`, which warns)."""
     import control
 
@@ -134,7 +134,7 @@ def _augmented(G: Any, weights: list[Any]) -> control.StateSpace:
     return control.StateSpace(states, inputs, np.vstack(wide), np.vstack(direct), 0)
 
 
-def _verified(closed: Any, bound: float) -> float:
+def _verify_norm(closed: Any, bound: float) -> float:
     """Return the norm of the closed loop on a grid; raise where it is not stable or beyond `bound`."""
     largest = float(np.max(np.linalg.eigvals(np.asarray(closed.A)).real, initial=-np.inf))
     if largest >= 0.0:
@@ -144,7 +144,7 @@ def _verified(closed: Any, bound: float) -> float:
         )
     response = np.moveaxis(np.asarray(closed(1j * np.geomspace(1e-4, 1e5, 400), squeeze=False)), -1, 0)
     size = float(np.linalg.norm(response, 2, axis=(1, 2)).max())
-    if size > (1.0 + _SLACK) * bound:
+    if size > (1.0 + _NORM_TOLERANCE) * bound:
         raise SettingsError(f"the result has a norm of {size:.4g}, beyond {bound:.4g}: scale the weights.")
     return size
 
@@ -159,7 +159,7 @@ def _dt_of(system: Any) -> float:
     return float(system.dt)
 
 
-def _named(K: Any, G: Any, dt: float) -> control.StateSpace:
+def _name_signals(K: Any, G: Any, dt: float) -> control.StateSpace:
     """Return K, from the plant's outputs to its inputs by name."""
     import control
 
@@ -168,12 +168,12 @@ def _named(K: Any, G: Any, dt: float) -> control.StateSpace:
 
 
 # Gamma is found to 0.01 %: what is built is 5 % above it.
-_CLOSENESS = 1e-4
-_LARGEST = 1e8
+_GAMMA_TOLERANCE = 1e-4
+_MAX_GAMMA = 1e8
 # An eigenvalue of the Hamiltonian this close to the axis (relative to the largest) counts as on it.
 _ON_AXIS = 1e-13
 # X and Y may come out negative by rounding: relative to their size.
-_NEGATIVE = 1e-7
+_DEFINITENESS_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +226,7 @@ def partition(A: Matrix, B: Matrix, C: Matrix, D: Matrix, *, nmeas: int, ncon: i
 
 
 def least_gamma(plant: Partition) -> float:
-    """Return the least gamma for which a controller exists, 0.01 % above at most.
+    """Return the optimal gamma, at most 0.01 % too large.
 
     Raises:
         SettingsError: none up to 1e8.
@@ -234,11 +234,11 @@ def least_gamma(plant: Partition) -> float:
     low, high = 0.0, 1.0
     while solve_at(plant, high) is None:
         low, high = high, 4.0 * high
-        if high > _LARGEST:
+        if high > _MAX_GAMMA:
             raise SettingsError(
                 "no controller exists for any gamma: the plant cannot be stabilised, or a weight is not stable."
             )
-    while high - low > _CLOSENESS * high:
+    while high - low > _GAMMA_TOLERANCE * high:
         middle = 0.5 * (low + high) if low > 0.0 else 0.25 * high
         if solve_at(plant, middle) is None:
             low = middle
@@ -287,10 +287,12 @@ def solve_at(plant: Partition, gamma: float) -> tuple[Matrix, Matrix, Matrix, Ma
     B1h = -Z @ L2 + B2h @ np.linalg.solve(D12h, D11h)
     C1h = F2 + D11h @ np.linalg.solve(D21h, C2h)
     Ah = A + B @ F + B1h @ np.linalg.solve(D21h, C2h)
-    return _restored(plant, Ah, B1h, C1h, D11h)
+    return _undo_scaling(plant, Ah, B1h, C1h, D11h)
 
 
-def _restored(plant: Partition, A: Matrix, B: Matrix, C: Matrix, D: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
+def _undo_scaling(
+    plant: Partition, A: Matrix, B: Matrix, C: Matrix, D: Matrix
+) -> tuple[Matrix, Matrix, Matrix, Matrix]:
     """Undo the scaling, and put D22 back: K (I + D22 K)^-1."""
     B, C, D = B @ plant.right, plant.left @ C, plant.left @ D @ plant.right
     E = np.linalg.inv(np.eye(D.shape[0]) + D @ plant.D22)
@@ -318,7 +320,7 @@ def _riccati(A: Matrix, B: Matrix, Q: Matrix, R: Matrix, S: Matrix) -> Matrix | 
         return None
     X = 0.5 * (X + X.T)
     lowest = float(np.linalg.eigvalsh(X).min(initial=0.0))
-    return X if lowest >= -_NEGATIVE * max(1.0, float(np.abs(X).max(initial=0.0))) else None
+    return X if lowest >= -_DEFINITENESS_TOLERANCE * max(1.0, float(np.abs(X).max(initial=0.0))) else None
 
 
 def _size(D: Matrix) -> float:
@@ -326,9 +328,9 @@ def _size(D: Matrix) -> float:
 
 
 # Gain of W1 at rest: its pole lies this far below the bandwidth and becomes an integrator afterwards.
-_AT_REST = 1e4
+_W1_STATIC_GAIN = 1e4
 # What W1 allows |S| far up: below it the bound on Ms, from 1.2 on, is what binds.
-_PEAK = 1.3
+_HIGH_FREQUENCY_BOUND = 1.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -358,18 +360,18 @@ class HinfSettings(AxisSettings):
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
         if self.bandwidth is not None:
-            return self._built(axis, self.bandwidth)
+            return self._design_at(axis, self.bandwidth)
         lag = axis.nominal.time_constant + axis.nominal.delay * axis.sample_time
         return self._fastest(
-            lambda speed: self._built(axis, speed), axis, low=0.05 / lag, high=5.0 / lag, what="bandwidth"
+            lambda speed: self._design_at(axis, speed), axis, low=0.05 / lag, high=5.0 / lag, what="bandwidth"
         )
 
-    def _built(self, axis: UncertainAxis, bandwidth: float) -> AxisDesign:
+    def _design_at(self, axis: UncertainAxis, bandwidth: float) -> AxisDesign:
         import control
 
         gain, dt = axis.nominal.static_gain, axis.sample_time
         G = axis.nominal.tf(extra_delay=self.extra_delay) / gain
-        W1 = makeweight(_AT_REST, bandwidth, 1.0 / _PEAK, dt=dt)
+        W1 = makeweight(_W1_STATIC_GAIN, bandwidth, 1.0 / _HIGH_FREQUENCY_BOUND, dt=dt)
         found = mixsyn(G, W1, self.control_weight)
         K: Any = with_integrator(found.controller)
         return AxisDesign(

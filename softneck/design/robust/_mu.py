@@ -20,8 +20,8 @@ from softneck.core import Matrix, SettingsError, Vector
 Array = np.ndarray
 Blocks = Sequence[tuple[int, int]]
 # Sharpness of the smoothed maximum, relative to the bound: the last is off by log(n)/3000, 0.05 % for n = 4.
-_SHARPNESS = (20.0, 150.0, 1000.0, 3000.0)
-_ITERATIONS = 40
+_SMOOTHING_SHARPNESS = (20.0, 150.0, 1000.0, 3000.0)
+_MAX_ITERATIONS = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,17 +95,17 @@ def mu_upper(M: Array, blocks: Blocks) -> Vector:
     M = structure.check(M)
     reals = np.flatnonzero(structure.real)
     size = np.maximum(np.linalg.norm(M, 2, axis=(1, 2)), 1e-300)
-    x = _balanced(M, structure)
+    x = _balance_blocks(M, structure)
     theta = np.concatenate([x, np.zeros((M.shape[0], reals.size))], axis=1)
     problem = _EigenvalueProblem(M / size[:, None, None], structure, reals)
-    best, where = problem.exact(theta), theta.copy()
+    best, where = problem.largest_eigenvalue(theta), theta.copy()
     # The last d is free: only ratios count.
     free = np.ones(theta.shape[1])
     free[x.shape[1] - 1] = 0.0
-    for sharpness in _SHARPNESS if theta.shape[1] > 1 or reals.size else ():
+    for sharpness in _SMOOTHING_SHARPNESS if theta.shape[1] > 1 or reals.size else ():
         scale = np.maximum(np.abs(best), 1e-3)
         theta = _descend(problem, where, sharpness / scale, free)
-        value = problem.exact(theta)
+        value = problem.largest_eigenvalue(theta)
         better = value < best
         best, where = np.where(better, value, best), np.where(better[:, None], theta, where)
     return size * np.sqrt(np.maximum(best, 0.0))
@@ -119,10 +119,10 @@ class _EigenvalueProblem:
         self.rows = np.array([int(np.argmax(structure.out_of[:, b])) for b in reals], dtype=int)
         self.columns = np.array([int(np.argmax(structure.into[:, b])) for b in reals], dtype=int)
 
-    def exact(self, theta: Matrix) -> Vector:
+    def largest_eigenvalue(self, theta: Matrix) -> Vector:
         return np.linalg.eigvalsh(self._matrices(theta, slice(None))[2])[:, -1]
 
-    def smoothed(self, theta: Matrix, sharpness: Vector, which: Array) -> tuple[Vector, Matrix]:
+    def smooth_eigenvalue(self, theta: Matrix, sharpness: Vector, which: Array) -> tuple[Vector, Matrix]:
         scaled, G, H = self._matrices(theta, which)
         values, V = np.linalg.eigh(H)
         shifted = sharpness[:, None] * (values - values[:, -1:])
@@ -156,9 +156,9 @@ def _descend(problem: _EigenvalueProblem, start: Matrix, sharpness: Vector, free
     m, p = theta.shape
     B = np.tile(np.diag(free), (m, 1, 1)) / sharpness[:, None, None]
     active = np.arange(m)
-    f, gradient = problem.smoothed(theta, sharpness, active)
+    f, gradient = problem.smooth_eigenvalue(theta, sharpness, active)
     gradient *= free
-    for _ in range(_ITERATIONS):
+    for _ in range(_MAX_ITERATIONS):
         t, fa, ga = theta[active], f[active], gradient[active]
         step = -np.einsum("mij,mj->mi", B[active], ga)
         slope = np.einsum("mi,mi->m", step, ga)
@@ -189,7 +189,7 @@ def _backtrack(
     todo = np.arange(f.size)
     for _ in range(25):
         trial = t[todo] + length[todo, None] * step[todo]
-        value, gradient = problem.smoothed(trial, sharpness[todo], which[todo])
+        value, gradient = problem.smooth_eigenvalue(trial, sharpness[todo], which[todo])
         done = value <= f[todo] + 1e-4 * length[todo] * slope[todo]
         at = todo[done]
         new_t[at], new_f[at], new_g[at] = trial[done], value[done], gradient[done]
@@ -200,7 +200,7 @@ def _backtrack(
     return new_t, new_f, new_g
 
 
-def _balanced(M: Array, structure: Structure) -> Matrix:
+def _balance_blocks(M: Array, structure: Structure) -> Matrix:
     """Return log d (m, blocks) that balances the norms of the blocks (Osborne 1960, J. ACM 7:338)."""
     N = np.sqrt(np.einsum("mij,ik,jl->mkl", np.abs(M) ** 2, structure.out_of, structure.into))
     n = N.shape[1]

@@ -51,14 +51,14 @@ def makeweight(
             "otherwise no weight of one slope passes through all three."
         )
     l, h, m = (value ** (1.0 / order) for value in (low, high, size))
-    w = float(drawn_out(np.array([frequency]), dt)[0]) if dt else frequency
+    w = float(warp_frequency(np.array([frequency]), dt)[0]) if dt else frequency
     if not 0.0 < w < math.inf or (dt and frequency >= math.pi / dt):
         raise SettingsError(f"the corner {frequency:g} rad/s must be below the Nyquist frequency of dt = {dt} s.")
     p = w * math.sqrt((h**2 - m**2) / (m**2 - l**2))
     above, below = np.array([1.0]), np.array([1.0])
     for _ in range(order):
         above, below = np.convolve(above, [h, l * p]), np.convolve(below, [1.0, p])
-    return control.TransferFunction(above, below) if not dt else _discrete(above, below, dt)
+    return control.TransferFunction(above, below) if not dt else _discretize(above, below, dt)
 
 
 def weight_image(weight: Any, dt: float, name: str, size: int = 1) -> control.StateSpace | None:
@@ -101,10 +101,10 @@ def weight_image(weight: Any, dt: float, name: str, size: int = 1) -> control.St
         )
     if poles.size and float(np.max(poles.real)) >= 0.0:
         raise SettingsError(f"{name} is not stable (a pole at {np.max(poles.real):.3g} rad/s); weights must be.")
-    return repeated(image, size) if scalar else image
+    return repeat_diagonal(image, size) if scalar else image
 
 
-def repeated(system: control.StateSpace, size: int) -> control.StateSpace:
+def repeat_diagonal(system: control.StateSpace, size: int) -> control.StateSpace:
     """Return a scalar system beside itself, once for each of `size` signals."""
     import control
 
@@ -119,7 +119,7 @@ def _entries(weight: Any) -> list[tuple[Any, Any]]:
     return [(weight.num[i][j], weight.den[i][j]) for i, j in places]
 
 
-def _discrete(above: np.ndarray, below: np.ndarray, dt: float) -> control.TransferFunction:
+def _discretize(above: np.ndarray, below: np.ndarray, dt: float) -> control.TransferFunction:
     import control
 
     made: Any = control.ss2tf(to_discrete(control.TransferFunction(above, below), dt))
@@ -161,6 +161,6 @@ def to_discrete(system: Any, sample_time: float) -> control.StateSpace:
     return control.StateSpace((np.eye(n) + 0.5 * T * A) @ E, r * E @ B, r * C @ E, D + 0.5 * T * C @ E @ B, T)
 
 
-def drawn_out(frequency: Vector, sample_time: float) -> Vector:
+def warp_frequency(frequency: Vector, sample_time: float) -> Vector:
     """Return `2/Ts tan(w Ts/2)`, where the image has the response that the discrete system has at w [rad/s]."""
     return 2.0 / sample_time * np.tan(0.5 * sample_time * np.asarray(frequency))

@@ -20,25 +20,25 @@ from ..linear._axis_loop import LOWEST, filter_for_lag, frequencies
 from ..linear._controller import ReferenceFilter, assemble, pi_axis, robot_in
 from ..linear._linear_parts_runtime import LinearArrays
 from ..linear._ports import ControllerLimits, controller_inputs, controller_outputs
-from ..linear._settings import LoopSettings, slowest
-from ..plants._uncertain import UncertainPlant, scaled, uncertain_plant
+from ..linear._settings import LoopSettings, cocontraction_filter
+from ..plants._uncertain import UncertainPlant, scale_gain, uncertain_plant
 from ._adaptive_runtime import AdaptiveArrays
 
-_RUNTIME = "softneck.design.varying._adaptive_runtime"
+_RUNTIME_MODULE = "softneck.design.varying._adaptive_runtime"
 _ADAPT = Port(name="adapt", description="1: learn; 0: nominal gains", start=1.0, minimum=0.0, maximum=1.0)
 # Sizes of the loop kappa z^-d / (z - 1) that are tried, 1 % apart.
-_SIZES = np.geomspace(1e-3, 1.0, 695)
+_LOOP_SIZES = np.geomspace(1e-3, 1.0, 695)
 # The paper's static gain [rad/rad], 27.69 / 5.293 deg/rad (Eq. 31).
 _SCALED_GAIN = math.radians(27.69 / 5.293)
 
 
 # Of the reference filter, in scaled seconds.
-_REFERENCE_TIME = 0.06
+_REFERENCE_TIME_S = 0.06
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Learning:
-    """The numbers of what is learnt, for a plant with the neck's static gain, reach and pole.
+    """Constants of the estimation, for a plant with the neck's static gain, reach and pole.
 
     Attributes:
         forgetting: lambda of the recursion, for the samples it takes in; 4 s of motion.
@@ -66,7 +66,7 @@ class Learning:
     gain_rate: float = 1.0
     leak_time: float = 3.0
 
-    def scaled(self, size: float, second: float) -> Learning:
+    def scale(self, size: float, second: float) -> Learning:
         """Return them for outputs that go `size` times as far, where a scaled second is `second` [s]."""
         # Inputs and outputs have the neck's ratio: a covariance goes by 1 / size^2.
         return replace(
@@ -81,10 +81,10 @@ LEARNING = Learning()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdaptiveSettings(LoopSettings):
-    """Online recursive least squares and a redesign in every sample, with what keeps it safe.
+    """Online recursive least squares and a redesign in every sample, with safeguards.
 
     Limits and the order of the loop are those of `LoopSettings`. The nominal plant is taken as late and as quick as
-    small moves are (`Doubts`). The numbers of the learning are in `Learning`, in scaled quantities.
+    small moves are (`ModelUncertainty`). The numbers of the learning are in `Learning`, in scaled quantities.
 
     Attributes:
         max_sensitivity: bound on Ms of the loop that every redesign makes, with its delay in full.
@@ -128,7 +128,7 @@ class AdaptiveSettings(LoopSettings):
         second = max(plant.second for plant in nominal)
         if Scaling.of(uncertain.robot).is_identity and uncertain.robot.motors.nominal is not None:
             ones = np.ones(len(uncertain.names))
-            return asked._designed(uncertain, LEARNING.scaled(1.0, second), uncertain.redefinition, ones)
+            return asked._design_scaled(uncertain, LEARNING.scale(1.0, second), uncertain.redefinition, ones)
         # Inputs in such a unit that every static gain has the neck's size: what learns need not know the robot's units.
         units = np.array([_SCALED_GAIN / abs(plant.static_gain) for plant in nominal])
         T, inverse = uncertain.redefinition
@@ -136,13 +136,13 @@ class AdaptiveSettings(LoopSettings):
         T[:-1] /= units[:, None]
         inverse[:, :-1] *= units
         size = linear_reach(nominal, uncertain.robot, np.asarray(uncertain.weights)) / NECK_REACH
-        return asked._designed(uncertain, LEARNING.scaled(size, second), (T, inverse), units)
+        return asked._design_scaled(uncertain, LEARNING.scale(size, second), (T, inverse), units)
 
     def _defaults(self, plant: UncertainPlant) -> dict[str, Any]:
         second = max(axis.nominal.second for axis in plant.axes.values())
-        return {**LoopSettings._defaults(self, plant), "reference_time": _REFERENCE_TIME * second}
+        return {**LoopSettings._defaults(self, plant), "reference_time": _REFERENCE_TIME_S * second}
 
-    def _designed(
+    def _design_scaled(
         self, uncertain: UncertainPlant, learning: Learning, redefinition: tuple[Matrix, Matrix], units: Vector
     ) -> VaryingController:
         """Return the controller: `units` of the inputs (axes,)."""
@@ -171,13 +171,13 @@ class AdaptiveSettings(LoopSettings):
 
     def _plant(self, uncertain: UncertainPlant, name: str, unit: float) -> AxisPlant:
         axis = uncertain.axis(name)
-        plant = scaled(axis.nominal, unit)
+        plant = scale_gain(axis.nominal, unit)
         if plant.order != 1 or plant.denominator[1] >= 0.0:
             raise SettingsError(
                 f"{name}: adaptive control takes a plant of one pole and a dead time; this one is of order "
                 f"{plant.order}. Identify `rls` or `oe` of order 1."
             )
-        late, pole = plant.with_min_delay(axis.doubts.least_delay), axis.doubts.small_move_pole
+        late, pole = plant.with_min_delay(axis.uncertainty.least_delay), axis.uncertainty.small_move_pole
         return late.with_faster_pole(pole) if pole > 0.0 else late
 
     def _loop(self, plant: AxisPlant, delay: int) -> float:
@@ -186,7 +186,7 @@ class AdaptiveSettings(LoopSettings):
         z = np.exp(1j * w * plant.sample_time)
         shape = z ** (-delay) / (z - 1.0)
         best = 0.0
-        for size in _SIZES:
+        for size in _LOOP_SIZES:
             L = size * shape
             # |L| falls with the frequency, so it crosses 1 once.
             crossing = L[np.abs(L) >= 1.0]
@@ -221,7 +221,7 @@ class AdaptiveSettings(LoopSettings):
         return worst
 
     def _box(self, plant: AxisPlant) -> Vector:
-        """Return least and largest a, and least and largest static gain."""
+        """Return lower and upper bounds of a and of the static gain."""
         a, K = -float(plant.denominator[1]), plant.static_gain
         gains = sorted((K * (1.0 - self.gain_range), K * (1.0 + self.gain_range)))
         return np.array([a**LEARNING.pole_range, a ** (1.0 / LEARNING.pole_range), *gains])
@@ -231,7 +231,7 @@ class AdaptiveSettings(LoopSettings):
         if self.rise_s is None:
             return (ReferenceFilter(self.reference_time or 0.0),) * (len(plants) + 1)
         each = [filter_for_lag(self.rise_s, 1.0 / _pole(plant)) for plant in plants]
-        return (*each, slowest(each))
+        return (*each, cocontraction_filter(each))
 
     def _arrays(
         self, plants: list[AxisPlant], delays: list[int], kappas: list[float], limits: ControllerLimits,
@@ -263,7 +263,7 @@ class AdaptiveSettings(LoopSettings):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class VaryingController(ReprMixin):
-    """A designed controller of all outputs whose gains follow what it learns.
+    """A controller of all outputs whose gains follow its estimates.
 
     Attributes:
         sample_time: [s].
@@ -296,7 +296,7 @@ class VaryingController(ReprMixin):
         return Block(
             kind=self.kind,
             role="controller",
-            runtime=sized_name(_RUNTIME, len(self.robot.motors.names), len(self.robot.outputs.names)),
+            runtime=sized_name(_RUNTIME_MODULE, len(self.robot.motors.names), len(self.robot.outputs.names)),
             sample_time=self.sample_time,
             arrays=tuple(self.arrays.values()),
             inputs=controller_inputs(self.robot),

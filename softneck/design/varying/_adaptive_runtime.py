@@ -1,4 +1,4 @@
-"""Indirect adaptive control of all axes: what the neck is, learnt as it moves, and the gains that follow from it.
+"""Indirect adaptive control of all axes: online estimation, and the gains that follow from it.
 
 Each axis is y+ = a y + b u(k-d) with the delay d known. Its a and b are estimated by recursive least squares in the
 kit's U D U' form on angles and inputs behind one band-pass, (1 - z^-1) / (1 - f z^-1)^2, which takes out offsets and
@@ -57,7 +57,7 @@ def adaptive_longest(delays: np.ndarray) -> int:
 
 
 class AdaptiveArrays(FilterArrays):
-    """Reference filter, allocation, and what is known of the neck before anything is learnt."""
+    """Reference filter, allocation, and prior model."""
 
     rest = array("m, references", "from r to the filter's state at rest")
     T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
@@ -73,7 +73,7 @@ class AdaptiveArrays(FilterArrays):
 
 
 class AdaptiveState(LinearState):
-    """That of the linear controller, and for each axis what it learnt."""
+    """State of the linear controller, and estimates of each axis."""
 
     x = cells("outputs, d + 2", "integral s, then y of the model and its past, newest first [rad]")
     theta = cells("outputs, 2", "estimate: -a and b")
@@ -149,7 +149,7 @@ def adaptive_forget(p: AdaptiveArrays, x: AdaptiveState, axis: int) -> None:
 
 
 def adaptive_learn(p: AdaptiveArrays, x: AdaptiveState, axis: int, y: float) -> None:
-    """Take the angle of now in, unless it says too little; compare the estimate with the nominal plant."""
+    """Update the estimate with the present angle if it is informative; compare it with the nominal plant."""
     f = p.guards[ADAPTIVE_FILTER]
     # The angle of now behind the band-pass, which `adaptive_see` advances once all is decided.
     first = f * x.angle[axis, 1] + (y - x.angle[axis, 0])
@@ -221,7 +221,7 @@ def adaptive_redesign(p: AdaptiveArrays, x: AdaptiveState, axis: int, adapt: boo
 
 
 def adaptive_asked(p: AdaptiveArrays, parameters: np.ndarray, x: AdaptiveState, axis: int, inputs: np.ndarray) -> float:
-    """Return what the gains in use ask for, without the integral."""
+    """Return the control action of the gains in use, without the integral."""
     rf = linear_reference(p, p.constants, parameters, x.xf, inputs)[axis]
     ym = x.x[axis, 1 + int(p.delays[axis])]
     a, b = x.used[axis, 0], x.used[axis, 1]
@@ -291,7 +291,7 @@ def adaptive_arrays(p: AdaptiveArrays, x: AdaptiveState) -> LinearArrays:
 
 
 def adaptive_align(p: AdaptiveArrays, now: LinearArrays, x: AdaptiveState, y: np.ndarray) -> None:
-    """Let the model rest where the neck is, and the integral ask for what is held besides: no bump."""
+    """Set the model to rest at the present angle and the integral to the held action: a bumpless start."""
     v = np.dot(p.T, x.held)
     rest = np.empty(p.outputs + 1)
     rest[: p.outputs] = y

@@ -11,21 +11,21 @@ import numpy as np
 
 from softneck.core import Matrix, SettingsError
 
-from ..plants._coupled import AnyAxes, closed, radius, sensitivity
+from ..plants._coupled import AnyAxes, close_loop, radius, sensitivity
 from ._axis_loop import LOWEST, frequencies, rise_time
-from ._controller import LinearController, ReferenceFilter, assemble_whole
+from ._controller import LinearController, ReferenceFilter, assemble_law
 from ._settings import AxisSettings, _slowest_filter, reference_numbers
 
 # Steps are looked at for so many times the slowest time constant, dead time and filter.
-_LONG = 8.0
-_HALVINGS = 20
+_STEP_WINDOW_RATIO = 8.0
+_BISECTION_STEPS = 20
 # Samples are judged on frequencies 4 % apart, as those of one axis are.
-_COARSE = 4
+_COARSE_POINTS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class WholeDesign:
-    """A controller of all axes and what it is for.
+class MultivariableDesign:
+    """A multivariable controller with the plants of its design.
 
     Attributes:
         law: A, Br, By, C, Dr, Dy and the conditioning L, see `LinearArrays`.
@@ -50,13 +50,15 @@ class WholeDesign:
     def worst(self, extra_delay: int) -> float:
         """Return the largest Ms of all samples; inf where one is not stable."""
         nominal = self.samples[0][0]
-        w = frequencies(nominal.sample_time, lowest=LOWEST / nominal.second)[::-_COARSE][::-1]
+        w = frequencies(nominal.sample_time, lowest=LOWEST / nominal.second)[::-_COARSE_POINTS][::-1]
         if any(radius(self.parts, plants, extra_delay) >= 1.0 for plants in self.samples):
             return math.inf
         return max(sensitivity(self.parts, plants, extra_delay, w) for plants in self.samples)
 
 
-def whole_controller(settings: AxisSettings, made: WholeDesign, robot: Any, *, filtered: bool) -> LinearController:
+def multivariable_controller(
+    settings: AxisSettings, made: MultivariableDesign, robot: Any, *, filtered: bool
+) -> LinearController:
     """Return the controller.
 
     Args:
@@ -99,7 +101,7 @@ def whole_controller(settings: AxisSettings, made: WholeDesign, robot: Any, *, f
     return LinearController(
         kind=settings.KIND,
         sample_time=sample_time,
-        arrays=assemble_whole(
+        arrays=assemble_law(
             made.law,
             filters=[ReferenceFilter(time)] * (len(plants) + 1),
             redefinition=made.redefinition,
@@ -107,12 +109,12 @@ def whole_controller(settings: AxisSettings, made: WholeDesign, robot: Any, *, f
         ),
         limits=limits,
         order=settings.order,
-        design={"settings": settings._stored(), "extra_delay": extra, **found},
+        design={"settings": settings._settings_json(), "extra_delay": extra, **found},
     )
 
 
-def fastest(keeps: Callable[[float], bool], low: float, high: float) -> float | None:
-    """Return the largest speed from `low` to `high` that keeps what it must, to 3 %; None where not even `low` does."""
+def bisect_speed(keeps: Callable[[float], bool], low: float, high: float) -> float | None:
+    """Bisect the largest speed from `low` to `high` that passes `keeps`, to 3 %; None if `low` fails."""
     if not keeps(low):
         return None
     for _ in range(math.ceil(math.log2(math.log(high / low) / 0.03))):
@@ -121,13 +123,13 @@ def fastest(keeps: Callable[[float], bool], low: float, high: float) -> float | 
     return low
 
 
-def _steps(made: WholeDesign, plants: AnyAxes, extra_delay: int, time: float) -> Matrix:
+def _steps(made: MultivariableDesign, plants: AnyAxes, extra_delay: int, time: float) -> Matrix:
     """Return each output (rows, outputs) after a unit step of its own reference alone, no limit acting."""
-    A, B, C = closed(made.parts, plants, extra_delay)
+    A, B, C = close_loop(made.parts, plants, extra_delay)
     Ts, m = plants[0].sample_time, len(plants)
     slowest = max(plant.time_constant for plant in plants)
     late = max(plant.delay for plant in plants) + extra_delay
-    rows = math.ceil(_LONG * ((slowest + time) / Ts + late))
+    rows = math.ceil(_STEP_WINDOW_RATIO * ((slowest + time) / Ts + late))
     keep, at = ReferenceFilter(time).pole(Ts), 0.0
     x, y = np.zeros((len(A), m)), np.zeros((rows, m))
     for k in range(rows):
@@ -137,8 +139,8 @@ def _steps(made: WholeDesign, plants: AnyAxes, extra_delay: int, time: float) ->
     return y
 
 
-def _least_filter(settings: AxisSettings, made: WholeDesign) -> float:
-    """Return the least time [s], from half the plant's lag on, with which no sample overshoots by more."""
+def _least_filter(settings: AxisSettings, made: MultivariableDesign) -> float:
+    """Return the smallest filter time [s], from half the plant's lag on, that keeps the overshoot of all samples."""
     plants, Ts = made.samples[0], made.samples[0][0].sample_time
     slowest: Any = max(plants, key=lambda plant: plant.time_constant)
     high = _slowest_filter(slowest)
@@ -161,8 +163,8 @@ def _least_filter(settings: AxisSettings, made: WholeDesign) -> float:
     return high * Ts
 
 
-def _filter_for(asked: float, made: WholeDesign, extra_delay: int) -> float:
-    """Return the time [s] of the filter with which the slowest output rises in `asked` [s] on the nominal plant."""
+def _filter_for(asked: float, made: MultivariableDesign, extra_delay: int) -> float:
+    """Return the filter time [s] with which the slowest output of the nominal plant rises in the required time [s]."""
     plants = made.samples[0]
     Ts = plants[0].sample_time
 
@@ -176,7 +178,7 @@ def _filter_for(asked: float, made: WholeDesign, extra_delay: int) -> float:
             "faster (`max_sensitivity`)."
         )
     low, high = 0.0, asked
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTION_STEPS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if rise(middle) < asked else (low, middle)
     return low
