@@ -1,6 +1,6 @@
 """An owner's first day, command by command, on drives whose SDO answers take 50 ms.
 
-Once they are obliging else, and once for each order of start-up with every other habit that they may have.
+Once they are obliging else, and once for each order of start-up with every other quirk that they may have.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ import pytest
 from softneck.cli import main
 from softneck.drives.running import _virtual
 from softneck.drives.simulated import SimulatedSettings
-from softneck.drives.simulated._habits import WireHabits
+from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.signals import read_recording
 
 from ..drives.conftest import Project
 from ..drives.conftest import project as project  # the fixture
 
 pytestmark = pytest.mark.slow
-SLOW = WireHabits(sdo_latency=0.05)
+SLOW = DriveQuirks(sdo_latency=0.05)
 STRICT = replace(SLOW, write_only=True, lacks=(0x1003, 0x1005, 0x1014, 0x1200))
 
 
 @pytest.fixture(params=["slow", "off", "enabled"])
-def strict(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[WireHabits]:
-    """The habits of all simulated drives of a command, as they asked for them."""
-    made: list[WireHabits] = []
-    habits = SLOW if request.param == "slow" else replace(STRICT, mode_when=request.param)
+def strict(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[DriveQuirks]:
+    """The quirks of all simulated drives of a command, as they asked for them."""
+    made: list[DriveQuirks] = []
+    quirks = SLOW if request.param == "slow" else replace(STRICT, mode_when=request.param)
 
     def asked(**how: Any) -> SimulatedSettings:
-        made.append(habits)
-        return SimulatedSettings(**{**how, "habits": habits})
+        made.append(quirks)
+        return SimulatedSettings(**{**how, "quirks": quirks})
 
     monkeypatch.setattr(_virtual, "SimulatedSettings", asked)
     return made
 
 
 def test_the_walk_of_an_owner(
-    project: Project, strict: list[WireHabits], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    project: Project, strict: list[DriveQuirks], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)

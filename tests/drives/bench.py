@@ -15,7 +15,7 @@ from softneck.drives.master._master import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._virtual import VirtualRun, simulated_plant
 from softneck.drives.simulated import SimulatedDrive
-from softneck.drives.simulated._habits import WireHabits
+from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.plant import NeckParameters
 
 T = 0.01
@@ -69,14 +69,14 @@ class Bench:
         seed: int = 0,
         rows: int = 100_000,
         profile: str = "ipos2015",
-        habits: WireHabits | None = None,
+        quirks: DriveQuirks | None = None,
     ) -> None:
         self.file = replace(file or default_drives(profile), ramps=FAST)
         count = len(self.file.drives)
-        self.neck = simulated_plant(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed, habits=habits)
+        self.neck = simulated_plant(self.file, neck or NeckParameters.paper(), sample_time=TS, seed=seed, quirks=quirks)
         self.link = VirtualLink(self.neck)
         self.pilot = Script(rows, count)
-        late = self.file.nodes if habits is not None and habits.mode_when == "enabled" else ()
+        late = self.file.nodes if quirks is not None and quirks.mode_when == "enabled" else ()
         settings = self.file.master_settings(TS, guarding=guarding, late_modes=late)
         settings = replace(settings, bus=replace(settings.bus, off=off))
         self.master = Master(settings if change is None else change(settings), self.pilot)

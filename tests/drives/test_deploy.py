@@ -35,7 +35,7 @@ from softneck.drives.master._master import Measurement
 from softneck.drives.master._settings import RampSettings
 from softneck.drives.running._pilot import LoopPilot
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
-from softneck.drives.simulated._habits import WireHabits
+from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.drives.simulated._servo_runtime import (
     SERVO_DEMAND,
     SERVO_POSITION,
@@ -196,7 +196,7 @@ ENDS_OF_HOMING = (
 def test_no_zero_is_taken_for_one_where_homing_did_not_end(what: str, latency: float) -> None:
     """A winch that turns on, a zero that was set later or not at all; whatever the time of an answer."""
     file = default_drives()
-    settings = SimulatedSettings(homed=False, habits=WireHabits(sdo_latency=latency))
+    settings = SimulatedSettings(homed=False, quirks=DriveQuirks(sdo_latency=latency))
     link = VirtualLink(SimulatedNeck(NeckParameters.paper(), settings))
     report, axis = preflight(link, file), link.neck.drives[2].axis
     begin, status = axis._mode_bits, axis.getters[(0x6041, 0)]

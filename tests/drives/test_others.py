@@ -24,8 +24,8 @@ from softneck.drives.bus._link import CanLink
 from softneck.drives.bus._sdo import NUMBERS, Objects, SdoError
 from softneck.drives.running._preflight import scan
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings, serve
-from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._profiles import PROFILES
+from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.plant import NeckParameters
 
 EDS = Path(_sdo.__file__).parent / "eds"
@@ -80,8 +80,8 @@ def wait_for(what: Any, seconds: float = 5.0) -> Any:
 def foreign_master(request: pytest.FixtureRequest) -> Iterator[tuple[SimulatedNeck, canopen.Network]]:
     """Our drives, stricter than they must be, and a network of python-canopen's."""
     name, ended = request.node.name, threading.Event()
-    habits = WireHabits(sdo_latency=0.005)
-    neck = SimulatedNeck(NeckParameters.paper(), SimulatedSettings(habits=habits))
+    quirks = DriveQuirks(sdo_latency=0.005)
+    neck = SimulatedNeck(NeckParameters.paper(), SimulatedSettings(quirks=quirks))
     neck.move()
     network = canopen.Network()
     with opened(request.param, name) as theirs:

@@ -1,6 +1,6 @@
 """Simulated drives as strict as drives are: transfers, PDO types, error objects and answers that take their time.
 
-Each habit can be switched; python-canopen's client, which others wrote, is the second opinion on the transfers.
+Each quirk can be switched; python-canopen's client, which others wrote, is the second opinion on the transfers.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 
 from softneck.drives.master import Phase
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
-from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._node import CanFrame
+from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.drives.simulated._sdo import SdoServer
 from softneck.plant import NeckParameters
 
@@ -28,8 +28,8 @@ from .pairwise import all_pairs, covering, pairs_of
 from .scenarios import SCENARIOS
 
 
-def neck(profile: str = "ipos2015", **habits: Any) -> SimulatedNeck:
-    return SimulatedNeck(NeckParameters.paper(), SimulatedSettings(profile=profile, habits=WireHabits(**habits)))
+def neck(profile: str = "ipos2015", **quirks: Any) -> SimulatedNeck:
+    return SimulatedNeck(NeckParameters.paper(), SimulatedSettings(profile=profile, quirks=DriveQuirks(**quirks)))
 
 
 class Direct:
@@ -234,8 +234,8 @@ def test_every_pair_stands_in_the_covering_array() -> None:
 
 def play(row: dict[str, Any]) -> None:
     scenario = SCENARIOS[row["fault"]]
-    habits = WireHabits(sdo_latency=row["sdo_latency"], mode_when=row["mode_when"], write_only=row["write_only"])
-    bench = Bench(off=scenario.others_off, change=scenario.change, profile=row["profile"], habits=habits).start()
+    quirks = DriveQuirks(sdo_latency=row["sdo_latency"], mode_when=row["mode_when"], write_only=row["write_only"])
+    bench = Bench(off=scenario.others_off, change=scenario.change, profile=row["profile"], quirks=quirks).start()
     assert bench.phase is Phase.RUNNING
     scenario.play(bench)
 

@@ -16,20 +16,20 @@ from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.master import Frame
 from softneck.drives.running._bus_loop import Session, run_session
 from softneck.drives.running._stop import wait
-from softneck.drives.simulated._habits import WireHabits
 from softneck.drives.simulated._profiles import PROFILES, Profile, ds402
+from softneck.drives.simulated._quirks import DriveQuirks
 from softneck.plant import NeckParameters
 
 from .bench import FAST
 
 
-def linked(file: DrivesFile, habits: WireHabits | None = None) -> VirtualLink:
-    return VirtualLink(simulated_neck(file, NeckParameters.paper(), sample_time=0.02, habits=habits))
+def linked(file: DrivesFile, quirks: DriveQuirks | None = None) -> VirtualLink:
+    return VirtualLink(simulated_neck(file, NeckParameters.paper(), sample_time=0.02, quirks=quirks))
 
 
 def with_twin() -> VirtualLink:
     """Two drives with number 2, of serial numbers 11 and 12."""
-    link = linked(default_drives(), WireHabits(twin=2))
+    link = linked(default_drives(), DriveQuirks(twin=2))
     link.neck.drives[1].axis.values[(0x1018, 4)] = 11
     link.neck.twins[0].axis.values[(0x1018, 4)] = 12
     return link

@@ -37,7 +37,7 @@ def simulated_neck(file: DrivesFile, parameters: NeckParameters, **how: Any) -> 
     Args:
         file: of the drives, and what they move.
         parameters: physics.
-        how: `sample_time`, `homed`, `seed`, `habits`: see `SimulatedSettings`.
+        how: `sample_time`, `homed`, `seed`, `quirks`: see `SimulatedSettings`.
 
     Raises:
         SettingsError: a robot without tendons, or that the neck's physics does not fit.

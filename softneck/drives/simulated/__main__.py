@@ -16,10 +16,10 @@ from softneck.core import SettingsError
 from softneck.plant import NeckParameters
 
 from ._drives import SimulatedDrives, SimulatedSettings
-from ._habits import habits_of
 from ._neck import SimulatedNeck
 from ._power import STATES
 from ._profiles import PROFILES
+from ._quirks import quirks_of
 from ._server import serve
 
 
@@ -32,15 +32,15 @@ from ._server import serve
 @click.option("--report", is_flag=True, help="Print one JSON line for each change of a drive's power state.")
 @click.option("--cycle", type=float, default=0.01, show_default=True, help="Bus period the drives expect [s].")
 @click.option(
-    "--habit",
-    "habits",
+    "--quirk",
+    "quirks",
     multiple=True,
     metavar="NAME=VALUE",
     help="How strict the drives are, such as sdo_latency=0.05; again for more (docs/reference/drives.md).",
 )
 def main(
     bus: str, neck: str, profile: str, homed: bool, seed: int, report: bool, cycle: float,
-    habits: tuple[str, ...],
+    quirks: tuple[str, ...],
 ) -> None:  # fmt: skip
     """Simulate three drives (nodes 1 to 3), the neck and an inclinometer (node 10) on a bus, until Ctrl-C.
 
@@ -52,9 +52,9 @@ def main(
     interface, _, channel = bus.partition(":")
     common: dict[str, Any] = {"profile": profile, "homed": homed, "seed": seed, "cycle": cycle}
     try:
-        common["habits"] = habits_of(habits)
+        common["quirks"] = quirks_of(quirks)
     except SettingsError as error:
-        raise click.BadParameter(str(error), param_hint="--habit") from error
+        raise click.BadParameter(str(error), param_hint="--quirk") from error
     virtual = SimulatedNeck(NeckParameters.preset(neck), SimulatedSettings(**common))
     # Compile everything before the drives answer.
     virtual.move()

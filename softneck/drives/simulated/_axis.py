@@ -10,8 +10,8 @@ from softneck.core import Vector
 
 from . import _power as power
 from . import _servo_runtime as servo
-from ._habits import WireHabits
 from ._profiles import Item, Profile
+from ._quirks import DriveQuirks
 from ._sdo import NO_OBJECT, NO_SUBINDEX, READ_ONLY, WRONG_LENGTH, WRONG_VALUE
 
 # Current in internal units: A x 65520 / (2 I_peak).
@@ -35,19 +35,19 @@ class Axis:
         fault: code of the active fault, 0 if none.
         homed: whether the encoder's zero was set since the last reset.
         enable_input: the hardware input; without it the drive faults.
-        habits: its restrictions compared with other drives.
+        quirks: its restrictions compared with other drives.
         device_name: its type (1008h), "" if it has none.
         counts_per_turn: of the motor; the encoder's index pulse occurs once a turn.
     """
 
     def __init__(
         self, node: int, profile: Profile, motion: Vector, *, peak_current: float, slow_loop: float,
-        habits: WireHabits | None = None,
+        quirks: DriveQuirks | None = None,
     ) -> None:  # fmt: skip
         """Make a drive with node number `node` and its row `motion` of the servo runtime."""
         self.node, self.profile, self.motion = node, profile, motion
         self.peak_current, self.slow_loop = peak_current, slow_loop
-        self.enable_input, self.habits = True, habits or WireHabits()
+        self.enable_input, self.quirks = True, quirks or DriveQuirks()
         self.device_name = profile.name_of(peak_current)
         self.tick, self.counts_per_turn = 1e-3, 2048.0
         self.values: dict[tuple[int, int], int] = {}
@@ -106,9 +106,9 @@ class Axis:
     def read(self, index: int, subindex: int) -> bytes | int:
         """Return an object's bytes, or an SDO abort code."""
         item = self.profile.items.get((index, subindex))
-        if item is None or index in self.habits.lacks:
+        if item is None or index in self.quirks.lacks:
             return self._not_there(index)
-        if code := self.habits.unreadable(index):
+        if code := self.quirks.unreadable(index):
             return code
         if not item.size:
             return (self.device_name if index == 0x1008 else item.text).encode("ascii")
@@ -117,7 +117,7 @@ class Axis:
         return (int(value) & ((1 << 8 * item.size) - 1)).to_bytes(item.size, "little")
 
     def _not_there(self, index: int) -> int:
-        known = index not in self.habits.lacks and any(key[0] == index for key in self.profile.items)
+        known = index not in self.quirks.lacks and any(key[0] == index for key in self.profile.items)
         return NO_SUBINDEX if known else NO_OBJECT
 
     def size(self, index: int, subindex: int) -> int:
@@ -128,14 +128,14 @@ class Axis:
     def write(self, index: int, subindex: int, data: bytes) -> int:
         """Store an object's bytes; return 0 or an SDO abort code."""
         item = self.profile.items.get((index, subindex))
-        if item is None or index in self.habits.lacks:
+        if item is None or index in self.quirks.lacks:
             return self._not_there(index)
         if not item.writable:
             return READ_ONLY
         if len(data) != item.size:
             return WRONG_LENGTH
         value = int.from_bytes(data, "little", signed=item.signed)
-        refused = self.habits.unwritable(index, value, enabled=self.state == power.ENABLED)
+        refused = self.quirks.unwritable(index, value, enabled=self.state == power.ENABLED)
         return refused or self.store((index, subindex), value, item)
 
     def store(self, key: tuple[int, int], value: int, item: Item) -> int:

@@ -14,9 +14,9 @@ from softneck.core import Matrix, ReprMixin, SettingsError, require_between, req
 
 from . import _servo_runtime as servo
 from ._axis import Axis
-from ._habits import WireHabits
 from ._node import CanFrame, SimulatedDrive
 from ._profiles import PROFILES
+from ._quirks import DriveQuirks
 
 _TICK_S = 1e-3
 # Length of the ring buffer [ticks]: longer than the largest `drive_latency`, 0.1 s.
@@ -40,7 +40,7 @@ class SimulatedSettings(ReprMixin):
             the neck's drive latency.
         homed: whether the drives were zeroed with the neck at rest before.
         seed: of the inclinometer's noise.
-        habits: restrictions of the drives.
+        quirks: restrictions of the drives.
     """
 
     nodes: tuple[int, ...] = (1, 2, 3)
@@ -55,7 +55,7 @@ class SimulatedSettings(ReprMixin):
     hold: float = 0.02
     homed: bool = True
     seed: int = 0
-    habits: WireHabits = field(default_factory=WireHabits)
+    quirks: DriveQuirks = field(default_factory=DriveQuirks)
 
     def __post_init__(self) -> None:
         require_one_of("profile", self.profile, tuple(PROFILES))
@@ -99,8 +99,8 @@ class SimulatedDrives(abc.ABC):
             self.motion[row, servo.SERVO_PLACE], self.motion[row, servo.SERVO_GEARING] = 0, 1.0
         self.drives = tuple(self._drive(settings, row, current_limit) for row in range(count))
         # A second device with a used node number has no plant; its boot-up message was earlier.
-        self.twins = tuple(twin(node, settings) for node in (settings.habits.twin,) if node)
-        self._latency = settings.habits.sdo_latency
+        self.twins = tuple(twin(node, settings) for node in (settings.quirks.twin,) if node)
+        self._latency = settings.quirks.sdo_latency
         self._late: list[tuple[float, CanFrame]] = []
         self.sensor = "works"
         self.newest = self._last = Sample(0.0, (), (), valid=True)
@@ -160,7 +160,7 @@ class SimulatedDrives(abc.ABC):
         m = self.motion[row]
         axis = Axis(
             s.nodes[row], PROFILES[s.profile](), m, peak_current=s.peak_current[row], slow_loop=s.slow_loop[row],
-            habits=s.habits,
+            quirks=s.quirks,
         )  # fmt: skip
         axis.tick, axis.counts_per_turn = self.h, s.counts_per_turn[row]
         m[servo.SERVO_CURRENT_LIMIT] = current_limit
@@ -176,7 +176,7 @@ def twin(node: int, settings: SimulatedSettings) -> SimulatedDrive:
     """Return a drive with number `node` without a plant, like one left on the bus by mistake."""
     axis = Axis(
         node, PROFILES[settings.profile](), np.zeros(servo.SERVO_SIZE), peak_current=10.0, slow_loop=1e-3,
-        habits=settings.habits,
+        quirks=settings.quirks,
     )  # fmt: skip
     axis.values[(0x1018, 4)] = 2000 + node
     drive = SimulatedDrive(axis)

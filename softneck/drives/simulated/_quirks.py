@@ -24,7 +24,7 @@ _KNOWN_MODES = (1, 3, 6, 8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WireHabits:
+class DriveQuirks:
     """Restrictions of simulated drives; 0 and False are off.
 
     Attributes:
@@ -61,17 +61,17 @@ class WireHabits:
         return WRONG_STATE if self.mode_when == ("off" if enabled else "enabled") else 0
 
 
-def habits_of(texts: Sequence[str]) -> WireHabits:
-    """Return the habits of texts NAME=VALUE, with values as in TOML: `sdo_latency=0.05`, `lacks=[0x1003]`.
+def quirks_of(texts: Sequence[str]) -> DriveQuirks:
+    """Return the quirks of texts NAME=VALUE, with values as in TOML: `sdo_latency=0.05`, `lacks=[0x1003]`.
 
     Raises:
-        SettingsError: an unknown habit, or a value of another type.
+        SettingsError: an unknown quirk, or a value of another type.
     """
-    defaults = {field.name: field.default for field in fields(WireHabits)}
+    defaults = {field.name: field.default for field in fields(DriveQuirks)}
     given: dict[str, Any] = {}
     for text in texts:
         name, _, value = text.partition("=")
-        require_one_of("habit", name, tuple(defaults))
+        require_one_of("quirk", name, tuple(defaults))
         try:
             told = tomllib.loads(f"value = {value}")["value"]
         except tomllib.TOMLDecodeError:
@@ -81,4 +81,4 @@ def habits_of(texts: Sequence[str]) -> WireHabits:
         if type(told) is not type(defaults[name]):
             raise SettingsError(f"`{name}` takes a value such as {defaults[name]}; got `{value}`.")
         given[name] = told
-    return WireHabits(**given)
+    return DriveQuirks(**given)

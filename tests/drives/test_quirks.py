@@ -1,4 +1,4 @@
-"""What drives may refuse, not tell, or want in another order: each habit by itself, and the commands on it."""
+"""What drives may refuse, not tell, or want in another order: each quirk by itself, and the commands on it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from softneck.drives.master._cia402 import DriveState, Goal
 from softneck.drives.master._fieldbus import BusSettings, Fieldbus
 from softneck.drives.running._bus_loop import Session, run_session
 from softneck.drives.simulated import SimulatedNeck, SimulatedSettings
-from softneck.drives.simulated._habits import WireHabits, habits_of
+from softneck.drives.simulated._quirks import DriveQuirks, quirks_of
 from softneck.drives.simulated._servo_runtime import SERVO_SCALE, SERVO_ZERO
 from softneck.plant import NeckParameters
 
@@ -33,8 +33,8 @@ ENABLED_MODE_3 = ((0x6060, b"\3"), (0x6040, b"\6\0"), (0x6040, b"\7\0"), (0x6040
 OPTIONAL = (0x1003, 0x1005, 0x1014, 0x1200, 0x2000, 0x2002)
 
 
-def linked(*, homed: bool = True, profile: str = "ipos2015", **habits: Any) -> VirtualLink:
-    settings = SimulatedSettings(profile=profile, homed=homed, habits=WireHabits(**habits))
+def linked(*, homed: bool = True, profile: str = "ipos2015", **quirks: Any) -> VirtualLink:
+    settings = SimulatedSettings(profile=profile, homed=homed, quirks=DriveQuirks(**quirks))
     return VirtualLink(SimulatedNeck(NeckParameters.paper(), settings))
 
 
@@ -49,21 +49,21 @@ def refusal(act: Any, *said: Any) -> int:
     return refused.value.code
 
 
-def test_each_habit_stands_in_the_reference() -> None:
+def test_each_quirk_stands_in_the_reference() -> None:
     text = (ROOT / "docs" / "reference" / "drives.md").read_text(encoding="utf-8")
     begin = text.index("## The simulated drives")
     named = set(re.findall(r"^\| `(\w+)` \|", text[begin:], re.M))
-    assert named == {field.name for field in fields(WireHabits)}
+    assert named == {field.name for field in fields(DriveQuirks)}
 
 
 @pytest.mark.parametrize(
     ("texts", "said"),
     [
-        ([], WireHabits()),
-        (["sdo_latency=0.05", "twin=4", "write_only=true"], WireHabits(sdo_latency=0.05, twin=4, write_only=True)),
-        (["mode_when=off", "lacks=[0x1003, 0x1014]"], WireHabits(mode_when="off", lacks=(0x1003, 0x1014))),
-        (["sdo_latency=1"], WireHabits(sdo_latency=1.0)),
-        (["twins=4"], "`habit` must be"),
+        ([], DriveQuirks()),
+        (["sdo_latency=0.05", "twin=4", "write_only=true"], DriveQuirks(sdo_latency=0.05, twin=4, write_only=True)),
+        (["mode_when=off", "lacks=[0x1003, 0x1014]"], DriveQuirks(mode_when="off", lacks=(0x1003, 0x1014))),
+        (["sdo_latency=1"], DriveQuirks(sdo_latency=1.0)),
+        (["twins=4"], "`quirk` must be"),
         (["twin=many"], "`twin` takes a value such as 0; got `many`"),
         (["twin=0.5"], "`twin` takes a value such as 0; got `0.5`"),
         (["write_only=1"], "`write_only` takes a value such as False; got `1`"),
@@ -72,12 +72,12 @@ def test_each_habit_stands_in_the_reference() -> None:
         (["lacks=[0x6041]"], "`lacks` may not hold 6041h"),
     ],
 )
-def test_habits_are_said_in_words(texts: list[str], said: WireHabits | str) -> None:
-    if isinstance(said, WireHabits):
-        assert habits_of(texts) == said
+def test_quirks_are_said_in_words(texts: list[str], said: DriveQuirks | str) -> None:
+    if isinstance(said, DriveQuirks):
+        assert quirks_of(texts) == said
         return
     with pytest.raises(SettingsError, match=re.escape(said)):
-        habits_of(texts)
+        quirks_of(texts)
 
 
 # -- each by itself ---------------------------------------------------------------------------------------------------
@@ -123,9 +123,9 @@ def test_an_object_that_a_drive_lacks_is_not_there(index: int) -> None:
 
 def test_no_drive_lacks_what_makes_it_one() -> None:
     with pytest.raises(SettingsError, match="`lacks` may not hold 6041h"):
-        WireHabits(lacks=(0x1003, 0x6041))
+        DriveQuirks(lacks=(0x1003, 0x6041))
     with pytest.raises(SettingsError, match="`mode_when` must be"):
-        WireHabits(mode_when="never")
+        DriveQuirks(mode_when="never")
 
 
 def test_a_twin_answers_with_its_own_serial_number_and_turns_nothing() -> None:
@@ -150,7 +150,7 @@ QUIRKS: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize(
-    ("habits", "said"),
+    ("quirks", "said"),
     [
         ({"write_only": True}, "3 values written and read back (not 6060h, 60C2h: write only)"),
         ({"mode_when": "enabled"}, "2 values written and read back"),
@@ -158,11 +158,11 @@ QUIRKS: dict[str, tuple[Any, ...]] = {
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
-def test_the_pre_flight_says_what_it_could_not_read_back(habits: dict[str, Any], said: str) -> None:
-    report = preflight(linked(**habits), default_drives(), homed=True)
+def test_the_pre_flight_says_what_it_could_not_read_back(quirks: dict[str, Any], said: str) -> None:
+    report = preflight(linked(**quirks), default_drives(), homed=True)
     assert report.holds, [row for row in report.rows if not row.holds]
     assert any(row.name == "modes" and row.found.startswith(said) for row in report.rows)
-    assert tuple(report.late_modes) == ((1, 2, 3) if habits.get("mode_when") == "enabled" else ())
+    assert tuple(report.late_modes) == ((1, 2, 3) if quirks.get("mode_when") == "enabled" else ())
 
 
 def test_a_guard_that_cannot_be_read_back_is_none() -> None:
@@ -185,7 +185,7 @@ def test_a_drive_that_takes_its_mode_late_must_hold_until_then(mode: int, holds:
 
 
 def test_a_mode_that_a_drive_does_not_have_is_not_asked_for_later(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("softneck.drives.simulated._habits._KNOWN_MODES", (1, 3, 6))
+    monkeypatch.setattr("softneck.drives.simulated._quirks._KNOWN_MODES", (1, 3, 6))
     report = preflight(linked(mode_when="enabled"), default_drives())
     assert [row.found for row in report.rows if row.found.startswith("6502h")] == [
         "6502h is 001F0065h, mode 8 is refused"
@@ -200,10 +200,10 @@ def ran(link: VirtualLink, profile: str) -> Any:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", covering(QUIRKS), ids=lambda row: ",".join(f"{v}" for v in row.values()))
-def test_zero_pre_flight_and_a_run_hold_under_all_pairs_of_habits(row: dict[str, Any]) -> None:
-    habits = {name: value for name, value in row.items() if name != "profile"}
+def test_zero_pre_flight_and_a_run_hold_under_all_pairs_of_quirks(row: dict[str, Any]) -> None:
+    quirks = {name: value for name, value in row.items() if name != "profile"}
     profile = row["profile"]
-    link, file = linked(homed=False, profile=profile, **habits), default_drives(profile)
+    link, file = linked(homed=False, profile=profile, **quirks), default_drives(profile)
     report = preflight(link, file)
     report.require()
     zeroed = zero(link, file, lambda: link.newest, guarding=report.guarding)
@@ -219,8 +219,8 @@ def test_zero_pre_flight_and_a_run_hold_under_all_pairs_of_habits(row: dict[str,
 def test_a_zero_stands_where_the_tendons_were_tight_whatever_the_order(mode_when: str) -> None:
     """A drive that loses its power to change its mode lets the winch go back; the zero does not."""
     zeros, file = [], default_drives()
-    for habits in ({}, {"mode_when": mode_when}):
-        link = linked(homed=False, **habits)
+    for quirks in ({}, {"mode_when": mode_when}):
+        link = linked(homed=False, **quirks)
         zero(link, file, lambda link=link: link.newest, guarding=preflight(link, file).guarding)
         zeros.append(link.neck.motion[:, SERVO_ZERO] / link.neck.motion[:, SERVO_SCALE])
         assert [drive.axis.values[(0x607C, 0)] for drive in link.neck.drives] == [1, 1, 1]
@@ -265,8 +265,8 @@ def test_a_drive_that_is_to_stop_is_not_asked_to_change_its_mode() -> None:
 
 def test_a_run_waits_for_the_late_mode_and_is_then_like_any_other() -> None:
     begun = []
-    for habits in (WireHabits(), WireHabits(mode_when="enabled")):
-        bench = Bench(habits=habits)
+    for quirks in (DriveQuirks(), DriveQuirks(mode_when="enabled")):
+        bench = Bench(quirks=quirks)
         bench.master.start()
         while bench.phase is not Phase.RAMP_IN and bench.now < 2.0:
             bench.step()
@@ -283,8 +283,8 @@ def test_a_late_mode_that_is_not_taken_stops_the_run_before_anything_moves(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if what == "refused":
-        monkeypatch.setattr("softneck.drives.simulated._habits._KNOWN_MODES", (1, 3, 6))
-    bench = Bench(habits=WireHabits(mode_when="enabled"))
+        monkeypatch.setattr("softneck.drives.simulated._quirks._KNOWN_MODES", (1, 3, 6))
+    bench = Bench(quirks=DriveQuirks(mode_when="enabled"))
     if what == "lost":
         bench.link.lose = lambda _from_master, frame: 0x580 <= frame.identifier < 0x680
     bench.start()
