@@ -276,8 +276,8 @@ def normal_table(table: Mapping[str, Any]) -> dict[str, Any]:
             continue
         text, key = str(value), OBJECT
         if isinstance(value, str | Path) and name != "reference":
-            is_neck = text in PRESETS or text.endswith(".toml")
-            own = "file" if name != "plant" else "neck" if is_neck else "model"
+            is_file_or_preset = text in PRESETS or text.endswith(".toml")
+            own = "file" if name != "plant" else "neck" if is_file_or_preset else "model"
             key, value = "fmu" if text.endswith(".fmu") else own, text
         made[name] = {key: value}
     return {key: value for key, value in made.items() if value is not None}
