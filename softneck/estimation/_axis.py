@@ -259,16 +259,9 @@ _RANDOM_LEVELS, _SAMPLES_PER_LEVEL = 60, 50
 
 
 def plants_scaling(robot: Robot, plants: Sequence[Any], weights: Matrix, what: str) -> Scaling:
-    """Return the scaling of a robot with a linear plant for each output.
+    """Return the scaling of a robot with a linear plant for each output; `weights` (outputs, motors).
 
-    Args:
-        robot: the plants' robot; ranges in its file take precedence.
-        plants: with `static_gain`, `time_constant` and `sample_time`.
-        weights: (outputs, motors) of the motors in each output.
-        what: such as "an observer", for the message.
-
-    Raises:
-        SettingsError: the robot gives no range of its set-points.
+    Ranges in the robot's file take precedence. SettingsError: it gives no range of its set-points.
     """
     seconds = max(max(plant.time_constant, plant.sample_time) for plant in plants)
     if robot.motors.nominal is not None:

@@ -48,13 +48,8 @@ def require_levels(form: str, robot: Robot, noise: Sequence[float]) -> tuple[flo
 class FilterMatrices:
     """Matrices of all axes together, as the runtime takes them.
 
-    Attributes:
-        F: (n, n) state over one sample.
-        B: (n, outputs) of the inputs.
-        H: (outputs, n) angles.
-        first_noise, second_noise: (n, n) unit covariances of the process noises.
-        start: (n, n) initial covariance.
-        forced: (n, n) added before a measurement that passes without the gate.
+    F (n, n) state over one sample; B (n, outputs); H (outputs, n); first_noise, second_noise (n, n) unit covariances;
+    start (n, n) initial covariance; forced (n, n) added before a measurement that passes without the gate.
     """
 
     F: Matrix
@@ -72,13 +67,7 @@ class FilterMatrices:
 
 
 def model_form(plants: Sequence[AxisPlant], scaling: Scaling, input_units: Vector) -> FilterMatrices:
-    """Return the matrices of the model's states and a random-walk output disturbance for each output.
-
-    Args:
-        plants: of each output.
-        scaling: of the robot.
-        input_units: (outputs,) of the redefined inputs.
-    """
+    """Return the matrices of the model's states and a random-walk output disturbance for each output."""
     from scipy.linalg import solve_discrete_lyapunov
 
     axes: list[tuple[Matrix, ...]] = []

@@ -32,15 +32,9 @@ _LEAST_ROWS = 200
 class NoiseFit:
     """Noise levels that a recording supports.
 
-    Attributes:
-        observer: the filter with these levels.
-        names: of the levels.
-        noise: standard deviations, in the units of the filter's form.
-        start: where the search began.
-        log_likelihood: per measurement, before and after.
-        rows: measurements used.
-        outliers: measurements left out.
-        at_bound: names of levels at the end of their range: the data do not determine them.
+    `noise` and `start` in the units of the filter's form; log_likelihood: per measurement, before and after; rows,
+    outliers: measurements used, left out; at_bound: names of levels at the end of their range, which the data do not
+    determine.
     """
 
     observer: KalmanObserver | NonlinearObserver
@@ -300,15 +294,8 @@ def look_ahead_error(
     """Return the RMS [SI] between the estimates and later measurements of the same instants.
 
     Five of every 25 samples are withheld from the filter. Likelihood favours levels that trust every measurement where
-    the model is wrong; the gaps and the prediction over the sensor's delay show the price. Outliers are not compared.
-
-    Args:
-        observer: the filter.
-        recording: of its sample time, preferably rows that its noise levels were not fitted to.
-        late: delay of the sensor [s]; None for that of the filter.
-
-    Raises:
-        DataError: no gap fits into the runs.
+    the model is wrong; the gaps and the prediction over the sensor's delay (`late` [s]; None: the filter's) show the
+    price. Outliers are not compared. Rows should be others than the noise levels were fitted to.
     """
     late = (observer.lead if late is None else late) / observer.sample_time
     names = measured_names(recording)

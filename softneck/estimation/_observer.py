@@ -37,15 +37,10 @@ _MIN_EXPLAINED_SHARE = 0.8
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FittedObserver:
-    """An observer fitted to recordings.
+    """The best candidate on the rows held out.
 
-    Attributes:
-        observer: the best candidate on the rows held out.
-        kept: its name: "default", "noise" or "noise and delay".
-        checks: name of each candidate -> look-ahead error on rows held out [SI].
-        fit: of the noise levels.
-        not_identifiable: names of parameters that the data do not determine.
-        rows: held out.
+    kept: "default", "noise" or "noise and delay"; checks: candidate -> look-ahead error [SI]; fit: of the noise levels;
+    rows: held out.
     """
 
     observer: AnyObserver
@@ -64,17 +59,7 @@ def fit_levels_and_delays(
     Noise levels, and in form "model" the dead time of the set-points, are fitted to the first 70 % of each run.
     Set-points and angles determine only the sum of drive and sensor delay; `estimate_sensor_delay` uses motor positions
     and rates. The errors of a nonlinear model are not fitted to its own training rows. All candidates are compared by
-    `look_ahead_error` on the other 30 %.
-
-    Args:
-        observer: to start from.
-        recordings: of its sample time.
-        fixed: names of noise levels that stay as they are.
-        delay: whether the delays may change as well.
-
-    Raises:
-        SettingsError: the model was trained on these rows and the sensor's noise is fixed: no level is left to fit.
-        SettingsError, DataError: as `fit_noise` and `look_ahead_error`.
+    `look_ahead_error` on the other 30 %. `fixed`: noise levels that stay as they are.
     """
     parts = [recording.split(_FIT_SHARE) for recording in recordings]
     heads, rest = [head for head, _ in parts], concatenate([tail for _, tail in parts])

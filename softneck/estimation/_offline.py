@@ -76,11 +76,8 @@ def filter_recording(
 ) -> Estimates:
     """Return the estimates of a recording; each run starts anew.
 
-    Args:
-        observer: of either kind.
-        recording: of its robot and sample time.
-        parts: slices of its state by name.
-        align: returns outputs (time, outputs) and their covariance at the filter's time, from states (time, states).
+    `parts`: slices of the state by name; `align` returns outputs (time, outputs) and their covariance at the filter's
+    time, from states (time, states).
     """
     check_recording(observer, recording)
     m = len(observer.robot.outputs.names)

@@ -54,12 +54,8 @@ _GYRO_NOISE_FACTOR = 3.0
 class SensorNoise:
     """An inclinometer.
 
-    Attributes:
-        name: as in settings.
-        noise_std: standard deviation of pitch and of roll at rest [rad].
-        gyro_noise_std: standard deviation of its rates from sample to sample [rad/s].
-        source: where the numbers come from.
-        delay: of its angles, with the lag of its filter [s]; None: unknown, the robot's file is used.
+    noise_std: of pitch and of roll at rest [rad]; gyro_noise_std: of its rates from sample to sample [rad/s]; delay: of
+    its angles, with the lag of its filter [s]; None: unknown, the robot's file is used.
     """
 
     name: str

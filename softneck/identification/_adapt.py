@@ -1,20 +1,11 @@
 """A model that follows a neck that changed: a warm refit on the latest data, held to the old model elsewhere.
 
-Strength and blocks are chosen on necks that were left out: `benchmarks/adaptation.py choose`.
-
-The cost of an adaptation: errors of the free run over the window, and how far it leads the old free run elsewhere.
-
     V(theta) = sum |y - yhat(theta)|^2 / rows + strength * sum |J (theta - theta_0)|^2 / rows of the reference
 
 J are the derivatives of the old model's free run along a reference motion over all set-points that it was trained on:
-with the noise's variance J'J is the information that a fit along that motion has, and depends on no measurement. So
-the second term is the Gaussian prior that such a fit leaves behind (Ljung 1999, sec. 9.2 and 11.2), in the mean of its
-rows, and `strength` its weight beside the mean of the window's.
-
-Which numbers of each kind of model an adaptation moves, and what it moves with them.
-
-Of a network those are the weights to and from its states: a change of the neck is a change of its gains, rests and
-rates, while what was learnt of its shape stays.
+the second term is the Gaussian prior that a fit along that motion leaves behind (Ljung 1999, sec. 9.2 and 11.2).
+Strength and blocks are chosen on held-out necks: `benchmarks/adaptation.py choose`. Of a network only the weights to
+and from its states are moved.
 """
 
 from __future__ import annotations
@@ -57,12 +48,7 @@ def require_adapting(model: Model) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeParameters:
-    """The numbers of one model as one vector.
-
-    Attributes:
-        model: whose they are.
-        places: array and mask of the entries in it that are moved.
-    """
+    """The numbers of one model as one vector; `places`: array and mask of the entries in it that are moved."""
 
     model: Model
     places: tuple[tuple[str, np.ndarray], ...]
@@ -178,13 +164,8 @@ def reference(model: Model) -> Recording:
 class Problem:
     """One adaptation, its free runs along the window and along the reference.
 
-    Attributes:
-        free: the numbers.
-        window: to learn from.
-        learnt: (time, outputs) which entries count.
-        target: (time, outputs) what was measured.
-        information: (n, n) J'J / rows of the reference, by sizes.
-        strength: of the prior.
+    learnt, target (time, outputs): which entries count, what was measured; information (n, n): J'J / rows of the
+    reference, by sizes; strength: of the prior.
     """
 
     free: FreeParameters
@@ -299,13 +280,8 @@ _STEP_FRACTIONS = (1.0, 0.5, 0.25)
 class AdaptationResult:
     """The result of an adaptation.
 
-    Attributes:
-        adapted: whether anything changed.
-        why: the old model was kept; "" where not.
-        seconds: of the window.
-        rows: held out.
-        before, after: fit [%] of the free run on them, of each output.
-        part: of the way that was gone.
+    why: the old model was kept, "" where not; seconds: of the window; rows: held out; before, after: fit [%] of the
+    free run on them, of each output; part: of the way that was gone.
     """
 
     adapted: bool
@@ -346,12 +322,7 @@ class Adaptation:
 
     @one_blas_thread
     def of(self, model: Model, recording: Recording) -> Model:
-        """Return the adapted model, or the old one if it is no worse; findings hold the reason under `adaptation`.
-
-        Raises:
-            SettingsError: a kind that cannot adapt.
-            DataError: another robot or sample time.
-        """
+        """Return the adapted model, or the old one if it is no worse; findings hold the reason under `adaptation`."""
         require_adapting(model)
         model.check(recording)
         window = _latest(recording, self.window or _scale_seconds(_WINDOW_S, model))

@@ -1,9 +1,7 @@
 """Output error: transfer functions with dead time, fitted by their simulation error, by variable projection.
 
-Only the poles are searched, as the prediction is linear in all other parameters of an axis:
-
-`y(k) = B(q) / F(q) u(k - d) + c(q) / F(q) pulse(k) + e(k)`, with B by least squares for each F, and c, the start
-of each run, projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivatives are exact, by filters.
+`y(k) = B(q) / F(q) u(k - d) + c(q) / F(q) pulse(k) + e(k)`: only the poles are searched; B and c, the start of each
+run, are projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivatives are exact, by filters.
 """
 
 from __future__ import annotations
@@ -56,13 +54,9 @@ _LOG_PRECISION = 36.0
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class OutputErrorFit:
-    """One axis at one dead time.
+    """One axis at one dead time: f (nf,) without its leading one, b (nb,), the sum of squared errors `cost`.
 
-    Attributes:
-        f: (nf,) denominator without its leading one.
-        b: (nb,) numerator.
-        cost: sum of squared errors.
-        covariance: (nf + nb, nf + nb) of (f, b), if the output noise is white.
+    covariance: (nf + nb, nf + nb) of (f, b), if the output noise is white.
     """
 
     f: Vector

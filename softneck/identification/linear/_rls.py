@@ -48,12 +48,9 @@ EXACT_START = 1e12
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
 class RecursionState(ReprMixin):
-    """State of the recursion.
+    """Parameters theta (n,) and F = U D U' with U' = `factor` (n, n) + I and D = `scale` (n,).
 
-    Attributes:
-        theta: (n,) parameters.
-        factor, scale: (n, n) and (n,): F = U D U' with U' = `factor` + I and D = `scale`.
-        tally: (4,) number of rows and their squared errors (both forgotten with lambda), dead-zone rows, projections.
+    tally: (4,) number of rows and their squared errors (both forgotten with lambda), dead-zone rows, projections.
     """
 
     theta: Vector
@@ -381,12 +378,9 @@ def _simulation_fits(model: Model, recording: Recording) -> list[float]:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class OnlineState:
-    """State of `OnlineRls`.
+    """State of `OnlineRls`: recursions of pitch and roll, and the last samples, newest first, NaN where missed.
 
-    Attributes:
-        recursions: of pitch and roll.
-        inputs: (delay + nb, 3) set-points, newest first; NaN before the first.
-        outputs: (na, 2) angles, newest first; NaN where missed.
+    inputs: (delay + nb, 3) set-points; outputs: (na, 2) angles.
     """
 
     recursions: tuple[RecursionState, RecursionState]

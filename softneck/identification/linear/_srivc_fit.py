@@ -27,13 +27,7 @@ Runs = Sequence[tuple[Vector, Vector]]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Continuous:
-    """`B(s)/A(s) exp(-L s)`.
-
-    Attributes:
-        a: (n,) A without its leading one, highest power first.
-        b: (m,) B, highest power first, m <= n.
-        delay: L [s].
-    """
+    """`B(s)/A(s) exp(-L s)`: a (n,) without its leading one and b (m,), m <= n, highest power first; delay L [s]."""
 
     a: Vector
     b: Vector
@@ -66,14 +60,10 @@ class Continuous:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SrivcFit:
-    """A fitted model with its simulation.
+    """A fitted model, the sum of squared errors `cost`, and `simulated` (time,) of each run.
 
-    Attributes:
-        model: the transfer function.
-        cost: sum of squared errors.
-        simulated: (time,) of each run.
-        starts: initial states of each run, and its offset.
-        information: (p, p) moments of the instruments of (a, b, L), with the starts eliminated.
+    starts: initial states of each run, and its offset; information: (p, p) moments of the instruments of (a, b, L),
+    with the starts eliminated.
     """
 
     model: Continuous
@@ -87,14 +77,9 @@ class SrivcFit:
 class SrivcFitOptions:
     """Settings of the fit.
 
-    Attributes:
-        sample_time: [s].
-        order: poles n.
-        offset: estimate a constant on the output of each run too (for windows around an operating point).
-        max_delay: bound on the dead time [s].
-        free_delay: estimate the dead time too.
-        fastest: bound on the poles [1/s].
-        runs_per_time_constant: the longest run over the largest time constant; slower poles only fit a drift.
+    sample_time, max_delay: [s]; order: poles n; offset: estimate a constant on the output of each run (for windows
+    around an operating point); free_delay: estimate the dead time; fastest: bound on the poles [1/s];
+    runs_per_time_constant: the longest run over the largest time constant, as slower poles only fit a drift.
     """
 
     sample_time: float

@@ -1,7 +1,6 @@
-"""Arrays and ports of an identified plant, the same for every kind (public face, "FMUs").
+"""Arrays and ports of an identified plant, the same for every kind; checked before compiled code indexes them.
 
-Arrays are checked before compiled code indexes them; each kind has further checks of its own. A model may have other
-models as members: the arrays of member 0 of kind `play` are named `0.play.history` and so on, after the model's own.
+Arrays of member 0 of kind `play` are named `0.play.history` and so on, after the model's own.
 """
 
 from __future__ import annotations

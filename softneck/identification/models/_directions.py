@@ -1,11 +1,6 @@
 """Directions and time constant of a robot, from its robot file or estimated from data, and synthetic test motions.
 
-Each output is fitted by one low-pass filter with dead time over all motors, by least squares for each time constant and
-dead time tried. Its weights are the output's direction, and its time constant that of the robot, where the robot file
-gives none.
-
-Test motions have the range, speed and correlation of a recording's set-points but another course: random levels, many
-tones, one motor after the other. No outputs were measured along them.
+Estimates are the weights and time constant of one low-pass filter with dead time over all motors for each output.
 """
 
 from __future__ import annotations
@@ -35,14 +30,9 @@ _RANK_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Directions:
-    """Directions and time constants of a robot's outputs.
+    """Weights (outputs, motors) of the redefined inputs and time constants `seconds` (outputs,) of a robot.
 
-    Attributes:
-        names: of the outputs.
-        weights: (outputs, motors) of the motors in the redefined input of each output.
-        seconds: (outputs,) time constants [s].
-        learned: whether the weights were estimated from data.
-        given: (inputs, motors) T of Eq. 9-11 from the robot file: the weights, and co-contraction last.
+    learned: whether from data; given: (inputs, motors) T of Eq. 9-11 from the robot file, co-contraction last.
     """
 
     names: tuple[str, ...]
@@ -84,10 +74,7 @@ class Directions:
 def directions_of(recording: Recording, motors: list[Matrix], robot: Robot | None = None) -> Directions:
     """Return the directions and time constants of a robot; estimate those that its file does not give.
 
-    Motors are the set-points or positions (time, motors) of each run of the recording.
-
-    Raises:
-        DataError: an output follows no motor.
+    Motors are set-points or positions (time, motors) of each run. DataError: an output follows no motor.
     """
     robot = robot or recording.robot
     names, given = robot.outputs.names, robot.weights()
@@ -199,10 +186,7 @@ _MIN_CROSSINGS, _MAX_CROSSINGS = 6.8e-5, 0.68
 
 
 def make_test_motions(train: Recording, seconds: float, *, seed: int = 0) -> list[Recording]:
-    """Generate motions within the set-points of a recording; their outputs are NaN after the start.
-
-    Each has a length of `seconds` before it is scaled to the recording's speed.
-    """
+    """Generate motions of `seconds`, before scaling to a recording's speed, with NaN outputs after the start."""
     length = _MIXED_PER_MOTION * seconds
     start, stop = (round(share * length / SAMPLE_TIME) for share in _SINGLE_TENDON_SHARE)
     alone = signal("mixed", duration=length, seed=seed).set_points[start:stop]

@@ -1,8 +1,4 @@
-"""Drive models, from motor set-point to measured position, and noise models of prediction errors.
-
-A drive is a first-order lag with dead time for each motor. Tendon robots add a common limit: a motor that pulls against
-its current limit stalls (see `_bank_runtime`).
-"""
+"""Drive models, from motor set-point to measured position, and noise models of prediction errors."""
 
 from __future__ import annotations
 
@@ -21,12 +17,7 @@ _MAX_DELAY_SAMPLES = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveModel:
-    """`m(k+1) = a m(k) + (1 - a) u(k+1-d)` per motor.
-
-    Attributes:
-        pole: (motors,) a.
-        delay: (motors,) d in samples; 0 where no positions were logged and the position is the set-point.
-    """
+    """`m(k+1) = a m(k) + (1 - a) u(k+1-d)`: pole a, delay d [samples] of each motor; d = 0 without logged positions."""
 
     pole: Vector
     delay: Vector
@@ -106,12 +97,7 @@ _MAX_ROWS = 10_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedDrive:
-    """A lag with dead time for each motor, and their common load limit.
-
-    Attributes:
-        drive: (motors, 2) pole and delay, as in `DriveModel`.
-        load: (4,) pole of q, c, c1, c2 of `_bank_runtime`; `NO_LOAD` for none.
-    """
+    """A drive (motors, 2): pole, delay; its load limit (4,): pole of q, c, c1, c2 of `_bank_runtime` or `NO_LOAD`."""
 
     drive: Matrix
     load: Vector
@@ -213,8 +199,7 @@ _MAX_POLE_RADIUS = 0.995
 def fit_noise_model(errors: list[Vector], order: int, *, beyond: float = 1.0) -> Vector:
     """Fit c (order,) of `e(k+1) = sum_i c_i e(k+1-i)` by Yule and Walker (Stoica and Moses 2005, sec. 3.4).
 
-    There is one sequence of errors a run, NaN where not measured. On new motions errors are assumed `beyond` times
-    larger, with the same measurement noise.
+    On new motions errors are assumed `beyond` times larger, with the same measurement noise.
     """
     r = np.zeros(order + 1)
     counts = np.zeros(order + 1)

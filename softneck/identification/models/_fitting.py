@@ -1,8 +1,6 @@
 """Steps that all estimators share: check and scale the training data, try dead times, build the model.
 
-A model keeps hashes of its training rows, so that validation can leave them out. Set-points, motor positions and
-outputs are scaled and rounded first. Directions and the time constant are learned from these, in samples, so that
-neither units nor pace change a bit of them. Then time is scaled, and the fitted model is converted back to SI.
+All is scaled and rounded before anything is learned, so that neither units nor pace change a bit of the result.
 """
 
 from __future__ import annotations
@@ -119,8 +117,7 @@ def delay_samples(
 def free_run_fit(runs: Sequence[tuple[Matrix, Matrix]], a: Vector, B: Matrix, d: int) -> float:
     """Return the simulation fit [%] of the first output over all runs; -inf where the model is unstable.
 
-    Runs are outputs (time, ny) and inputs (time, nu); a (na,) is the denominator without its leading one, B (nu, nb)
-    are the numerators.
+    Runs are y (time, ny) and u (time, nu); a (na,) is the denominator without its leading one, B (nu, nb).
     """
     from scipy.signal import lfilter, lfiltic
 
@@ -149,12 +146,7 @@ SAME_EXCITATION = "chosen on rows of the excitation it was trained on; a hold-ou
 def training_recording(recordings: Recording | list[Recording], *, all_motors: bool = False) -> Recording:
     """Return all runs, which stay separate, as one recording to identify from.
 
-    Args:
-        recordings: of one robot and sample time.
-        all_motors: whether the kind learns the effect of each motor, and so needs motors that move independently.
-
-    Raises:
-        DataError: too short, without excitation, or with an output that never moves.
+    `all_motors`: motors must move independently. DataError: too short, no excitation, or an output that never moves.
     """
     recording = concatenate(recordings if isinstance(recordings, list) else [recordings])
     check_training(recording)
@@ -211,14 +203,7 @@ Convert = Callable[[NamedArrays, Scaling], dict[str, Matrix]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaledData:
-    """A training recording in SI and in scaled quantities.
-
-    Attributes:
-        recording: in SI.
-        data: the same, scaled.
-        scaling: between them.
-        directions: of `data`.
-    """
+    """A training recording in SI, the same scaled (`data`), and the directions of `data`."""
 
     recording: Recording
     data: Recording
@@ -227,16 +212,7 @@ class ScaledData:
 
     @classmethod
     def of(cls, recording: Recording, *, amplitudes: bool = True, alike: bool = False) -> ScaledData:
-        """Scale a recording.
-
-        Args:
-            recording: to train on.
-            amplitudes: scale set-points and outputs too; false scales time alone, for equations in SI.
-            alike: scale all outputs by one unit, as the motors are.
-
-        Raises:
-            DataError: an output follows no motor.
-        """
+        """Scale a recording; without `amplitudes` time alone, for equations in SI; `alike` gives outputs one unit."""
         robot = recording.robot
         scaling = Scaling.of(robot, set_points=recording.set_points, outputs=recording.outputs)
         if not amplitudes:

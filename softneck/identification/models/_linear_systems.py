@@ -260,11 +260,7 @@ _REST_TOLERANCE = 1e-12
 
 
 class Jacobian(NamedTuple):
-    """Derivatives of one step: `dx(k+1) = A dx(k) + B du(k)`, `dy(k+1) = C dx(k) + D du(k)`.
-
-    States x are in the order of the state's `values`, inputs u are the set-points (motors,), and outputs y (n_out,)
-    are in the order of the block's.
-    """
+    """`dx(k+1) = A dx(k) + B du(k)`, `dy(k+1) = C dx(k) + D du(k)`; states as in `values`, u the set-points."""
 
     A: Matrix
     B: Matrix
@@ -378,17 +374,11 @@ def lss_arrays(
     source: int = 0,
     history: int | None = None,
 ) -> dict[str, Matrix]:
-    """Return the runtime's arrays of `x+ = A x + B u(k-delay) + K (y - C x)`, `y = C x`.
+    """Return the runtime's arrays of `x+ = A x + B u(k-delay) + K (y - C x)`, `y = C x`, with n >= outputs.
 
-    The states are transformed so that the first are the outputs y, and all states are (y, y, ...) at rest, which is
-    how the runtime starts.
-
-    Args:
-        system: A (n, n), B (n, motors), C (outputs, n), K (n, outputs), with n >= outputs.
-        delay: dead time of all inputs in samples.
-        drive: (motors, 2), see `_narx_runtime`.
-        source: 1 where u are motor positions.
-        history: samples held when a run starts; by default as many as the observer needs to settle.
+    The states are transformed so that the first are the outputs y, and all states are (y, y, ...) at rest, which is how
+    the runtime starts. `source` is 1 where u are motor positions; `history`: samples held when a run starts, by default
+    as many as the observer needs to settle.
     """
     from scipy.linalg import null_space
 
@@ -430,10 +420,7 @@ def history_array(length: int, outputs: int) -> Vector:
 
 
 def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Return the observer form of `y(k) = -sum A_i y(k-i) + sum B_i u(k-i)`, with A (p, y, y) and B (p, y, u).
-
-    Its observer is dead-beat: after p samples it predicts as the difference equation does.
-    """
+    """Return the dead-beat observer form of `y(k) = -sum A_i y(k-i) + sum B_i u(k-i)`, A (p, y, y), B (p, y, u)."""
     p, y = A.shape[:2]
     n = y * p
     F = np.zeros((n, n))
@@ -444,10 +431,7 @@ def varx_system(A: Matrix, B: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
 
 
 def axes_system(a: list[Vector], b: list[Vector], directions: Matrix) -> tuple[Matrix, Matrix, Matrix, Matrix]:
-    """Join transfer functions over redefined inputs to one system over the motors, with a Kalman gain.
-
-    Denominators `a` are without their leading ones; `directions` (outputs, motors) lead to the redefined inputs.
-    """
+    """Join transfer functions over redefined inputs, `directions` (outputs, motors), to a system with a Kalman gain."""
     from scipy.linalg import block_diag
 
     parts = [_observer_form(*axis) for axis in zip(a, b, strict=True)]

@@ -26,8 +26,7 @@ def lag_table(
 ) -> Matrix:
     """Return the regressor table, with rows (source, channel, lag), of lags of y, u_i and M_i [samples].
 
-    With `both_outputs` it has all outputs at each lag, as form `residual` takes them from its base. `sizes` are the
-    numbers of motors and outputs.
+    `both_outputs`: all outputs at each lag, for form `residual`; `sizes`: numbers of motors and outputs.
     """
     rows = [[0, 0, lag] for lag in outputs]
     if both_outputs:

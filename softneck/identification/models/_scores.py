@@ -31,10 +31,7 @@ def rmse(measured: Vector, predicted: Vector) -> float:
 
 
 def worst_error(measured: Vector, predicted: Vector) -> tuple[float, int]:
-    """Return the largest absolute error and its row; (NaN, -1) without any measurement.
-
-    A prediction that is NaN counts as an infinite error.
-    """
+    """Return the largest absolute error, infinite for a NaN prediction, and its row; (NaN, -1) without measurements."""
     size = np.abs(measured - predicted)
     size[np.isfinite(measured) & np.isnan(predicted)] = np.inf
     if not np.isfinite(measured).any():

@@ -1,7 +1,6 @@
 """The training range of the motors and the error of a model, from which its output `validity` is computed.
 
-The error is that of the simulation of the training rows. How it grows outside them depends on the kind of model:
-the numbers of `TRUST` were chosen on held-out robots (`benchmarks/leave_one_neck_out.py validity.*`).
+The numbers of `TRUST` were chosen on held-out robots (`benchmarks/leave_one_neck_out.py validity.*`).
 """
 
 from __future__ import annotations
@@ -113,12 +112,7 @@ def tolerance_of(model: Model) -> Vector | None:
 
 
 def with_tolerance(model: Model, tolerance: float) -> Model:
-    """Return the model with a `validity` that allows an error of `tolerance`, in the display unit of the outputs.
-
-    Raises:
-        SettingsError: a tolerance that is not positive.
-        DataError: a model that has no validity.
-    """
+    """Return the model with a `validity` that allows an error of `tolerance`, in the display unit of the outputs."""
     unit, known = model.robot.outputs.display_unit, tolerance_of(model)
     require_positive("tolerance", tolerance, unit)
     if known is None or not has_validity(model):
@@ -137,9 +131,7 @@ def has_validity(model: Model) -> bool:
 def find_farthest_motor(block: Block, motors: Matrix) -> tuple[int, bool, float, float]:
     """Find the motor farthest from its training range at the end of positions `motors` (time, motors).
 
-    Returns:
-        Its index, whether its low-passed position counts, that position, and its distance from the training's mean
-        over the region's extent.
+    Returns its index, whether its low-passed position counts, that position, and its relative distance.
     """
     ground = block.arrays[layout_of(block.runtime.partition("(")[0], Arrays).place("ground")]
     n = motors.shape[1]
