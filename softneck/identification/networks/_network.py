@@ -52,10 +52,7 @@ INTERRUPTED = "training was interrupted; this is the best network until then"
 class _Problem:
     """Training and hold-out (`judge`) data of all networks of one fit.
 
-    Attributes:
-        hints: test motions with the outputs of the linear model; None for none.
-        prior: weight of their errors.
-        has_time_constant: whether the robot file gives it.
+    hints: test motions with the outputs of the linear model, None for none; prior: weight of their errors.
     """
 
     train: Recording

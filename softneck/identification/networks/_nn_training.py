@@ -141,16 +141,10 @@ _UNSCORED_ROWS = 25
 class AxisData:
     """Scaled regressors and targets of one axis, all runs in sequence.
 
-    Attributes:
-        measured: (time, n) along logged motors.
-        simulated: (time, n) along simulated motors; no row crosses a run's border.
-        target: (time,) scaled output, NaN where it was missed.
-        first: (time,) whether a run begins here.
-        lags: (f,) of the first regressors, past outputs [samples].
-        shift, gain: (f,) of these regressors from the scaled output, `shift + gain y`.
-        window: samples of one scaled second.
-        has_time_constant: whether the robot file gives it; if not, the simulation alone decides.
-        weight: (time,) of the errors.
+    measured, simulated (time, n): along logged, simulated motors, no row across a run's border; target (time,): NaN
+    where missed; first (time,): whether a run begins here; lags (f,): of the first regressors, past outputs [samples],
+    which are `shift + gain y`; window: samples of one scaled second; without has_time_constant the simulation alone
+    decides.
     """
 
     measured: Matrix
@@ -294,10 +288,9 @@ def train_axis(
     refine: int,
     rng: np.random.Generator,
 ) -> Layers:
-    """Return the network with the best simulation of the hold-out among all starts and stages.
+    """Return the network with the best simulation of the hold-out among all starts, one for each of `decays`.
 
-    Each of `decays` gives one start, with a third of the `iterations` (series-parallel); the best gets them all. Then
-    it takes `refine` steps over simulation windows.
+    Each start gets a third of the `iterations` (series-parallel), the best all, then `refine` steps over windows.
     """
     known = np.isfinite(data.measured).all(axis=1) & np.isfinite(data.target)
     rows = np.flatnonzero(known)[:: data.decimation]

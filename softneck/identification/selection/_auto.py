@@ -41,18 +41,12 @@ _NOT_FOUND = ("history", "memory", "table", "redefinition", "nodes", "frame", "s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KindTrial:
-    """One kind that was tried.
+    """One kind that was tried; `failure` says why it failed.
 
-    Attributes:
-        kind: its name.
-        seconds: of training.
-        model: None where it failed.
-        judged: on the rows held out; None where it failed or was stopped before it was trained on all rows.
-        failure: why it failed; empty otherwise.
-        left_out: what was left out of a training -> free-run fit on it [%], the mean of the outputs; "agreement" is
-            that with the other kinds on motions that nobody recorded.
-        errors: the same names -> standard error [%], over blocks of 2 s; "agreement" has none.
-        whole: whether `model` was trained on all rows; the others were stopped before that.
+    seconds: of training; model: None where it failed; judged: on the rows held out, None where it failed or stopped
+    early; left_out, errors: what was left out of a training -> free-run fit on it and its standard error over blocks of
+    2 s [%] ("agreement": with the other kinds on motions that nobody recorded, without error); whole: trained on all
+    rows.
     """
 
     kind: str
@@ -357,9 +351,8 @@ class _Race:
     def guard_best(self, best: KindTrial, progress: Progress) -> KindTrial:
         """Return the guarded form of a learned kind unless it is worse on the rows held out.
 
-        Over `greybox` its members are there already: the model of all rows, and the short one without the largest and
-        fastest motions. `oe` saves less, and needs members of their own. It is ranked by what its kind was worth on
-        what was left out, and by its own hold-out and cold start.
+        Over `greybox` its members are there already; `oe` saves less, and needs members of their own. It is ranked by
+        what its kind was worth on what was left out, and by its own hold-out and cold start.
         """
         bases = [one.kind for one in self.ranking() if one.kind in BASES and one.fit > float("-inf")]
         if best.kind not in OF or best.model is None or not bases:

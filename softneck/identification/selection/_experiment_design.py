@@ -1,15 +1,9 @@
 """The next experiment: motions on which the members disagree, or which leave the training range.
 
-Where several models that were trained alike part, most of them are wrong, and a record there would tell which. Each
-motion is scored by what it would make known of all of them: a sample's doubt,
-
-    s^2 = spread of the members^2 + (slope d)^2,
-
-d the distance from the set-points that were seen, falls by `1 - k^2` where the nearest recorded sample has the
-correlation k with it in set-points and their change (a kernel of length `_KERNEL_LENGTH`). The sum of what is left is
-submodular: taking the best motion first and so on reaches 63 % of the best choice at least (Nemhauser, Wolsey and
-Fisher 1978; Krause, Singh and Guestrin 2008). What is expected is expected by the members: what they share, they do not
-know.
+A sample's doubt, `s^2 = spread of the members^2 + (slope d)^2` with d the distance from the set-points seen, falls by
+`1 - k^2` where the nearest recorded sample has the correlation k with it (a kernel of length `_KERNEL_LENGTH`). The sum
+is submodular: taking the best motion first reaches 63 % of the best choice at least (Nemhauser, Wolsey and Fisher 1978;
+Krause, Singh and Guestrin 2008). What the members share, they do not know.
 """
 
 from __future__ import annotations
@@ -55,12 +49,7 @@ RAMP = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Bounds:
-    """The limits of set-points, in SI.
-
-    Attributes:
-        lowest, highest: (motors,) set-points.
-        speed: largest change by the time, of any motor.
-    """
+    """The limits of set-points (motors,) in SI; `speed` is the largest change by the time, of any motor."""
 
     lowest: Vector
     highest: Vector
@@ -68,11 +57,7 @@ class Bounds:
 
     @classmethod
     def of(cls, robot: Robot, limits: SetPointLimits | None = None) -> Bounds:
-        """Return the bounds of a robot, and `limits` within them.
-
-        Raises:
-            SettingsError: nothing is left between them.
-        """
+        """Return the bounds of a robot, and `limits` within them; SettingsError where nothing is left between them."""
         motors, scale, inside = robot.motors, to_si(robot.motors.unit)[0], limits or SetPointLimits(position=math.inf)
         count = len(motors.names)
         low, high = (
@@ -150,16 +135,10 @@ _KERNEL_LENGTH = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Known:
-    """The models and data before the experiment.
+    """The models that run free, and the data before the experiment.
 
-    Attributes:
-        models: members that run free.
-        seen: (points, motors) set-points that stand for all that were seen.
-        reach: how far any was from the nearest of them.
-        slope: (outputs,) how the doubt grows with the distance from them.
-        sample_time: [s].
-        robot: whose motors move.
-        said: where this is from.
+    seen: (points, motors) set-points that stand for all that were seen; reach: how far any was from the nearest of
+    them; slope: (outputs,) how the doubt grows with the distance from them; sample_time: [s]; said: where this is from.
     """
 
     models: tuple[Model, ...]
@@ -172,11 +151,7 @@ class Known:
 
     @classmethod
     def of_model(cls, model: Model) -> Known:
-        """Return the members and the training set-points of a guarded model.
-
-        Raises:
-            SettingsError: a model of one piece.
-        """
+        """Return the members and the training set-points of a guarded model; SettingsError for one of one piece."""
         if model.kind != "guarded":
             raise SettingsError(
                 f"a model of kind `{model.kind}` has no members that could part; give one of kind `guarded`."
@@ -219,13 +194,9 @@ class Part:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class NextExperiment(ReprMixin):
-    """The next experiment.
+    """The next experiment: its recording holds set-points, and as outputs what the members expect.
 
-    Attributes:
-        recording: its set-points, and as outputs what the members expect.
-        parts: in their order.
-        before, after: rms doubt over all motions that could be played [SI]: now, and expected once this is recorded.
-        said: who doubts.
+    before, after: rms doubt over all motions [SI], now and expected once this is recorded; said: who doubts.
     """
 
     recording: Recording
@@ -257,16 +228,9 @@ class NextExperiment(ReprMixin):
 def next_experiment(
     known: Known, *, duration: float, seed: int = 0, bounds: Bounds | None = None, progress: Progress = silent
 ) -> NextExperiment:
-    """Choose motions one after the other, each for the doubt that it removes beside those before.
+    """Choose motions of `duration` [s] one after the other, each for the doubt that it removes beside those before.
 
-    Motions that would lead an output beyond the robot's range are left out.
-
-    Args:
-        known: what is there.
-        duration: of the experiment [s].
-        seed: of levels and phases.
-        bounds: of the set-points; None takes the robot's.
-        progress: called with the part done.
+    Motions that would lead an output beyond the robot's range are left out. `bounds` None takes the robot's.
 
     Raises:
         SettingsError: too short or too long, or no motion within the outputs' range.

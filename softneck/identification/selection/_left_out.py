@@ -1,16 +1,8 @@
 """Cross-validation of kinds: trainings with a part left out, each scored on that part.
 
-Of the record that kinds begin with, the largest and the fastest motions are blanked, and what follows the rows they are
-trained on is held out: a block in time says how a kind interpolates, blocks by *region of the inputs* how it goes on
-where they end. Blanked outputs are missed samples to every kind; the set-points stay, so that no memory is cut. Then
-several runs or recordings are left out one after the other (leave one excitation out).
-
-Motions that nobody recorded: where kinds that were trained alike part, most of them are wrong.
-
-The exam's set-points stay within those that were trained on, move together as much and as fast, but otherwise: levels
-that are held, many tones, one motor after the other. No measurement says what is right there. What says most is the
-median of all models, each weighing by what it is worth on rows left out: a kind that leaves it alone has learnt the
-record and not the robot. That is a comparison, no proof: kinds that share a bias agree (Ovadia et al. 2019).
+The largest and the fastest motions, the end, and whole runs or recordings are left out. Blanked outputs are missed
+samples; the set-points stay, so that no memory is cut. On motions that nobody recorded, within the set-points trained
+on, kinds are compared with their weighted median: no proof, as kinds that share a bias agree (Ovadia et al. 2019).
 """
 
 from __future__ import annotations
@@ -48,14 +40,9 @@ def free_runs(model: Model, motions: Sequence[Recording]) -> list[Matrix]:
 
 
 def agreement(runs: Mapping[str, Sequence[Matrix]], worth: Mapping[str, float]) -> dict[str, float]:
-    """Return the lowest fit of each model to the weighted median over all motions [%].
+    """Return name -> lowest fit of its `free_runs` to the weighted median over all motions [%], mean of the outputs.
 
-    Args:
-        runs: name -> `free_runs`.
-        worth: name of those that vote -> fit on rows left out [%]; they weigh by the inverse square of what is missing.
-
-    Returns:
-        Name -> fit [%], the mean of the outputs; nothing where fewer than three that vote run free.
+    Those in `worth` (fit on rows left out [%]) vote, by the inverse square of what is missing; {} for fewer than three.
     """
     there = [name for name in worth if np.isfinite(worth[name]) and all(np.isfinite(y).all() for y in runs[name])]
     if len(there) < _LEAST_VOTES:
@@ -95,23 +82,14 @@ _BOOTSTRAP_RESAMPLES = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Judged:
-    """Rows that a training did not see.
-
-    Attributes:
-        name: what was left out, for people.
-        recording: to run free over.
-        rows: (time,) which of it count.
-    """
+    """Rows of a recording that a training did not see, `rows` (time,), and a name of what was left out, for people."""
 
     name: str
     recording: Recording
     rows: np.ndarray
 
     def fit(self, model: Model) -> tuple[float, float]:
-        """Return the mean over the outputs of the free-run fit and its standard error over blocks [%].
-
-        -inf and NaN where the free run is no number.
-        """
+        """Return the free-run fit [%], mean over outputs, and its standard error over blocks; or -inf and NaN."""
         y = np.where(self.rows[:, None], self.recording.outputs, np.nan)
         free = model.simulate(self.recording)[:, : y.shape[1]]
         fits = [nrmse_fit(y[:, i], free[:, i]) for i in range(y.shape[1])]
@@ -132,10 +110,7 @@ class Fold:
 def folds(train: Recording, hold_out: Recording, *, other_excitation: bool) -> list[Fold]:
     """Return the trainings with something left out, the one that all kinds begin with first.
 
-    Args:
-        train: all rows to train on.
-        hold_out: shown to no training but those that leave `train` out.
-        other_excitation: whether `hold_out` is another experiment.
+    `hold_out` is shown only to those that leave `train` out; `other_excitation`: it is another experiment.
     """
     head, tail = _first_rows(train)
     seconds = time_constant_of(train)
@@ -188,9 +163,7 @@ def _scored_rows(recording: Recording) -> np.ndarray:
 def _blank_extreme_motions(recording: Recording, slow: float) -> tuple[Recording, list[Judged]]:
     """Return the recording without its largest and fastest motions, and those; as it was where too little is left.
 
-    Args:
-        recording: to begin with.
-        slow: the robot's time constant in samples.
+    `slow` is the robot's time constant [samples].
     """
     reach, span = round(_WIDEN * slow), max(round(_MOVED_OVER * slow), 1)
     far, fast = (_largest_rows(recording, size, reach) for size in (_sizes(recording), _speeds(recording, span)))

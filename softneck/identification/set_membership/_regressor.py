@@ -1,14 +1,7 @@
-"""The kd-trees over the points of a set: balanced, so that the order of the points is all of their structure.
+"""What a set stands on: its regressor, drives and base, and balanced kd-trees over its points.
 
-The slanted one is a kd-tree in the directions in which the points spread. Regressors are histories, so that points
-hardly leave a few directions, and what the values do over those is nearly a plane. Boxes along those directions are
-far tighter than boxes along the regressors, have fewer sides, and values over the plane range far less within one than
-values do.
-
-What a set of form `paper_eq21`, `lags` or `residual` stands on: its regressor, its drives and its base.
-
-Form `residual` is set membership on what a linear base leaves over: a regressor of simulated signals, so no feedback
-to drift.
+The slanted tree has the directions in which the points spread: its boxes are tighter and have fewer sides, and values
+over the plane range far less within one. Form `residual` is over what a linear base leaves: no feedback to drift.
 """
 
 from __future__ import annotations
@@ -45,10 +38,7 @@ def depth_of(rows: int) -> int:
 
 
 def tree_order(points: Matrix) -> np.ndarray:
-    """Return the order (N,) of the columns of `points` (n, N) in which each node is one segment of them.
-
-    Each level halves all its nodes at once, across the widest side of each, by one stable sort.
-    """
+    """Return the order (N,) of `points` (n, N) in which each node is a segment, halved across its widest side."""
     rows = points.shape[1]
     order = np.arange(rows)
     for level in range(depth_of(rows)):
@@ -202,11 +192,7 @@ _MAX_WIDTH_ROWS = 5000
 def usual_width(points: Matrix, values: Vector, gamma: float, correlated: int, quantile: float) -> float:
     """Return the half-width, without epsilon, that a quantile of the rows stays below, themselves left out.
 
-    Args:
-        points, values: scaled regressors (n, N) and targets (N,), in order of time.
-        gamma: slope of the cones.
-        correlated: rows before and after a row that are left out with it.
-        quantile: of the rows.
+    Points (n, N) and values (N,) in order of time; `correlated` rows before and after a row are left out with it.
     """
     rows, halves = np.arange(values.size), []
     # Spread over the tree, and so over all places.
@@ -253,7 +239,6 @@ _TREE_SEARCH = "softneck.identification.set_membership._gamma_runtime"
 def least_gammas(points: Matrix, values: Vector, slacks: Vector) -> tuple[Vector, np.ndarray]:
     """Return the smallest gamma (m,) of a slack with `|y_j - y_k| <= slack + gamma |w_j - w_k|`, and its pair (m, 2).
 
-    Compiled by branch and bound; without numba over all pairs by numpy, some hundred times slower.
     A gamma beyond 1e200 says that equal regressors have outputs further apart than the slack.
     """
     rising = np.argsort(slacks, kind="stable")
@@ -295,12 +280,7 @@ def require_feasible(
 ) -> None:
     """Raise DataError, naming two samples of the recording, where equal regressors deny epsilon whatever gamma is.
 
-    Args:
-        training: with what the set was made of.
-        table: the regressor, rows (source, channel, lag).
-        data: scaled regressors (n, N) and targets (N,) of each axis, in the recording's order.
-        gamma: (outputs,) the least; beyond 1e100 there is none.
-        epsilon: (outputs,).
+    `data`: regressors (n, N) and targets (N,) of each axis, in order; a least gamma beyond 1e100: there is none.
     """
     if gamma.max() <= 1e100:
         return
@@ -366,15 +346,7 @@ def residual_rows(
 ) -> tuple[Matrix, Vector]:
     """Return regressors (n, N) and y(k) less the base's free run (N,), no row of a run before the base settled.
 
-    Args:
-        recording: what the set is made of.
-        base: the linear model.
-        table: the regressor; source 3 is the base's free run.
-        axis: place of the output.
-        measured: take logged motor positions instead of the drive model's.
-
-    Raises:
-        DataError: every run is too short.
+    Source 3 of the table is the base's free run; `measured` takes logged motor positions. DataError: runs too short.
     """
     parts, left = [], []
     outputs, both = recording.outputs.shape[1], recording.outputs.shape[1] + recording.set_points.shape[1]
@@ -403,11 +375,8 @@ Data = Sequence[tuple[Matrix, Vector]]
 class Ground:
     """All of a set but its points and their scale.
 
-    Attributes:
-        table: the regressor, rows (source, channel, lag).
-        drive: supplies motor positions in free run.
-        base: the linear model of form `residual`, or None.
-        measured: whether the set is made of logged motor positions, where there are any.
+    table: rows (source, channel, lag); drive: supplies motor positions in free run; base: of form `residual`, or None;
+    measured: whether the set is made of logged motor positions, where there are any.
     """
 
     table: Matrix

@@ -60,16 +60,10 @@ def grouped_scale(table: Matrix, output_weight: float, motor_weight: float = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaleTrial:
-    """One scale and epsilon (outputs,), with their simulation scores on the hold-out.
+    """One scale (n,) and epsilon (outputs,), scaled, with their simulation scores on the hold-out.
 
-    Attributes:
-        output_weight, motor_weight: of the scale, or None.
-        scale: (n,).
-        epsilon: (outputs,) scaled.
-        score: sum of all axes' fits [%]; -inf where it left all bounds.
-        coverage: part of the samples within f_l and f_u.
-        width: mean of f_u - f_l, scaled.
-        slope: the least gamma of all axes; 0: the set is a constant, as epsilon swallowed all there was to learn.
+    score: sum of all axes' fits [%], -inf where it left all bounds; coverage: part of the samples within f_l and f_u;
+    width: mean of f_u - f_l, scaled; slope: least gamma of all axes, 0 where epsilon swallowed all there was to learn.
     """
 
     output_weight: float | None
@@ -91,13 +85,9 @@ class ScaleTrial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HoldOut:
-    """Free runs over the last part of the training rows, of sets made of the part before.
+    """Free runs over the last part of the training rows (`tail`), of sets made of the part before.
 
-    Attributes:
-        ground, data: of the first part.
-        tail: the last part.
-        epsilons: (outputs,) each, tried with every scale.
-        narrow: among equally good ones take the narrowest bounds that cover the hold-out.
+    epsilons: (outputs,) each, tried with every scale; narrow: of equally good ones take the narrowest that cover it.
     """
 
     ground: Ground
@@ -154,13 +144,7 @@ _WIDTH_QUANTILE = 0.99
 
 
 def usual_widths(data: Sequence[tuple[Matrix, Vector]], gamma: Vector, epsilon: Vector) -> Vector:
-    """Return each axis' half-width that 99 % of the training rows stay below.
-
-    Args:
-        data: scaled regressors (n, N) and targets (N,) of each axis, in order of time.
-        gamma: (outputs,).
-        epsilon: (outputs,) [rad].
-    """
+    """Return each axis' half-width that 99 % of the training rows stay below; epsilon (outputs,) [rad]."""
     # Half a second on either side is the same motion; less where there is hardly more than that.
     widths = [
         usual_width(points, values, float(gamma[axis]), min(WARM_UP, values.size // 8), _WIDTH_QUANTILE)

@@ -1,8 +1,6 @@
 """Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its free run.
 
-Those of a robot with other tendons are the same; its rates and dead times are in the time of a neck, so that their
-ranges hold for it. With one output it bends in one plane. What hangs on it is in its stiffness and pretension:
-recordings of several payloads tell how these go with it, and the model takes the payload as a parameter.
+Rates and dead times are in the time of a neck. Several payloads tell how stiffness and pretension go with them.
 """
 
 from __future__ import annotations
@@ -32,16 +30,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of the neck's equations.
+    """One number of the neck's equations, searched between `low` and `high`, by its logarithm where `positive`.
 
-    Attributes:
-        name: as in `_neck_equations_runtime`.
-        unit: SI; lengths of tendon and tensions are in radians of motor.
-        guess: where the search starts: the order of magnitude of a neck of 0.1 m with winches of 7.5 mm.
-        low, high: its range.
-        spread: of the weak prior around the guess: of its logarithm where `positive`, else of itself.
-        positive: searched by its logarithm.
-        about: one line.
+    unit: SI, lengths of tendon and tensions in radians of motor; guess: start, for a neck of 0.1 m with winches of 7.5
+    mm; spread: of the weak prior around it, of the logarithm where `positive`.
     """
 
     name: str
@@ -179,14 +171,8 @@ class GreyBox:
 class _FitProblem:
     """All runs as arrays; the drives' dead times are known beforehand.
 
-    Attributes:
-        sample_time: scaled.
-        runs: set-points, start, motor positions and outputs of each.
-        payloads: of each run [kg].
-        drive: (motors, 2) pole and delay.
-        logged: whether motor positions were.
-        numbers: those that are searched; with one output not those across, with several payloads what these change.
-        tendons: what stands behind the numbers; nothing of three tendons 120 deg apart.
+    runs: set-points, start, motor positions and outputs of each; payloads: [kg]; drive: (motors, 2) pole and delay;
+    logged: whether motor positions were; numbers: searched; tendons: nothing of three tendons 120 deg apart.
     """
 
     sample_time: float

@@ -29,15 +29,10 @@ _MANY_RUNS = 4
 
 @dataclass(frozen=True, slots=True)
 class PlayStructure:
-    """Which terms there are.
+    """Which terms there are, of polynomials of `degree`.
 
-    Attributes:
-        rate: of the low-pass filters [1/s].
-        order: filters in a chain.
-        widths: half-widths of the play operators [rad].
-        degree: of the polynomial.
-        inputs: redefined inputs.
-        tilts: those of them that stand in cubes.
+    rate: of the low-pass filters [1/s], `order` in a chain; widths: half-widths of the play operators [rad]; tilts: the
+    redefined inputs that stand in cubes.
     """
 
     rate: float
@@ -69,14 +64,9 @@ class PlayStructure:
 class Data:
     """Simulated motors and measured outputs of all runs, rows in which the start shows marked.
 
-    Attributes:
-        motors: one (time, motors) a run, simulated.
-        measured: the same with what was logged, where it was.
-        outputs: (time, outputs) of all runs behind each other.
-        settled: (time,) rows to learn from and to judge.
-        groups: masks (time,) of rows to hold out in turn: the last fifth of each run; of many runs a third of them.
-        sample_time: [s].
-        redefinition: (inputs, motors) T of Eq. 9-11.
+    motors, measured: one (time, motors) a run, simulated, and logged where it was; outputs: (time, outputs) of all
+    runs; settled: (time,) rows to learn from and to judge; groups: masks (time,) of rows to hold out in turn;
+    sample_time: [s]; redefinition: (inputs, motors) T of Eq. 9-11.
     """
 
     motors: list[Matrix]
@@ -146,8 +136,7 @@ def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
 def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tuple[float, ...]) -> list[float]:
     """Return, for each ridge weight, the mean free-run fit [%] of all outputs on rows that were not learnt from.
 
-    Without `hold_out` parts of the data are held out in turn: the end of each run (of many runs a third of them,
-    experiments of their own), and what is furthest from all the rest, which tells how the form extrapolates.
+    Without `hold_out` parts of the data are held out in turn, and what is furthest from the rest (extrapolation).
     """
     X, good = data.terms(form), data.settled
     if hold_out is None:

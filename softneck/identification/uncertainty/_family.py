@@ -47,15 +47,11 @@ SCOPES = ("window", "point", "recording")
 class AxisFamily:
     """The uncertainty of one axis.
 
-    Attributes:
-        samples: (n, 3) static gain [rad/rad], pole [1/s], dead time [s] of every local model.
-        std: (n, 4) standard deviations of those, and of K.
-        where: (n, 5) scope (0 window, 1 point, 2 recording), recording, time [s], inclination, direction [rad].
-        used: (n,) 1 where the sample is in the uncertain plant, else 0.
-        nominal: (3,) middle of the box, its dead time in whole samples.
-        box: (2, 3) least and largest of the samples used.
-        weight: (2, order + 1) numerator and denominator of W(s): `|G/G0 - 1| <= |W|` for every sample used.
-        envelope: (m,) largest relative error of the samples used at the family's frequencies.
+    samples: (n, 3) static gain [rad/rad], pole [1/s], dead time [s] of every local model; std: (n, 4) of those, and of
+    K; where: (n, 5) scope (0 window, 1 point, 2 recording), recording, time [s], inclination, direction [rad]; used:
+    (n,) 1 where the sample is in the uncertain plant; nominal: (3,) middle of the box (2, 3), its dead time in whole
+    samples; weight: (2, order + 1) numerator and denominator of W(s), `|G/G0 - 1| <= |W|` for every sample used;
+    envelope: (m,) largest relative error of those at the family's frequencies.
     """
 
     samples: Matrix

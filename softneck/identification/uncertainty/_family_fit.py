@@ -54,18 +54,11 @@ _MIN_ENVELOPE_RATIO = 0.02
 
 
 def envelope_weight(frequency: Vector, envelope: Vector, order: int) -> tuple[Vector, Vector]:
-    """Return numerator and denominator of W(s) with `|W(j w)| >= envelope`, as close as its order allows.
+    """Return numerator and denominator of W(s) with `|W(j w)| >= envelope` (m,), as close as its order 1 to 3 allows.
 
     `|W|^2 = N(w^2)/D(w^2)`: for a given closeness gamma, `e^2 D <= N <= gamma^2 e^2 D` is linear in the coefficients;
-    the least gamma is found by bisection, W by spectral factorisation (Balas et al. 2007, `ucover`).
-
-    Args:
-        frequency: (m,) rising [rad/s].
-        envelope: (m,) the largest relative error at each.
-        order: of W, 1 to 3.
-
-    Raises:
-        SettingsError: an order beyond those, or an envelope that is not positive and finite.
+    the least gamma is found by bisection, W by spectral factorisation (Balas et al. 2007, `ucover`). `frequency` (m,)
+    rises [rad/s]; SettingsError for another order, or an envelope that is not positive and finite.
     """
     require_whole("order", order, 1, 3)
     e = np.asarray(envelope, dtype=np.float64)
@@ -143,14 +136,8 @@ def cross_gains(
 ) -> tuple[Matrix, Matrix]:
     """Return static gains (outputs, channels) from the inputs of all axes to each output, and their deviations.
 
-    Every input is given the pole and the dead time of the output's own axis; gains and an offset for each run by
-    least squares, so that only ratios of slow effects are told.
-
-    Args:
-        recordings: of one robot.
-        nominal: models of its outputs.
-        directions: which way its motors move them.
-        source: "set_points" or "positions".
+    Every input is given the pole and the dead time of the output's own axis; gains and an offset for each run by least
+    squares, so that only ratios of slow effects are told. `source` is "set_points" or "positions".
     """
     channels = axis_inputs(recordings[0].rows(0, 2), directions, source).shape[1]
     gains, stds = np.full((len(nominal), channels), np.nan), np.full((len(nominal), channels), np.nan)

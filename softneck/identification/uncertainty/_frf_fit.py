@@ -296,10 +296,9 @@ def frequency_response(recordings: RecordingLike, *, source: str = "set_points")
 
 
 def input_names(robot: Robot) -> tuple[tuple[str, ...], Matrix]:
-    """Return names of the inputs and their weights (q, motors).
+    """Return names of the inputs and their weights (q, motors): one for each output, one for each way that moves none.
 
-    One for each output, as the directions are given, and one for each way to move motors that moves no output (of the
-    neck theta_i, phi_i, delta_i, Eq. 9-11); without directions, the motors themselves.
+    Of the neck theta_i, phi_i, delta_i (Eq. 9-11); without directions, the motors themselves.
     """
     weights, motors = robot.weights(), len(robot.motors.names)
     if weights is None:
@@ -340,11 +339,7 @@ def _interpolate_missing(values: Matrix) -> Matrix:
 
 
 def _references(run: Recording) -> Matrix | None:
-    """Return the references of a run in a closed loop, None for one in the open.
-
-    Raises:
-        DataError: a controller was at work, and what it was asked for rests or was not logged.
-    """
+    """Return the references of a run in a closed loop, None for an open one; DataError if they rest or are missing."""
     names = [f"{name}_reference" for name in run.robot.outputs.names]
     logged = [name for name in names if name in run.channels]
     if not logged:

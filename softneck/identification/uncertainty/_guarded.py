@@ -52,10 +52,7 @@ class Job:
 
 
 def run_jobs(jobs: Sequence[Job], workers: int, progress: Progress) -> list[Any]:
-    """Run the jobs in `workers` processes, or here for 1; return their results in order.
-
-    Raises whatever a job raises; the others are ended then, as they are by Ctrl-C.
-    """
+    """Run the jobs in `workers` processes, or here for 1; return results in order. Whatever a job raises ends all."""
     if workers < 2:
         found = []
         for number, job in enumerate(jobs):
@@ -87,10 +84,7 @@ _MIN_BLOCK_ROWS = 3 * WARM_UP
 
 
 def left_out(recording: Recording, parts: int) -> list[tuple[Recording, Recording]]:
-    """Return (rest, part) for each part: whole runs where there are as many, else as many blocks of each run.
-
-    What stands before and behind a block are runs of their own, never joined.
-    """
+    """Return (rest, part) for each part: whole runs where there are as many, else blocks of each run, never joined."""
     runs = recording.runs()
     if len(runs) >= parts:
         return [
@@ -136,13 +130,7 @@ _POOR_ERROR_RATIO = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """A base and its errors.
-
-    Attributes:
-        model: trained on all rows.
-        error: (outputs,) rms of its free run on rows left out, in the outputs' unit.
-        fit: (outputs,) the same as a fit [%].
-    """
+    """A base trained on all rows; `error` (outputs,) rms of its free run on rows left out [outputs'], as `fit` [%]."""
 
     model: Model
     error: Vector
@@ -160,11 +148,7 @@ class Base:
 
 
 def fitted_base(kind: str, recording: Recording, settings: Any = None) -> Base:
-    """Return a base of that kind, with the kind's defaults where no settings are given.
-
-    Raises:
-        DataError: what the kind raises.
-    """
+    """Return a base of that kind, with the kind's defaults where no settings are given."""
     settings = resolve(KINDS[kind].settings)() if settings is None else settings
     model = settings.fit(recording)
     parts = left_out(recording, _BLOCKS)
@@ -238,11 +222,7 @@ class Guarded:
 
     @one_blas_thread
     def fit(self, recordings: Recording | list[Recording], *, progress: Progress = silent) -> Model:
-        """Identify base and members; Ctrl-C ends it without a model.
-
-        Raises:
-            DataError: what a member raises, or no base that fits.
-        """
+        """Identify base and members; Ctrl-C ends it without a model. DataError: a member's, or no base that fits."""
         recording = training_recording(recordings)
         jobs = [Job("base", base_or_reason, (kind, recording)) for kind in BASES]
         if self.base is not None:
@@ -318,10 +298,7 @@ def _least_missing(found: list[Base | str]) -> Base:
 
 
 def covering(points: Matrix, most: int) -> tuple[Matrix, float]:
-    """Return at most so many of the points (rows, n), and how far any is from the nearest of them.
-
-    Each is the one farthest from those before (Gonzalez 1985), so that no part is left out for being rare.
-    """
+    """Return up to `most` points (rows, n), each farthest from those before (Gonzalez 1985), and how far any is."""
     chosen = [0]
     distance = np.linalg.norm(points - points[0], axis=1)
     while len(chosen) < most and distance.max() > 0.0:

@@ -25,16 +25,11 @@ _START_POLES = (5.0, 1.5, 15.0)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Local:
-    """One local model of one axis.
+    """One local model `K exp(-L s)/(s + p)` of one axis.
 
-    Attributes:
-        scope: "window", "point" or "recording".
-        recording: index of the recording; -1 for a point over several.
-        time: middle of the window [s]; NaN for others.
-        inclination, direction: mean tilt and its direction [rad].
-        model: `K exp(-L s)/(s + p)`.
-        std: (4,) standard deviations of static gain, pole, dead time and K.
-        fit: [%] of the window's own variation.
+    scope: "window", "point" or "recording"; recording: index, -1 for a point over several; time: middle of the window
+    [s], NaN for others; inclination, direction: mean tilt and its direction [rad]; std: (4,) of static gain, pole, dead
+    time and K; fit: [%] of the window's own variation.
     """
 
     scope: str
@@ -56,12 +51,8 @@ class Local:
 class Window:
     """A segment of one run, with rows before it whose outputs are not judged.
 
-    Attributes:
-        recording: index.
-        time: of its middle [s].
-        inputs: (time, channels) the redefined inputs, and co-contraction where the robot names it.
-        outputs: (time, outputs), NaN in the rows before.
-        inclination, direction: means over it [rad].
+    time: of its middle [s]; inputs: (time, channels) redefined, and co-contraction where the robot names it; outputs:
+    (time, outputs), NaN in the rows before; inclination, direction: means over it [rad].
     """
 
     recording: int
@@ -113,14 +104,8 @@ def windows(
 ) -> list[Window]:
     """Cut every run into half-overlapping windows of `length` [s]; a run of half that length is one window.
 
-    Args:
-        recording: to cut.
-        number: its index.
-        directions: which way its motors move its outputs.
-        length: of a window [s].
-        lead: rows before a window whose inputs still act in it [s].
-        source: "set_points" or "positions".
-        upright: whether outputs are one or two angles from a rest that the robot gives.
+    `number` is the recording's index; inputs in the `lead` [s] before a window still act in it; `source` is
+    "set_points" or "positions"; `upright`: outputs are one or two angles from a rest that the robot gives.
     """
     Ts = recording.sample_time
     size, before = round(length / Ts), round(lead / Ts)
@@ -160,12 +145,7 @@ def fit_local(
 ) -> Local | None:
     """Fit one model to all windows of a group, each with its own start and offset; None if they are not informative.
 
-    Args:
-        search: how to fit.
-        group: windows.
-        axis: of the outputs.
-        scope: of the result.
-        near: model to start from as well.
+    `scope` is of the result; `near`: a model to start from as well.
     """
     chosen = [window for window in group if window.is_excited(axis)]
     if not chosen:

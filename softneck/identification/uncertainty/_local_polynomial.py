@@ -16,15 +16,11 @@ ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """An estimate at some frequencies; `G[k, i, a]` is from input a to output i, NaN where it was not excited.
+    """An estimate at (k,) rising frequencies [rad/s]; `response[k, i, a]` from input a to output i, NaN if not excited.
 
-    Attributes:
-        frequency: (k,) rising [rad/s].
-        response: (k, m, q).
-        covariance: (k, m q, m q) of the estimate, entry i q + a for `G[i, a]`; noise and nonlinear distortion.
-        freedom: (k,) degrees of freedom of the covariance.
-        coherence: (k, m) what part of each output's power the inputs explain, 0 to 1.
-        noise: (k, m, q) variance of the estimate by noise alone, None where it was not told apart.
+    covariance: (k, m q, m q), entry i q + a for `G[i, a]`, of noise and nonlinear distortion; freedom: (k,) its degrees
+    of freedom; coherence: (k, m) part of each output's power that the inputs explain; noise: (k, m, q) variance by
+    noise alone, None where it was not told apart.
     """
 
     frequency: Vector
@@ -48,12 +44,9 @@ _MIN_EXCITATION = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """One run, transformed.
+    """One run, transformed; frequencies (bins,) [rad/s] of both signs, without zero.
 
-    Attributes:
-        frequency: (bins,) [rad/s], of both signs, without zero.
-        driven: (bins, q) what the experimenter chose: the inputs, or the references of a closed loop.
-        answered: (bins, m + p) outputs, and in a closed loop the inputs behind them.
+    driven: (bins, q) inputs, or the references of a closed loop; answered: (bins, m + p) outputs, in a loop inputs too.
     """
 
     frequency: Vector
@@ -210,10 +203,7 @@ _SINE_TOLERANCE = 1e-6
 class Periods:
     """A run of equal periods, transformed, without those in which it settles.
 
-    Attributes:
-        frequency: (lines,) [rad/s], above zero and up to the Nyquist frequency.
-        inputs: (lines, q) amplitudes.
-        outputs: (periods, lines, m) amplitudes.
+    frequency: (lines,) [rad/s], above zero; amplitudes of inputs (lines, q) and outputs (periods, lines, m).
     """
 
     frequency: Vector

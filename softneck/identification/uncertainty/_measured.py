@@ -1,9 +1,7 @@
 """A family against its recordings: measured responses, the weight that covers them, their band, and invalidation.
 
-Model invalidation: the least uncertainty with which a whole record is consistent, in one band of frequencies.
-
-`y = G0 (1 + D W) u + v` with `|D| <= d` and a bound on the noise v: a record whose transforms leave over more than
-d allows invalidates it (Smith and Doyle 1992, IEEE Trans. Automatic Control 37:942; Poolla et al. 1994, ibid. 39:951).
+`y = G0 (1 + D W) u + v` with `|D| <= d` and a bound on the noise v: a record whose transforms leave over more than d
+allows invalidates it (Smith and Doyle 1992, IEEE Trans. Automatic Control 37:942; Poolla et al. 1994, ibid. 39:951).
 The energies over a band are compared, so d is a lower bound: what is not invalidated is not thereby explained.
 """
 
@@ -33,18 +31,10 @@ _SEGMENTS_PER_RUN = 5
 
 
 def choose_order(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[Continuous | None, Vector]:
-    """Return the model of the chosen order, fitted to all rows, and the rms error of each order on held-out rows.
+    """Return the model of the chosen order, fitted to all rows, and rms errors (3,) of each order on held-out rows.
 
-    The lowest order whose error is within one standard error of the least is taken (Breiman et al. 1984, 3.4.3), as
-    segments of the runs differ: one pole more must be worth it on all of them.
-
-    Args:
-        search: how to fit; its order is overridden.
-        runs: input and output of every run.
-        near: one pole and dead time to start from.
-
-    Returns:
-        the model, None where no order can be fitted; (3,) rms errors in the output's unit, NaN where one cannot.
+    The lowest order whose error is within one standard error of the least is taken (Breiman et al. 1984, 3.4.3); None
+    and NaN where none can be fitted. `near`: one pole and dead time to start from.
     """
     squares = {n: found for n in ORDERS if (found := _held_out(replace(search, order=n), runs, near)) is not None}
     errors = {n: error for n, (_, error) in squares.items()}
@@ -99,17 +89,9 @@ def least_uncertainty(
     band: tuple[float, float],
     sample_time: float,
 ) -> float:
-    """Return the smallest norm of the uncertainty, relative to the weight, that explains a record in a band.
+    """Return the smallest norm of the uncertainty, relative to the weight (m,), that explains a record in a band.
 
-    Args:
-        runs: input (time,) and output (time,) of each; missing outputs are filled by straight lines.
-        model: nominal.
-        frequency, weight: (m,) of W.
-        band: its ends [rad/s].
-        sample_time: [s].
-
-    Returns:
-        at least 0; NaN where no run has three frequencies in the band.
+    Missing outputs are filled by straight lines. NaN where no run has three frequencies in the band [rad/s].
     """
     left, noise, allowed, lines = 0.0, 0.0, 0.0, 0
     for u, y in runs:
@@ -161,14 +143,11 @@ _ARRAY_NAMES = ("a", "b", "delay", "held_out", "points", "frequency", "weight", 
 class AxisMeasured:
     """Measured responses of one axis; gains in SI of output over its own input.
 
-    Attributes:
-        model: nominal of one, two or three poles behind a dead time, in the middle of the measured responses.
-        held_out: (3,) rms error [SI] of one, two and three poles in free run on rows held out; NaN without a fit.
-        points: (p, 5) recording, frequency [rad/s], real and imaginary part of the response, radius of its circle.
-        frequency: (m,) from end to end of the band that the data support [rad/s].
-        weight: (m,) `|G/G0 - 1| <= weight` for all circles of all recordings.
-        borders: (b + 1,) of the bands in which whole records are judged [rad/s].
-        needed: (recordings, b) times the weight that each needs; NaN where it does not excite.
+    model: nominal of one, two or three poles behind a dead time; held_out: (3,) rms error [SI] of each order in free
+    run on rows held out, NaN without a fit; points: (p, 5) recording, frequency [rad/s], real and imaginary part of the
+    response, radius of its circle; frequency: (m,) [rad/s] of the band that the data support; weight: (m,) `|G/G0 - 1|
+    <= weight` for all circles; borders: (b + 1,) of the bands in which whole records are judged [rad/s]; needed:
+    (recordings, b) times the weight that each needs, NaN where it does not excite.
     """
 
     model: Continuous
@@ -195,11 +174,7 @@ class AxisMeasured:
 
     @classmethod
     def from_arrays(cls, arrays: dict[str, np.ndarray], recordings: int) -> AxisMeasured:
-        """Return the object of `arrays`.
-
-        Raises:
-            FileFormatError: shapes that do not fit, or numbers that are none.
-        """
+        """Return the object of `arrays`; FileFormatError for shapes that do not fit, or numbers that are none."""
         m, b = arrays["frequency"].size, max(arrays["borders"].size - 1, 0)
         shapes = {"delay": (1,), "held_out": (3,), "points": (len(arrays["points"]), 5), "frequency": (m,),
                   "weight": (m,), "needed": (recordings, b)}  # fmt: skip
@@ -314,10 +289,9 @@ def _own_response(
 
 
 def middle_model(start: Continuous, points: Matrix, sample_time: float, max_delay: float) -> Continuous:
-    """Return the model of the start's order that is nearest to the measured responses, in parts of themselves.
+    """Return the model of the start's order nearest to the measured responses, in parts of themselves.
 
-    Least squares; a point whose circle is as large as what is still called supported counts half. Each recording
-    counts alike.
+    Least squares, each recording alike; a point whose circle is as large as what is called supported counts half.
     """
     from scipy.optimize import least_squares
 
@@ -374,14 +348,7 @@ def band_borders(low: float, high: float) -> Vector:
 def judge_records(
     runs: Sequence[Sequence[tuple[Vector, Vector]]], measured: AxisMeasured, points: Matrix, sample_time: float
 ) -> Matrix:
-    """Return (recordings, bands) how many times the weight each whole record needs; NaN where it does not excite.
-
-    Args:
-        runs: of each recording, input and output of every run.
-        measured: model, weight and bands.
-        points: of these recordings, which tell where each excites.
-        sample_time: [s].
-    """
+    """Return (recordings, bands) how many times the weight each whole record needs; NaN where `points` excite none."""
     needed = np.full((len(runs), measured.borders.size - 1), np.nan)
     for number, parts in enumerate(runs):
         own = points[points[:, 0] == number, 1]

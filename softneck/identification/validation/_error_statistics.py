@@ -1,16 +1,9 @@
 """Residual tests as MATLAB's `resid`: whiteness, and correlation with the inputs, with 99 % bounds (Ljung 1999, 16.6).
 
-All sums are taken inside each segment of rows: no product joins two runs. A missed sample adds no product, and those
-around it keep their true distance.
-
-What bounds are worth: whether they held what they promise, whether they are of use, and bounds from whole records.
-
-Calibrated bounds take the errors of whole segments as exchangeable, never rows: a free run that is wrong is wrong for
-long. The half-width for the largest error of a further record is an order statistic of the records' largest errors
-(Stankeviciute et al. 2021); that for one of its samples weighs each record alike, and a further one as infinite (Lee,
-Barber and Willett 2023). At 90 % either needs nine records. They are exchangeable with records of the same kind alone:
-beyond the set-points of these there is no bound, and on motions unlike these the coverage is what it turns out to be:
-no guarantee (Barber et al. 2023).
+All sums are inside each segment of rows. Calibrated bounds take the errors of whole records as exchangeable, never
+rows: the half-width for the largest error of a further record is an order statistic (Stankeviciute et al. 2021); that
+for one of its samples weighs each record alike, and a further one as infinite (Lee, Barber and Willett 2023). On
+motions unlike these there is no guarantee (Barber et al. 2023).
 """
 
 from __future__ import annotations
@@ -33,16 +26,12 @@ LEVEL, LAGS = 0.99, 25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResidualTests:
-    """Whiteness of the one-step errors, and their correlation with the inputs.
+    """Whiteness of the one-step errors of pitch and roll, and their correlation with the inputs.
 
-    Attributes:
-        lags: (26,) 0 to 25 samples.
-        autocorrelation: (2, 26) of pitch and roll errors.
-        bound: (2,) a white error stays within +- this at each lag with 99 %.
-        p_value: (2,) of the portmanteau test of lags 1 to 25 (Ljung and Box 1978); NaN where rows are too few.
-        cross_lags: (51,) -25 to 25; positive: the error follows the input.
-        cross_correlation: (2, 3, 51) of each error with each set-point.
-        cross_bound: (2, 3) the same for an error of its own colour that does not depend on the input.
+    lags: (26,) 0 to 25 samples; autocorrelation: (2, 26); bound: (2,) a white error stays within +- this at each lag
+    with 99 %; p_value: (2,) of the portmanteau test of lags 1 to 25 (Ljung and Box 1978), NaN where rows are too few;
+    cross_lags: (51,) -25 to 25, positive: the error follows the input; cross_correlation: (2, 3, 51) of each error with
+    each set-point; cross_bound: (2, 3) for an error of its own colour that does not depend on the input.
     """
 
     lags: np.ndarray
@@ -80,12 +69,9 @@ class ResidualTests:
 
 
 def residual_tests(errors: Matrix, inputs: Matrix, segment: np.ndarray) -> ResidualTests:
-    """Test errors (time, 2), NaN where there is none, against themselves and inputs (time, 3).
+    """Test one-step errors (time, 2), NaN where there is none, against themselves and set-points (time, 3).
 
-    Args:
-        errors: one-step errors.
-        inputs: the set-points.
-        segment: (time,) number of the segment of rows; sorted.
+    `segment`: (time,) number of the segment of rows; sorted.
     """
     from scipy.stats import chi2
 
@@ -162,10 +148,7 @@ def judged_bounds(
 ) -> tuple[dict[str, float | None] | None, list[str]]:
     """Return the mean widths, None for useless ones, and the remarks, one line each.
 
-    Args:
-        rows: those judged.
-        coverage, width: of `coverage_tables`.
-        promised: whether the bounds promise to hold all samples, as set membership does.
+    `promised`: whether the bounds promise to hold all samples, as set membership does.
     """
     if coverage is None or width is None:
         return None, []
@@ -195,16 +178,10 @@ def judged_bounds(
 def calibrated_bounds(rows: Rows, errors: Matrix) -> dict[str, Any]:
     """Return 90 % half-widths around a simulation from whole segments, and their coverage of segments left out.
 
-    `pointwise` is for any one sample of a further record of this kind, `path` for all of its samples at once.
-
-    Args:
-        rows: those judged.
-        errors: (time, outputs) measured less free run; NaN where not judged.
-
-    Returns:
-        Level, number of records, the range of their set-points (`domain`, in SI) beyond which there is no bound, and
-        for each of both axis -> half-width, what it held on records left out within the domain of the others, and how
-        much of them lay beyond that (`outside_pct`); or the reason why there is none.
+    `pointwise` is for any one sample of a further record of this kind, `path` for all of its samples at once. Of both:
+    axis -> half-width, what it held on records left out within the domain of the others, and how much of them lay
+    beyond (`outside_pct`). `domain`: range of set-points [SI] beyond which there is no bound. `errors` (time, outputs)
+    are NaN where not judged. Without bounds, the reason.
     """
     numbers = [number for number in range(int(rows.segment[-1]) + 1)
                if np.isfinite(errors[rows.segment == number]).all(axis=1).any()]  # fmt: skip
@@ -289,20 +266,11 @@ _RELIABILITY_BINS = 10
 
 
 def judged_validity(model: Model, rows: Rows, free: Matrix) -> dict[str, Any] | None:
-    """Return the validity over a simulation, compared with the share of errors within tolerance.
+    """Return the validity over a simulation `free` (time, n_out), compared with the share of errors within tolerance.
 
-    The Brier score is the mean squared distance between the probability and what happened, 0 at best (Brier 1950);
-    `brier_base_rate` is that of who knows how often these rows stay within the tolerance and nothing else.
-
-    Args:
-        model: whose free run it is.
-        rows: those judged.
-        free: (time, n_out) the free run with all outputs of the model.
-
-    Returns:
-        least, mean, held (share of the rows with all errors within the tolerance), brier, brier_base_rate, and
-        reliability: predicted, held and rows for each tenth of the probability. None where the model has no validity
-        or nothing is judged.
+    The Brier score is the mean squared distance between the probability and what happened (Brier 1950);
+    `brier_base_rate` is that of who knows only how often these rows stay within. `held`: share of rows with all errors
+    within the tolerance; reliability: predicted, held and rows for each tenth. None without validity or rows.
     """
     allowed = tolerance_of(model)
     if not has_validity(model) or allowed is None or free.shape[1] <= allowed.size:

@@ -1,14 +1,8 @@
-"""Which rows are judged: segments of rows that the model was not trained on, less those that set its start.
+"""Rows that are judged, the tables of scores of a `Validation`, and when a free run predicts nothing any more.
 
-The tables of scores that a `Validation` holds; and when a free run predicts nothing any more.
-
-How sure a fit is: bootstrap over blocks of rows, as errors and motions of a neck last many samples.
-
-The interval is for another experiment of this kind and length. On AR(1) errors and motions it held the true fit in 84
-to 93 % of experiments (tests): with few correlation times in a record, read it as a lower bound of the doubt.
-
-Moving blocks that wrap inside their run (Politis and Romano 1992, "A circular block-resampling procedure"): every row
-is drawn equally often and no block joins two runs. A fit needs only sums over rows, so blocks are drawn as sums.
+Intervals are by moving blocks that wrap inside their run (Politis and Romano 1992, "A circular block-resampling
+procedure"), for another experiment of this kind and length. On AR(1) errors and motions they held the true fit in 84 to
+93 % of experiments (tests): with few correlation times in a record, read them as a lower bound of the doubt.
 """
 
 from __future__ import annotations
@@ -42,11 +36,7 @@ _MOST_STEPS = 75_000
 class ScoredSegment:
     """Rows of one run that follow each other.
 
-    Attributes:
-        recording: those rows alone.
-        scored: (time,) which of them are judged; never the first 25, a row that the model was trained on, or one
-            where neither angle was measured.
-        run: number of the run, as the recording counts.
+    scored: (time,) which are judged: never the first 25, rows trained on, or those where neither angle was measured.
     """
 
     recording: Recording
@@ -58,13 +48,8 @@ class ScoredSegment:
 class Rows:
     """The rows of all segments, one segment after the other.
 
-    Attributes:
-        time: (time,) [s].
-        segment: (time,) number of the segment.
-        since: (time,) samples since its start.
-        measured: (time, 2) [rad]; NaN where missed or not scored.
-        set_points: (time, 3) [rad].
-        robot: whose rows they are; another than the neck has its own numbers of motors and outputs, in SI.
+    time: (time,) [s]; segment: (time,) its number; since: (time,) samples since its start; measured: (time, 2) [rad],
+    NaN where missed or not scored; set_points: (time, 3) [rad]; another robot than the neck: its own numbers, in SI.
     """
 
     time: Vector
@@ -99,11 +84,7 @@ class Rows:
 
 
 def unseen_segments(recording: Recording, hashes: np.ndarray) -> tuple[list[ScoredSegment], int]:
-    """Return the segments of rows whose hash is not in `hashes`, and how many rows were left out.
-
-    Raises:
-        DataError: nothing is left to judge.
-    """
+    """Return the segments of rows whose hash is not in `hashes`, and how many were left out; DataError if all were."""
     segments: list[ScoredSegment] = []
     left_out = longest = 0
     for run in recording.runs():
@@ -238,12 +219,8 @@ def fit_intervals(
 ) -> list[list[list[float] | None]]:
     """Return for each prediction and axis the 95 % interval [low, high] of its fit [%].
 
-    None where nothing is measured or moves, or the rows are fewer than eight blocks of five time constants.
-
-    Args:
-        measured, predicted: one pair of (time, 2) for each horizon; NaN in `measured` where not judged.
-        segment: (time,) number of the segment of rows; sorted.
-        time_constant: [samples]; 0 where the robot gives none.
+    None where nothing is measured or moves, or the rows are fewer than eight blocks of five time constants [samples].
+    Measured and predicted: (time, 2) for each horizon, NaN where not judged; `segment` (time,) is sorted.
     """
     from scipy.sparse import csr_array
 
@@ -370,13 +347,9 @@ INFINITE = "inf"
 def score_tables(
     rows: Rows, time: Vector, measured: dict[str, Matrix], predicted: dict[str, Matrix], *, lost: bool
 ) -> dict[str, Any]:
-    """Return the tables of scores by their names in `Validation`; a lost free run has none.
+    """Return the tables of scores by their names in `Validation`; a lost (diverged) free run has none.
 
-    Args:
-        rows: whose outputs these are.
-        time: (time,) [s].
-        measured, predicted: horizon -> (time, outputs).
-        lost: whether the free run diverged.
+    `measured` and `predicted`: horizon -> (time, outputs).
     """
     tables: dict[str, Any] = {name: {} for name in ("fits", "rmse_deg", "r2", "worst_deg", "worst_time")}
     for h, y in measured.items():
