@@ -1,4 +1,4 @@
-"""softneck identify auto: all kinds, ranked by free run over rows held out."""
+"""softneck identify auto: all kinds, ranked by simulation over rows held out."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 _TABLE_HEAD = ["kind", "worst", "of", "all of them", "rows held out", "cold", "tried in", "found", ""]
-_TABLE_TITLE = "Free-run fit [%] over what was left out, mean of {names}; +- one standard error"
+_TABLE_TITLE = "Simulation fit [%] over what was left out, mean of {names}; +- one standard error"
 
 _OTHER = {
     "linear": "`design` of most kinds takes linear models: the best of them, {kind}, is in {path}",
@@ -157,7 +157,7 @@ def _page(choice: identification.Choice) -> str:
     table = plots.Table(_title(_model(choice).robot), _TABLE_HEAD, _rows(choice))
     names = list(dict.fromkeys(name for one in choice.ranking for name in one.scores))
     each = [[one.kind, *(percent(one.scores.get(name)) for name in names)] for one in choice.ranking]
-    all_scores = plots.Table("Free-run fit [%] over each part that was left out", ["kind", *names], each)
+    all_scores = plots.Table("Simulation fit [%] over each part that was left out", ["kind", *names], each)
     charts = [] if choice.chosen.judged is None else [curves(choice.chosen.judged)]
     found = _model(choice).summary().splitlines()
     sections = [

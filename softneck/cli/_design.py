@@ -29,7 +29,7 @@ _KINDS = "\n".join(f"  {name:9} {KINDS[name].summary}" for name in kinds_of("con
 @click.argument("kind", shell_complete=kinds_complete("controller"))
 @click.argument("models", nargs=-1, required=True, metavar="MODEL|FAMILY...", type=click.Path(path_type=Path))
 @output_option("controller", "CONTROLLER")
-@click.option("--any-fit", is_flag=True, help="Also on a model whose free run has a fit below 30 %.")
+@click.option("--any-fit", is_flag=True, help="Also on a model whose simulation has a fit below 30 %.")
 @click.option(
     "--observer", type=click.Path(path_type=Path), metavar="OBSERVER",
     help="Of the loop: `mpc` and `nmpc` plan without the delay that it makes up for, and `mpc` with tendons as taut as "
@@ -99,7 +99,7 @@ def observer_command(
     """Build a filter over the identified MODEL.
 
     The form follows from the model: a Kalman filter over a linear one, with a disturbance on each axis; of a nonlinear
-    one the free run, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
+    one the simulation, with a disturbance. Another: --set form=gyro, driven by the gyro's rates with their bias as a
     state.
     """
     kind = find_kind("kalman", "observer")

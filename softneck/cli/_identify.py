@@ -36,7 +36,7 @@ from .shared._options import (
 
 _ADVICE = "Try another kind or settings, or record longer; `softneck identify auto` compares kinds."
 _KINDS = "\n".join(f"  {name:8} {KINDS[name].summary}" for name in kinds_of("model"))
-_KINDS += "\n  auto     tries them all and takes the best in free run"
+_KINDS += "\n  auto     tries them all and takes the best in simulation"
 
 
 @click.command(
@@ -165,7 +165,7 @@ def adapt(
         return
     names = "/".join(new.robot.outputs.names)
     before, after = ("/".join(percent(fit) for fit in said[key]) for key in ("fit_before", "fit_after"))
-    told = f"free run on {said['rows_held_out']} rows held out of {said['window_s']:.3g} s, fit [%] {names}:"
+    told = f"simulation on {said['rows_held_out']} rows held out of {said['window_s']:.3g} s, fit [%] {names}:"
     if said["adapted"]:
         click.echo(f"{path}: adapted\n{told} {before} -> {after}")
     else:

@@ -15,8 +15,8 @@ from .shared._options import common_options, tolerance_option
 
 _FIT_NOTE = (
     "Fit is 100 (1 - |y - yhat| / |y - mean y|) in %. Persistence repeats the last sample; a one-step fit that is not "
-    "above it says nothing. The free run (inf) is what an FMU of the plant does. Best linear is fitted on the judged "
-    "rows: no linear model of the set-points has a better free run on them."
+    "above it says nothing. The simulation (inf) is what an FMU of the plant does. Best linear is fitted on the judged "
+    "rows: no linear model of the set-points has a better simulation on them."
 )
 
 
@@ -25,13 +25,15 @@ _FIT_NOTE = (
 )
 @click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--data", "data", multiple=True, required=True, type=click.Path(path_type=Path), help="Recordings.")
-@click.option("--horizon", default="1,5,25,inf", show_default=True, help="Samples ahead; inf is the free run.")
+@click.option(
+    "--horizon", default="1,5,25,inf", show_default=True, help="Samples ahead; inf is the simulation (free run)."
+)
 @click.option(
     "--motors",
     type=click.Choice(["simulated", "measured"]),
     default="simulated",
     show_default=True,
-    help="Free run from set-points alone, or with logged motor positions as the paper does.",
+    help="Simulation from set-points alone, or with logged motor positions as the paper does.",
 )
 @click.option("--include-training", is_flag=True, help="Also score rows that the model was trained on.")
 @click.option("--html", type=click.Path(path_type=Path), help="Write a page with plots.")
@@ -51,7 +53,7 @@ def command(
 ) -> None:
     """Validate MODELs on the rows of recordings that they were not trained on.
 
-    Exit code 1 if a free run diverges or a fit is below 0 %.
+    Exit code 1 if a simulation diverges or a fit is below 0 %.
     """
     horizons = _horizons(horizon)
     if html is not None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from .predictive._nmpc import NmpcController
     from .varying._adaptive import VaryingController
 
-# [%] Free run over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
+# [%] Simulation over the rows held out: below it R2 is below 1/2, so more of the motion is unexplained than explained.
 _MIN_FIT_PCT = 30.0
 
 
@@ -57,7 +57,7 @@ def design_controller(
         kind: name in the table of kinds: "pi", "pid", "hinf", "mpc", ...
         plant: an identified linear model, a family, the file of one, or a list whose first entry is the nominal plant.
         robot: whose limits count, itself, a preset or its file; None: those that the plant says.
-        any_fit: design on models too whose free run on the rows held out fits less than 30 %.
+        any_fit: design on models too whose simulation on the rows held out fits less than 30 %.
         **settings: for instance `phase_margin=1.05`; angles in rad.
 
     Raises:
@@ -100,7 +100,7 @@ def linear_plant(thing: Any, *, any_fit: bool, robot: Robot | str | Path | None 
     if (diverged or least < _MIN_FIT_PCT) and not any_fit:
         what = "diverges" if diverged else f"fits {percent(least)} %"
         raise SettingsError(
-            f"{path and path + ': '}its free run over the rows held out {what}; {_MIN_FIT_PCT:g} % is the least to "
+            f"{path and path + ': '}its simulation over the rows held out {what}; {_MIN_FIT_PCT:g} % is the least to "
             "design on. Identify a better model, or go on by --any-fit (`any_fit=True`)."
         )
     return plant

@@ -36,7 +36,7 @@ _BY_LOGARITHM = (
     "tendon_stiffness", "pretension", "guide_friction", "position_gain", "speed_limit", "drive_latency", "sensor_delay",
 )  # fmt: skip
 _BY_STEPS = {"stiffness_asymmetry": 0.2, "stiffness_angle": 0.5, "rest_pitch": 0.02, "rest_roll": 0.02}
-# The first part of each run is fitted, the rest judged; both in one free run from the set-points alone.
+# The first part of each run is fitted, the rest judged; both in one simulation from the set-points alone.
 _TRAINING_SHARE = 0.7
 # By definition of issue 29: a neck that follows less [%] is not the user's.
 LEAST_FIT = 85.0
@@ -53,7 +53,7 @@ class Calibration(ReprMixin):
     Attributes:
         neck: the numbers.
         start: name of the preset that the search began at.
-        fits: (recordings, 2) fit of pitch and roll in free run on the last 30 % of each run [%].
+        fits: (recordings, 2) fit of pitch and roll in simulation on the last 30 % of each run [%].
         fitted: names of the numbers that were fitted.
     """
 
@@ -71,7 +71,7 @@ class Calibration(ReprMixin):
         """Return a neck file."""
         plain = NeckParameters.preset(self.start)
         lines = [
-            "# Written by softneck.calibrate: fitted in free run from set-points. On the last 30 % of each run,",
+            "# Written by softneck.calibrate: fitted in simulation from set-points. On the last 30 % of each run,",
             f"# which it was not fitted to, it follows pitch and roll to {self.worst:.1f} % or better.",
             f'preset = "{self.start}"',
         ]
@@ -106,7 +106,7 @@ def calibrate(
     evaluations: int = 30,
     progress: Progress = silent,
 ) -> Calibration:
-    """Return the neck whose free run is nearest to the recordings, by least squares.
+    """Return the neck whose simulation is nearest to the recordings, by least squares.
 
     Args:
         recordings: of a neck.
@@ -209,7 +209,7 @@ def _search(
     def errors(x: Vector) -> Vector:
         nonlocal calls
         calls += 1
-        progress(min(0.99, calls / (evaluations * (len(names) + 1))), "free runs")
+        progress(min(0.99, calls / (evaluations * (len(names) + 1))), "simulations")
         try:
             e = _errors(runs, neck_of(x))
         except SettingsError:  # it buckles, or its tendons miss the link

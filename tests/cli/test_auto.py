@@ -29,7 +29,7 @@ def test_auto_ranks_explains_and_saves(call: Call, recording: Path) -> None:
     said = call("identify", "auto", recording, "-o", "best.npz", "--html", "why.html")
     assert said.code == 0, said.err
     assert "chosen" in said.out
-    assert "Free-run fit" in said.out
+    assert "Simulation fit" in said.out
     assert "+-" in said.out
     assert "last one is held out" in " ".join(said.err.split())
     assert load("best.npz").kind in ("rls", "play")
@@ -95,11 +95,13 @@ def test_auto_saves_the_best_of_the_other_sort_beside_its_choice(
 def test_auto_ends_with_exit_code_1_where_no_kind_makes_a_model(
     call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("softneck.cli._auto.useless", lambda judged: f"its free run diverges at {judged.time[0]:.0f} s")
+    monkeypatch.setattr(
+        "softneck.cli._auto.useless", lambda judged: f"its simulation diverges at {judged.time[0]:.0f} s"
+    )
     for more in ((), ("--json",)):
         said = call("identify", "auto", recording, "-o", f"best{len(more)}.npz", *more)
         assert said.code == 1
-        assert "no kind is a model of the rows held out: its free run diverges" in said.err.splitlines()[-1]
+        assert "no kind is a model of the rows held out: its simulation diverges" in said.err.splitlines()[-1]
     assert json.loads(said.out)["model"] == "best1.npz"
 
 

@@ -137,7 +137,7 @@ def test_people_get_a_table_and_progress_stays_on_stderr(call: Call, recording: 
     said = call("identify", "rls", recording, "-o", "m.npz", "--set", "delay=0.06")
     assert said.code == 0
     assert said.out.startswith("m.npz\nrls:")
-    assert "free run" in said.out
+    assert "simulation" in said.out
     assert "identify rls ..." in said.err
     table = call("validate", rls_file, "--data", recording, "--html", "page.html")
     assert "best linear" in table.out

@@ -34,7 +34,7 @@ def test_a_model_that_diverges_is_judged_and_gives_exit_code_1(
     judged = json.loads(said.out)["models"][0]
     assert judged["diverged"] > 0.0
     assert judged["fits"]["model"]["25"]["pitch"] < -1000.0
-    assert f"no model of this data: away.npz on {recording.name}: its free run diverges at" in said.error
+    assert f"no model of this data: away.npz on {recording.name}: its simulation diverges at" in said.error
     # A table shows no digits of such a number.
     assert "<-1000" in call("validate", "away.npz", "--data", recording).out
 
@@ -45,7 +45,7 @@ def test_a_model_that_moves_the_wrong_way_gives_exit_code_1(call: Call, rls_file
     write_recording("mirrored.csv", replace(right, channels=channels))
     said = call("validate", rls_file, "--data", "mirrored.csv", "--horizon", "inf")
     assert said.code == 1
-    assert "its fit in free run is -1" in said.error
+    assert "its fit in simulation is -1" in said.error
 
 
 def test_identify_of_outputs_that_follow_no_motor_gives_exit_code_1_and_what_to_do(call: Call) -> None:
@@ -55,7 +55,7 @@ def test_identify_of_outputs_that_follow_no_motor_gives_exit_code_1_and_what_to_
     write_recording("foreign.csv", replace(moving, channels={**moving.channels, **angles}))
     said = call("identify", "oe", "foreign.csv", "-o", "m.npz")
     assert said.code == 1
-    assert "m.npz: no model of the rows held out: its fit in free run is -" in said.error
+    assert "m.npz: no model of the rows held out: its fit in simulation is -" in said.error
     assert "does not follow the motors" in said.error
     assert call("identify", "oe", "foreign.csv", "-o", "m.npz", "--json", "--force").code == 1
     # One of the two alone: the robot may do without it.
@@ -72,11 +72,11 @@ def test_identify_says_that_its_model_diverges_and_keeps_it(
     monkeypatch.setattr(Rls, "fit", lambda *given, **more: unstable(fit(*given, **more)))
     said = call("identify", "rls", recording, "-o", "away.npz")
     assert said.code == 1
-    assert "away.npz: no model of the rows held out: its free run diverges at" in said.error
+    assert "away.npz: no model of the rows held out: its simulation diverges at" in said.error
     assert load("away.npz").findings["hold_out"]["diverged"] > 0.0
     said = call("design", "pi", "away.npz", "-o", "pi.npz")
     assert (said.code, Path("pi.npz").exists()) == (2, False)
-    assert "its free run over the rows held out diverges" in said.error
+    assert "its simulation over the rows held out diverges" in said.error
 
 
 def test_an_angle_that_stands_still_has_no_fit(call: Call, rls_file: Path) -> None:
@@ -105,7 +105,7 @@ def test_design_refuses_a_model_that_explains_less_than_half(
     said = call("design", "pi", "m.npz", "-o", "pi.npz")
     assert said.code == code, said.err
     if code == 2:
-        assert f"m.npz: its free run over the rows held out fits {fit} %; 30 % is the least" in said.error
+        assert f"m.npz: its simulation over the rows held out fits {fit} %; 30 % is the least" in said.error
         assert call("design", "pi", "m.npz", "-o", "pi.npz", "--any-fit").code == 0
 
 

@@ -124,8 +124,8 @@ _MIN_DESIGN_FIT_PCT = 30.0
 def useless(r: identification.Validation) -> str | None:
     """Return why a model is no model of the rows that it was judged on, or None."""
     if r.diverged is not None:
-        return f"its free run diverges at {r.diverged:.2f} s"
-    fits = [(fit, "in free run" if h == "inf" else f"{h} sample(s) ahead", axis)
+        return f"its simulation diverges at {r.diverged:.2f} s"
+    fits = [(fit, "in simulation" if h == "inf" else f"{h} sample(s) ahead", axis)
             for h, table in r.fits.items() for axis, fit in table.items() if fit is not None]  # fmt: skip
     worst, horizon, axis = min(fits, default=(0.0, "", ""))
     return f"its fit {horizon} is {percent(worst)} % in {axis}" if worst < _MIN_FIT_PCT else None

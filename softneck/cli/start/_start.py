@@ -290,7 +290,7 @@ def _tell(facts: dict[str, Any], *, as_json: bool) -> None:
         for sort, model in facts["models"].items():
             fits = "/".join(map(percent, model["fit"].values())) or "not known"
             click.echo(
-                f"\nbest {sort} model: {model['kind']}, free run {fits} % over the rows held out, {model['file']}"
+                f"\nbest {sort} model: {model['kind']}, simulation {fits} % over the rows held out, {model['file']}"
             )
         print_table(f"Verdict on {folder}", ["step", "", "processor time [s]"], _rows(facts))
         for metric, one in facts["loosened"].items():

@@ -133,7 +133,7 @@ class ModelUncertainty:
     """Uncertainty that a design adds to the identified plants.
 
     Attributes:
-        least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
+        least_delay: the dead time is taken as at least this [s]; a fit of simulations hides it in the pole.
         small_move_pole: the plant is taken as well with its main pole as fast as this [1/s], at the same static gain;
             0 for the identified plant alone. Fits to large moves come out slower than small moves are, for there the
             drives run at their current limit.

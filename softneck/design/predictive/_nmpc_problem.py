@@ -129,7 +129,7 @@ class NonlinearProblem:
 
         min  sum_i w_i |y_i(z) - t_i|^2 + lambda |z - a|^2 + rho sum_i (delta_i(z) - c)^2
 
-    with y_i the model's free run and t_i the reference less the estimated disturbance.
+    with y_i the model's simulation and t_i the reference less the estimated disturbance.
 
     Attributes:
         model: that is predicted.
@@ -163,7 +163,7 @@ def estimate_gains(pole: float, window: int) -> Matrix:
     """Return (2, window): gains from past model errors, newest first, to level and rate of the disturbance.
 
     Of all `o(k+1) = o(k) + r(k)`, `r(k+1) = a r(k)` the one nearest to the last `window` residuals, in least squares:
-    with the model's inputs known and its state that of its free run the estimation over the horizon is linear.
+    with the model's inputs known and its state that of its simulation the estimation over the horizon is linear.
 
     Args:
         pole: a, the plant's slowest.

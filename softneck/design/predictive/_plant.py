@@ -170,7 +170,7 @@ def remove_limits(arrays: tuple[Matrix, ...]) -> tuple[Matrix, ...]:
 
 # That many samples of a family judge robustness; they are spread evenly over all.
 _JUDGED_SAMPLES = 12
-# A fit of free runs hides more of the dead time than a plant of one's own has: by so much.
+# A fit of simulations hides more of the dead time than a plant of one's own has: by so much.
 HIDDEN_DELAY_FACTOR = 1.25
 
 # Small moves that tell whether tendons hang, of a scaled redefined input, and the scaled seconds that a model settles.

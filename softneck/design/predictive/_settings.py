@@ -160,7 +160,7 @@ class MpcNumbers(MpcSettings):
         reference_time: time constant of the reference filter [s].
         horizon: N, samples predicted behind the dead time.
         moves: times at which the motors move within the horizon; in between they are held.
-        least_delay: the dead time is taken as at least this [s]; a fit of free runs hides it in the pole.
+        least_delay: the dead time is taken as at least this [s]; a fit of simulations hides it in the pole.
         small_move_pole: the design must hold as well where the main pole is as fast as this [1/s]; 0 for the
             identified plant alone.
         taut_pole: an identified neck is predicted as it moves while its tendons are taut: its slowest pole at least as

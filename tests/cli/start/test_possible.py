@@ -175,7 +175,7 @@ def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
                    unmet=Unmet.NO_MODEL)  # fmt: skip
 
     def refuse(*_: Any, **__: Any) -> None:
-        why = "no kind is a model of the rows held out: its fit in free run is -31.9 % in yaw."
+        why = "no kind is a model of the rows held out: its fit in simulation is -31.9 % in yaw."
         raise CheckFailedError(f"models/auto.npz: {why} {leave}: without it pitch fits 76.5 %.")
 
     monkeypatch.setattr(_start, "steps", plan)
@@ -183,7 +183,7 @@ def test_an_output_that_spoils_the_model_of_the_others_may_be_left_out(
     said = call("start", short, "-o", "p", "--yes")
     last = said.err.splitlines()[-1]
     assert said.code == 1
-    assert last.endswith(f"its fit in free run is -31.9 % in yaw. {leave}.")
+    assert last.endswith(f"its fit in simulation is -31.9 % in yaw. {leave}.")
     assert len(last) <= 160
 
 
