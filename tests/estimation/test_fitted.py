@@ -25,6 +25,7 @@ def observer_of(settings: KalmanSettings = IN_TIME, *, pitch_delay: int = 4, rol
     return settings.design(neck(pitch_delay=pitch_delay, roll_delay=roll_delay))
 
 
+@pytest.mark.slow
 def test_a_dead_time_that_the_model_lacks_is_found_by_likelihood() -> None:
     record = recording(rows=800)
     assert most_likely_extra_delay(observer_of(), [record]) == 0

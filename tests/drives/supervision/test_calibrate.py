@@ -33,6 +33,7 @@ def motions() -> tuple[Motion, ...]:
 calibrated = partial(calibrate, cycle=T, sample_cycles=2, slack=default_drives().limits.slack)
 
 
+@pytest.mark.slow
 def test_a_quarter_of_the_slow_error_of_each_output_and_each_sample_that_is_missing_is_known() -> None:
     part, whole = calibrated(motions()), calibrated(motions(), known_bias=1.0)
     assert len(part.tilt_bias) == part.outputs
