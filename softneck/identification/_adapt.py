@@ -2,7 +2,7 @@
 
     V(theta) = sum |y - yhat(theta)|^2 / rows + strength * sum |J (theta - theta_0)|^2 / rows of the reference
 
-J are the derivatives of the old model's free run along a reference motion over all set-points that it was trained on:
+J are the derivatives of the old model's simulation along a reference motion over all set-points that it was trained on:
 the second term is the Gaussian prior that a fit along that motion leaves behind (Ljung 1999, sec. 9.2 and 11.2).
 Strength and blocks are chosen on held-out necks: `benchmarks/adaptation.py choose`. Of a network only the weights to
 and from its states are moved.
@@ -78,7 +78,7 @@ class FreeParameters:
 
     @property
     def linear(self) -> bool:
-        """Whether the free run is linear in them, but for its limits: one step is all."""
+        """Whether the simulation is linear in them, but for its limits: one step is all."""
         return self.model.kind == "play"
 
     def groups(self) -> list[list[tuple[int, int | None]]]:
@@ -135,7 +135,7 @@ _DIFFERENCE_STEP = 1e-4
 # Of each number against the reference [parts of its size]: what moves nothing at all stays where it is.
 _MIN_INFORMATION = 1e-6
 _STEPS, _MOST_DAMPING, _ENOUGH = 8, 1e4, 0.01
-# Derivatives cost a free run for each number: so many in all, which bounds the time whatever the kind.
+# Derivatives cost a simulation for each number: so many in all, which bounds the time whatever the kind.
 _MAX_SIMULATIONS = 160
 # The reference lasts so long [s of a neck]: all of `mixed`'s motions, each for two seconds.
 _REFERENCE_S = 20.0
@@ -162,7 +162,7 @@ def reference(model: Model) -> Recording:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """One adaptation, its free runs along the window and along the reference.
+    """One adaptation, its simulations along the window and along the reference.
 
     learnt, target (time, outputs): which entries count, what was measured; information (n, n): J'J / rows of the
     reference, by sizes; strength: of the prior.
@@ -227,7 +227,7 @@ class Problem:
 
 
 def information(free: FreeParameters, motion: Recording) -> Matrix:
-    """Return J'J (n, n) / entries of the old free run along `motion`, by sizes of the numbers, positive definite."""
+    """Return J'J (n, n) / entries of the old simulation along `motion`, by sizes of the numbers, positive definite."""
     J = derivatives(free, free.start(), lambda model: simulate_outputs(model, motion))
     J = J.reshape(len(J), -1)
     H = J @ J.T / J.shape[1]
@@ -235,12 +235,12 @@ def information(free: FreeParameters, motion: Recording) -> Matrix:
 
 
 def simulate_outputs(model: Model, recording: Recording) -> Matrix:
-    """Return the free run (time, outputs)."""
+    """Return the simulation (time, outputs)."""
     return model.simulate(recording)[:, : recording.outputs.shape[1]]
 
 
 def derivatives(free: FreeParameters, numbers: Vector, run: Callable[[Model], Matrix]) -> np.ndarray:
-    """Return the derivatives (n, time, outputs) of a free run by each number over its size."""
+    """Return the derivatives (n, time, outputs) of a simulation by each number over its size."""
     now, sizes = run(free.at(numbers)), free.sizes()
     J = np.zeros((numbers.size, *now.shape))
     for group in free.groups():
@@ -281,7 +281,7 @@ class AdaptationResult:
     """The result of an adaptation.
 
     why: the old model was kept, "" where not; seconds: of the window; rows: held out; before, after: fit [%] of the
-    free run on them, of each output; part: of the way that was gone.
+    simulation on them, of each output; part: of the way that was gone.
     """
 
     adapted: bool
@@ -306,7 +306,7 @@ class Adaptation:
 
     Attributes:
         window: latest seconds of the recording that are looked at [s]; None: 150 time constants (of a neck 30 s).
-        strength: weight of a change of the old free run along its reference motion beside an error over the window.
+        strength: weight of a change of the old simulation along its reference motion beside an error over the window.
         block: length of a block [s], of which every third is held out; None: 10 time constants (of a neck 2 s).
     """
 

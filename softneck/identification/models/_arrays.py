@@ -238,7 +238,7 @@ def _motor_port(robot: Robot, name: str, description: str, *, missing: bool = Fa
 def parameter_ports(robot: Robot, arrays: Mapping[str, np.ndarray]) -> tuple[Port, ...]:
     """Return the parameters: start values, `use_measurement`, noise, and the payload where the model depends on it."""
     known, names, unit = payloads(arrays), robot.outputs.names, to_si(robot.outputs.unit)[1]
-    measured = "false: free run (paper, Fig. 3b); true: from measured angles and motors (Fig. 3a)"
+    measured = "false: simulation (paper, Fig. 3b); true: from measured angles and motors (Fig. 3a)"
     noise = f"Standard deviation of the noise on {' and '.join(names)}"
     ports = [_output_port(robot, f"{name}_start", f"{name.capitalize()} at the start") for name in names]
     ports += [

@@ -243,7 +243,7 @@ class Model(ReprMixin):
         free = np.asarray(self.simulate(recording))[:, : self._sizes[1]]
         draw = resolve("softneck.plots:validation_figure")
         return draw(
-            recording.time, recording.outputs, {"free run": free}, title, run=recording.run, robot=recording.robot
+            recording.time, recording.outputs, {"simulation": free}, title, run=recording.run, robot=recording.robot
         )
 
     def _open(self, recording: RecordingLike) -> Recording:
@@ -430,7 +430,7 @@ def _held_out_lines(found: Mapping[str, Any], names: Sequence[str]) -> list[str]
     """Return the lines of a summary on the hold-out."""
     if not found:
         return []
-    tables = {"persistence": "persistence", "one_step": "one step", "fit": "free run"}
+    tables = {"persistence": "persistence", "one_step": "one step", "fit": "simulation"}
     lines = [f"hold-out of {found.get('rows', '-')} rows, fit [%] {'/'.join(names)}:"]
     for key, what in tables.items():
         if table := found.get(key):

@@ -1,4 +1,4 @@
-"""Which kind and which settings: tried and ranked in free run over rows held out.
+"""Which kind and which settings: tried and ranked in simulation over rows held out.
 
 Searches repeat to the bit with the same seed.
 May import all other subpackages of `identification`.

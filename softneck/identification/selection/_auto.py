@@ -44,7 +44,7 @@ class KindTrial:
     """One kind that was tried; `failure` says why it failed.
 
     seconds: of training; model: None where it failed; judged: on the rows held out, None where it failed or stopped
-    early; left_out, errors: what was left out of a training -> free-run fit on it and its standard error over blocks of
+    early; left_out, errors: what was left out of a training -> fit on it and standard error over blocks of
     2 s [%] ("agreement": with the other kinds on motions that nobody recorded, without error); whole: trained on all
     rows.
     """
@@ -77,7 +77,7 @@ class KindTrial:
 
     @property
     def hold_out_fit(self) -> float:
-        """Mean free-run fit on the rows held out [%]; -inf where it failed or diverged."""
+        """Mean simulation fit on the rows held out [%]; -inf where it failed or diverged."""
         return self.scores.get(HOLD_OUT, float("-inf"))
 
     @property
@@ -109,7 +109,7 @@ def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
     """Return why kinds failed, each reason once."""
     said: dict[str, list[str]] = {}
     for one in ranking:
-        said.setdefault(one.failure or "its free run diverged", []).append(one.kind)
+        said.setdefault(one.failure or "its simulation diverged", []).append(one.kind)
     if len(said) == 1:
         return next(iter(said))
     return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
@@ -155,7 +155,7 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
         )
     if ranking[0].fit < _POOR_FIT_PCT:
         remarks.append(
-            f"No kind reaches {_POOR_FIT_PCT:g} % in free run. Look for a drifting sensor, a wrong sample time or "
+            f"No kind reaches {_POOR_FIT_PCT:g} % in simulation. Look for a drifting sensor, a wrong sample time or "
             "sign, motors that were not logged, or an excitation that hardly moves the robot."
         )
     failed = [one.kind for one in ranking if one.fit == float("-inf")]
@@ -277,7 +277,7 @@ class _Race:
         self.folds = left_out or [Fold(train, ())]
         self.tried: dict[str, KindTrial] = {}
         self.short: dict[str, Model] = {}
-        # Baselines of the rows held out, which are the same for all; of the exam its motions, free runs and weights.
+        # Baselines of the rows held out, which are the same for all; of the exam its motions, simulations and weights.
         self._known: dict = {}
         self._motions: list[Recording] = []
         self._free: dict[str, list[Matrix]] = {}

@@ -72,7 +72,7 @@ SCREENED_ROWS = 2000
 _REGION, _WIDEN = 0.12, 1.0
 # Over how long a motion is fast or slow [time constants].
 _MOVED_OVER = 2.5
-# Runs are left out in so many groups at most; a group of fewer rows says nothing of a free run.
+# Runs are left out in so many groups at most; a group of fewer rows says nothing of a simulation.
 _MOST_GROUPS, _LEAST_ROWS = 3, 10 * WARM_UP
 # Errors within 2 s of each other belong together: that is ten time constants of the neck.
 _BLOCK_SAMPLES = 100
@@ -89,7 +89,7 @@ class Judged:
     rows: np.ndarray
 
     def fit(self, model: Model) -> tuple[float, float]:
-        """Return the free-run fit [%], mean over outputs, and its standard error over blocks; or -inf and NaN."""
+        """Return the simulation fit [%], mean over outputs, and its standard error over blocks; or -inf and NaN."""
         y = np.where(self.rows[:, None], self.recording.outputs, np.nan)
         free = model.simulate(self.recording)[:, : y.shape[1]]
         fits = [nrmse_fit(y[:, i], free[:, i]) for i in range(y.shape[1])]

@@ -321,7 +321,7 @@ def _rows_of(recording: Recording, table: Matrix, axis: int, count: int) -> np.n
 
 
 # How far back the state shows in the inputs: the newest sample of a neck, then about one, two and four time constants
-# of 0.2. Denser or longer ones moved no free run by more than 2 points (virtual neck, `paper`).
+# of 0.2. Denser or longer ones moved no simulation by more than 2 points (virtual neck, `paper`).
 _LOOKS_BACK = (0.02, 0.2, 0.4, 0.8)
 # The longest lag is at most this part of a run where the time constant is learned, as twice as long the base settles: a
 # robot as slow as its record is long does not show what was so long ago.
@@ -344,9 +344,9 @@ def residual_rows(
     *,
     measured: bool = False,
 ) -> tuple[Matrix, Vector]:
-    """Return regressors (n, N) and y(k) less the base's free run (N,), no row of a run before the base settled.
+    """Return regressors (n, N) and y(k) less the base's simulation (N,), no row of a run before the base settled.
 
-    Source 3 of the table is the base's free run; `measured` takes logged motor positions. DataError: runs too short.
+    Source 3 of the table is the base's simulation; `measured` takes logged motor positions. DataError: runs too short.
     """
     parts, left = [], []
     outputs, both = recording.outputs.shape[1], recording.outputs.shape[1] + recording.set_points.shape[1]
@@ -375,7 +375,7 @@ Data = Sequence[tuple[Matrix, Vector]]
 class Ground:
     """All of a set but its points and their scale.
 
-    table: rows (source, channel, lag); drive: supplies motor positions in free run; base: of form `residual`, or None;
+    table: rows (source, channel, lag); drive: supplies motor positions in simulation; base: of form `residual`;
     measured: whether the set is made of logged motor positions, where there are any.
     """
 
@@ -411,7 +411,7 @@ class Ground:
         }
 
     def free_run(self, arrays: dict[str, Matrix], recording: Recording) -> tuple[float, float, float]:
-        """Return the sum of all axes' free-run fits [%], the bounds' coverage (0 to 1) and mean width [rad].
+        """Return the sum of all axes' simulation fits [%], the bounds' coverage (0 to 1) and mean width [rad].
 
         The score of a run that left all bounds is -inf.
         """

@@ -85,7 +85,7 @@ class ScaleTrial:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HoldOut:
-    """Free runs over the last part of the training rows (`tail`), of sets made of the part before.
+    """Simulations over the last part of the training rows (`tail`), of sets made of the part before.
 
     epsilons: (outputs,) each, tried with every scale; narrow: of equally good ones take the narrowest that cover it.
     """
@@ -186,22 +186,22 @@ def is_extrapolating(model: Model, outputs: Matrix) -> np.ndarray:
 FORMS = ("paper_eq21", "residual")
 # Kinds whose arrays hold `a`, `b`, `delay` over the redefined set-points, as the runtime runs them.
 _BASES = tuple(name for name in ("rls", "oe") if name in KINDS)
-# Free run of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
+# Simulation of form `residual` hardly depends on it, the width of its bounds does: below what the base and the last
 # 0.8 s leave unexplained, gamma and the width grow a hundredfold.
 _RESIDUAL_SIGMAS = (4.0, 8.0, 16.0, 32.0)
-# The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise; in free run more is better, as the model's own
+# The knee of gamma*(epsilon) lies at 3 to 5 sigma of the noise; in simulation more is better, as the model's own
 # errors stand in the regressor too. The hold-out decides.
 _EPSILON_SIGMAS = (3.0, 5.0, 8.0, 12.0)
 # Weight of the output in the regressor, set-points having 1: half a decade apart up to the paper's own, 57.3, which
-# logs angles in degrees beside motors in radians. A high weight trusts the fed-back output and drifts in free run.
+# logs angles in degrees beside motors in radians. A high weight trusts the fed-back output and drifts in simulation.
 _OUTPUT_WEIGHTS = (3.0, 10.0, 30.0, 57.29577951308232)
 # Weights of measured motors beside set-points, tried with the best weight of the output. A position is what bends
-# the neck, a set-point what will: 10 gains 10 points in free run on sine and rotation (virtual neck, `paper`), 0.3
+# the neck, a set-point what will: 10 gains 10 points in simulation on sine and rotation (virtual neck, `paper`), 0.3
 # lost as many.
 _MOTOR_WEIGHTS = (3.0, 10.0)
 # Of the base's angles: a radian of motor tilts the neck by about 0.2 rad, so that 5 makes the two equal in the norm.
 _ANGLE_WEIGHTS = (1.0, 2.0, 5.0, 10.0)
-# The end of the training rows on which epsilon and the scale are chosen, in free run.
+# The end of the training rows on which epsilon and the scale are chosen, in simulation.
 _HOLD_OUT = 0.2
 
 
@@ -211,12 +211,12 @@ class SetMembership:
 
     Attributes:
         form: "paper_eq21", the lags of Eq. 21 (by the robot's time constant); or "residual": set membership over
-            simulated signals on what the free run of a linear base leaves over, where nothing is fed back and so
+            simulated signals on what the simulation of a linear base leaves over, where nothing is fed back and so
             nothing drifts.
         output_weight: weight of the outputs in the norm of Eq. 16, all other components having 1; None chooses it, and
-            one of the motors, by free run on the last fifth of the training rows. It is for scaled components, which
+            one of the motors, by simulation on the last fifth of the training rows. It is for scaled components, which
             range as a neck's do.
-        epsilon: noise bound of Eq. 15 [rad, or the SI unit of the outputs]; None chooses it by the same free run
+        epsilon: noise bound of Eq. 15 [rad, or the SI unit of the outputs]; None chooses it by the same simulation
             (form "residual": so that the bounds are narrowest among equal fits).
         base: linear kind of one pole that form "residual" stands on.
     """

@@ -1,5 +1,5 @@
 """Models with the neck's structure: grey-box equations, and play operators with polynomials.
 
-Few numbers, strong in free run.
+Few numbers, strong in simulation.
 May import `identification.models`.
 """

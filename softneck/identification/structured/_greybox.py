@@ -1,4 +1,4 @@
-"""Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its free run.
+"""Kind `greybox`: the equations of a tendon-driven neck with unknown numbers, fitted by the error of its simulation.
 
 Rates and dead times are in the time of a neck. Several payloads tell how stiffness and pretension go with them.
 """

@@ -21,7 +21,7 @@ from ..models._model import WARM_UP, Model
 from ..models._scores import nrmse_fit
 
 HOLD_OUT = 0.2
-# Rows held out that say something of a free run, where there are that many.
+# Rows held out that say something of a simulation, where there are that many.
 _LEAST_HELD = 50
 # From so many runs on, a run is held out as a whole.
 _MANY_RUNS = 4
@@ -134,7 +134,7 @@ def ridge(X: Matrix, Y: Matrix, weight: float) -> Matrix:
 
 
 def scores(data: Data, hold_out: Data | None, form: PlayStructure, weights: tuple[float, ...]) -> list[float]:
-    """Return, for each ridge weight, the mean free-run fit [%] of all outputs on rows that were not learnt from.
+    """Return, for each ridge weight, the mean simulation fit [%] of all outputs on rows that were not learnt from.
 
     Without `hold_out` parts of the data are held out in turn, and what is furthest from the rest (extrapolation).
     """
@@ -189,7 +189,7 @@ class Play:
 
     theta_i, phi_i and delta_i of the simulated motors (drives that stall under load) pass play operators and
     chains of low-pass filters; pitch and roll are ridge regressions on all of these and on products of one stage.
-    What is None is chosen by the free run over rows held out: the last fifth of each run and the fifth furthest
+    What is None is chosen by the simulation over rows held out: the last fifth of each run and the fifth furthest
     from all others, or `hold_out`.
 
     Attributes:
@@ -234,7 +234,7 @@ class Play:
 
         Args:
             recordings: one or several of one sample time; their runs are never joined.
-            hold_out: another excitation, on whose free run to choose what is None.
+            hold_out: another excitation, on whose simulation to choose what is None.
             progress: called with the part done and a word on it.
 
         Raises:
@@ -274,7 +274,7 @@ class Play:
     def _choose(
         self, data: Data, extra: Data | None, rates: tuple[float, ...], progress: Progress
     ) -> tuple[PlayStructure, float, float, int]:
-        """Return form and ridge of the best free run on the hold-out, its fit [%], and how many were tried."""
+        """Return form and ridge of the best simulation on the hold-out, its fit [%], and how many were tried."""
         inputs, tilts = len(data.redefinition), min(len(data.redefinition), data.outputs.shape[1])
         forms = [
             PlayStructure(rate, self.order, widths, degree, inputs, tilts)
@@ -305,7 +305,7 @@ class Play:
 
 def _arrays(data: Data, drive: LoadedDrive, form: PlayStructure, weight: float, order: int) -> dict[str, Matrix]:
     good = data.settled
-    # Along the simulated motors, as in free run, and along the logged ones, as in a prediction: one f serves both.
+    # Along the simulated motors, as in simulation, and along the logged ones, as in a prediction: one f serves both.
     both = np.concatenate([data.terms(form)[good], data.terms(form, measured=True)[good]])
     W = ridge(both, np.tile(data.outputs[good], (2, 1)), weight)
     lowest, highest = data.outputs[good].min(axis=0), data.outputs[good].max(axis=0)

@@ -107,13 +107,13 @@ def _block(runs: Sequence[Recording], i: int, parts: int) -> tuple[Recording, Re
 
 
 def left_out_error(fit: Callable[[Recording], Model], parts: Sequence[tuple[Recording, Recording]]) -> Vector:
-    """Return the rms error (outputs,) of free runs over parts that were left out in turn; inf where one diverges."""
+    """Return the rms error (outputs,) of simulations over parts that were left out in turn; inf where one diverges."""
     errors = np.concatenate([_simulation_errors(fit(rest), part) for rest, part in parts])
     return np.sqrt(np.nanmean(errors**2, axis=0))
 
 
 def _simulation_errors(model: Model, recording: Recording) -> Matrix:
-    """Return the errors (rows, outputs) of a free run, without the samples that set its initial state."""
+    """Return the errors (rows, outputs) of a simulation, without the samples that set its initial state."""
     Y = model.simulate(recording)[:, : recording.outputs.shape[1]]
     errors = np.where(np.isfinite(Y), recording.outputs - Y, np.where(np.isfinite(recording.outputs), np.inf, np.nan))
     starts = np.concatenate([np.arange(len(run)) < WARM_UP for run in recording.runs()])
@@ -130,7 +130,7 @@ _POOR_ERROR_RATIO = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Base:
-    """A base trained on all rows; `error` (outputs,) rms of its free run on rows left out [outputs'], as `fit` [%]."""
+    """Base trained on all rows; `error` (outputs,) rms of its simulation on rows left out [outputs'], as `fit` [%]."""
 
     model: Model
     error: Vector

@@ -54,7 +54,7 @@ def _as_good(worse: Vector) -> bool:
 
 
 def _held_out(search: SrivcFitOptions, runs: Runs, near: Continuous) -> tuple[SrivcFit, Vector] | None:
-    """Return a fit and its mean squared errors in free run over segments that it did not see; None without a fit."""
+    """Return a fit and its mean squared errors in simulation over segments that it did not see; None without a fit."""
     trained = []
     for u, y in runs:
         seen = y.copy()

@@ -50,9 +50,9 @@ _ROWS_PER_PARAMETER = 10
 def best_linear(
     segments: Sequence[ScoredSegment], rows: Rows, horizons: Sequence[int | None]
 ) -> list[list[float | None]]:
-    """Return for each horizon (None: free run) the fit [%] of pitch and roll; None where rows are too few.
+    """Return for each horizon (None: simulation) the fit [%] of pitch and roll; None where rows are too few.
 
-    For a finite horizon persistence and, in free run, every stable linear model of the set-points lies below.
+    For a finite horizon persistence and, in simulation, every stable linear model of the set-points lies below.
     """
     Ts = segments[0].recording.sample_time * TIME_CONSTANT / (rows.robot.time_constant_s or np.nan)
     inputs = np.concatenate([_response_columns(segment.recording.set_points, Ts) for segment in segments])

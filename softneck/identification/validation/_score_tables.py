@@ -1,4 +1,4 @@
-"""Rows that are judged, the tables of scores of a `Validation`, and when a free run predicts nothing any more.
+"""Rows that are judged, the tables of scores of a `Validation`, and when a simulation predicts nothing any more.
 
 Intervals are by moving blocks that wrap inside their run (Politis and Romano 1992, "A circular block-resampling
 procedure"), for another experiment of this kind and length. On AR(1) errors and motions they held the true fit in 84 to
@@ -70,7 +70,7 @@ class Rows:
         return float(np.degrees(value)) if unit == "deg" else value / to_si(unit)[0]
 
     def outputs_at(self, horizon: int | None) -> Matrix:
-        """Return `measured`, NaN as well where there are not `horizon` samples of past; None is the free run."""
+        """Return `measured`, NaN as well where there are not `horizon` samples of past; None is the simulation."""
         if horizon is None:
             return self.measured
         # A row with less past than the horizon was not predicted from that far back.
@@ -340,14 +340,14 @@ def _range(measured: Matrix) -> tuple[Vector, float]:
 # A set-point so much of the trained range beyond it [1] is the same to any model, and to the rounding of a file.
 _RANGE_TOLERANCE = 1e-6
 
-#: The name of the free run among the horizons of a validation.
+#: The name of the simulation among the horizons of a validation.
 INFINITE = "inf"
 
 
 def score_tables(
     rows: Rows, time: Vector, measured: dict[str, Matrix], predicted: dict[str, Matrix], *, lost: bool
 ) -> dict[str, Any]:
-    """Return the tables of scores by their names in `Validation`; a lost (diverged) free run has none.
+    """Return the tables of scores by their names in `Validation`; a lost (diverged) simulation has none.
 
     `measured` and `predicted`: horizon -> (time, outputs).
     """
@@ -419,7 +419,7 @@ def free_run_bounds(kind: str, free: Matrix, robot: Robot) -> tuple[Matrix, Matr
     Bounds of set membership follow the outputs and motors, lower and upper of one output after the other.
     """
     outputs = len(robot.outputs.names)
-    if kind not in BOUNDED or free.shape[1] == outputs:  # that many where there is no free run
+    if kind not in BOUNDED or free.shape[1] == outputs:  # that many where there is no simulation
         nothing = np.full((len(free), outputs), np.nan)
         return nothing, nothing
     bounds = free[:, outputs + len(robot.motors.names) :][:, : 2 * outputs]

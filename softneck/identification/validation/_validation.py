@@ -1,4 +1,4 @@
-"""Honest validation: every model beside persistence and the best linear one, one step, k steps and in free run."""
+"""Honest validation: every model beside persistence and the best linear one, one step, k steps and in simulation."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ Scores = dict[str, dict[str, float | None]]
 class Validation(ReprMixin):
     """The scores of one model on one recording.
 
-    Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the free run diverged or
+    Scores are tables horizon -> axis -> value ("1", ..., "inf"; "pitch", "roll"), None where the simulation diverged or
     nothing was measured or moved; all but `per_run` are over the rows of all runs together.
 
     Attributes:
@@ -80,22 +80,22 @@ class Validation(ReprMixin):
         best_linear: fit [%] that no linear model of the set-points beats on these rows (see `best_linear`).
         per_run: the same scores for each segment of rows that follow each other, with its `stretch`, `run`,
             `start_s`, `rows_scored` and `diverged`.
-        cold_fits: fit [%] of a free run that knows the first row only, as an FMU starts, on the same rows; None where
+        cold_fits: fit [%] of a simulation that knows the first row only, as an FMU starts, on the same rows; None where
             it diverged.
-        diverged: time [s] at which the first free run left the data's range, or None.
+        diverged: time [s] at which the first simulation left the data's range, or None.
         residual_tests: of the one-step errors; `white` and `uncorrelated` are their verdicts.
-        coverage_pct, mean_width_deg: of kinds with bounds in free run: axis -> measured samples within them [%], and
+        coverage_pct, mean_width_deg: of kinds with bounds in simulation: axis -> measured samples within them [%], and
             their mean distance [deg], None where that is more than the range of the data; None for other kinds.
         bounds_remarks: where these bounds are of no use or do not hold what they promise.
         calibrated_bounds: of every kind, from nine or more segments: see `_error_statistics`; else why there are none.
         outside_pct: axis -> measured samples [%] outside what the model has seen: of set membership where its bounds
             are wider than training's usually are (see `is_extrapolating`), of other kinds where a set-point lies beyond
             those that it was trained on; None where the model does not know.
-        validity: least and mean of the model's own in free run, and how well it foretold errors within its tolerance
+        validity: least and mean of the model's own in simulation, and how well it foretold errors within its tolerance
             (see `judged_validity`); None where the model has none.
         time, run: (time,) [s] and the number of the segment, for plots: no line joins two of them.
         measured, free_run, one_step: (time, 2) [rad], NaN where nothing is scored.
-        lower, upper: (time, 2) [rad] bounds of the free run, NaN where none is narrower than the data.
+        lower, upper: (time, 2) [rad] bounds of the simulation, NaN where none is narrower than the data.
         robot: whose outputs these are; of another than the neck they have its number and SI unit.
     """
 
@@ -142,7 +142,7 @@ class Validation(ReprMixin):
         bounds = (self.lower, self.upper) if np.isfinite(self.lower).any() else None
         draw = resolve("softneck.plots:validation_figure")
         return draw(
-            self.time, self.measured, {"free run": self.free_run, "one step": self.one_step},
+            self.time, self.measured, {"simulation": self.free_run, "one step": self.one_step},
             title or f"{self.model} on {self.data}", bounds=bounds, run=self.run, robot=self.robot,
         )  # fmt: skip
 
@@ -232,15 +232,15 @@ def validate(
 ) -> Validation:
     """Judge a model on the rows of a recording that it was not trained on.
 
-    Each segment of unseen rows starts from 25 measured samples, which are not scored. A free run then has the
-    set-points alone, or the logged motor positions as well (`motors="measured"`). `cold_fits` are of a free run that
+    Each segment of unseen rows starts from 25 measured samples, which are not scored. A simulation then has the
+    set-points alone, or the logged motor positions as well (`motors="measured"`). `cold_fits` are of a simulation that
     had the first row only.
 
     Args:
         model: of any kind, or its file.
         recording: at the model's sample time, its file, or what else `identify` takes; its runs are never joined.
         names: of model and data, for reports; the files' where files are given.
-        horizons: samples ahead; "inf" is the free run.
+        horizons: samples ahead; "inf" is the simulation.
         motors: "simulated" or "measured".
         include_training: whether rows that the model was trained on are judged too.
         tolerance: error that `validity` is to allow, in the unit in which people see the outputs; None: the model's.
@@ -258,7 +258,7 @@ def validate(
         >>> recording = softneck.record(signal("eq22", duration=20.0), neck, seed=1)
         >>> train, rest = recording.split(0.7)
         >>> found = softneck.validate(softneck.identify("rls", train), rest)
-        >>> bool(found.fits["inf"]["pitch"] > 50.0)  # free run [%]
+        >>> bool(found.fits["inf"]["pitch"] > 50.0)  # simulation [%]
         True
     """
     rules = Rules(tuple(horizons), motors, include_training, tolerance)
@@ -331,7 +331,7 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
     if first is None and INFINITE in outputs:
         calibrated = calibrated_bounds(rows, rows.measured - free[:, :axes])
     else:
-        calibrated = {"reason": "there is no free run, or it diverged"}
+        calibrated = {"reason": "there is no simulation, or it diverged"}
     lower, upper = useful_parts(rows, lower, upper)
     per_run = run_tables(parts.segments, rows, measured, predicted, lost)
     return Validation(
@@ -366,7 +366,7 @@ def judge(model: Model, parts: Parts, rules: Rules, *, names: tuple[str, str]) -
 
 
 def _cold_fits(model: Model, parts: Parts, rules: Rules) -> dict[str, float | None]:
-    """Return the fit [%] of each output in free run from the first row of each segment; None where it diverged."""
+    """Return the fit [%] of each output in simulation from the first row of each segment; None where it diverged."""
     rows = parts.rows
     free = np.concatenate([model.simulate(s.recording, motors=rules.motors, warm_up=0) for s in parts.segments])
     free = free[:, : len(rows.names)]
