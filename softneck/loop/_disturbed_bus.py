@@ -30,11 +30,8 @@ _SAME_TIME = 1e-6
 class ActiveFault:
     """One fault with its positions on the bus.
 
-    Attributes:
-        what: its action, see `_faults_runtime`.
-        slots, flags: positions of its signals, and of their validity flags.
-        first, last: rows of its window.
-        lag: number of rows in its memory.
+    `what`: its action, see `_faults_runtime`. `slots`, `flags`: positions of its signals, and of their validity flags.
+    `first`, `last`: rows of its window. `lag`: number of rows in its memory.
     """
 
     def __init__(self, fault: Fault, slots: list[int], flags: list[int], scale: Vector, step: float) -> None:
@@ -115,11 +112,7 @@ class FaultStages:
 def place_faults(
     faults: Sequence[Fault], wiring: Wiring, parts: Mapping[str, Part], *, step: float, rows: int, robot: Robot = _NECK
 ) -> tuple[Wiring, FaultStages]:
-    """Return the wiring with the copies that `faults` change, and the faults laid out for `rows` rows of `step` [s].
-
-    Raises:
-        SettingsError: the plant lacks what a fault acts on, or a delay is not a multiple of the step.
-    """
+    """Return the wiring with the copies that `faults` change, and the faults laid out for `rows` rows of `step` [s]."""
     detours = _FaultRouting(wiring, measured_names(robot))
     sensors, plant = [], []
     for fault in faults:

@@ -149,11 +149,7 @@ FAULT_KINDS = tuple(_FILE_KINDS)
 
 
 def make_fault(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> Fault:
-    """Return a fault from the keys of a loop file, which end in their unit: `start_s`, `size_deg`, `payload_kg`.
-
-    Raises:
-        SettingsError: unknown kind or key, or a value out of range.
-    """
+    """Return a fault from the keys of a loop file, which end in their unit: `start_s`, `size_deg`, `payload_kg`."""
     if kind not in _FILE_KINDS:
         raise SettingsError(f"unknown kind of fault `{kind}`; use one of {', '.join(FAULT_KINDS)}.")
     made, what, known = _FILE_KINDS[kind]

@@ -92,9 +92,7 @@ class BlockPart:
 class Link:
     """A connection factor * value + offset, in place of any conversion of units.
 
-    Attributes:
-        origin: "part.output".
-        factor, offset: applied to the output's value.
+    `origin`: "part.output". `factor`, `offset`: applied to the output's value.
     """
 
     origin: str
@@ -191,13 +189,9 @@ class Loop(ReprMixin):
 class System(ReprMixin):
     """Parts with explicit connections; none of them needs to be a plant or a controller.
 
-    Attributes:
-        parts: by name.
-        connections: "part.input" -> "part.output", or a `Link` with factor and offset.
-        constants: part -> values of inputs that are not connected.
-        parameters: part -> values that differ from the defaults.
-        duration: [s].
-        order: "jacobi" or "sequential", as of a `Loop`.
+    `parts`: by name. `connections`: "part.input" -> "part.output", or a `Link` with factor and offset. `constants`:
+    part -> values of inputs that are not connected. `parameters`: part -> values that differ from the defaults.
+    `duration`: [s]. `order`: "jacobi" or "sequential", as of a `Loop`.
     """
 
     parts: Mapping[str, Part]

@@ -53,14 +53,9 @@ class Reference(Protocol):
 class RobotReference:
     """A step (from zero at `at`), ramp (over `rise`), sine (with phase zero at `at`) or rotation of two angles.
 
-    A rotation is A cos(w t) and A sin(w t), where A rises from zero over `rise`.
-
-    Attributes:
-        kind: "step", "ramp", "sine" or "rotation".
-        values: (outputs,) end values or amplitudes [SI]; for a rotation the inclination A.
-        cocontraction: mean of the motors, delta_i of a neck [SI]; constant for sine and rotation.
-        at, rise: [s].
-        frequency: [Hz].
+    A rotation is A cos(w t) and A sin(w t), where A rises from zero over `rise`. `kind`: "step", "ramp", "sine" or
+    "rotation". `values`: (outputs,) end values or amplitudes [SI]; for a rotation the inclination A. `cocontraction`:
+    mean of the motors, delta_i of a neck [SI]; constant for sine and rotation. `at`, `rise`: [s]. `frequency`: [Hz].
     """
 
     kind: str
@@ -118,11 +113,7 @@ class RecordingReference(ReprMixin):
 
 
 def reference(kind: str, values: Mapping[str, float], robot: Robot = _NECK) -> RobotReference:
-    """Return a reference from outputs, `inclination`, `cocontraction`, `at`, `rise` and `frequency`, all in SI.
-
-    Raises:
-        SettingsError: unknown kind or name, a value outside the range of the output, or a rotation without two angles.
-    """
+    """Return a reference from outputs, `inclination`, `cocontraction`, `at`, `rise` and `frequency`, all in SI."""
     if kind == "rotation" and (len(robot.outputs.names) != 2 or to_si(robot.outputs.unit)[1] != "rad"):
         names = ", ".join(robot.outputs.names)
         raise SettingsError(f'kind = "rotation" needs two angles; {robot.label()} has {names}.')
@@ -163,10 +154,8 @@ def RotationReference(**values: float) -> RobotReference:
 def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK) -> RobotReference:
     """Return a reference from the keys of a loop file: `x_mm = 10`, or `x = 10` in its display unit; `at_s`.
 
-    The kinds are step, ramp, sine and rotation; `RecordingReference` makes a recorded one.
-
-    Raises:
-        SettingsError: as for `reference`.
+    The kinds are step, ramp, sine and rotation; `RecordingReference` makes a recorded one. Raises SettingsError: as for
+    `reference`.
     """
     require_one_of("kind", kind, tuple(SHAPES))
     chosen = {}
@@ -179,11 +168,7 @@ def make_reference(kind: str, values: Mapping[str, object], robot: Robot = _NECK
 
 
 def reference_key(kind: str, key: str, robot: Robot) -> tuple[str, float]:
-    """Return the value that a key such as `x_mm` or `at_s` sets in a reference of `kind`, and its factor to SI.
-
-    Raises:
-        SettingsError: an unknown key, or an angle without unit where unit and display unit of the outputs differ.
-    """
+    """Return the value that a key such as `x_mm` or `at_s` sets in a reference of `kind`, and its factor to SI."""
     units, times = _units(kind, robot), SHAPES.get(kind, {})
     name, _, unit = (key, "", "") if key in units or key in times else key.rpartition("_")
     if name in times and unit in _TIMES:

@@ -76,10 +76,8 @@ def row_actions(
 def step_order(parts: Mapping[str, Part], taps: Mapping[str, Tap]) -> tuple[str, ...]:
     """Return the names of the parts without delayed outputs, each after those that feed it.
 
-    An observer reads the set-points of the last row (docs, "Timing"), so it waits for no controller.
-
-    Raises:
-        SettingsError: an algebraic loop; the message names its parts and variables.
+    An observer reads the set-points of the last row (docs, "Timing"), so it waits for no controller. Raises
+    SettingsError: an algebraic loop; the message names its parts and variables.
     """
     waits = {name: _feeders(name, parts, taps[name]) for name, part in parts.items() if not has_delayed_outputs(part)}
     done: list[str] = []
@@ -120,10 +118,8 @@ _ROWS_RUNTIME = "softneck.loop._rows_runtime"
 class LoopRows:
     """The rows of one run; its parts have started.
 
-    Attributes:
-        names: of the parts, by the number that `run` returns.
-        bus: the current values of all signals.
-        held: the last outputs of each part, put on the bus by an action, and the reference at the end.
+    `names`: of the parts, by the number that `run` returns. `bus`: the current values of all signals. `held`: the last
+    outputs of each part, put on the bus by an action, and the reference at the end.
     """
 
     def __init__(

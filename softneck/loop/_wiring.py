@@ -50,14 +50,10 @@ class BusSignal:
 class Tap:
     """The inputs of one part as a selection of the bus.
 
-    Attributes:
-        part: its name in the loop.
-        ports: of the inputs.
-        owners: part that feeds each input, "" for a constant.
-        sources: name of each source, such as "plant `pitch`", for messages.
-        slots: (n_in,) positions in the bus.
-        scales: (2, n_in) factor and offset from the source to the input; None where nothing is converted.
-        fragile: inputs whose source may be missing, but that must not be missing themselves.
+    `part`: its name in the loop. `ports`: of the inputs. `owners`: part that feeds each input, "" for a constant.
+    `sources`: name of each source, such as "plant `pitch`", for messages. `slots`: (n_in,) positions in the bus.
+    `scales`: (2, n_in) factor and offset from the source to the input; None where nothing is converted. `fragile`:
+    inputs whose source may be missing, but that must not be missing themselves.
     """
 
     part: str
@@ -89,11 +85,8 @@ class Tap:
 class Wiring:
     """All connections of a loop.
 
-    Attributes:
-        start: (n_bus,) the bus with its start values and constants.
-        named: its signals in a result.
-        spans: part -> its outputs in the bus.
-        taps: part -> its inputs.
+    `start`: (n_bus,) the bus with its start values and constants. `named`: its signals in a result. `spans`: part ->
+    its outputs in the bus. `taps`: part -> its inputs.
     """
 
     start: Vector
@@ -112,15 +105,10 @@ def wire(
 ) -> Wiring:
     """Connect the parts "plant", "controller" and others by name.
 
-    Args:
-        parts: name in the loop -> part.
-        constants: part -> values of inputs that are not connected, such as `payload` of the plant.
-        connections: "part.input" -> "part.output", or a `Link`, for ports with different names.
-        robot: that is controlled.
-        closed: whether it is a loop with a plant and a reference.
-
-    Raises:
-        SettingsError: an input without a source, two writers, units that do not fit, an unknown name.
+    `parts`: name in the loop -> part. `constants`: part -> values of inputs that are not connected, such as `payload`
+    of the plant. `connections`: "part.input" -> "part.output", or a `Link`, for ports with different names. `robot`:
+    that is controlled. `closed`: whether it is a loop with a plant and a reference. Raises SettingsError: an input
+    without a source, two writers, units that do not fit, an unknown name.
     """
     if closed:
         _check_plant(parts["plant"], constants.get("plant", {}), robot)

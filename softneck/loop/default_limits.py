@@ -38,10 +38,8 @@ def required_rise(fastest: float, dead_time: float) -> float:
 
     It is the rise that slew rate and range of the motors allow, plus that of a loop whose time constant is its dead
     time, the tightest robust one (Skogestad 2003, J. Process Control 13:291): ln 9 dead times from 10 to 90 %.
-
-    Args:
-        fastest: rise [s] with the motors as fast as slew rate and range allow.
-        dead_time: the longest of the plant [s], with one sample of the loop.
+    `fastest`: rise [s] with the motors as fast as slew rate and range allow. `dead_time`: the longest of the plant [s],
+    with one sample of the loop.
     """
     return round(fastest + math.log(9.0) * dead_time, 2)
 

@@ -41,11 +41,8 @@ _RUN_SPACING = 0.03
 class Timeline:
     """Positions of rows on the time axis.
 
-    Attributes:
-        x: (rows + breaks,) [s]; each segment has one more point, a sample after its last row.
-        breaks: first rows of all segments but the first.
-        starts: x of these rows.
-        moved: whether segments were moved because their times overlap.
+    `x`: (rows + breaks,) [s]; each segment has one more point, a sample after its last row. `breaks`: first rows of all
+    segments but the first. `starts`: x of these rows. `moved`: whether segments were moved because their times overlap.
     """
 
     x: Vector
@@ -135,12 +132,9 @@ def validation_chart(
 ) -> Chart:
     """Describe measured and predicted outputs, each with its error (measured - predicted) below.
 
-    Args:
-        time: (time,) [s].
-        measured: (time, outputs) in SI; NaN for rows that are not scored.
-        predictions: name -> (time, outputs); NaN for missing ones.
-        bounds: lower and upper (time, outputs) of a model, drawn as a band.
-        run: (time,) segment numbers, which no line connects; None breaks lines where the time jumps.
+    `time`: (time,) [s]. `measured`: (time, outputs) in SI; NaN for rows that are not scored. `predictions`: name ->
+    (time, outputs); NaN for missing ones. `bounds`: lower and upper (time, outputs) of a model, drawn as a band. `run`:
+    (time,) segment numbers, which no line connects; None breaks lines where the time jumps.
     """
     line = timeline(time, run)
     panels, unit, there = [], robot.outputs.display_unit, np.where(np.isfinite(measured).any(axis=0), measured, 0.0)
@@ -183,11 +177,9 @@ def loop_chart(
 ) -> Chart:
     """Describe a closed loop: reference, true, measured and estimated outputs, motors, and tensions.
 
-    Args:
-        time: (time,) [s].
-        signals: name -> (time,) in SI: outputs (and their _reference, _measured, _estimate), motor_setpoint_1..n,
-            motor_position_1..n, tension_1..n [N].
-        limits: metric -> limit; those of overshoot and settling time are drawn for a step.
+    `time`: (time,) [s]. `signals`: name -> (time,) in SI: outputs (and their _reference, _measured, _estimate),
+    motor_setpoint_1..n, motor_position_1..n, tension_1..n [N]. `limits`: metric -> limit; those of overshoot and
+    settling time are drawn for a step.
     """
     panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
@@ -266,11 +258,9 @@ def residual_chart(
 ) -> Chart:
     """Describe residual tests as MATLAB's `resid` does, one column for each output.
 
-    Args:
-        autocorrelation: of the one-step errors: lags (n,) [samples], values (outputs, n), bounds (outputs,); lag 0,
-            which is 1, is not drawn.
-        cross_correlation: with the motors' set-points: lags (m,) [samples], values (outputs, motors, m), bounds
-            (outputs, motors).
+    `autocorrelation`: of the one-step errors: lags (n,) [samples], values (outputs, n), bounds (outputs,); lag 0, which
+    is 1, is not drawn. `cross_correlation`: with the motors' set-points: lags (m,) [samples], values (outputs, motors,
+    m), bounds (outputs, motors).
     """
     lags, values, bounds = autocorrelation
     cross_lags, cross, cross_bounds = cross_correlation

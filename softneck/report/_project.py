@@ -57,14 +57,10 @@ _MAX_LOG_BYTES = 200_000_000
 class Project:
     """Contents of a project, by path relative to its folder.
 
-    Attributes:
-        recordings: path -> (recording, its quality).
-        models, observers, controllers, families: path -> what `load` returns.
-        fmus: path -> fmpy's description.
-        loops: path -> result of its simulation.
-        studies: path of the folder -> (description, runs).
-        doubts: path of a layout or robot file -> its uncertain decisions.
-        problems: path -> reason why it could not be read or run.
+    `recordings`: path -> (recording, its quality). `models`, `observers`, `controllers`, `families`: path -> what
+    `load` returns. `fmus`: path -> fmpy's description. `loops`: path -> result of its simulation. `studies`: path of
+    the folder -> (description, runs). `doubts`: path of a layout or robot file -> its uncertain decisions. `problems`:
+    path -> reason why it could not be read or run.
     """
 
     folder: Path

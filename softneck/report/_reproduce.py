@@ -65,11 +65,8 @@ class ReproduceSettings:
 class Reproduction:
     """The paper's experiments, models and scores on our necks.
 
-    Attributes:
-        experiments: recordings on the preset `paper`.
-        models: nlsm, nn and rls, trained on them.
-        judged: (model, data) -> validation on the preset `paper`.
-        others: name of another neck -> its validations.
+    `experiments`: recordings on the preset `paper`. `models`: nlsm, nn and rls, trained on them. `judged`: (model,
+    data) -> validation on the preset `paper`. `others`: name of another neck -> its validations.
     """
 
     settings: ReproduceSettings
@@ -172,12 +169,10 @@ PAPER_NOTE = (
 class Entry:
     """A published figure beside ours.
 
-    Attributes:
-        model, data, axis, configuration: subject of the figure.
-        persistence: of the same rows one step ahead [%], for figures one step ahead.
-        paper, ours: fits [%]; ours is None if the simulation diverged.
-        rough: ours on the preset `rough` [%]; None if it diverged, or `rough` is not among the other necks.
-        other_necks: smallest and largest fit over the other necks [%], or None.
+    `model`, `data`, `axis`, `configuration`: subject of the figure. `persistence`: of the same rows one step ahead [%],
+    for figures one step ahead. `paper`, `ours`: fits [%]; ours is None if the simulation diverged. `rough`: ours on the
+    preset `rough` [%]; None if it diverged, or `rough` is not among the other necks. `other_necks`: smallest and
+    largest fit over the other necks [%], or None.
     """
 
     where: str

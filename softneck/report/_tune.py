@@ -31,11 +31,9 @@ def write_tuned(
 ) -> dict[str, Any]:
     """Write all files of a tuning and return its JSON values.
 
-    Args:
-        found: the result.
-        folder: target; files of an earlier run are replaced, and its certificate is removed if this one does not hold.
-        files: role -> path of an input file, for the certificate.
-        steps: name -> file, or preset, of the simulation models.
+    `found`: the result. `folder`: target; files of an earlier run are replaced, and its certificate is removed if this
+    one does not hold. `files`: role -> path of an input file, for the certificate. `steps`: name -> file, or preset, of
+    the simulation models.
     """
     found.controller.save(folder / BEST, force=True)
     if found.observer is not None:

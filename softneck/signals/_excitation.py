@@ -64,10 +64,9 @@ class Excitation(ReprMixin):
 class PullDirections:
     """Directions in which the motors pull; signals move the motors along them.
 
-    Attributes:
-        angles: (motors,) tendon angles [rad]; evenly spaced if a robot gives none.
-        rows: (outputs, motors) weights of the motors in each output, the largest 1 or -1.
-        inverse: (motors, outputs + 1) motors that move each output, and all together.
+    `angles`: (motors,) tendon angles [rad]; evenly spaced if a robot gives none. `rows`: (outputs, motors) weights of
+    the motors in each output, the largest 1 or -1. `inverse`: (motors, outputs + 1) motors that move each output, and
+    all together.
     """
 
     angles: Vector
@@ -360,11 +359,8 @@ class SetPointLimits:
 class Changes:
     """Shares of the samples (of all three motors, 0 to 1) that `prepare` changed, by rule.
 
-    Attributes:
-        ramp: faded in or out.
-        position: clipped at the largest magnitude.
-        slack: clipped at the largest pay-out.
-        speed: limited in speed.
+    `ramp`: faded in or out. `position`: clipped at the largest magnitude. `slack`: clipped at the largest pay-out.
+    `speed`: limited in speed.
     """
 
     ramp: float = 0.0

@@ -53,14 +53,9 @@ _MAX_PREVIEW_S = 0.8
 class Case:
     """One loop over a simulation model.
 
-    Attributes:
-        plant: number of the plant.
-        payload: [kg].
-        orientation: of the step [rad].
-        part: share of the step's size.
-        noise: whether the sensor is noisy.
-        late: whether the plant has more delay than modelled.
-        circle: a circle instead of the step.
+    `plant`: number of the plant. `payload`: [kg]. `orientation`: of the step [rad]. `part`: share of the step's size.
+    `noise`: whether the sensor is noisy. `late`: whether the plant has more delay than modelled. `circle`: a circle
+    instead of the step.
     """
 
     plant: int
@@ -195,14 +190,9 @@ LARGE = LARGE
 class Ready:
     """Objects that a worker prepares once per task.
 
-    Attributes:
-        plants: linear ones, without the delay that a loop's order adds.
-        frequency: grid of the margins [rad/s].
-        weights: of the motors in each axis's input.
-        uncertain: plant of the linear designs.
-        own: simulation models.
-        all: loops of the level `all`.
-        kept: designs by kind and settings.
+    `plants`: linear ones, without the delay that a loop's order adds. `frequency`: grid of the margins [rad/s].
+    `weights`: of the motors in each axis's input. `uncertain`: plant of the linear designs. `own`: simulation models.
+    `all`: loops of the level `all`. `kept`: designs by kind and settings.
     """
 
     plants: Plants

@@ -49,13 +49,10 @@ _TRACK_NUMBERS = {
 class TuneRequirements:
     """Requirements of a search.
 
-    Attributes:
-        certificate: requirements of `verify`.
-        track: settings of the additional loops.
-        bounds: all requirements, those of `certificate` first, less the safety margins.
-        reserve: metric -> safety margin of its limit, for the difference between a robot and its models.
-        stated: metrics and keys of [track] that the user states.
-        table: a requirements file that gives `tune` and `verify` the same requirements.
+    `certificate`: requirements of `verify`. `track`: settings of the additional loops. `bounds`: all requirements,
+    those of `certificate` first, less the safety margins. `reserve`: metric -> safety margin of its limit, for the
+    difference between a robot and its models. `stated`: metrics and keys of [track] that the user states. `table`: a
+    requirements file that gives `tune` and `verify` the same requirements.
     """
 
     certificate: Requirements
@@ -97,12 +94,9 @@ def read_tune_requirements(
 ) -> TuneRequirements:  # fmt: skip
     """Return the requirements of a file, with defaults for the rest.
 
-    Args:
-        path: a requirements file, also one for `verify`.
-        robot: of the controller; None: the neck.
-        scale: of the defaults; None: from the robot alone.
-        stepping: whether there are simulation models; else default `sim.*` limits apply to the linear plants.
-        rise: the default [s]; None: that of the paper's neck, by the robot's time constant.
+    `path`: a requirements file, also one for `verify`. `robot`: of the controller; None: the neck. `scale`: of the
+    defaults; None: from the robot alone. `stepping`: whether there are simulation models; else default `sim.*` limits
+    apply to the linear plants. `rise`: the default [s]; None: that of the paper's neck, by the robot's time constant.
     """
     return read_file(path, partial(make_tune_requirements, robot=robot, scale=scale, stepping=stepping, rise=rise))
 

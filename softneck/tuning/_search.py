@@ -50,13 +50,8 @@ _LINEAR_GROUPS = ("axes.", "mimo.", "robust.")
 class Candidate:
     """One kind with its settings and its metrics.
 
-    Attributes:
-        kind: of controller.
-        settings: of its design.
-        x: its point in the cube.
-        level: of its last judgement, or "".
-        metrics: of all levels.
-        error: why it has none.
+    `kind`: of controller. `settings`: of its design. `x`: its point in the cube. `level`: of its last judgement, or "".
+    `metrics`: of all levels. `error`: why it has none.
     """
 
     kind: str
@@ -131,14 +126,8 @@ def ratio(item: Requirement, value: float) -> float:
 class Search:
     """A running search.
 
-    Attributes:
-        task: what is tuned.
-        spaces: of the kinds.
-        crew: workers.
-        log: of judgements.
-        budget: of judgements.
-        report: called with progress and the best so far.
-        finals: number of final candidates with margins by experiment.
+    `task`: what is tuned. `spaces`: of the kinds. `crew`: workers. `log`: of judgements. `budget`: of judgements.
+    `report`: called with progress and the best so far. `finals`: number of final candidates with margins by experiment.
     """
 
     task: Task

@@ -26,10 +26,7 @@ COSTLY = ("mpc", "nmpc")
 class Dimension:
     """The range of one setting.
 
-    Attributes:
-        name: of the setting.
-        low, high: ends of its range; logarithmic.
-        start: where the search begins.
+    `name`: of the setting. `low`, `high`: ends of its range; logarithmic. `start`: where the search begins.
     """
 
     name: str
@@ -78,10 +75,7 @@ _PREDICTIVE_KINDS = ("mpc", "nmpc")
 class Space:
     """The searched and fixed settings of one kind.
 
-    Attributes:
-        kind: of controller.
-        dimensions: searched.
-        fixed: settings that hold for all.
+    `kind`: of controller. `dimensions`: searched. `fixed`: settings that hold for all.
     """
 
     kind: str
@@ -115,10 +109,8 @@ def spaces(
     """Return the space of every kind.
 
     `rise` and `least` [s] are the longest allowed rise and the shortest of the motors; `cocontraction` is that of the
-    recordings in the unit of the motors, or None. Only tendons on winches need a `lead_limit`.
-
-    Raises:
-        SettingsError: an unknown kind, or one with nothing to search.
+    recordings in the unit of the motors, or None. Only tendons on winches need a `lead_limit`. Raises SettingsError: an
+    unknown kind, or one with nothing to search.
     """
     found, least = [], min(least, rise)
     lead = Scaling.of(robot).motor_unit / to_si(robot.motors.unit)[0] if robot.tendon_angles is not None else None

@@ -86,9 +86,7 @@ class Task:
 class Judgement:
     """Result of a candidate at one level.
 
-    Attributes:
-        metrics: name -> value; inf where a level is never reached.
-        error: why there are no metrics, or "".
+    `metrics`: name -> value; inf where a level is never reached. `error`: why there are no metrics, or "".
     """
 
     metrics: Mapping[str, float]
@@ -116,9 +114,7 @@ class Job:
 class Log:
     """Judgements of a search, in the order of the requests.
 
-    Attributes:
-        folder: of the search; None: nothing is written.
-        found: job -> judgement.
+    `folder`: of the search; None: nothing is written. `found`: job -> judgement.
     """
 
     def __init__(self, folder: Path | None, digest: str, *, force: bool = False) -> None:

@@ -405,10 +405,7 @@ def active_requirement(
 class Loosened:
     """A default that no candidate meets beside the rest.
 
-    Attributes:
-        default: its limit.
-        reached: value of the best candidate.
-        limit: certified instead.
+    `default`: its limit. `reached`: value of the best candidate. `limit`: certified instead.
     """
 
     default: float

@@ -38,9 +38,7 @@ Describe = Callable[[int], dict[str, Any]]
 class Values:
     """Values of one metric over all plants.
 
-    Attributes:
-        values: (n,).
-        describe: row -> facts on that plant for the certificate.
+    `values`: (n,). `describe`: row -> facts on that plant for the certificate.
     """
 
     values: Vector
@@ -51,13 +49,9 @@ class Values:
 class LinearEvidence:
     """Results of the linear methods for one linear form.
 
-    Attributes:
-        name: of the frozen point, "" for a linear controller.
-        law: the form.
-        plants: with the delay that the order adds: those of the boxes, then the worst of the search.
-        margins: name -> (n,).
-        found: result of the search; None if switched off.
-        structured: bounds of each source.
+    `name`: of the frozen point, "" for a linear controller. `law`: the form. `plants`: with the delay that the order
+    adds: those of the boxes, then the worst of the search. `margins`: name -> (n,). `found`: result of the search; None
+    if switched off. `structured`: bounds of each source.
     """
 
     name: str

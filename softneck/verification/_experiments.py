@@ -139,14 +139,11 @@ def crossings(
 ) -> list[Crossing]:
     """Return the crossings of every loop over axes, gain and delay, step size and posture.
 
-    A scan ends at the crossing of an earlier one of the same plant, axes and kind, and then gives inf.
-
-    Args:
-        loops: over each plant.
-        coarse: one posture, both axes at once, coarse gains, no bisection: the last value without oscillation.
-        overall: find only the smallest gain and delay margin of all loops: the last loop with all axes at once, the
-            hardest test, bounds the scans of all others, which take every other step.
-        progress: called now and then.
+    A scan ends at the crossing of an earlier one of the same plant, axes and kind, and then gives inf. `loops`: over
+    each plant. `coarse`: one posture, both axes at once, coarse gains, no bisection: the last value without
+    oscillation. `overall`: find only the smallest gain and delay margin of all loops: the last loop with all axes at
+    once, the hardest test, bounds the scans of all others, which take every other step. `progress`: called now and
+    then.
     """
     kinds = ("gain_up", "gain_down", "delay")
     groups = [

@@ -34,12 +34,7 @@ _COS_PI = -1.0 + 5e-13
 class LinearLaw:
     """State space of a linear controller, `u = Kr(z) r + Ky(z) y`.
 
-    Attributes:
-        A: (n, n).
-        Br, By: (n, axes).
-        C: (axes, n).
-        Dr, Dy: (axes, axes).
-        sample_time: [s].
+    `A`: (n, n). `Br`, `By`: (n, axes). `C`: (axes, n). `Dr`, `Dy`: (axes, axes). `sample_time`: [s].
     """
 
     A: Matrix
@@ -52,11 +47,7 @@ class LinearLaw:
 
     @classmethod
     def of(cls, system: Any, robot: Robot | None = None) -> LinearLaw:
-        """Return the law of a system from references and outputs to the redefined inputs, such as theta_i and phi_i.
-
-        Raises:
-            SettingsError: other channels or not discrete.
-        """
+        """Return the law of a system from references and outputs to the redefined inputs, such as theta_i and phi_i."""
         import control
 
         if not isinstance(system, control.StateSpace | control.TransferFunction):
@@ -244,13 +235,9 @@ def classical_margins(L: np.ndarray, w: Vector) -> dict[str, Vector]:
 class ControllerUnderTest:
     """A controller with its linear forms.
 
-    Attributes:
-        block: its runtime.
-        robot: of the controller.
-        laws: name -> linear form: "" for a linear controller, else one for each frozen point.
-        order: of the loop.
-        extra: samples that the order adds to the plant's delay.
-        why: why there is no linear form, or "".
+    `block`: its runtime. `robot`: of the controller. `laws`: name -> linear form: "" for a linear controller, else one
+    for each frozen point. `order`: of the loop. `extra`: samples that the order adds to the plant's delay. `why`: why
+    there is no linear form, or "".
     """
 
     block: Block
@@ -265,10 +252,8 @@ def controller_under_test(controller: Any, *, order: str | None, observer: bool)
     """Return a controller with its linear forms; `order` None is that of its design.
 
     A linear controller has `ss()` or `to_lti()`, from references and outputs to the redefined inputs. One that is
-    linear at each operating point has `ss_at(point)` and `points()`, name -> point.
-
-    Raises:
-        SettingsError: no controller, or a linear form with other channels.
+    linear at each operating point has `ss_at(point)` and `points()`, name -> point. Raises SettingsError: no
+    controller, or a linear form with other channels.
     """
     if not hasattr(controller, "block"):
         raise SettingsError(f"a controller is needed, one with `block()`; got {type(controller).__name__}.")

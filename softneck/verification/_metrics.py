@@ -29,13 +29,9 @@ _ANGLE_KEYS = ("orientations_deg", "phase_margin_deg")
 class Scale:
     """Factors from the neck's limits to those of a robot; all are 1 for the neck.
 
-    Attributes:
-        robot: of the requirements.
-        time: factor of seconds.
-        size: of degrees, in the display unit of the outputs.
-        load: of radians at the plant's input, in the unit of the motors.
-        noise: of degrees of sensor noise, as `size`.
-        known: whether robot and plants give all factors; else stated values are not checked against them.
+    `robot`: of the requirements. `time`: factor of seconds. `size`: of degrees, in the display unit of the outputs.
+    `load`: of radians at the plant's input, in the unit of the motors. `noise`: of degrees of sensor noise, as `size`.
+    `known`: whether robot and plants give all factors; else stated values are not checked against them.
     """
 
     robot: Robot = field(default_factory=Robot.preset)
@@ -47,11 +43,7 @@ class Scale:
 
     @classmethod
     def of(cls, robot: Robot, sources: Sequence[PlantSource] = ()) -> Scale:
-        """Return the scale from the robot file, else from its ranges and plants.
-
-        Raises:
-            SettingsError: plants of a robot without limits of its set-points.
-        """
+        """Return the scale from the robot file, else from its ranges and plants."""
         slowest = [1.0 / float(box.nominal[1]) for source in sources for box in source.axes]
         scaling = Scaling.of(robot, time_constant=max([*slowest, *(s.sample_time for s in sources)], default=None))
         motors, outputs = robot.motors, robot.outputs

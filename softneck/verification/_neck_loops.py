@@ -38,13 +38,9 @@ ALONE = (
 class SimulationModel:
     """A simulation model of the robot.
 
-    Attributes:
-        name: of its file.
-        make: returns a new part, given the seed of its sensor's noise and the loop's sample time [s].
-        quiet: as `make`, without noise if the plant can.
-        payload: "inputs" or "parameters" that set it, or "".
-        parameters: of a virtual neck; else None.
-        conditions: payload and co-contraction of the training data, if known.
+    `name`: of its file. `make`: returns a new part, given the seed of its sensor's noise and the loop's sample time
+    [s]. `quiet`: as `make`, without noise if the plant can. `payload`: "inputs" or "parameters" that set it, or "".
+    `parameters`: of a virtual neck; else None. `conditions`: payload and co-contraction of the training data, if known.
     """
 
     name: str
@@ -106,11 +102,7 @@ def is_simulation_model(thing: Any) -> bool:
 
 
 def make_simulation_model(thing: Any, name: str, robot: Robot | None = None) -> SimulationModel:
-    """Return neck parameters, a nonlinear model, a block, or a function that returns a part, as a simulation model.
-
-    Raises:
-        SettingsError: no plant, or one without the robot's outputs.
-    """
+    """Return neck parameters, a nonlinear model, a block, or a function that returns a part, as a simulation model."""
     if isinstance(thing, NeckParameters | VirtualNeck):
         neck = thing if isinstance(thing, VirtualNeck) else VirtualNeck(thing)
         still = VirtualNeck(neck.parameters.without_noise(), neck.robot)
@@ -212,14 +204,9 @@ _STEPPED_SHARE = 0.05
 class LoopRun:
     """One loop over a simulation model.
 
-    Attributes:
-        name: "paper, 0.5 kg, 45 deg".
-        parameters: of a virtual neck; else None.
-        payload: [kg].
-        orientation: of the step [rad].
-        seed: of the sensor's noise.
-        metrics: name -> value of the worst stepped axis, or of the motors; inf where a level is never reached.
-        result: its signals; None if the loop diverged.
+    `name`: "paper, 0.5 kg, 45 deg". `parameters`: of a virtual neck; else None. `payload`: [kg]. `orientation`: of the
+    step [rad]. `seed`: of the sensor's noise. `metrics`: name -> value of the worst stepped axis, or of the motors; inf
+    where a level is never reached. `result`: its signals; None if the loop diverged.
     """
 
     name: str

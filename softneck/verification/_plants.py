@@ -27,13 +27,9 @@ _BISECTION_STEPS = 10
 class AxisBox:
     """The uncertain first-order part of one axis: static gain [rad/rad, else SI], pole [1/s], dead time [s].
 
-    Attributes:
-        nominal: (3,).
-        low, high: (3,).
-        samples: (n, 3) identified plants; none for a model.
-        std: (n, 3) their standard deviations, if known.
-        rest: numerator and denominator (r + 1,) of certain dynamics, highest power first.
-        measured: response in the recordings of a tested family; plants that these exclude are not in the box.
+    `nominal`: (3,). `low`, `high`: (3,). `samples`: (n, 3) identified plants; none for a model. `std`: (n, 3) their
+    standard deviations, if known. `rest`: numerator and denominator (r + 1,) of certain dynamics, highest power first.
+    `measured`: response in the recordings of a tested family; plants that these exclude are not in the box.
     """
 
     nominal: Vector
@@ -117,15 +113,9 @@ _CROSS_TOLERANCE = 1e-6
 class PlantSource:
     """A model or family as a source of plants.
 
-    Attributes:
-        name: of its file.
-        sample_time: [s].
-        axes: one for each output.
-        cross: (m (m - 1),) gains of the other axes' inputs over the axis's own, axis by axis: for the neck phi_i into
-            pitch, theta_i into roll.
-        kind: "family" or "model".
-        robot: of the plant.
-        weights: (m, motors) of the motors in each axis's input; for the neck Eq. 9, 10.
+    `name`: of its file. `sample_time`: [s]. `axes`: one for each output. `cross`: (m (m - 1),) gains of the other axes'
+    inputs over the axis's own, axis by axis: for the neck phi_i into pitch, theta_i into roll. `kind`: "family" or
+    "model". `robot`: of the plant. `weights`: (m, motors) of the motors in each axis's input; for the neck Eq. 9, 10.
     """
 
     name: str
@@ -196,11 +186,7 @@ class Plants:
 
 
 def source_of_family(family: Any, name: str) -> PlantSource:
-    """Return a `Family` as a source of plants.
-
-    Raises:
-        SettingsError: it has no samples.
-    """
+    """Return a `Family` as a source of plants."""
     boxes, names = [], tuple(family.axes)
     for axis in names:
         found = family.axes[axis]
@@ -237,11 +223,7 @@ def mixing_matrix(cross: np.ndarray, axes: int) -> np.ndarray:
 
 
 def source_of_model(model: Any, name: str, spread: Mapping[str, float]) -> PlantSource:
-    """Return a linear model as a source of plants within +-`gain` and +-`pole` (relative) and +-`delay` [s] of it.
-
-    Raises:
-        SettingsError: a model that is not linear, discrete and stable.
-    """
+    """Return a linear model as a source of plants within +-`gain` and +-`pole` (relative) and +-`delay` [s] of it."""
     plants, robot = [], robot_of(model)
     names = robot.outputs.names
     for axis in names:

@@ -146,11 +146,8 @@ _INTEGER_KEYS = ("plants", "search_generations", "seed", "necks")
 class Requirement:
     """One bound on one metric.
 
-    Attributes:
-        metric: such as `axes.sensitivity`.
-        bound: "min", "max" or "below" (which excludes the limit itself).
-        limit: for the worst plant.
-        asked: whether the user states it; a default that cannot be computed does not fail.
+    `metric`: such as `axes.sensitivity`. `bound`: "min", "max" or "below" (which excludes the limit itself). `limit`:
+    for the worst plant. `asked`: whether the user states it; a default that cannot be computed does not fail.
     """
 
     metric: str

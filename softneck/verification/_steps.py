@@ -33,12 +33,9 @@ _RISE_LEVELS, _STEADY_SHARE = (0.1, 0.9), 0.25
 class StepTest:
     """A step of one axis after the other, then a load; [rad] is the SI unit of the outputs.
 
-    Attributes:
-        step: size [rad].
-        duration: of the step, and of the load after it [s].
-        noise: standard deviation of the measured angles [rad].
-        load: added to the plant's input after `duration` [rad].
-        seed: of the noise, equal for all plants.
+    `step`: size [rad]. `duration`: of the step, and of the load after it [s]. `noise`: standard deviation of the
+    measured angles [rad]. `load`: added to the plant's input after `duration` [rad]. `seed`: of the noise, equal for
+    all plants.
     """
 
     step: float
@@ -52,13 +49,9 @@ class StepTest:
 class Steps:
     """Responses of all plants to a step of each axis; [rad] is the SI unit of the outputs.
 
-    Attributes:
-        time: (rows,) [s].
-        angles: (axes, n, rows) the stepped angle [rad].
-        motors: (axes, n, rows, motors) set-points [rad].
-        metrics: name -> (n,) the worst of all axes, in deg or the robot's display unit; inf where a level is never
-            reached or numbers overflow.
-        worse: name -> (n,) the worst axis.
+    `time`: (rows,) [s]. `angles`: (axes, n, rows) the stepped angle [rad]. `motors`: (axes, n, rows, motors) set-points
+    [rad]. `metrics`: name -> (n,) the worst of all axes, in deg or the robot's display unit; inf where a level is never
+    reached or numbers overflow. `worse`: name -> (n,) the worst axis.
     """
 
     time: Vector

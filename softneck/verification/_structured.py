@@ -36,9 +36,7 @@ _UNSTABLE_BADNESS = 1e3
 class SearchResult:
     """Result of a search.
 
-    Attributes:
-        plants: the worst plant of each source, and of each axis if they are decoupled.
-        radius: largest spectral radius.
+    `plants`: the worst plant of each source, and of each axis if they are decoupled. `radius`: largest spectral radius.
     """
 
     plants: Plants
@@ -129,10 +127,8 @@ _FINE_FREQUENCY_COUNT = 4000
 class StructuredResult:
     """Bounds over frequency.
 
-    Attributes:
-        axes: name of the axis, "both" of two coupled ones, or "all".
-        frequency: (m,) [rad/s].
-        upper: (m,) bound of mu for stability.
+    `axes`: name of the axis, "both" of two coupled ones, or "all". `frequency`: (m,) [rad/s]. `upper`: (m,) bound of mu
+    for stability.
     """
 
     axes: str

@@ -48,12 +48,9 @@ from ._worst import write_linear, write_neck
 class Verdict(ReprMixin):
     """The verdict on one requirement.
 
-    Attributes:
-        requirement: metric, bound and limit.
-        value: of the worst plant; inf where a level is never reached, None if not computed.
-        holds: None for a default that was not computed.
-        worst: the worst plant, as JSON values.
-        note: why it was not computed, does not count or does not hold.
+    `requirement`: metric, bound and limit. `value`: of the worst plant; inf where a level is never reached, None if not
+    computed. `holds`: None for a default that was not computed. `worst`: the worst plant, as JSON values. `note`: why
+    it was not computed, does not count or does not hold.
     """
 
     requirement: Requirement
@@ -187,10 +184,8 @@ def with_robot(thing: Any, robot: Robot) -> Any:
 def sources_of(things: Mapping[str, Any], requirements: Requirements | None = None) -> list[PlantSource]:
     """Return linear models and families, by name, as sources of plants.
 
-    The requirements give the uncertainty of a model; without them it is certain.
-
-    Raises:
-        SettingsError: none, an empty family, one that is not linear.
+    The requirements give the uncertainty of a model; without them it is certain. Raises SettingsError: none, an empty
+    family, one that is not linear.
     """
     if not things:
         raise SettingsError("no plant: give at least one MODEL or FAMILY.")

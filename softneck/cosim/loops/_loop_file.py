@@ -31,11 +31,9 @@ from ._loop_parts import OBJECT, PRESETS, SOURCES, PartOpener, links, number, nu
 class LoopSetup(ReprMixin):
     """A loop with its limits; a loop file describes one.
 
-    Attributes:
-        loop: the parts, the reference, the order.
-        limits: metric -> upper limit, such as "pitch.overshoot_pct": 5.0; that of "validity.min" is a lower one.
-        files: role -> (path, SHA-256) of each file that was read.
-        angle: the outputs of the metrics: "true" (if the plant has them) or "measured".
+    `loop`: the parts, the reference, the order. `limits`: metric -> upper limit, such as "pitch.overshoot_pct": 5.0;
+    that of "validity.min" is a lower one. `files`: role -> (path, SHA-256) of each file that was read. `angle`: the
+    outputs of the metrics: "true" (if the plant has them) or "measured".
     """
 
     loop: Loop
@@ -149,15 +147,10 @@ def is_loop_file(path: Path) -> bool:
 def reference_of(path: str | Path, *, robot: str | None = None) -> ReferenceBlock:
     """Return the [reference] of a loop file as a block, from which `build_fmu` makes a reference FMU.
 
-    Its sample time is the file's `sample_time_s`, 20 ms by default; the other parts are not opened. References of
-    other robots than the neck are tabulated over the file's `duration_s`.
-
-    Args:
-        path: of the file.
-        robot: a preset or a robot file that replaces the file's `robot` or the one beside it.
-
-    Raises:
-        SettingsError: the reference is an FMU already, or invalid.
+    Its sample time is the file's `sample_time_s`, 20 ms by default; the other parts are not opened. References of other
+    robots than the neck are tabulated over the file's `duration_s`. `path`: of the file. `robot`: a preset or a robot
+    file that replaces the file's `robot` or the one beside it. Raises SettingsError: the reference is an FMU already,
+    or invalid.
     """
     source = Path(path)
     table = read_toml(source)
@@ -329,11 +322,7 @@ def _iterate_texts(value: Any) -> Iterator[str]:
 
 
 def foreign_python(source: Path) -> str:
-    """Return the first `python =` of a loop or study file whose module is not in the loop's folder, else "".
-
-    Raises:
-        FileFormatError: no such file, or not TOML.
-    """
+    """Return the first `python =` of a loop or study file whose module is not in the loop's folder, else ""."""
     table = read_toml(source)
     loop, named = table.get("loop"), list(find_python(table))
     project = source.resolve().parent

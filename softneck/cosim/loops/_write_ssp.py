@@ -175,12 +175,7 @@ def _corner(name: str, number: int) -> tuple[float, float]:
 
 
 def block_without_python(path: Path) -> Block | None:
-    """Return the block in a Python FMU; None for an FMU that needs neither Python nor another tool.
-
-    Raises:
-        SettingsError: the FMU needs another tool, or was made by another version of softneck.
-        FileFormatError: no FMU.
-    """
+    """Return the block in a Python FMU; None for an FMU that needs neither Python nor another tool."""
     with unpacked(path) as folder:
         description = read_description(path, folder, {})
         block = python_block(path, folder, description)

@@ -264,10 +264,6 @@ def drive_fmu(
 
     Row 0 of a plant has its outputs at the start, row k its outputs after the inputs up to row k - 1. Row k of an
     observer or controller has its outputs for the inputs of row k. Inputs without a column keep their start value.
-
-    Raises:
-        DataError: inputs of different lengths or unknown names.
-        FmuError: the FMU refused; the message says why.
     """
     part = FmuPart(path)
     rows = _rows(part, inputs)

@@ -50,14 +50,10 @@ _MAX_STATES = 60
 class LinearPoint:
     """A linear system near a moment.
 
-    Attributes:
-        A, B, C, D: (n, n), (n, inputs), (outputs, n), (outputs, inputs).
-        sample_time: [s].
-        time: the moment [s].
-        inputs, outputs: names; FMUs of other tools keep their own units.
-        name: of the model.
-        method: "exact", or "pulses" on saved states.
-        error: largest error of the pulse responses, relative to the largest response; 0 if exact.
+    `A`, `B`, `C`, `D`: (n, n), (n, inputs), (outputs, n), (outputs, inputs). `sample_time`: [s]. `time`: the moment
+    [s]. `inputs`, `outputs`: names; FMUs of other tools keep their own units. `name`: of the model. `method`: "exact",
+    or "pulses" on saved states. `error`: largest error of the pulse responses, relative to the largest response; 0 if
+    exact.
     """
 
     A: Matrix
@@ -273,10 +269,8 @@ def realize(
     """Return A, B, C, D of the lowest order with the pulse responses of `part`, and their relative error.
 
     `held` (inputs,) are the constant inputs after `first` steps, `moved` and `sizes` the positions and sizes of those
-    with pulses, `shown` the positions of the outputs.
-
-    Raises:
-        SettingsError: no inputs or outputs, or no input moves an output.
+    with pulses, `shown` the positions of the outputs. Raises SettingsError: no inputs or outputs, or no input moves an
+    output.
     """
     if not moved or not shown:
         raise SettingsError(f"{name}: has no {'output' if moved else 'input'} that is a number, so no linear system.")

@@ -38,12 +38,7 @@ class CallError(RuntimeError):
 
 
 class Native:
-    """An instance of an FMU.
-
-    Attributes:
-        fmu: fmpy's object.
-        version: 2 or 3.
-    """
+    """An instance of an FMU. `fmu`: fmpy's object. `version`: 2 or 3."""
 
     def __init__(self, description: Description, folder: Path, log: Log) -> None:
         """Load the library in `folder`; errors are those of fmpy."""

@@ -61,13 +61,8 @@ class Annotation:
 class Description:
     """The parts of an FMU's description that a loop needs.
 
-    Attributes:
-        path: of the FMU.
-        model: fmpy's description.
-        annotation: see `Annotation`.
-        variables: our name -> variable, for all numbers.
-        version: of FMI, 2 or 3.
-        units: our name -> unit, which replace those of the FMU.
+    `path`: of the FMU. `model`: fmpy's description. `annotation`: see `Annotation`. `variables`: our name -> variable,
+    for all numbers. `version`: of FMI, 2 or 3. `units`: our name -> unit, which replace those of the FMU.
     """
 
     path: Path
@@ -111,10 +106,8 @@ def read_description(
 ) -> Description:
     """Read the description of the FMU `path`, unpacked in `folder`.
 
-    `names` (the FMU's variable name -> ours) and `units` (our name -> unit) are as in `FmuPart`.
-
-    Raises:
-        FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
+    `names` (the FMU's variable name -> ours) and `units` (our name -> unit) are as in `FmuPart`. Raises
+    FileFormatError: no valid FMI 2.0 or 3.0 Co-Simulation FMU, or it lacks a variable of `names`.
     """
     import fmpy
 
@@ -171,11 +164,7 @@ def number_of(text: Any, default: Any) -> Any:
 
 
 def read_block(path: Path) -> Block | None:
-    """Return the block in an FMU of this softneck that runs Python; None for any other.
-
-    Raises:
-        FileFormatError: no FMU, or a damaged one.
-    """
+    """Return the block in an FMU of this softneck that runs Python; None for any other."""
     with unpacked(path) as folder:
         try:
             return python_block(path, folder, read_description(path, folder, {}))
@@ -184,12 +173,7 @@ def read_block(path: Path) -> Block | None:
 
 
 def python_block(path: Path, folder: Path, description: Description) -> Block | None:
-    """Return the block in a Python FMU of softneck, unpacked in `folder`; None for any other FMU.
-
-    Raises:
-        SettingsError: it was made by another version of softneck.
-        FileFormatError: it is damaged.
-    """
+    """Return the block in a Python FMU of softneck, unpacked in `folder`; None for any other FMU."""
     if not description.annotation.role or not (folder / "resources" / "block.json").is_file():
         return None
     try:

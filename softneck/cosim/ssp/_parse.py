@@ -127,11 +127,7 @@ class StructureReader:
         self.where, self.folder = where, folder
 
     def structure(self) -> Structure:
-        """Return the structure in the archive's `SystemStructure.ssd`.
-
-        Raises:
-            FileFormatError: no valid structure, or features that a loop does not have; the message names them.
-        """
+        """Return the structure in the archive's `SystemStructure.ssd`."""
         root = self._xml("SystemStructure.ssd")
         if root.tag != f"{SSD}SystemStructureDescription" or root.get("version", "1.0") not in ("1.0", "2.0"):
             raise self._wrong("SystemStructure.ssd", "is no SSP 1.0 or 2.0 system structure description")

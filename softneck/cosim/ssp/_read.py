@@ -68,10 +68,8 @@ class Ports:
 class Flat:
     """The FMUs of a structure without its systems.
 
-    Attributes:
-        components: path -> component.
-        links: input of an FMU -> (output of an FMU, line).
-        values: path -> values of inputs and parameters, in the FMU's units.
+    `components`: path -> component. `links`: input of an FMU -> (output of an FMU, line). `values`: path -> values of
+    inputs and parameters, in the FMU's units.
     """
 
     components: Mapping[tuple[str, ...], Component]
@@ -80,12 +78,7 @@ class Flat:
 
 
 def flatten(structure: Structure, ports: Mapping[str, Ports], where: Path) -> Flat:
-    """Return the FMUs of a structure with their connections; `ports` are the variables by source.
-
-    Raises:
-        SettingsError: two writers of an input, unknown connectors, units that do not fit, features that a loop does
-            not have; the message names them.
-    """
+    """Return the FMUs of a structure with their connections; `ports` are the variables by source."""
     flattening = _Flattening(structure, ports, where)
     flattening.visit((), structure.root)
     return flattening.result()
@@ -304,11 +297,8 @@ def read_ssp(path: str | Path) -> StructureTable:
     Nested systems become flat; transformations and units of connections become factors and offsets; parameter sets and
     mappings become values. SSP prescribes no master: step and order are those of softneck's annotation, else the step
     is OMSimulator's or the smallest of the FMUs, and the order "jacobi". The FMUs are unpacked in a temporary folder
-    until this process ends.
-
-    Raises:
-        FileFormatError: no archive, a damaged one, or one that names files that are missing or outside of it.
-        SettingsError: features that a loop does not have; the message names them.
+    until this process ends. Raises FileFormatError: no archive, a damaged one, or one that names files that are missing
+    or outside of it. Raises SettingsError: features that a loop does not have; the message names them.
     """
     source = Path(path)
     folder = unpack(source, main="SystemStructure.ssd", what="an SSP archive")

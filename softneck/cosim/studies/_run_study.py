@@ -71,11 +71,7 @@ class SameProcess(Executor):
 
 @contextlib.contextmanager
 def open_workers(workers: int | None, dask: str | None) -> Iterator[WorkerPool]:
-    """Yield the workers: a cluster, a number of local processes (default: one for each core), or this process for 0.
-
-    Raises:
-        SettingsError: an impossible number of workers, both at once, or a scheduler that cannot be reached.
-    """
+    """Yield the workers: a cluster, a number of local processes (default: one for each core), or this process for 0."""
     if dask is not None:
         if workers is not None:
             raise SettingsError("give workers or a Dask scheduler, not both: a cluster has its own workers.")

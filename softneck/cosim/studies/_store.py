@@ -49,11 +49,7 @@ class Store:
     """
 
     def __init__(self, study: Study, folder: Path, *, force: bool = False) -> None:
-        """Start the study in `folder`, or continue the same one there; with `force` replace any study.
-
-        Raises:
-            SettingsError: the folder holds another study and `force` is not given.
-        """
+        """Start the study in `folder`, or continue the same one there; with `force` replace any study."""
         self.folder, self._study, self._parts = folder, study, folder / _PARTS_FOLDER
         if (folder / STUDY_FILE).is_file() and not force:
             self._check_same(study)
@@ -295,10 +291,8 @@ def worst_runs(runs: pd.DataFrame, objectives: Sequence[str], count: int = 3) ->
 def write_worst(study: Study, runs: pd.DataFrame, folder: str | Path, *, count: int = 3) -> list[Path]:
     """Write the worst runs as loop files `run_NUMBER.toml`, which `softneck simulate` runs; return their paths.
 
-    Their key `folder` makes relative paths start where those of the study's loop do.
-
-    Raises:
-        SettingsError: the loop holds parts that are not files; `Study.setup(run)` returns its loops.
+    Their key `folder` makes relative paths start where those of the study's loop do. Raises SettingsError: the loop
+    holds parts that are not files; `Study.setup(run)` returns its loops.
     """
     target = Path(folder)
     paths = []

@@ -36,11 +36,9 @@ _MAX_RUNS = 1_000_000
 class Vary:
     """How one key varies.
 
-    Attributes:
-        kind: "grid" (all values, in all combinations with other grids), "uniform" and "log_uniform" (between two
-            bounds), "normal" (mean and standard deviation), "choices" (one of some values), "seed" (of the run).
-        values: the values of a grid or of choices; two numbers for the other kinds.
-        labels: of the values of a grid or of choices in tables.
+    `kind`: "grid" (all values, in all combinations with other grids), "uniform" and "log_uniform" (between two bounds),
+    "normal" (mean and standard deviation), "choices" (one of some values), "seed" (of the run). `values`: the values of
+    a grid or of choices; two numbers for the other kinds. `labels`: of the values of a grid or of choices in tables.
     """
 
     kind: str
@@ -75,11 +73,7 @@ class Vary:
 
 
 def make_vary(key: str, given: Any) -> Vary:
-    """Return the range of `key` from a table such as {"uniform": [0.0, 0.3]}; a plain list is a grid.
-
-    Raises:
-        SettingsError: unknown kind, or an empty or contradictory range.
-    """
+    """Return the range of `key` from a table such as {"uniform": [0.0, 0.3]}; a plain list is a grid."""
     if isinstance(given, Vary):
         return given
     if isinstance(given, list | tuple):
@@ -123,11 +117,7 @@ class StudyPoints:
     """The points of a study: all samples at all points of the grid; they depend on the seed alone."""
 
     def __init__(self, vary: Mapping[str, Vary], runs: int | None, seed: int) -> None:
-        """Draw the samples.
-
-        Raises:
-            SettingsError: no runs, no varied key, or a number of runs that does not fit the grid.
-        """
+        """Draw the samples."""
         if not vary:
             raise SettingsError("the study varies nothing: give [vary] at least one key.")
         self._vary = vary
@@ -297,11 +287,7 @@ class Study(ReprMixin):
         return make_loop(self.table(run), self.folder, opened=opened)
 
     def check(self) -> None:
-        """Open the loop of the first run with each part in turn, and check that it has all keys.
-
-        Raises:
-            SettingsError: a key that the loop does not have, or an invalid loop.
-        """
+        """Open the loop of the first run with each part in turn, and check that it has all keys."""
         first = self.points[0].values
         kinds = {key: value for key, value in first.items() if set_sources(key)}
         turns: list[dict[str, Any]] = [kinds]

@@ -129,10 +129,8 @@ _NOT_SENSED = (
 class Title:
     """The meaning of a title.
 
-    Attributes:
-        role: time, run, set-point, position, velocity, pitch, ..., ignored, or unknown.
-        family: words without number and unit; columns of the motors share it.
-        rank: clarity of the reason; smaller is clearer.
+    `role`: time, run, set-point, position, velocity, pitch, ..., ignored, or unknown. `family`: words without number
+    and unit; columns of the motors share it. `rank`: clarity of the reason; smaller is clearer.
     """
 
     role: str

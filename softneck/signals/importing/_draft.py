@@ -35,12 +35,9 @@ def take_moving_rows(columns: Mapping[Column, Vector]) -> dict[Column, Vector]:
 class Pick:
     """The columns chosen for one channel.
 
-    Attributes:
-        terms: of a weighted sum of columns.
-        unit: named by the title, or None.
-        confidence: probability that the columns are right, by names and data.
-        unit_sure: whether the title's unit is unambiguous: `Grad` means degrees in German.
-        integrate: whether the columns are rates to integrate.
+    `terms`: of a weighted sum of columns. `unit`: named by the title, or None. `confidence`: probability that the
+    columns are right, by names and data. `unit_sure`: whether the title's unit is unambiguous: `Grad` means degrees in
+    German. `integrate`: whether the columns are rates to integrate.
     """
 
     terms: tuple[Term, ...]

@@ -33,11 +33,8 @@ _MOST_SURE = 0.89
 class Doubt:
     """One uncertain decision.
 
-    Attributes:
-        about: subject, in words.
-        taken: the choice made.
-        confidence: probability that it is right, 0 to 1.
-        choices: alternatives for `settle_doubt`; without any, the columns have to be edited in the layout.
+    `about`: subject, in words. `taken`: the choice made. `confidence`: probability that it is right, 0 to 1. `choices`:
+    alternatives for `settle_doubt`; without any, the columns have to be edited in the layout.
     """
 
     about: str

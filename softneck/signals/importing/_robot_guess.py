@@ -100,10 +100,8 @@ def robot_of_columns(
 ) -> RobotGuess:
     """Return robot and layout of a log whose columns the user named.
 
-    Args:
-        named: its columns, in the order of the robot's channels.
-        robot: None takes the neck if the columns fit it, else proposes a robot.
-        sample_time: [s] of a log without a clock.
+    `named`: its columns, in the order of the robot's channels. `robot`: None takes the neck if the columns fit it, else
+    proposes a robot. `sample_time`: [s] of a log without a clock.
     """
     table = sniff(path, fewest=2)
     if not named.motors or not named.outputs:

@@ -43,13 +43,10 @@ Form = tuple["pd.DataFrame", Layout, tuple[str, ...], list[str]]
 class SniffResult:
     """A log's columns and the detected format.
 
-    Attributes:
-        columns: name, or index without a header -> (time,) numbers; NaN for empty cells. Dates are seconds; with
-            several clocks each column holds its last value.
-        words: columns without numbers.
-        form: a layout without channels: the format of the file; `merge` if rows may be of several clocks.
-        units: column -> unit in a line of units, if there is one.
-        dates: columns of dates or times of day.
+    `columns`: name, or index without a header -> (time,) numbers; NaN for empty cells. Dates are seconds; with several
+    clocks each column holds its last value. `words`: columns without numbers. `form`: a layout without channels: the
+    format of the file; `merge` if rows may be of several clocks. `units`: column -> unit in a line of units, if there
+    is one. `dates`: columns of dates or times of day.
     """
 
     columns: dict[Column, Vector]

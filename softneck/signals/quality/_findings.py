@@ -35,11 +35,8 @@ _SLOW_SHARE, _REACHED_SHARE = 0.5, 0.95
 class Finding:
     """One finding of the report.
 
-    Attributes:
-        severity: ok, note (for information) or warning (fix it, or expect a worse model).
-        topic: such as "dropouts" or "excitation".
-        advice: what to do; may be empty.
-        time: [s] of the first place in its run; None without a place.
+    `severity`: ok, note (for information) or warning (fix it, or expect a worse model). `topic`: such as "dropouts" or
+    "excitation". `advice`: what to do; may be empty. `time`: [s] of the first place in its run; None without a place.
     """
 
     severity: str

@@ -179,10 +179,9 @@ RecordingLike: TypeAlias = (
 def open_recording(thing: object, robot: Robot | str | Path | None = None) -> Recording:
     """Return `thing` as a recording; several become runs of one.
 
-    Args:
-        thing: a recording, its file, a DataFrame or a dict of columns with units in their titles, an array (time,
-            motors and outputs, or motors alone) in SI at the robot's sample time, or a list of them.
-        robot: as in `read_recording`; an array needs one.
+    `thing`: a recording, its file, a DataFrame or a dict of columns with units in their titles, an array (time, motors
+    and outputs, or motors alone) in SI at the robot's sample time, or a list of them. `robot`: as in `read_recording`;
+    an array needs one.
     """
     if isinstance(thing, str | Path):
         return read_recording(thing, robot=robot)
@@ -352,9 +351,8 @@ def require_samples(recording: Recording) -> None:
 def numbers(column: pd.Series | Vector, name: str, *, missing: bool, nan_words: bool = False) -> Vector:
     """Return a column as floats; an empty cell is NaN where `missing` samples are allowed.
 
-    Args:
-        missing: whether samples may be missing.
-        nan_words: whether a missing sample may be written as `NaN`, as MATLAB and numpy write it.
+    `missing`: whether samples may be missing. `nan_words`: whether a missing sample may be written as `NaN`, as MATLAB
+    and numpy write it.
     """
     if isinstance(column, np.ndarray):
         if not missing and np.isnan(column).any():

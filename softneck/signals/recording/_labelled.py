@@ -19,9 +19,7 @@ if TYPE_CHECKING:
 class Labelled(np.ndarray):
     """Channels over time (time, channels) in SI; a computed result or a slice has no labels.
 
-    Attributes:
-        time: (time,) [s].
-        units: channel -> unit.
+    `time`: (time,) [s]. `units`: channel -> unit.
     """
 
     time: Vector

@@ -233,12 +233,9 @@ _MAX_SIGNAL_COLUMNS = 16
 def table_of(source: Path, arrays: Arrays, variable: str | None, wanted: tuple[str, ...] = ()) -> pd.DataFrame:
     """Return the table of a file's arrays.
 
-    Args:
-        arrays: name -> (rows, columns).
-        variable: a matrix (time, columns), whose columns get the numbers 0, 1, ...; None takes all vectors by name, and
-            matrices (time, n) as `name(:,1)` to `name(:,n)`. Experiments in elements of a cell are concatenated, with
-            the column `run`.
-        wanted: the required columns; vectors of another length are dropped.
+    `arrays`: name -> (rows, columns). `variable`: a matrix (time, columns), whose columns get the numbers 0, 1, ...;
+    None takes all vectors by name, and matrices (time, n) as `name(:,1)` to `name(:,n)`. Experiments in elements of a
+    cell are concatenated, with the column `run`. `wanted`: the required columns; vectors of another length are dropped.
     """
     import pandas as pd
 
