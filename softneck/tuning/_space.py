@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, SettingsError, Vector, kinds_of, resolve, to_si
+from softneck.core import KINDS, SettingsError, Vector, kinds_of, resolve
 from softneck.design import AxisSettings
 from softneck.robot import Robot, Scaling
 
@@ -109,11 +109,11 @@ def spaces(
     """Return the space of every kind.
 
     `rise` and `least` [s] are the longest allowed rise and the shortest of the motors; `cocontraction` is that of the
-    recordings in the unit of the motors, or None. Only tendons on winches need a `lead_limit`. Raises SettingsError: an
+    recordings [SI], or None. Only tendons on winches need a `lead_limit`. Raises SettingsError: an
     unknown kind, or one with nothing to search.
     """
     found, least = [], min(least, rise)
-    lead = Scaling.of(robot).motor_unit / to_si(robot.motors.unit)[0] if robot.tendon_angles is not None else None
+    lead = Scaling.of(robot).motor_unit if robot.tendon_angles is not None else None
     planned = () if lead is None else (Dimension("lead_limit", 0.4 * lead, 2.0 * lead, 0.8 * lead),)
     for kind in kinds:
         if kind not in _DIMENSIONS:

@@ -19,6 +19,9 @@ from softneck.core import KINDS, SettingsError, resolve
         ("nlsm", "epsilon_deg=0.5", "epsilon", math.radians(0.5)),
         ("pi", "phase_margin_deg=60", "phase_margin", math.radians(60.0)),
         ("pi", "reference_time_ms=300", "reference_time", 0.3),
+        ("pi", "least_cocontraction_kPa=20", "least_cocontraction", 2e4),
+        ("mpc", "minimum_tautness_deg=-10", "minimum_tautness", -math.radians(10.0)),
+        ("lqg", "lead_limit_V=2", "lead_limit", 2.0),
     ],
 )
 def test_a_unit_behind_the_key_is_converted(kind: str, given: str, key: str, value: float) -> None:

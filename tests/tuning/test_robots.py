@@ -82,7 +82,7 @@ def test_a_loosened_settling_time_of_a_slow_robot_is_a_file_that_is_read_again()
     assert again.certificate.sim["duration_s"] == asked.certificate.sim["duration_s"]
 
 
-def test_the_recordings_cocontraction_is_told_to_controllers_in_the_unit_of_the_motors() -> None:
+def test_the_recordings_cocontraction_is_told_to_controllers_in_si() -> None:
     muscles = replace(Robot.preset("antagonist").motors, unit="bar", setpoint_min=(0.0, 0.0), setpoint_max=(3.0, 3.0))
     robot = replace(Robot.preset("antagonist"), motors=muscles)
     recorded = {"tested": {"conditions": [{"payload_kg": [0.0, 0.0], "cocontraction": [1.4e5, 1.8e5]}]}}
@@ -91,10 +91,10 @@ def test_the_recordings_cocontraction_is_told_to_controllers_in_the_unit_of_the_
     model = plant(robot, gain=1e-6)
     task = task_of({"model": replace(model, findings={**model.findings, **recorded})}, QUICK, 0)
     assert (task.cocontraction, task.said_cocontraction) == (1.6e5, 1.6)  # Pa and bar
-    for space in spaces(("pi", "lqg"), rise=0.4, cocontraction=task.said_cocontraction, robot=robot):
+    for space in spaces(("pi", "lqg"), rise=0.4, cocontraction=task.cocontraction, robot=robot):
         limits = resolve(KINDS[space.kind].settings)(**space.settings(space.start)).design(model).limits
         assert limits.least_cocontraction == 1.6e5
-    (planned,) = spaces(("nmpc",), rise=0.4, cocontraction=1.6, robot=BELLOWS)
+    (planned,) = spaces(("nmpc",), rise=0.4, cocontraction=1.6e5, robot=BELLOWS)
     assert "minimum_tautness" not in planned.fixed  # which only tendons have
 
 

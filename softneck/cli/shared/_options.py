@@ -124,7 +124,14 @@ _TIMES = {
     "preview",
     "sample_time",
 }
-_OF_OUTPUTS = {"epsilon", "measurement_noise_std", "disturbance_noise_std"}
+_OF_CHANNELS = {
+    "epsilon",
+    "measurement_noise_std",
+    "disturbance_noise_std",
+    "lead_limit",
+    "least_cocontraction",
+    "minimum_tautness",
+}
 _ANGLES = {"phase_margin", "inclination_step", "angle_limit"}
 
 
@@ -135,7 +142,7 @@ def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
         SettingsError: a unit of another quantity than the setting's.
     """
     name, _, unit = key.rpartition("_")
-    if key in fields or name not in _TIMES | _OF_OUTPUTS | _ANGLES or name not in fields:
+    if key in fields or name not in _TIMES | _OF_CHANNELS | _ANGLES or name not in fields:
         return key, value
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise SettingsError(f"`{key}` takes a number; got {value!r}.")
@@ -143,7 +150,7 @@ def in_si(key: str, value: Any, fields: set[str]) -> tuple[str, Any]:
         factor, quantity = to_si(unit)
     except DataError as error:
         raise SettingsError(f"`{key}`: {error}") from error
-    wanted = quantity if name in _OF_OUTPUTS else "s" if name in _TIMES else "rad"
+    wanted = quantity if name in _OF_CHANNELS else "s" if name in _TIMES else "rad"
     if quantity != wanted:
         raise SettingsError(f"`{key}`: `{name}` is in {wanted}, and {unit} is no unit of that.")
     return name, factor * value

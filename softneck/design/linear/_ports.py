@@ -216,7 +216,7 @@ def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: fl
 
     Args:
         robot: whose motors they are.
-        lead_limit, least_cocontraction: in the unit of its motors; None for no such limit.
+        lead_limit, least_cocontraction: [SI]; None for no such limit.
 
     Raises:
         SettingsError: a limit that the robot's file does not say.
@@ -239,8 +239,8 @@ def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: fl
         rates.append(_NOMINAL_SLEW * scaling.motor_unit / scaling.second)
     return ControllerLimits(
         robot=robot, position_limit=most, slew_limit=min(rates), least_position=least,
-        lead_limit=2.0 * most if lead_limit is None else factor * lead_limit,
-        least_cocontraction=-(largest or most) if least_cocontraction is None else factor * least_cocontraction,
+        lead_limit=2.0 * most if lead_limit is None else lead_limit,
+        least_cocontraction=-(largest or most) if least_cocontraction is None else least_cocontraction,
     )  # fmt: skip
 
 

@@ -18,7 +18,6 @@ from softneck.core import (
     require_finite,
     require_one_of,
     require_positive,
-    to_si,
 )
 from softneck.estimation import ORDERS, AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_IN_LIMITS_PCT
@@ -60,10 +59,10 @@ class LoopSettings:
     How far and how fast motors go, and how often, is in the robot's file.
 
     Attributes:
-        lead_limit: how far a set-point may be from its measured motor, in the unit of the motors; keeps the integral
+        lead_limit: how far a set-point may be from its measured motor [SI]; keeps the integral
             from winding up while a drive at its current limit falls behind. None: of the neck 0.4 rad, without a
             nominal set-point no limit.
-        least_cocontraction: the co-contraction reference is at least this, in the unit of the motors; keeps tendons
+        least_cocontraction: the co-contraction reference is at least this [SI]; keeps tendons
             taut under a payload. None for no such rule.
         order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
         rise_s: time [s] in which a step on the nominal plant rises from 10 to 90 %, no limit acting; the reference
@@ -101,7 +100,7 @@ class LoopSettings:
         """Return settings that depend on the plant, where they are not given."""
         if plant.robot.motors.nominal is None:
             return {}
-        return {"lead_limit": self.LEAD * Scaling.of(plant.robot).motor_unit / to_si(plant.robot.motors.unit)[0]}
+        return {"lead_limit": self.LEAD * Scaling.of(plant.robot).motor_unit}
 
     def limits(self, robot: Robot) -> ControllerLimits:
         """Return the limits of the set-points.

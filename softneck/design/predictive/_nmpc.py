@@ -122,7 +122,7 @@ class NmpcSettings(ReprMixin):
                 "For a linear model use `softneck design mpc`."
             )
         robot = model.robot
-        found = identify_near_rest(model, to_si(robot.motors.unit)[0] * max(0.0, self.minimum_tautness or 0.0))
+        found = identify_near_rest(model, max(0.0, self.minimum_tautness or 0.0))
         plant = near_rest(model, found)
         limits = predictive_limits(self, plant)
         own = apply_rise_time(NmpcNumbers.of(self).fill_defaults(plant))

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.core import Matrix, SettingsError, Vector
 from softneck.estimation import AxisPlant
 from softneck.identification import Model, weights_of
 from softneck.robot import TIME_CONSTANT, Scaling
@@ -207,12 +207,12 @@ def controller_arrays(controller: Any) -> tuple[Matrix, ...]:
     asked_at = np.minimum(np.arange(1, slopes.shape[1] + 1) + lead, max(ahead, 1)) - 1
     slack = 0.0 if s.angle_limit is None else SLACK_WEIGHT * float(p.weights[0].max())
     coast, settle = (max(1, round(time / plant.axes[0].sample_time)) for time in (_COAST_S, _SETTLE_S))
-    per = to_si(controller.robot.motors.unit)[0] / plant.scaling.motor_unit
     scale = scale_numbers(plant, controller.limits)
     constants = np.array([
         Ts, p.horizon, s.window, ahead, lead, math.exp(-Ts / s.reference_time) if s.reference_time > 0.0 else 0.0,
         p.move_weight, p.cocontraction_weight, slack, s.angle_limit or 0.0, BUDGET, coast, settle, len(block.outputs),
-        -NMPC_NO_BOUND if s.minimum_tautness is None else per * s.minimum_tautness, TAUTNESS_LEVER, p.look,
+        -NMPC_NO_BOUND if s.minimum_tautness is None else s.minimum_tautness / plant.scaling.motor_unit,
+        TAUTNESS_LEVER, p.look,
         # The redefined inputs' units are no numbers of this runtime.
         *scale[: max(0, len(scale) - m)],
     ])  # fmt: skip

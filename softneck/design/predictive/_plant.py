@@ -114,7 +114,7 @@ def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
             )
         least, most = 0.01 * float(scaling.output_unit.min()), float(reference_ranges(robot)[1].max())
         require_between("angle_limit", settings.angle_limit, least, most, "rad")
-    taut, most = settings.minimum_tautness, limits.position_limit / factor
+    taut, most = settings.minimum_tautness, limits.position_limit
     if isinstance(taut, str) or taut is None:
         return limits
     if not plant.has_tendons:
@@ -124,8 +124,8 @@ def predictive_limits(settings: Any, plant: ScaledPlant) -> ControllerLimits:
         )
     if taut >= most:
         raise SettingsError(
-            f"`minimum_tautness` {taut:g} {unit} and `position_limit` {most:g} {unit} contradict each other: no motor "
-            "could pull that far. Lower the first."
+            f"`minimum_tautness` {taut / factor:g} {unit} and `position_limit` {most / factor:g} {unit} contradict "
+            "each other: no motor could pull that far. Lower the first."
         )
     return limits
 

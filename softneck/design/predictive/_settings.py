@@ -16,7 +16,6 @@ from softneck.core import (
     require_between,
     require_finite,
     require_one_of,
-    to_si,
 )
 from softneck.estimation import ORDERS
 from softneck.robot import Robot, find_robot
@@ -235,7 +234,7 @@ class MpcNumbers(MpcSettings):
         taut = asked.minimum_tautness
         if taut is not None:
             unit = plant.scaling.motor_unit
-            taut = self.wish * unit if isinstance(taut, str) else to_si(plant.robot.motors.unit)[0] * taut
+            taut = self.wish * unit if isinstance(taut, str) else taut
         found["dead_time_s"] = [(item.delay + self.extra_delay) * plant.sample_time for item in nominal]
         return MpcController(
             sample_time=plant.sample_time,
