@@ -1,7 +1,4 @@
-"""Run a loop: the actions of a row in their order, and all rows on one bus of signals.
-
-Parts, wiring, order and faults become the arrays that `_rows_runtime` reads.
-"""
+"""Run a loop: the actions of a row in their order, and all rows on one bus of signals."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A robot bent by tendons in three dimensions: link, tendons coloured by tension, and platform, in one HTML file.
-
-The page needs no network and no library: it contains a canvas and a short renderer.
-"""
+"""A robot bent by tendons in three dimensions, in one HTML file without network or library."""
 
 from __future__ import annotations
 

@@ -3,7 +3,6 @@
 Gain and delay act on the control error. The loop moves to a posture and gets a step of its reference. An oscillation
 is sustained if it is as large in the last window as in the one before, and larger than at gain 1. Only the first
 crossing is bisected, as stability need not be monotone in the gain.
-
 Times and sizes are those of the neck, scaled to the robot; postures lie around the middle of its outputs.
 """
 

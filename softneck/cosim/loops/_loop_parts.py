@@ -1,7 +1,4 @@
-"""Open the parts of a loop's table: softneck files, FMUs, necks, and Python factories.
-
-Each value is checked as it is read; the error of an invalid one names its key.
-"""
+"""Open the parts of a loop's table: softneck files, FMUs, necks, and Python factories."""
 
 from __future__ import annotations
 

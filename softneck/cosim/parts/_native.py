@@ -1,7 +1,4 @@
-"""The C calls of a Co-Simulation FMU, for FMI 2.0 and FMI 3.0.
-
-fmpy loads and instantiates; the calls of each step go directly to the library, with buffers made once.
-"""
+"""The C calls of a Co-Simulation FMU, for FMI 2.0 and FMI 3.0; fmpy only loads and instantiates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Excitation of the inputs: spectrum against the bandwidth, correlation, and explained_variance variance.
+"""Excitation of the inputs: spectrum against the bandwidth, correlation, and explained variance.
 
 Inputs are the redefined ones and co-contraction if the robot gives its directions, else the motors' set-points.
 """
