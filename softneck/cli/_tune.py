@@ -124,10 +124,8 @@ def _why(found: tuning.Tuned, folder: Path) -> str:
 def way_on(binding: str | None, *, unheard: bool, blind: bool = False) -> str:
     """Return the advice on the active requirement.
 
-    Args:
-        binding: the active requirement; None if it is not known.
-        unheard: whether the data do not support it.
-        blind: whether the kind has no linear form to test against the data.
+    `binding`: the active requirement; None if it is not known. `unheard`: whether the data do not support it. `blind`:
+    whether the kind has no linear form to test against the data.
     """
     if blind:
         return "No setting fixes it: name kinds with a linear form in --kinds, such as pi or lqg"

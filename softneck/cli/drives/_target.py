@@ -44,9 +44,7 @@ def require_armed(bus: str, *, arm: bool) -> None:
 
     A bus whose far end is a program needs --arm only. Any other needs the words typed at a terminal as well, or
     in SOFTNECK_ARM where there is none.
-
-    Raises:
-        SettingsError: no --arm, nobody to ask, or other words; nothing was sent.
+    Raises SettingsError: no --arm, nobody to ask, or other words; nothing was sent.
     """
     if not arm:
         raise SettingsError(f"this moves the drives on {bus}; say --arm if they may. Nothing was sent.")
@@ -196,12 +194,8 @@ def moving(
 ) -> Iterator[tuple[Session, Keyboard]]:
     """Yield the session of a master and the keyboard; both are closed after the results.
 
-    Args:
-        asked, chosen: which drives.
-        command: what runs, for its log.
-        force: replace an existing log.
-        homed, seed: of simulated drives.
-        files: what acts beside the drives file, for the log.
+    `asked`, `chosen`: which drives. `command`: what runs, for its log. `force`: replace an existing log. `homed`,
+    `seed`: of simulated drives. `files`: what acts beside the drives file, for the log.
     """
     from softneck.drives import Keyboard, Session, VirtualLink
 
@@ -294,14 +288,9 @@ def require_log(log: str | None, *, force: bool) -> None:
 def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool) -> Iterator[RunLogger | None]:
     """Yield a logger, or None without a log; the files get their names at the end.
 
-    Args:
-        chosen: the drives; where they may be real and no log is asked for, one is written to `log_folder`.
-        command: what runs, for its name.
-        wanted: the one asked for; "none": write none that was not asked for.
-        force: replace an existing file.
-
-    Raises:
-        OutputFileError: it cannot be written (before anything moves), or is not complete.
+    `chosen`: the drives; where they may be real and no log is asked for, one is written to `log_folder`. `command`:
+    what runs, for its name. `wanted`: the one asked for; "none": write none that was not asked for. `force`: replace an
+    existing file. Raises OutputFileError: it cannot be written (before anything moves), or is not complete.
     """
     from softneck.drives import RunLogger
 

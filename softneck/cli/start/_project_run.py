@@ -42,11 +42,9 @@ _FORMAT_VERSION = 1
 class ProjectRun:
     """The steps done in the working folder.
 
-    Attributes:
-        done: key of a step -> its command, inputs (file -> SHA-256), whether it ended and held, its seconds.
-        answers: the options beside the logs.
-        as_json: print nothing but JSON.
-        ran: keys of the steps of this call, in their order, each with whether it was done before.
+    `done`: key of a step -> its command, inputs (file -> SHA-256), whether it ended and held, its seconds. `answers`:
+    the options beside the logs. `as_json`: print nothing but JSON. `ran`: keys of the steps of this call, in their
+    order, each with whether it was done before.
     """
 
     done: dict[str, dict[str, Any]] = field(default_factory=dict)

@@ -54,9 +54,7 @@ def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> M
     """Return the margins of the discrete open loop `loop`, verified to be stable when closed.
 
     Gain and phase margin are python-control's, from the exact z^-d; Ms is from the frequency response.
-
-    Raises:
-        SettingsError: the closed loop is not stable.
+    Raises SettingsError: the closed loop is not stable.
     """
     import control
 
@@ -82,9 +80,7 @@ def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> M
 def nearest_gain_margin(gain: float, last: complex) -> float:
     """Return the nearer of a gain margin and of that at the Nyquist frequency, which python-control leaves out.
 
-    Args:
-        gain: a factor.
-        last: the open loop at the Nyquist frequency, where it is real.
+    `gain`: a factor. `last`: the open loop at the Nyquist frequency, where it is real.
     """
     there = -1.0 / last.real if last.real < 0.0 else math.inf
     return min(gain, there, key=lambda factor: abs(math.log(max(factor, 1e-300))))
@@ -248,11 +244,8 @@ _SWEEP_RUNTIME = "softneck.design.linear._sweep_runtime"
 class Sweep:
     """A family of plants made ready for many runs of the bake-off.
 
-    Attributes:
-        plants: (plants, 2, order) numerators and denominators.
-        delays: (plants,) [samples].
-        test: what is asked.
-        nominal: index of the nominal plant.
+    `plants`: (plants, 2, order) numerators and denominators. `delays`: (plants,) [samples]. `test`: what is asked.
+    `nominal`: index of the nominal plant.
     """
 
     plants: Matrix
@@ -309,10 +302,7 @@ _NO_LIMIT = 1e9
 def check_rise(rise: float, plant: AxisPlant, test: StepAndLoad) -> None:
     """Raise SettingsError where the motors cannot make the plant rise so fast, however they are led.
 
-    Args:
-        rise: from 10 to 90 % [s].
-        plant: the nominal one.
-        test: the step and its limits on the plant's input.
+    `rise`: from 10 to 90 % [s]. `plant`: the nominal one. `test`: the step and its limits on the plant's input.
     """
     least = least_rise(plant, test)
     if rise < least:
@@ -325,10 +315,7 @@ def check_rise(rise: float, plant: AxisPlant, test: StepAndLoad) -> None:
 def least_rise(plant: AxisPlant, test: StepAndLoad, size: float | None = None) -> float:
     """Return the rise [s] with the input led to its end as fast as the slew allows; inf where 90 % is never reached.
 
-    Args:
-        plant: the nominal one.
-        test: the limits on its input.
-        size: of the step [rad]; that of the test if not given.
+    `plant`: the nominal one. `test`: the limits on its input. `size`: of the step [rad]; that of the test if not given.
     """
     from scipy.signal import lfilter
 
@@ -359,9 +346,7 @@ def filter_for(rise: float, axis: AxisController, plant: AxisPlant, extra_delay:
 
     A loop that rises by itself in r0 is taken for a lag: T2 = sqrt(rise^2 - r0^2)/ln 9 and no lead where it is faster
     than asked, else T2 = rise/ln 9 and T1 = r0/ln 9; the one that is free is then corrected on the loop's own response.
-
-    Raises:
-        SettingsError: the loop is too slow to be led.
+    Raises SettingsError: the loop is too slow to be led.
     """
     alone = _rise_time_with(ReferenceFilter(0.0), rise, axis, plant, extra_delay)
     if rise >= alone:

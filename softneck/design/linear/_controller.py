@@ -66,9 +66,7 @@ class AxisController:
 class ReferenceFilter:
     """The reference filter `(1 + T1 s)/(1 + T2 s)`, without a sample of delay.
 
-    Attributes:
-        time: T2 [s]; 0 for none.
-        lead: T1 [s].
+    `time`: T2 [s]; 0 for none. `lead`: T1 [s].
     """
 
     time: float
@@ -87,10 +85,7 @@ class ReferenceFilter:
 def pi_axis(gain: float, integral_time: float, sample_time: float) -> AxisController:
     """Return `v = K (e + s)`, `s+ = s + Ts/Ti e` with e = r - y.
 
-    Args:
-        gain: K [rad/rad].
-        integral_time: Ti [s].
-        sample_time: Ts [s].
+    `gain`: K [rad/rad]. `integral_time`: Ti [s]. `sample_time`: Ts [s].
     """
     one = np.eye(1)
     rate = sample_time / integral_time
@@ -106,11 +101,8 @@ def assemble(
 ) -> tuple[Matrix, ...]:
     """Return the arrays of `LinearArrays`.
 
-    Args:
-        axes: controllers of all axes: of pitch and roll.
-        filters: of the references of all axes and of co-contraction.
-        redefinition: T (axes + 1, motors) and its inverse.
-        constants: of the runtime, the sample time [s] first.
+    `axes`: controllers of all axes: of pitch and roll. `filters`: of the references of all axes and of co-contraction.
+    `redefinition`: T (axes + 1, motors) and its inverse. `constants`: of the runtime, the sample time [s] first.
     """
     from scipy.linalg import block_diag
 

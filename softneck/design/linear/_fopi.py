@@ -86,11 +86,8 @@ class _DelayedPlant:
 class FractionalPi:
     """`C(s) = K (1 + Ki s^-lambda)`.
 
-    Attributes:
-        gain: K [rad/rad].
-        integral: Ki [1/s^lambda].
-        integral_order: lambda, in (0, 2).
-        crossover: around which it is realised [rad/s].
+    `gain`: K [rad/rad]. `integral`: Ki [1/s^lambda]. `integral_order`: lambda, in (0, 2). `crossover`: around which it
+    is realised [rad/s].
     """
 
     gain: float
@@ -163,10 +160,8 @@ def fopi(G: Any, *, crossover: float, phase_margin: float = math.radians(60.0)) 
 class _FlatPhase:
     """C/K = 1 + Ki s^-order about the crossover, Ki such that its phase there is theta.
 
-    Attributes:
-        w: below, at and above the crossover (3,) [rad/s].
-        theta: the phase that C is to have at the crossover [rad].
-        slope: what its phase is to gain from the first to the last frequency [rad], so that the loop's is flat.
+    `w`: below, at and above the crossover (3,) [rad/s]. `theta`: the phase that C is to have at the crossover [rad].
+    `slope`: what its phase is to gain from the first to the last frequency [rad], so that the loop's is flat.
     """
 
     w: Vector

@@ -61,14 +61,9 @@ def multivariable_controller(
 ) -> LinearController:
     """Return the controller.
 
-    Args:
-        settings: order of the loop, limits, and what its references are filtered by.
-        made: the controller's law and its plants.
-        robot: whose plant it is.
-        filtered: whether a reference filter is chosen where none is given.
-
-    Raises:
-        SettingsError: a loop that is not stable around one of the samples, or a filter that does not help.
+    `settings`: order of the loop, limits, and what its references are filtered by. `made`: the controller's law and its
+    plants. `robot`: whose plant it is. `filtered`: whether a reference filter is chosen where none is given. Raises
+    SettingsError: a loop that is not stable around one of the samples, or a filter that does not help.
     """
     extra, plants = settings.extra_delay, made.samples[0]
     for k, sample in enumerate(made.samples):

@@ -127,9 +127,7 @@ Plants = tuple[AxisPlant, ...]
 class Gains:
     """PI gains of `v = K (e + 1/Ti int e)`.
 
-    Attributes:
-        gain: K [rad/rad].
-        integral_time: Ti [s].
+    `gain`: K [rad/rad]. `integral_time`: Ti [s].
     """
 
     gain: float
@@ -141,9 +139,7 @@ def tune_pi(plants: Plants, extra_delay: int, max_sensitivity: float, phase_marg
 
     The plants share sample time and the sign of their gain; times and gains are tried around the first. Of many
     plants, those that decide are found by adding the worst under the gains so far until none breaks a bound.
-
-    Raises:
-        SettingsError: none do.
+    Raises SettingsError: none do.
     """
     plant = plants[0]
     fine = len(plants) <= _FINE_GRID_PLANTS
@@ -192,15 +188,9 @@ def _maximise_integral_gain(
 def reference_time(plants: Plants, extra_delay: int, gains: Gains, *, gain_spread: float, overshoot: float) -> float:
     """Return the smallest time constant [s] of a reference filter that keeps the overshoot of all plants.
 
-    Args:
-        plants: what the axis may be.
-        extra_delay: samples added to their delay.
-        gains: of the PI.
-        gain_spread: relative; the gain of each plant is taken at both ends and in the middle.
-        overshoot: part of the step.
-
-    Raises:
-        SettingsError: none does that is fast enough.
+    `plants`: what the axis may be. `extra_delay`: samples added to their delay. `gains`: of the PI. `gain_spread`:
+    relative; the gain of each plant is taken at both ends and in the middle. `overshoot`: part of the step. Raises
+    SettingsError: none does that is fast enough.
     """
     from scipy.signal import lfilter
 

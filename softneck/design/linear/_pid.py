@@ -32,11 +32,7 @@ _SEARCH_SAMPLES = 12
 class PidGains:
     """`v = K (r - y + int(r - y)/Ti - Td s y/(1 + Tf s))`, integral and derivative by backward differences.
 
-    Attributes:
-        gain: K [rad/rad].
-        integral_time: Ti [s].
-        derivative_time: Td [s].
-        filter_time: Tf [s].
+    `gain`: K [rad/rad]. `integral_time`: Ti [s]. `derivative_time`: Td [s]. `filter_time`: Tf [s].
     """
 
     gain: float

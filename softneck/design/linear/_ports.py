@@ -23,10 +23,8 @@ _NO_LIMIT = 1e12
 def limit_ports(starts: tuple[float, float, float, float, float], robot: Robot = _NECK) -> tuple[Port, ...]:
     """Return the parameters of every controller with allocation, in the order of `_allocation_runtime`'s callers.
 
-    Args:
-        starts: position limit [rad], slew limit [rad/s], lead limit, least position, least co-contraction [rad]; of
-            another robot in the SI unit of its motors.
-        robot: whose motors they are.
+    `starts`: position limit [rad], slew limit [rad/s], lead limit, least position, least co-contraction [rad]; of
+    another robot in the SI unit of its motors. `robot`: whose motors they are.
     """
     position, slew, lead, least, common = starts
     unit = to_si(robot.motors.unit)[1]
@@ -214,12 +212,8 @@ _NOMINAL_SLEW = 12.5
 def limits_of(robot: Robot, *, lead_limit: float | None, least_cocontraction: float | None) -> ControllerLimits:
     """Return the limits of a robot's motors, and the two limits of the controller.
 
-    Args:
-        robot: whose motors they are.
-        lead_limit, least_cocontraction: [SI]; None for no such limit.
-
-    Raises:
-        SettingsError: a limit that the robot's file does not say.
+    `robot`: whose motors they are. `lead_limit`, `least_cocontraction`: [SI]; None for no such limit. Raises
+    SettingsError: a limit that the robot's file does not say.
     """
     motors, factor = robot.motors, to_si(robot.motors.unit)[0]
     largest, ranges = nominal_ends(robot), motor_ranges(robot, None)

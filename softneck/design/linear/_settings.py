@@ -57,16 +57,12 @@ class LoopSettings:
     A kind calls `LoopSettings.__post_init__(self)` by name: with slots `super()` would look in the wrong class.
 
     How far and how fast motors go, and how often, is in the robot's file.
-
-    Attributes:
-        lead_limit: how far a set-point may be from its measured motor [SI]; keeps the integral
-            from winding up while a drive at its current limit falls behind. None: of the neck 0.4 rad, without a
-            nominal set-point no limit.
-        least_cocontraction: the co-contraction reference is at least this [SI]; keeps tendons
-            taut under a payload. None for no such rule.
-        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
-        rise_s: time [s] in which a step on the nominal plant rises from 10 to 90 %, no limit acting; the reference
-            filter is made for it in the place of `reference_time`. None: by that.
+    `lead_limit`: how far a set-point may be from its measured motor [SI]; keeps the integral from winding up while a
+    drive at its current limit falls behind. None: of the neck 0.4 rad, without a nominal set-point no limit.
+    `least_cocontraction`: the co-contraction reference is at least this [SI]; keeps tendons taut under a payload. None
+    for no such rule. `order`: of the loop; "jacobi" adds one sample for the controller and one for the observer.
+    `rise_s`: time [s] in which a step on the nominal plant rises from 10 to 90 %, no limit acting; the reference filter
+    is made for it in the place of `reference_time`. None: by that.
     """
 
     #: How far a set-point may be from its motor, scaled.
@@ -144,10 +140,7 @@ _MIN_IMPROVEMENT_PCT = 0.5
 class AxisDesign:
     """The result of a synthesis for one axis.
 
-    Attributes:
-        controller: of the axis.
-        gains: its numbers by name, for people.
-        notes: more numbers, such as gamma.
+    `controller`: of the axis. `gains`: its numbers by name, for people. `notes`: more numbers, such as gamma.
     """
 
     controller: AxisController
@@ -160,13 +153,10 @@ class AxisSettings(LoopSettings, ABC):
     """Settings that all kinds of linear controller share; a kind adds its own and one synthesis.
 
     Limits and the order of the loop are those of `LoopSettings`.
-
-    Attributes:
-        max_sensitivity: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
-        reference_time: T2 of the reference filter (1 + T1 s)/(1 + T2 s) [s]; None for the least with which no sample
-            overshoots a step of 10 deg by more than 4 %, from half the plant's lag on. Or T2 and lead, [0.2, 0.5]: T1
-            is that part of the loop's own lag (its rise over ln 9); what moves is followed the closer, and a step
-            overshoots rather.
+    `max_sensitivity`: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
+    `reference_time`: T2 of the reference filter (1 + T1 s)/(1 + T2 s) [s]; None for the least with which no sample
+    overshoots a step of 10 deg by more than 4 %, from half the plant's lag on. Or T2 and lead, [0.2, 0.5]: T1 is that
+    part of the loop's own lag (its rise over ln 9); what moves is followed the closer, and a step overshoots rather.
     """
 
     KIND: ClassVar[str]
@@ -183,13 +173,9 @@ class AxisSettings(LoopSettings, ABC):
     def design(self, plant: Any, *, robot: Robot | str | Path | None = None) -> LinearController:
         """Return the controller for `plant`, verified on every sample.
 
-        Args:
-            plant: whatever `uncertain_plant` takes, continuous `control` systems as well; `lqg` and `custom` take
-                systems of any size.
-            robot: whose limits count, itself, a preset or a file; None: those that the plant says.
-
-        Raises:
-            SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
+        `plant`: whatever `uncertain_plant` takes, continuous `control` systems as well; `lqg` and `custom` take systems
+        of any size. `robot`: whose limits count, itself, a preset or a file; None: those that the plant says. Raises
+        SettingsError: a plant that does not fit, no solution, or a loop that does not hold on every sample.
         """
         whose = None if robot is None else find_robot(robot)
         period, taken = discretize_zoh(plant, self._period(whose))

@@ -150,10 +150,8 @@ def close_loop(
 ) -> tuple[Matrix, Matrix, Matrix]:
     """Return A, B (from all references) and C (to all outputs) of the loop with its dead time in full.
 
-    Args:
-        parts: A, B, C, D of the controller, from references and outputs to redefined inputs.
-        plants: of all axes.
-        extra_delay: samples added to their delay.
+    `parts`: A, B, C, D of the controller, from references and outputs to redefined inputs. `plants`: of all axes.
+    `extra_delay`: samples added to their delay.
     """
     A, B, C, D = parts
     m = len(plants)
@@ -204,11 +202,8 @@ _NECK_INPUTS = ("theta_i", "phi_i")
 class CoupledPlant:
     """A plant of n motors and m outputs; its redefined inputs are those that move one output each at rest.
 
-    Attributes:
-        rows: one for each output.
-        robot: whose plant it is.
-        redefinition: T (outputs + 1, motors) and its inverse.
-        turn: (outputs, outputs) from the robot's own redefined inputs to these; co-contraction is the robot's own.
+    `rows`: one for each output. `robot`: whose plant it is. `redefinition`: T (outputs + 1, motors) and its inverse.
+    `turn`: (outputs, outputs) from the robot's own redefined inputs to these; co-contraction is the robot's own.
     """
 
     rows: tuple[CoupledAxis, ...]
@@ -246,13 +241,10 @@ class CoupledPlant:
 def coupled_plant(source: Any, *, robot: Robot | None = None) -> CoupledPlant | None:
     """Return the coupled plant of a `control` system of any size; None if each axis is a plant of its own.
 
-    Args:
-        source: a discrete system from motors, or a neck's redefined inputs, to outputs; else whatever a design takes.
-        robot: whose plant a `control` system is; None: a neck's, or one with the names of its signals.
-
-    Raises:
-        SettingsError: a model that says nothing between its axes, or a system that no controller of this package can be
-            for, in a line.
+    `source`: a discrete system from motors, or a neck's redefined inputs, to outputs; else whatever a design takes.
+    `robot`: whose plant a `control` system is; None: a neck's, or one with the names of its signals. Raises
+    SettingsError: a model that says nothing between its axes, or a system that no controller of this package can be
+    for, in a line.
     """
     import control
 

@@ -163,11 +163,9 @@ def default_uncertainty(robot: Robot) -> ModelUncertainty:
 class UncertainAxis:
     """The uncertain plant of one axis.
 
-    Attributes:
-        nominal: the plant that synthesis takes.
-        samples: every plant that the controller must hold on; the nominal one is the first.
-        test: what a controller is judged by on all of them; None where nobody judges.
-        uncertainty: what is allowed for besides.
+    `nominal`: the plant that synthesis takes. `samples`: every plant that the controller must hold on; the nominal one
+    is the first. `test`: what a controller is judged by on all of them; None where nobody judges. `uncertainty`: what
+    is allowed for besides.
     """
 
     nominal: AxisPlant
@@ -211,11 +209,9 @@ class UncertainAxis:
 class UncertainPlant(ReprMixin):
     """The uncertain plant of all axes, on which every design works; of a neck pitch and roll.
 
-    Attributes:
-        axes: output -> what its axis may be.
-        robot: whose plant it is.
-        weights: (outputs, motors) of the motors in the redefined input of each axis; None: those that the robot gives.
-        uncertainty: what a design allows for; None for what is usual of the robot.
+    `axes`: output -> what its axis may be. `robot`: whose plant it is. `weights`: (outputs, motors) of the motors in
+    the redefined input of each axis; None: those that the robot gives. `uncertainty`: what a design allows for; None
+    for what is usual of the robot.
     """
 
     axes: Mapping[str, UncertainAxis]
@@ -437,9 +433,7 @@ def discretize_zoh(plant: Any, period: float) -> tuple[float | None, Any]:
     """Return the plant with each continuous `control` system of it made discrete by a zero-order hold, and its period.
 
     At the samples both agree, as set-points are held in between. A plant that is discrete stays as it is, with None.
-
-    Raises:
-        SettingsError: a system that has no state space.
+    Raises SettingsError: a system that has no state space.
     """
     return (period, _discretize(plant, period)) if _any_continuous(plant) else (None, plant)
 

@@ -87,10 +87,7 @@ def observer_gains(poles: Vector, trust: float) -> Matrix:
 
     Of a steady Kalman filter whose measurement noise is one and whose noise on the rate is `trust`: the model's own
     states are not corrected, so that one number says how much of what is measured is believed.
-
-    Args:
-        poles: (plants,) of the rates.
-        trust: > 0.
+    `poles`: (plants,) of the rates. `trust`: > 0.
     """
     from scipy.linalg import solve_discrete_are
 

@@ -33,12 +33,8 @@ S = TypeVar("S", bound=Any)
 def identify_near_rest(model: Model, pulled: float = 0.0) -> dict[str, dict[str, float]]:
     """Return static gain, pole [1/s] and dead time [samples] of each axis, as the model steps near rest.
 
-    Args:
-        model: of any robot.
-        pulled: where all motors stand before a step, above rest [SI]: a payload may leave tendons hanging at zero.
-
-    Raises:
-        SettingsError: an input that does not move its output.
+    `model`: of any robot. `pulled`: where all motors stand before a step, above rest [SI]: a payload may leave tendons
+    hanging at zero. Raises SettingsError: an input that does not move its output.
     """
     robot, weights, ends = model.robot, weights_of(model), motor_ranges(model.robot, None)
     scaling = Scaling.of(robot, set_points=None if ends is None else np.array(ends))
@@ -164,10 +160,7 @@ def estimate_gains(pole: float, window: int) -> Matrix:
 
     Of all `o(k+1) = o(k) + r(k)`, `r(k+1) = a r(k)` the one nearest to the last `window` residuals, in least squares:
     with the model's inputs known and its state that of its simulation the estimation over the horizon is linear.
-
-    Args:
-        pole: a, the plant's slowest.
-        window: residuals, at least 2.
+    `pole`: a, the plant's slowest. `window`: residuals, at least 2.
     """
     back = np.arange(window)
     # i samples ago the level was lower by the rates since then, r(k-j) = a^-j r(k).

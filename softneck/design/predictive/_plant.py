@@ -249,13 +249,8 @@ def sample_pairs(plant: ScaledPlant, timing: Any) -> list[AnyAxes]:
 def over(settings: S, observer: Any) -> S:
     """Return settings for a loop with this observer; given values stay.
 
-    Args:
-        settings: of `mpc` or `nmpc`.
-        observer: whose `lead` becomes `look_ahead`, of `mpc` at most half of `least_delay`; if it tells a payload, its
-            model says `payload_tautness`.
-
-    Raises:
-        SettingsError: what is no observer.
+    `settings`: of `mpc` or `nmpc`. `observer`: whose `lead` becomes `look_ahead`, of `mpc` at most half of
+    `least_delay`; if it tells a payload, its model says `payload_tautness`. Raises SettingsError: what is no observer.
     """
     if not hasattr(observer, "lead"):
         raise SettingsError(f"an observer is needed, of `softneck observer`; got {type(observer).__name__}.")

@@ -103,14 +103,8 @@ def observer_trust(
 ) -> float:
     """Return the trust of the fastest observer whose loop keeps every plant's bound on Ms.
 
-    Args:
-        arrays: of the controller.
-        families: plants, each with its bound.
-        extra_delay: samples added to their delay.
-        frequency: at which Ms is looked at [rad/s].
-
-    Raises:
-        SettingsError: not even the slowest does.
+    `arrays`: of the controller. `families`: plants, each with its bound. `extra_delay`: samples added to their delay.
+    `frequency`: at which Ms is looked at [rad/s]. Raises SettingsError: not even the slowest does.
     """
 
     def keeps(trust: float) -> bool:

@@ -29,10 +29,8 @@ _LEAST_DIRECT = 1e-9
 class Synthesis:
     """A controller and the norms of its loop.
 
-    Attributes:
-        controller: K for negative feedback, `u = K (r - y)`, with the plant's dt and names.
-        gamma: the least possible norm.
-        achieved: the norm with this controller, on a grid of frequencies.
+    `controller`: K for negative feedback, `u = K (r - y)`, with the plant's dt and names. `gamma`: the least possible
+    norm. `achieved`: the norm with this controller, on a grid of frequencies.
     """
 
     controller: control.StateSpace
@@ -180,11 +178,8 @@ _DEFINITENESS_TOLERANCE = 1e-7
 class Partition:
     """A generalised plant with D12 = [0; I], D21 = [0 I] and D22 = 0, after scaling of its signals.
 
-    Attributes:
-        A, B1, B2, C1, C2: as usual.
-        D11: (p1, m1).
-        left, right: K of the original plant is `left @ K @ right`.
-        D22: what was taken away.
+    `A`, `B1`, `B2`, `C1`, `C2`: as usual. `D11`: (p1, m1). `left`, `right`: K of the original plant is `left @ K @
+    right`. `D22`: what was taken away.
     """
 
     A: Matrix
@@ -385,9 +380,7 @@ def with_integrator(K: Any) -> control.StateSpace:
     """Return K with its slowest real pole moved to z = 1, its other modes untouched.
 
     W1's pole lies at a ten-thousandth of the bandwidth, and K inherits it; A + (1 - p) v w' moves only that mode.
-
-    Raises:
-        SettingsError: K has no pole near 1.
+    Raises SettingsError: K has no pole near 1.
     """
     import control
 

@@ -28,10 +28,8 @@ _MAX_ITERATIONS = 40
 class Structure:
     """A block structure, and which rows and columns of M belong to which block.
 
-    Attributes:
-        real: (blocks,) whether a block is a real scalar.
-        out_of: (rows of M, blocks) 1 where a row feeds a block.
-        into: (columns of M, blocks) 1 where a column comes from a block.
+    `real`: (blocks,) whether a block is a real scalar. `out_of`: (rows of M, blocks) 1 where a row feeds a block.
+    `into`: (columns of M, blocks) 1 where a column comes from a block.
     """
 
     real: Array
@@ -42,12 +40,8 @@ class Structure:
     def of(cls, blocks: Blocks) -> Structure:
         """Return the structure of `blocks` in the field's notation.
 
-        Args:
-            blocks: of each block of Delta (-1, 0) for a real scalar, (1, 0) for a complex one, (rows, columns) for a
-                full complex one; repeated scalars are not among them.
-
-        Raises:
-            SettingsError: none, or another notation.
+        `blocks`: of each block of Delta (-1, 0) for a real scalar, (1, 0) for a complex one, (rows, columns) for a full
+        complex one; repeated scalars are not among them. Raises SettingsError: none, or another notation.
         """
         if not blocks:
             raise SettingsError("`blocks` is empty; give one pair for each block of Delta.")

@@ -64,15 +64,9 @@ def makeweight(
 def weight_image(weight: Any, dt: float, name: str, size: int = 1) -> control.StateSpace | None:
     """Return a weight as a continuous system for synthesis at `dt`, after the checks that spare a hang or a lie.
 
-    Args:
-        weight: None, a number, or a system: continuous, or of the plant's sample time. A scalar one weighs each of
-            the signals alike.
-        dt: of the plant; 0 if continuous.
-        name: for messages.
-        size: signals that it weighs.
-
-    Raises:
-        SettingsError: another number of inputs, another sample time, an integrator, an unstable or improper weight.
+    `weight`: None, a number, or a system: continuous, or of the plant's sample time. A scalar one weighs each of the
+    signals alike. `dt`: of the plant; 0 if continuous. `name`: for messages. `size`: signals that it weighs. Raises
+    SettingsError: another number of inputs, another sample time, an integrator, an unstable or improper weight.
     """
     import control
 

@@ -38,12 +38,8 @@ def frame_bits(size: int, *, remote: bool = False) -> int:
 def bus_load(drives: int, *, cycle: float, guard_cycles: int, bit_rate: int, sensor_period: float = 0.0) -> float:
     """Return the part of the bus that set-points, SYNC, answers, life guarding and an inclinometer need.
 
-    Args:
-        drives: number of them.
-        cycle: of the bus [s].
-        guard_cycles: between two guarding requests to each.
-        bit_rate: [bit/s].
-        sensor_period: of an inclinometer on the bus [s]; 0 for none.
+    `drives`: number of them. `cycle`: of the bus [s]. `guard_cycles`: between two guarding requests to each.
+    `bit_rate`: [bit/s]. `sensor_period`: of an inclinometer on the bus [s]; 0 for none.
     """
     each = frame_bits(_RPDO) + frame_bits(_TPDO)
     each += (frame_bits(_GUARD, remote=True) + frame_bits(_GUARD)) / guard_cycles
@@ -112,11 +108,9 @@ class Guarding(Ranged):
 class ZeroSettings(Ranged):
     """How `softneck drives commission --only zero` tensions the tendons.
 
-    Attributes:
-        current: of the motor while it pulls [A]; by default 3.25 N with [neck]'s radius, constant and efficiency, the
-            pretension of the virtual neck, so that its rest is the zero. At 3.8 N Eq. 22 leaves the motors behind.
-        speed: of the winch while it pulls [rad/s].
-        tilt: the neck must be upright within this then [rad].
+    `current`: of the motor while it pulls [A]; by default 3.25 N with [neck]'s radius, constant and efficiency, the
+    pretension of the virtual neck, so that its rest is the zero. At 3.8 N Eq. 22 leaves the motors behind. `speed`: of
+    the winch while it pulls [rad/s]. `tilt`: the neck must be upright within this then [rad].
     """
 
     current: float = setting("current_A", 0.0151, 1e-6, 100.0)
@@ -128,10 +122,7 @@ class ZeroSettings(Ranged):
 class Neck(Ranged):
     """Constants that convert motor current into tension.
 
-    Attributes:
-        winch_radius: [m].
-        torque_constant: [N m/A].
-        efficiency: of the gear.
+    `winch_radius`: [m]. `torque_constant`: [N m/A]. `efficiency`: of the gear.
     """
 
     winch_radius: float = setting("winch_radius_m", 0.0075, 1e-6, 10.0)

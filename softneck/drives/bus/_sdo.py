@@ -58,9 +58,7 @@ def _number(index: int, subindex: int) -> struct.Struct:
 class Objects:
     """The objects of one drive.
 
-    Attributes:
-        node: its number.
-        untold: objects that took a value and cannot be read.
+    `node`: its number. `untold`: objects that took a value and cannot be read.
     """
 
     def __init__(self, link: Link, node: int) -> None:

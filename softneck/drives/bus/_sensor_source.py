@@ -18,11 +18,9 @@ SENSORS = ("simulated", "can", "serial", "python")
 class SensorSource:
     """Where the inclinometer's samples come from, beside its kind.
 
-    Attributes:
-        port, baud, request, start: of kind "serial", see `SerialInclinometer`.
-        python: of kind "python": `package.module:factory`, called with `options`.
-        options: for the factory.
-        folder: of the drives file, where modules are looked for.
+    `port`, `baud`, `request`, `start`: of kind "serial", see `SerialInclinometer`. `python`: of kind "python":
+    `package.module:factory`, called with `options`. `options`: for the factory. `folder`: of the drives file, where
+    modules are looked for.
     """
 
     port: str = ""
@@ -77,9 +75,7 @@ def axes_of(said: Sequence[str], outputs: Sequence[str]) -> Axes:
     """Parse a list such as `["-roll", "pitch"]`: the first output is the sensor's second, reversed.
 
     The sensor's own axes go by the outputs' names, in their order; an empty list is a sensor that sits as it should.
-
-    Raises:
-        SettingsError: not each axis once.
+    Raises SettingsError: not each axis once.
     """
     if not said:
         return tuple((k, 1.0) for k in range(len(outputs)))

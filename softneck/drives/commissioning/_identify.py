@@ -44,11 +44,8 @@ _SLOPE_LIMIT = 0.25
 class Expected:
     """Expected features of drives that are set up as in the file.
 
-    Attributes:
-        gain: tilt for one radian of each tendon's winch [rad/rad].
-        force: current for one radian of each tendon's winch [A/rad].
-        lag: of the tilt [s].
-        source: where that is from.
+    `gain`: tilt for one radian of each tendon's winch [rad/rad]. `force`: current for one radian of each tendon's winch
+    [A/rad]. `lag`: of the tilt [s]. `source`: where that is from.
     """
 
     gain: tuple[float, ...]

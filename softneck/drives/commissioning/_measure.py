@@ -42,9 +42,7 @@ def measure(
     """Move `motors` (from 1 on) one after the other, switch the drives off, and return the measurements.
 
     What stopped it early is in the moves; those of the motors before are whole.
-
-    Raises:
-        CheckFailedError: the pre-flight failed; nothing moved.
+    Raises CheckFailedError: the pre-flight failed; nothing moved.
     """
     file = cautious(session.file, guards)
     scales = [entry.scale for entry in file.drives]
@@ -79,10 +77,8 @@ def measure(
 def expected_of(file: DrivesFile, guards: Guards, neck: NeckParameters | None = None) -> Expected | None:
     """Return the moves of the robot's virtual plant with drives as in `file`; None without a virtual plant.
 
-    Args:
-        file: as believed.
-        guards: as for the moves themselves.
-        neck: physics of the virtual plant; None: those that the robot names.
+    `file`: as believed. `guards`: as for the moves themselves. `neck`: physics of the virtual plant; None: those that
+    the robot names.
     """
     physics = physics_of(file.moves, neck)
     if physics is None:

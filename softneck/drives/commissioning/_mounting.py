@@ -27,10 +27,8 @@ _ALL_ORDERS = 5
 class Mounting:
     """One explanation.
 
-    Attributes:
-        order: for each motor the tendon that it pulls, both from 0 on.
-        axes: for each output as it was measured which true output it is, and its sign.
-        off: rms angle between what is measured and what it should be then [rad].
+    `order`: for each motor the tendon that it pulls, both from 0 on. `axes`: for each output as it was measured which
+    true output it is, and its sign. `off`: rms angle between what is measured and what it should be then [rad].
     """
 
     order: tuple[int, ...]

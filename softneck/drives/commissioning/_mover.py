@@ -66,12 +66,9 @@ _Until = Callable[[], bool]
 class Mover:
     """The pilot of a commissioning: gives set-points and stores measurements.
 
-    Attributes:
-        done: moves of each motor that is over.
-        stopped: which guard ended the moves, "" if none did.
-        motor: which one moves, from 1 on; 0 before the first.
-        captured: counts at the newest index pulse of the motor that moves, None before the first; set by the code that
-            reads the drives' objects.
+    `done`: moves of each motor that is over. `stopped`: which guard ended the moves, "" if none did. `motor`: which one
+    moves, from 1 on; 0 before the first. `captured`: counts at the newest index pulse of the motor that moves, None
+    before the first; set by the code that reads the drives' objects.
     """
 
     def __init__(
@@ -80,12 +77,8 @@ class Mover:
     ) -> None:  # fmt: skip
         """Move `motors` (from 1 on) of those on `nodes`.
 
-        Args:
-            guards: limits.
-            nodes: of all drives.
-            counts_per_radian, turns: of each winch and of each motor's turn [counts], as the drives file has them.
-            motors: those that are to move.
-            sample_time: [s].
+        `guards`: limits. `nodes`: of all drives. `counts_per_radian`, `turns`: of each winch and of each motor's turn
+        [counts], as the drives file has them. `motors`: those that are to move. `sample_time`: [s].
         """
         self.guards, self._nodes, self._motors, self._step = guards, tuple(nodes), tuple(motors), sample_time
         self._signs = [math.copysign(1.0, scale) for scale in counts_per_radian]

@@ -104,9 +104,7 @@ class MotorMoves:
 class Moves:
     """Measurements of all motors' moves.
 
-    Attributes:
-        motors: each motor's.
-        stopped: what ended them early, "" if nothing did.
+    `motors`: each motor's. `stopped`: what ended them early, "" if nothing did.
     """
 
     motors: tuple[MotorMoves, ...]

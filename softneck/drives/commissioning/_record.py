@@ -45,10 +45,8 @@ _SLACK_RAD = 3.0
 class ExperimentResult:
     """An experiment that is over.
 
-    Attributes:
-        recording: what was logged, None if it ended before the second sample.
-        planned: rows that were asked for.
-        ended: how the run on the drives ended.
+    `recording`: what was logged, None if it ended before the second sample. `planned`: rows that were asked for.
+    `ended`: how the run on the drives ended.
     """
 
     recording: Recording | None

@@ -41,10 +41,8 @@ Look = Callable[[], Reading | None]
 class ZeroResult:
     """The result of zeroing, for each motor.
 
-    Attributes:
-        nodes: of the drives.
-        pulled: how far each winch turned until its tendon was tight [rad].
-        outputs: what is measured, and how much of it then [rad].
+    `nodes`: of the drives. `pulled`: how far each winch turned until its tendon was tight [rad]. `outputs`: what is
+    measured, and how much of it then [rad].
     """
 
     nodes: tuple[int, ...]

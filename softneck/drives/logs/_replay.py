@@ -23,11 +23,8 @@ from ._log_file import LoggedRun, read_run_log
 class Difference:
     """The first difference between a replay and its log.
 
-    Attributes:
-        cycle: number of the step.
-        time: [s] after the first step.
-        what: the quantity that differs, in words.
-        logged, replayed: both sides.
+    `cycle`: number of the step. `time`: [s] after the first step. `what`: the quantity that differs, in words.
+    `logged`, `replayed`: both sides.
     """
 
     cycle: int

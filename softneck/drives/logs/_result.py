@@ -23,11 +23,8 @@ _BIN_COUNT = 20_000
 class CycleTimes:
     """Statistics of the periods between cycles and of the computing times.
 
-    Attributes:
-        count: number of periods.
-        late: number of periods beyond 1.5 cycles.
-        missed: cycles without a step: a period of n cycles misses n - 1.
-        longest_period, longest_step: [s].
+    `count`: number of periods. `late`: number of periods beyond 1.5 cycles. `missed`: cycles without a step: a period
+    of n cycles misses n - 1. `longest_period`, `longest_step`: [s].
     """
 
     def __init__(self, cycle: float) -> None:
@@ -87,10 +84,7 @@ def signal_units(names: Iterable[str]) -> dict[str, str]:
 def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Recording:
     """Return a run as a recording: measured values, with true angles and tensions from simulated drives.
 
-    Args:
-        signals: of the run.
-        speeds: of the motors at its samples, (time, motors) [rad/s].
-        robot: of the run.
+    `signals`: of the run. `speeds`: of the motors at its samples, (time, motors) [rad/s]. `robot`: of the run.
     """
     known = set(known_channels(robot))
     channels = {name: values for name, values in signals.signals.items() if name in known}

@@ -44,11 +44,8 @@ def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[
 
     A speed is the central difference over the cycles before and after, with an error of h^2/6 of the third derivative,
     and of at most one count over 2 h. NaN if the cycles after it are missing.
-
-    Args:
-        times: of all cycles, (cycles,) [s].
-        positions: as read in all cycles, (cycles, motors) [rad]: those of the cycle before.
-        cycles: indices of the cycles.
+    `times`: of all cycles, (cycles,) [s]. `positions`: as read in all cycles, (cycles, motors) [rad]: those of the
+    cycle before. `cycles`: indices of the cycles.
     """
     k = np.asarray(cycles, dtype=np.int64)
     here = np.full((k.size, positions.shape[1]), np.nan)
@@ -98,11 +95,8 @@ def experiment_recording(
 ) -> Recording | None:
     """Return the rows of an experiment without its pauses; None for fewer than two rows, or without angles.
 
-    Args:
-        columns: channel -> (rows,).
-        run: number of the run of each row, 0 in pauses, (rows,).
-        sample_time: [s].
-        robot: of the run.
+    `columns`: channel -> (rows,). `run`: number of the run of each row, 0 in pauses, (rows,). `sample_time`: [s].
+    `robot`: of the run.
     """
     kept = np.flatnonzero(run)
     if kept.size < 2:

@@ -72,9 +72,7 @@ def partial(path: Path) -> Path:
 def require_log_path(path: Path, *, force: bool = False) -> None:
     """Raise an error if `RunLogger` cannot write to `path`.
 
-    Raises:
-        SettingsError: another ending than `.mcap`.
-        OutputFileError: the file exists.
+    Raises SettingsError: another ending than `.mcap`; OutputFileError: the file exists.
     """
     if path.suffix.lower() != RUN_LOG:
         raise SettingsError(f"{path}: a log ends in {RUN_LOG}.")
@@ -101,27 +99,17 @@ class RunLogger:
     """Writer of the log of one run. The loop only puts references into a queue; a thread encodes them.
 
     A log has `.part` before its ending until the run is over; the log of a killed process can be read.
-
-    Attributes:
-        path: of the log.
-        lost: number of cycles dropped because the disk was too slow.
-        problem: reason why writing ended, "" while it goes on.
-        described: whether a run has started; before that there is no data for a replay.
+    `path`: of the log. `lost`: number of cycles dropped because the disk was too slow. `problem`: reason why writing
+    ended, "" while it goes on. `described`: whether a run has started; before that there is no data for a replay.
     """
 
     def __init__(self, path: Path, *, force: bool = False, wait: bool = False, epoch: float = 0.0) -> None:
         """Open the file.
 
-        Args:
-            path: of the log.
-            force: replace an existing one.
-            wait: whether the loop may wait for the disk, as in virtual time.
-            epoch: wall-clock time [s] of t = 0 of the loop's clock; read once, so that jumps of the wall clock have no
-                effect.
-
-        Raises:
-            SettingsError: another ending than `.mcap`.
-            OutputFileError: the file exists or cannot be written.
+        `path`: of the log. `force`: replace an existing one. `wait`: whether the loop may wait for the disk, as in
+        virtual time. `epoch`: wall-clock time [s] of t = 0 of the loop's clock; read once, so that jumps of the wall
+        clock have no effect. Raises SettingsError: another ending than `.mcap`; OutputFileError: the file exists or
+        cannot be written.
         """
         self.path = path
         require_log_path(path, force=force)

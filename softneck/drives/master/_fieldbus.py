@@ -153,10 +153,7 @@ class DriveView:
 class Fieldbus:
     """Reader and writer of the cyclic frames of all drives.
 
-    Attributes:
-        settings: as given.
-        drives: the views.
-        malformed: number of frames with a wrong length so far.
+    `settings`: as given. `drives`: the views. `malformed`: number of frames with a wrong length so far.
     """
 
     def __init__(self, settings: BusSettings) -> None:

@@ -18,10 +18,8 @@ _RATE, _MARGIN = 8.0, math.radians(3.0)
 class Reading(NamedTuple):
     """One raw sample of a robot's outputs.
 
-    Attributes:
-        values: of the outputs [rad].
-        rates: [rad/s]; NaN without a gyro.
-        valid: False while the sensor itself reports no measurement.
+    `values`: of the outputs [rad]. `rates`: [rad/s]; NaN without a gyro. `valid`: False while the sensor itself reports
+    no measurement.
     """
 
     values: tuple[float, ...]

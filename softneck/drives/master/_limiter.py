@@ -15,10 +15,8 @@ _NEAR_LIMIT_SHARE = 0.8
 class Limiter:
     """Limiter of the set-point of one motor.
 
-    Attributes:
-        value: set-point [rad].
-        speed: of the set-point [rad/s].
-        clamped: the limit that was active in the last step; "" if none.
+    `value`: set-point [rad]. `speed`: of the set-point [rad/s]. `clamped`: the limit that was active in the last step;
+    "" if none.
     """
 
     __slots__ = ("_aim", "_cycle", "_limits", "_range", "_slack_at", "clamped", "speed", "value")
@@ -26,10 +24,8 @@ class Limiter:
     def __init__(self, limits: LimitSettings, cycle: float, own: tuple[float, float, float] | None = None) -> None:
         """Start at zero and at rest.
 
-        Args:
-            limits: of all motors.
-            cycle: of the bus [s].
-            own: limits of this motor: lowest and highest set-point [rad], largest speed [rad/s].
+        `limits`: of all motors. `cycle`: of the bus [s]. `own`: limits of this motor: lowest and highest set-point
+        [rad], largest speed [rad/s].
         """
         self._limits, self._cycle = limits, cycle
         self._range = own or (-limits.position, limits.position, limits.speed)

@@ -25,11 +25,8 @@ Motors = tuple[float, ...]
 class Measurement:
     """Measurements for the pilot at one sample.
 
-    Attributes:
-        index: of the sample, from 0 at the start of the phase `running`.
-        tilt: last accepted sample.
-        fresh: whether it is the present one.
-        positions: of the motors [rad].
+    `index`: of the sample, from 0 at the start of the phase `running`. `tilt`: last accepted sample. `fresh`: whether
+    it is the present one. `positions`: of the motors [rad].
     """
 
     index: int

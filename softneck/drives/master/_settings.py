@@ -89,10 +89,8 @@ class WatchSettings(Ranged):
 class RampSettings(Ranged):
     """Settings of the ramps at the start and the end of a run.
 
-    Attributes:
-        speed: of ramps [rad/s].
-        settle: waiting time at the end of a ramp [s].
-        tolerance: of the motors to their rest there [rad].
+    `speed`: of ramps [rad/s]. `settle`: waiting time at the end of a ramp [s]. `tolerance`: of the motors to their rest
+    there [rad].
     """
 
     speed: float = setting("speed_rad_s", 1.0, 0.01, 10.0)
@@ -104,11 +102,9 @@ class RampSettings(Ranged):
 class ChannelSettings:
     """Properties of the robot for the master.
 
-    Attributes:
-        outputs: names of the measured outputs.
-        weights: (outputs, motors), each output's direction; () if still to be identified, in which case motors and
-            outputs are not compared; None: those of the neck, by its tendons' angles.
-        ranges: of each motor: lowest and highest set-point [rad], largest speed [rad/s].
+    `outputs`: names of the measured outputs. `weights`: (outputs, motors), each output's direction; () if still to be
+    identified, in which case motors and outputs are not compared; None: those of the neck, by its tendons' angles.
+    `ranges`: of each motor: lowest and highest set-point [rad], largest speed [rad/s].
     """
 
     outputs: tuple[str, ...]

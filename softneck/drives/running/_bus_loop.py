@@ -123,16 +123,9 @@ def run_session(
 
     On a bus without an operator a `Keyboard` is one: SIGTERM ends it by the ramp to rest, a second one at once. A
     service manager is told (sd_notify) when the pre-flight holds, which phase the run is in, and that the loop lives.
-
-    Args:
-        session: on what.
-        pilot: gives set-points each `sample_time`.
-        sample_time: [s]; a multiple of the bus period.
-        most: length of what the pilot does [s].
-        begin: called with the master before the first cycle.
-
-    Raises:
-        CheckFailedError: the pre-flight failed; nothing moved.
+    `session`: on what. `pilot`: gives set-points each `sample_time`. `sample_time`: [s]; a multiple of the bus period.
+    `most`: length of what the pilot does [s]. `begin`: called with the master before the first cycle. Raises
+    CheckFailedError: the pre-flight failed; nothing moved.
     """
     if session.simulated:
         return _run_session(session, pilot, sample_time, most, begin, Notifier({}))

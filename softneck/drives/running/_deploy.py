@@ -28,10 +28,8 @@ from ._virtual import Watch, simulated_plant
 class Deployment:
     """A loop that is ready for drives.
 
-    Attributes:
-        loop: with the controller that is to run.
-        neck: the loop's plant if that is a virtual neck, else None.
-        notes: what of the loop file does not apply on drives.
+    `loop`: with the controller that is to run. `neck`: the loop's plant if that is a virtual neck, else None. `notes`:
+    what of the loop file does not apply on drives.
     """
 
     loop: Loop

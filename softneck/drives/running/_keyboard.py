@@ -26,10 +26,7 @@ class Keyboard:
 
     Keys are read only where stdin is a terminal and this process has it in the foreground; signals only in the main
     thread, and not where they were ignored before (`nohup`).
-
-    Attributes:
-        interrupted: whether Ctrl-C or Ctrl-Z was pressed, or the terminal was closed.
-        terminated: whether SIGTERM came.
+    `interrupted`: whether Ctrl-C or Ctrl-Z was pressed, or the terminal was closed. `terminated`: whether SIGTERM came.
     """
 
     def __init__(self) -> None:

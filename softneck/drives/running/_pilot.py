@@ -15,6 +15,7 @@ from softneck.robot import Robot
 from softneck.signals import NECK, require_same_robot
 
 from ..bus._link import VirtualLink
+from ..bus._robot import count_word
 from ..logs._result import signal_units
 from ..logs._rows import Motion, columns_of, experiment_channels, truths
 from ..master import Frame, Master, Phase
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 # Nothing is recorded here: the master's log does that.
 _NO_TABLE = np.zeros((0, 0))
-_NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight")
 
 
 class LoopPilot:
@@ -70,7 +70,7 @@ class LoopPilot:
             first = wiring.spans["controller"].start
             self._chosen = np.array([first + names.index(name) for name in robot.set_points])
         except ValueError as error:
-            word = _NUMBER_WORDS[len(robot.set_points)]
+            word = count_word(len(robot.set_points))
             raise SettingsError(f"the controller does not give {word} motor set-points: {', '.join(names)}.") from error
         # Where the plant would say each output and each rate, by their number in a sample.
         outputs = [*robot.outputs.names, *(f"{name}_rate" for name in robot.outputs.names)]

@@ -175,11 +175,8 @@ class PreflightCheck:
 class Report:
     """The result of one check.
 
-    Attributes:
-        overridden: names that are let pass by the user.
-        guarding: "life" or "heartbeat", as it was set up.
-        rows: all lines.
-        late_modes: nodes of drives that take their mode in Operation Enabled alone.
+    `overridden`: names that are let pass by the user. `guarding`: "life" or "heartbeat", as it was set up. `rows`: all
+    lines. `late_modes`: nodes of drives that take their mode in Operation Enabled alone.
     """
 
     overridden: tuple[str, ...] = ()

@@ -49,9 +49,7 @@ def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
     """Return drives on springs, for a robot without virtual plant; its directions give the outputs.
 
     Gain and lag of the outputs are those that the drives file watches for, motors and winches its own.
-
-    Raises:
-        SettingsError: the robot's directions are to be identified: nobody knows yet what its motors do.
+    Raises SettingsError: the robot's directions are to be identified: nobody knows yet what its motors do.
     """
     robot, neck = file.moves, file.neck
     weights = robot.weights()
@@ -78,10 +76,8 @@ def simulated_springs(file: DrivesFile, **how: Any) -> SimulatedSprings:
 def simulated_plant(file: DrivesFile, neck: NeckParameters | None, **how: Any) -> SimulatedNeck | SimulatedSprings:
     """Return the plant of the simulated drives of `file`: the virtual plant, or springs.
 
-    Args:
-        file: of the drives, and what they move.
-        neck: physics of the virtual plant; None: those that the robot names.
-        how: see `simulated_neck`.
+    `file`: of the drives, and what they move. `neck`: physics of the virtual plant; None: those that the robot names.
+    `how`: see `simulated_neck`.
     """
     physics = physics_of(file.moves, neck)
     return simulated_springs(file, **how) if physics is None else simulated_neck(file, physics, **how)

@@ -52,9 +52,7 @@ def tilt_of_line(line: bytes) -> Tilt | None:
 class TiltLines:
     """Parser of samples in a stream of bytes; damaged data only affects its own line.
 
-    Attributes:
-        good, bad: numbers of lines so far.
-        strange: the last bytes that were not a line of this protocol.
+    `good`, `bad`: numbers of lines so far. `strange`: the last bytes that were not a line of this protocol.
     """
 
     def __init__(self) -> None:

@@ -224,10 +224,8 @@ def make_python_sensor(
     """Call the factory `package.module:factory` with `options`; the module is also searched in `folder`.
 
     Its sensor returns `Tilt`s, or for robots without two outputs a sequence with one number for each output [rad].
-
-    Raises:
-        SettingsError: there is no such factory, or it does not return a sensor.
-        SensorError: the factory raises an error.
+    Raises SettingsError: there is no such factory, or it does not return a sensor; SensorError: the factory raises an
+    error.
     """
     module, _, name = python.partition(":")
     place = str(folder.resolve())

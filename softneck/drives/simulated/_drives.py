@@ -80,10 +80,7 @@ class SimulatedDrives(abc.ABC):
     def __init__(self, settings: SimulatedSettings, *, current_limit: float, latency: float) -> None:
         """Make drives without power; `homed` ones have their zero.
 
-        Args:
-            settings: of the drives.
-            current_limit: initial current limit [A].
-            latency: of the cyclic mode [s].
+        `settings`: of the drives. `current_limit`: initial current limit [A]. `latency`: of the cyclic mode [s].
         """
         count = len(settings.nodes)
         self.settings = settings

@@ -14,10 +14,7 @@ from ._sdo import WRONG_STATE, WRONG_VALUE, SdoServer
 class CanFrame(NamedTuple):
     """One frame with an 11-bit identifier.
 
-    Attributes:
-        identifier: COB-ID.
-        data: at most 8 bytes.
-        remote: a request (RTR).
+    `identifier`: COB-ID. `data`: at most 8 bytes. `remote`: a request (RTR).
     """
 
     identifier: int

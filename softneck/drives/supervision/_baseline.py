@@ -20,12 +20,10 @@ Rows = tuple[Row, ...]
 class Tracking(NamedTuple):
     """Reference model of the tracking of a loop; all fields are empty without a loop.
 
-    Attributes:
-        weights: c_i.
-        whitening: filter of each output's residual; spread: variance of its innovation [rad^2], and its increase for
-            each rad^2 between reference and model, and for each rad^2 of change of the model over two samples.
-        bias: largest mean over a second of each residual on runs outside the fit [rad].
-        thresholds: of the charts, an upper and a lower one for each output.
+    `weights`: c_i. `whitening`: filter of each output's residual; spread: variance of its innovation [rad^2], and its
+    increase for each rad^2 between reference and model, and for each rad^2 of change of the model over two samples.
+    `bias`: largest mean over a second of each residual on runs outside the fit [rad]. `thresholds`: of the charts, an
+    upper and a lower one for each output.
     """
 
     weights: Row = ()

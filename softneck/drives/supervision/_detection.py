@@ -50,12 +50,8 @@ class Whitening:
     def fit(cls, residuals: Sequence[Vector], *, most: int = 6) -> Whitening:
         """Fit an autoregression with the order of the smallest corrected Akaike criterion (AICc).
 
-        Args:
-            residuals: of undisturbed segments, each (time,); regressors do not cross segments.
-            most: highest order.
-
-        Raises:
-            DataError: a residual that is not finite, or no segment of 20 rows.
+        `residuals`: of undisturbed segments, each (time,); regressors do not cross segments. `most`: highest order.
+        Raises DataError: a residual that is not finite, or no segment of 20 rows.
         """
         if not all(np.isfinite(part).all() for part in residuals):
             raise DataError("residuals must be finite to fit a whitening filter.")
@@ -91,10 +87,8 @@ def lags(x: Vector, order: int) -> Matrix:
 class Filter:
     """Recursive whitening filters, one for each channel, for residuals and for their means under faults.
 
-    Attributes:
-        coefficients: (order, channels), zero beyond a channel's own order.
-        past: past values, latest first (order, kinds, channels).
-        seen: number of values so far.
+    `coefficients`: (order, channels), zero beyond a channel's own order. `past`: past values, latest first (order,
+    kinds, channels). `seen`: number of values so far.
     """
 
     __slots__ = ("_step", "coefficients", "past", "seen")
@@ -130,11 +124,8 @@ class Filter:
 def shift_score(innovation: Vector, mean: Vector, variance: Vector, *, sight: float = CHART_CLIP) -> Vector:
     """Return s (hypotheses,) for the hypotheses `mean` (hypotheses, channels).
 
-    Args:
-        innovation: e (channels,).
-        mean: f of each hypothesis, after the same whitening (hypotheses, channels).
-        variance: v of the innovation (channels,).
-        sight: limit of a fault in standard deviations.
+    `innovation`: e (channels,). `mean`: f of each hypothesis, after the same whitening (hypotheses, channels).
+    `variance`: v of the innovation (channels,). `sight`: limit of a fault in standard deviations.
     """
     spread = np.maximum(np.sqrt(variance), np.abs(mean) / sight)
     e = innovation / spread
@@ -147,9 +138,7 @@ def shift_score(innovation: Vector, mean: Vector, variance: Vector, *, sight: fl
 class Charts:
     """Parallel cumulative sums.
 
-    Attributes:
-        sums: S of each (charts,).
-        thresholds: h of each (charts,).
+    `sums`: S of each (charts,). `thresholds`: h of each (charts,).
     """
 
     __slots__ = ("sums", "thresholds")

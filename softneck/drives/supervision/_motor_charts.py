@@ -134,10 +134,7 @@ def motor_names(motors: int) -> list[tuple[str, int]]:
 class MotorCharts:
     """The charts of all motors.
 
-    Attributes:
-        features: of this cycle.
-        scores: of the last cycle, in the order of `motor_names`.
-        charts: their sums.
+    `features`: of this cycle. `scores`: of the last cycle, in the order of `motor_names`. `charts`: their sums.
     """
 
     def __init__(self, baseline: Baseline, thresholds: Vector | None = None) -> None:

@@ -28,10 +28,7 @@ _LEAD_LOG_LIKELIHOOD = 20.0
 class Finding(NamedTuple):
     """A detected fault.
 
-    Attributes:
-        name: of the event.
-        motor: from 0; -1 for none.
-        detail: further text.
+    `name`: of the event. `motor`: from 0; -1 for none. `detail`: further text.
     """
 
     name: str
@@ -89,10 +86,8 @@ class Plausibility:
     ) -> Finding | None:
         """Process a sample, after `cycle`.
 
-        Args:
-            positions: of the motors [rad].
-            values: of the tilt [rad], None if missing; rates: of its gyro [rad/s] or NaN.
-            reference: of the loop at the time of the measurement [rad], () without one.
+        `positions`: of the motors [rad]. `values`: of the tilt [rad], None if missing; rates: of its gyro [rad/s] or
+        NaN. `reference`: of the loop at the time of the measurement [rad], () without one.
         """
         if self._rate(values is None):
             return Finding("sensor_rate", -1, "samples are missing more often than in the commissioning run")

@@ -77,9 +77,7 @@ class TiltModel:
 class GyroLevel:
     """Difference of angles and integrated rates, without slow parts: bias of the gyro and initial angle.
 
-    Attributes:
-        level: [rad] (outputs,).
-        known: whether the bias was averaged for long enough.
+    `level`: [rad] (outputs,). `known`: whether the bias was averaged for long enough.
     """
 
     def __init__(self, outputs: int, step: float) -> None:
@@ -207,12 +205,9 @@ class TiltCharts:
     ) -> int:
         """Process one sample; return the number of a chart beyond its threshold, -1 for none.
 
-        Args:
-            positions: of the motors (motors,) [rad].
-            taut: tensions of the tendons without friction (motors,) [N].
-            values: of the tilt (outputs,) [rad]; None if missing.
-            rates: of its gyro (outputs,) [rad/s]; NaN without one.
-            known_load: whether the load of the tendons is within the experiments.
+        `positions`: of the motors (motors,) [rad]. `taut`: tensions of the tendons without friction (motors,) [N].
+        `values`: of the tilt (outputs,) [rad]; None if missing. `rates`: of its gyro (outputs,) [rad/s]; NaN without
+        one. `known_load`: whether the load of the tendons is within the experiments.
         """
         parts = self._model.step(positions)
         angle = parts.sum(axis=0)

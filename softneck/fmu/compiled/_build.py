@@ -87,9 +87,7 @@ def next_outputs(block: Block) -> tuple[Port, ...]:
     """Return the additional outputs of an FMU with sensitivities: its outputs at the next sample.
 
     These are the robot's outputs for an identified plant, and the leading numeric outputs for other blocks.
-
-    Raises:
-        SettingsError: a kind that has no derivative, or no such outputs.
+    Raises SettingsError: a kind that has no derivative, or no such outputs.
     """
     try:
         with_tangent(bundle(block.runtime, loops=False))

@@ -35,11 +35,8 @@ _PROGRESS_FILE = "begun.json"  # state of an interrupted `make native`
 class Library:
     """Libraries with their sources.
 
-    Attributes:
-        binaries: platform -> bytes.
-        sources: all C sources.
-        origin: one line on how they were compiled.
-        streams: bytes -> the deflated bytes, if already known.
+    `binaries`: platform -> bytes. `sources`: all C sources. `origin`: one line on how they were compiled. `streams`:
+    bytes -> the deflated bytes, if already known.
     """
 
     binaries: dict[str, bytes]
@@ -51,13 +48,9 @@ class Library:
 def find_library(modules: set[str] | None = None, *, sensitivities: bool = False) -> Library:
     """Return the available libraries; if there are none, compile one for this machine.
 
-    Args:
-        modules: that it must contain; modules for robots of other sizes than the neck are compiled for this machine.
-        sensitivities: with the derivatives of the kinds' steps.
-
-    Raises:
-        FileFormatError: a library is damaged.
-        SettingsError: there is no library, no C compiler and no zig.
+    `modules`: that it must contain; modules for robots of other sizes than the neck are compiled for this machine.
+    `sensitivities`: with the derivatives of the kinds' steps. Raises FileFormatError: a library is damaged;
+    SettingsError: there is no library, no C compiler and no zig.
     """
     if modules and not modules <= set(RUNTIMES):
         return _local_library(tuple(sorted(modules)), sensitivities=sensitivities)
@@ -70,12 +63,8 @@ def find_library(modules: set[str] | None = None, *, sensitivities: bool = False
 def packaged_library(folder: Path = BINARIES, modules: set[str] | None = None) -> Library | None:
     """Return the libraries that `make native` built, or None if there are none for the present sources.
 
-    Args:
-        folder: of the libraries.
-        modules: that it must contain: the first part with all of them is returned; the whole if None or no part has.
-
-    Raises:
-        FileFormatError: a file is damaged.
+    `folder`: of the libraries. `modules`: that it must contain: the first part with all of them is returned; the whole
+    if None or no part has. Raises FileFormatError: a file is damaged.
     """
     manifest = _manifest(folder)
     if manifest is None or manifest["key"] != sources_key(sensitivities=folder == SENSITIVE):

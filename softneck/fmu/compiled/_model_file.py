@@ -74,9 +74,7 @@ def model_bytes(block: Block, name: str, guid: str, *, ahead: int = 0) -> bytes:
     """Return the model file of `block`; by `guid` the library checks that it belongs to the model description.
 
     The last `ahead` outputs are the first outputs at the next sample.
-
-    Raises:
-        SettingsError: the block's kind is not in the library.
+    Raises SettingsError: the block's kind is not in the library.
     """
     writer = _Writer()
     writer.text(name)

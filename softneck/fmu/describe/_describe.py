@@ -73,11 +73,8 @@ _PAGE_STYLE = (
 def documentation_page(name: str, block: Block, info: FmuInfo, host: str = "") -> str:
     """Return the page as one HTML text without any outside resource.
 
-    Args:
-        name: of the model.
-        block: with its outputs of the next sample.
-        info: texts of the FMU.
-        host: requirements of the host; "" for Python.
+    `name`: of the model. `block`: with its outputs of the next sample. `info`: texts of the FMU. `host`: requirements
+    of the host; "" for Python.
     """
     title = escape(info.description or f"{block.kind} ({block.role})")
     timing = _TIMING["plant" if block.role == "plant" else "other"]
@@ -157,9 +154,7 @@ class Buildable(Protocol):
 def buildable(thing: Buildable | Block | str | Path, robot: str | Path | Robot | None = None) -> Any:
     """Return the object with a block: itself, or read from a softneck file, a neck or robot file, or a preset.
 
-    Raises:
-        FileFormatError: a file without a block.
-        SettingsError: not a file, a preset or an object with a block.
+    Raises FileFormatError: a file without a block; SettingsError: not a file, a preset or an object with a block.
     """
     thing = own_controller(thing)
     if not isinstance(thing, str | Path):

@@ -92,11 +92,9 @@ _OUTPUT_ENDINGS = ("_measured", "_reference")
 class Identity:
     """Name, GUID, generation date and build of one FMU.
 
-    Attributes:
-        name, guid, date: as in FMI.
-        tool: that built it; None for pythonfmu.
-        sources: files to compile it from; empty for FMUs with Python.
-        ahead: number of outputs at the next sample, with derivatives; they are the last outputs.
+    `name`, `guid`, `date`: as in FMI. `tool`: that built it; None for pythonfmu. `sources`: files to compile it from;
+    empty for FMUs with Python. `ahead`: number of outputs at the next sample, with derivatives; they are the last
+    outputs.
     """
 
     name: str

@@ -50,11 +50,9 @@ _SLAVE_FILES = ("_slave_compiled.py", "_slave_exit.py", "_slave.py")
 class SlaveModule:
     """The Python code of an FMU.
 
-    Attributes:
-        name, source: of the module with runtime and slave.
-        script_name, script: of the script that pythonfmu's binary loads for each instance.
-        runtime: name under which softneck and the FMUs cache the compiled runtime.
-        options: of numba, to compile it.
+    `name`, `source`: of the module with runtime and slave. `script_name`, `script`: of the script that pythonfmu's
+    binary loads for each instance. `runtime`: name under which softneck and the FMUs cache the compiled runtime.
+    `options`: of numba, to compile it.
     """
 
     name: str

@@ -38,9 +38,7 @@ def write_zip(path: Path, members: Mapping[str, bytes], streams: Mapping[bytes, 
     """Write `members` (archive name -> content) to `path`: sorted, deflated, with fixed times and rights.
 
     `streams` has content that is already deflated (by a slower, better compressor), which zipfile does not accept.
-
-    Raises:
-        SettingsError: more than 4 GB.
+    Raises SettingsError: more than 4 GB.
     """
     if sum(map(len, members.values())) > _MOST:
         raise SettingsError(f"{path.name}: would have more than 4 GB, which not every host reads; fit fewer points.")

@@ -132,11 +132,8 @@ _PLACE = re.compile(r"(?:[a-z]\w*|\(\*\w+\)|v_\w+->arrays\[\d+\]\.v\d)(?:\.f\d+|
 class Scope:
     """Variables and lines of a function under translation.
 
-    Attributes:
-        lines: of C.
-        variables: name -> type, widened from pass to pass.
-        allocates: whether the function allocates workspace.
-        by_pointer: parameter passed by pointer, or a named part of one -> C.
+    `lines`: of C. `variables`: name -> type, widened from pass to pass. `allocates`: whether the function allocates
+    workspace. `by_pointer`: parameter passed by pointer, or a named part of one -> C.
     """
 
     def __init__(self, function: str, types: CTypes, variables: dict[str, Type]) -> None:
