@@ -100,7 +100,7 @@ def test_what_too_few_rows_cannot_tell_is_not_told(call: Call, rls_file: Path) -
     write_recording("short.csv", WHOLE.rows(0, 70))  # 45 errors; a correlation at lag 25 needs more than 50
     said = call("validate", rls_file, "--data", "short.csv", "--html", "page.html")
     assert said.code == 0
-    assert "too few one-step errors to test whether they are white" in said.out
+    assert "too few residuals for a test of whiteness" in said.out
     assert "nan" not in said.out
     page = Path("page.html").read_text(encoding="utf-8")
-    assert "Too few one-step errors to test whether they are white." in page
+    assert "Too few residuals for a test of whiteness." in page
