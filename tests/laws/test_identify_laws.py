@@ -63,6 +63,7 @@ def check(label: str, name: str, view: View) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize(("name", "view"), [(name, view) for name in ("finger", "joint")
                                             for view in (*UNITS[name], *PACES)])  # fmt: skip
@@ -94,6 +95,7 @@ def test_a_cheap_kind_sees_the_same(label: str, name: str, view: View) -> None:
     check(label, name, view)
 
 
+@pytest.mark.slow
 @pytest.mark.nightly
 @pytest.mark.parametrize(("name", "view"), VIEWS)
 @pytest.mark.parametrize("label", DEAR)
