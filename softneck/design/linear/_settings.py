@@ -57,12 +57,16 @@ class LoopSettings:
     A kind calls `LoopSettings.__post_init__(self)` by name: with slots `super()` would look in the wrong class.
 
     How far and how fast motors go, and how often, is in the robot's file.
-    `lead_limit`: how far a set-point may be from its measured motor [SI]; keeps the integral from winding up while a
-    drive at its current limit falls behind. None: of the neck 0.4 rad, without a nominal set-point no limit.
-    `least_cocontraction`: the co-contraction reference is at least this [SI]; keeps tendons taut under a payload. None
-    for no such rule. `order`: of the loop; "jacobi" adds one sample for the controller and one for the observer.
-    `rise_s`: time [s] in which a step on the nominal plant rises from 10 to 90 %, no limit acting; the reference filter
-    is made for it in the place of `reference_time`. None: by that.
+
+    Attributes:
+        lead_limit: how far a set-point may be from its measured motor [SI]; keeps the integral
+            from winding up while a drive at its current limit falls behind. None: of the neck 0.4 rad, without a
+            nominal set-point no limit.
+        least_cocontraction: the co-contraction reference is at least this [SI]; keeps tendons
+            taut under a payload. None for no such rule.
+        order: of the loop; "jacobi" adds one sample for the controller and one for the observer.
+        rise_s: time [s] in which a step on the nominal plant rises from 10 to 90 %, no limit acting; the reference
+            filter is made for it in the place of `reference_time`. None: by that.
     """
 
     #: How far a set-point may be from its motor, scaled.
@@ -153,10 +157,13 @@ class AxisSettings(LoopSettings, ABC):
     """Settings that all kinds of linear controller share; a kind adds its own and one synthesis.
 
     Limits and the order of the loop are those of `LoopSettings`.
-    `max_sensitivity`: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
-    `reference_time`: T2 of the reference filter (1 + T1 s)/(1 + T2 s) [s]; None for the least with which no sample
-    overshoots a step of 10 deg by more than 4 %, from half the plant's lag on. Or T2 and lead, [0.2, 0.5]: T1 is that
-    part of the loop's own lag (its rise over ln 9); what moves is followed the closer, and a step overshoots rather.
+
+    Attributes:
+        max_sensitivity: bound on Ms around every sample of the plant; what a kind chooses itself keeps it.
+        reference_time: T2 of the reference filter (1 + T1 s)/(1 + T2 s) [s]; None for the least with which no sample
+            overshoots a step of 10 deg by more than 4 %, from half the plant's lag on. Or T2 and lead, [0.2, 0.5]: T1
+            is that part of the loop's own lag (its rise over ln 9); what moves is followed the closer, and a step
+            overshoots rather.
     """
 
     KIND: ClassVar[str]
