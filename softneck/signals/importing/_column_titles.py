@@ -89,8 +89,26 @@ _UNITS = {
     "mm": "mm", "m": "m", "grad": "deg", "grados": "deg", "grado": "deg", "grad/s": "deg/s", "grados/s": "deg/s",
     "radianes": "rad", "radiant": "rad", "rad/seg": "rad/s", "u/min": "rpm", "1/min": "rpm", "sek": "s",
     "sekunden": "s", "seg": "s", "segundos": "s", "millisekunden": "ms", "milisegundos": "ms", "mikrosekunden": "us",
-    "microsegundos": "us", "nsec": "ns", "nanosec": "ns",
+    "microsegundos": "us", "nsec": "ns", "nanosec": "ns", "min": "min", "mins": "min", "minutes": "min",
+    "minuten": "min", "minutos": "min", "h": "h", "hr": "h", "hours": "h", "stunden": "h", "horas": "h", "d": "days",
+    "day": "days", "days": "days", "tage": "days", "dias": "days", "mrad": "mrad", "milliradians": "mrad",
+    "turn": "turns", "turns": "turns", "rev": "turns", "revs": "turns", "revolutions": "turns", "rotations": "turns",
+    "gon": "gon", "cdeg": "cdeg", "centidegrees": "cdeg", "mdeg": "mdeg", "arcmin": "arcmin", "arcsec": "arcsec",
 }  # fmt: skip
+# Units of quantities that are no angles: of drives, of other sensors, and shares of a range.
+_NO_ANGLES = {
+    "%", "pct", "percent", "prozent", "v", "mv", "volt", "volts", "a", "ma", "amp", "amps", "bar", "mbar", "pa", "kpa",
+    "mpa", "hpa", "psi", "atm", "mmhg", "n", "mn", "nm", "mnm", "kn", "kg", "g", "m", "mm", "cm", "um", "inch", "in",
+    "w", "hz", "m/s", "m/s2", "m/s^2", "c", "degc", "°c", "t", "mt", "gauss",
+}  # fmt: skip
+# Of these, words as well: a unit only in brackets.
+_WORDS_TOO = {"in", "ma", "pa", "mn", "kn", "mt", "um"}
+# What stands where a unit would, and is none: an encoder's counts, numbers without a unit.
+_NO_UNITS = {"", "-", "1", "counts", "count", "ticks", "inc", "lsb", "raw", "a.u.", "au", "n/a"}
+# `_V` and `_kPa` at the end of a title; in lower case some are words.
+_CAPITAL = re.compile(r"[_ ](V|A|N|W|Nm|Pa|kPa|hPa|MPa|mmHg)$")
+# `setpoint / rad`, as DIN 1313 writes units of axes.
+_SLASH = re.compile(r"\s/\s*(\S+)\s*$")
 _BRACKET = re.compile(r"\s*[\[(]([^\])]*)[\])]\s*$")
 # `position[0]` of ROS and `u(:,1)` of MATLAB are motor numbers, not units.
 _INDEX = re.compile(r":?,?\s*\d+")
@@ -139,28 +157,38 @@ class Title:
     unit: str | None
     why: str
     rank: int = 0
+    other: str = ""
 
 
 def read_title(title: str) -> Title:
     """Return the meaning of a column's title."""
-    text, unit = _without_unit(title.strip())
+    text, unit, other = _without_unit(title.strip())
     words = words_of(text)
     numbers = [int(word) for word in words if word.isdigit() and len(word) < 4]
     names = [word for word in words if not word.isdigit()]
     if unit is None and len(names) > 1 and names[-1] in _UNITS and len(names[-1]) > 1:
         unit = _UNITS[names.pop()]
+    if unit is None and not other and len(names) > 1 and names[-1] in _NO_ANGLES - _WORDS_TOO and len(names[-1]) > 1:
+        other = names.pop()
     motor = numbers[-1] if numbers else None
     role, why, rank = _role(names, motor)
+    if unit in ("mm", "m"):
+        unit, other = None, unit
+    if other.lower() in _NO_ANGLES and role not in ("time", "run", "ignored", "unknown", "velocity"):
+        return Title("ignored", " ".join(names), motor, None, f"{other} is no unit of an angle", rank, other)
     if role == "time" and unit is None and names and names[-1] in _UNITS and names[-1] != "m":
         unit = _UNITS[names[-1]]
-    return Title(role, " ".join(names), motor, unit, why, rank)
+    return Title(role, " ".join(names), motor, unit, why, rank, other)
 
 
-def _without_unit(title: str) -> tuple[str, str | None]:
-    match = _BRACKET.search(title)
+def _without_unit(title: str) -> tuple[str, str | None, str]:
+    """Return a title without its unit, the unit if it is one of time or angle, and the text of another."""
+    match = _BRACKET.search(title) or _SLASH.search(title) or _CAPITAL.search(title)
     if match is None or _INDEX.fullmatch(match[1].strip()):
-        return title, None
-    return title[: match.start()], _UNITS.get(plain(match[1].strip()), _UNITS.get(match[1].strip().lower()))
+        return title, None, ""
+    text = match[1].strip()
+    unit = _UNITS.get(plain(text), _UNITS.get(text.lower()))
+    return title[: match.start()], unit, text if unit is None and text not in _NO_UNITS else ""
 
 
 def _role(words: list[str], motor: int | None) -> tuple[str, str, int]:

@@ -99,8 +99,17 @@ _TILT_CHANNELS = ("pitch", "roll", "inclination", *_REFERENCE_CHANNELS)
 # [s] The paper's sample time, the prior where data leave it open; two thirds of all loggers lie within a factor of
 # exp(1.2).
 _USUAL_STEP_S, _STEP_SPREAD = 0.02, 1.2
+# A sample time so many times longer or shorter than usual is doubted; the other reading is taken if it is this near.
+_FAR_STEP, _NEAR_STEP = 50.0, 5.0
+# What a clock's numbers may be, times what the title says: s for ms, us or min, and the other way round.
+_OTHER_READINGS = (1e3, 1e-3, 1e6, 1e-6, 60.0, 1.0 / 60.0)
 # Unit in the title of a time column -> unit `s` or `ms` of the layout, and factor.
 _CLOCKS = {"s": ("s", 1.0), "ms": ("ms", 1.0), "us": ("ms", 1e-3), "ns": ("ms", 1e-6)}
+# The same of units that only a title can name.
+_TITLED_CLOCKS = {**_CLOCKS, "min": ("s", 60.0), "h": ("s", 3600.0), "days": ("s", 86400.0)}
+# Unit of an angle in a title -> unit of the layout, and factor.
+_TITLED_ANGLES = {"mrad": ("rad", 1e-3), "turns": ("rad", 2.0 * pi), "gon": ("rad", pi / 200.0), "cdeg": ("deg", 1e-2),
+                  "mdeg": ("deg", 1e-3), "arcmin": ("deg", 1.0 / 60.0), "arcsec": ("deg", 1.0 / 3600.0)}  # fmt: skip
 # Largest confidence, since robots differ more than the prior; the same if set-points and positions have two units.
 _MAX_CONFIDENCE, _SEPARATE_CONFIDENCE = 0.99, 0.85
 # Ratio of pitch to roll that makes their unit doubtful, and its confidence.
@@ -126,7 +135,7 @@ def units(draft: Draft) -> dict[str, Unit]:
     for channel, pick in draft.picks.items():
         if pick.unit is not None and channel not in ("time", "run"):
             sure = 1.0 if pick.unit_sure else 0.8
-            found[channel] = Unit(pick.unit, 1.0, "its title says so", sure)
+            found[channel] = Unit(*_TITLED_ANGLES.get(pick.unit, (pick.unit, 1.0)), "its title says so", sure)
     _time(draft, found)
     counts = _counts(draft, found)
     _angles(draft, found, counted=counts is not None)
@@ -137,6 +146,13 @@ def units(draft: Draft) -> dict[str, Unit]:
     for channel in draft.picks:
         if channel not in found and channel != "run":
             found[channel] = Unit(file_unit(channel), 1.0, "the usual unit", 0.9)
+    for channel, pick in draft.picks.items():
+        title = draft.titles.get(pick.terms[0].column)
+        if title is not None and title.other and pick.unit is None and channel in found:
+            why = f"its title names `{title.other}`, which is no known unit; {found[channel].why}"
+            found[channel] = found[channel]._replace(
+                why=why, confidence=min(found[channel].confidence, _DOUBTFUL_CONFIDENCE)
+            )
     return found
 
 
@@ -159,7 +175,8 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
         return
     unit = draft.picks["time"].unit
     if unit is not None:
-        found["time"] = Unit(*_CLOCKS.get(unit, (unit, 1.0)), f"its title says {unit}")
+        found["time"] = Unit(*_TITLED_CLOCKS.get(unit, (unit, 1.0)), f"its title says {unit}")
+        _doubt_clock(found, nominal_step(draft, found))
         return
     step = np.diff(draft.values("time"))
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
@@ -176,6 +193,20 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
     found["time"] = Unit(*_CLOCKS[name], why, sure)
 
 
+def _doubt_clock(found: dict[str, Unit], step: float) -> None:
+    """Doubt a title whose sample time `step` [s] is far from usual; take another reading if that is near."""
+    if _USUAL_STEP_S / _FAR_STEP <= step <= _USUAL_STEP_S * _FAR_STEP:
+        return
+    times = min(_OTHER_READINGS, key=lambda times: abs(log(times * step / _USUAL_STEP_S)))
+    near = 1.0 / _NEAR_STEP <= times * step / _USUAL_STEP_S <= _NEAR_STEP
+    name, factor, *_ = found["time"]
+    why = (
+        f"its title and its numbers disagree: {1e3 * step:.4g} ms a sample by the title, {1e3 * times * step:.4g} ms "
+        f"if the numbers are {times:.4g} times as large"
+    )
+    found["time"] = Unit(name, factor * (times if near else 1.0), why, _DOUBTFUL_CONFIDENCE)
+
+
 def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
     """Judge the units of set-points, positions and platform together; a title's unit holds for its whole group."""
     apart = _asked_in_another_unit(draft, found)
@@ -186,7 +217,9 @@ def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
     }
     groups = {group: names for group, names in groups.items() if names}
     step = nominal_step(draft, found)
-    reaches = {group: max(largest(draft, name, step) for name in names) for group, names in groups.items()}
+    factors = {name: unit.factor for name, unit in found.items()}
+    reaches = {group: max(factors.get(name, 1.0) * largest(draft, name, step) for name in names)
+               for group, names in groups.items()}  # fmt: skip
     summed = {group for group, names in groups.items() if draft.picks[names[0]].integrate}
     titled: dict[str, str] = {}
     for group, names in groups.items():

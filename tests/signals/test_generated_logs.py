@@ -1,0 +1,92 @@
+"""Hundreds of generated logs: what is imported without a doubt is what was measured."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from softneck.cli._main import run
+
+from .log_generator import Log, clocks, formats, units, wraps
+
+#: Groups, and how many of each are imported as they were measured; the others are doubted or refused.
+GROUPS = {"units": (units, 64), "clocks": (clocks, 80), "wraps": (wraps, 0), "formats": (formats, 6)}
+
+
+def outcome(log: Log, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """Import a log as `softneck import LOG --guess --yes` does, and compare with the truth."""
+    path, out = folder / f"log{log.suffix}", folder / "out.csv"
+    log.write(path)
+    out.unlink(missing_ok=True)
+    capsys.readouterr()
+    code = run(["import", str(path), "--guess", "--yes", "-o", str(out), "--force", "--json"])
+    said = capsys.readouterr()
+    assert code in (0, 2), f"{log.name}: {said.err}"
+    if code == 2:
+        return "refused by name" if any(name in said.err for name in log.named) else "refused"
+    facts, frame = json.loads(said.out), pd.read_csv(out, comment="#")
+    outputs = [next(column for column in frame if column.startswith(f"{name} ")) for name in ("pitch", "roll")]
+    U = frame[[f"motor_setpoint_{j} [rad]" for j in (1, 2, 3)]].to_numpy()
+    Y = frame[outputs].to_numpy() * [np.pi / 180.0 if "deg" in column else 1.0 for column in outputs]
+    n = min(len(U), len(log.set_points))
+    # Angles differ by whole turns at most; cells have ten digits, and a resampled log is shifted by less than a step.
+    off = Y[:n] - log.angles[:n]
+    right = (
+        abs(facts["sample_time_s"] / log.sample_time - 1.0) < 0.02
+        and abs(len(U) - len(log.set_points)) <= 2
+        and np.allclose(U[:n], log.set_points[:n], atol=2e-3)
+        and np.allclose(off - 2.0 * np.pi * np.round(np.median(off, axis=0) / (2.0 * np.pi)), 0.0, atol=2e-3)
+    )
+    doubted = "doubted" if facts["doubts"] else "sure"
+    return f"right, {doubted}" if right else f"wrong, {doubted}"
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_no_log_is_imported_wrongly_without_a_doubt(
+    group: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make, right = GROUPS[group]
+    found = {log.name: outcome(log, tmp_path, capsys) for log in make()}
+    assert [name for name, what in found.items() if what == "wrong, sure"] == []
+    assert Counter(what.partition(",")[0] for what in found.values())["right"] >= right
+
+
+@pytest.mark.parametrize("group", ["units", "clocks"])
+def test_what_cannot_be_taken_is_refused_or_doubted_by_its_name(
+    group: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = {log.name: outcome(log, tmp_path, capsys) for log in GROUPS[group][0]() if log.named}
+    assert [name for name, what in found.items() if what in ("wrong, sure", "refused")] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "sample_time", "doubts"),
+    [
+        ("time_ms_title_seconds_values.csv", 0.02, True),
+        ("time_minutes.csv", 0.02, False),
+        ("setpoints_in_turns.csv", 0.02, False),
+        ("pitch_in_mrad.csv", 0.02, False),
+    ],
+)
+def test_a_reported_log_is_imported_as_its_title_says(
+    name: str, sample_time: float, doubts: bool, shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, out = shared_data / "reports" / name, tmp_path / "out.csv"
+    if not log.is_file():
+        pytest.skip(f"{log} is not here")
+    capsys.readouterr()
+    assert run(["import", str(log), "--guess", "--yes", "-o", str(out), "--json"]) == 0
+    facts, frame = json.loads(capsys.readouterr().out), pd.read_csv(out, comment="#")
+    # Times in minutes have eight decimals: 0.3 us of 20 ms.
+    assert facts["sample_time_s"] == pytest.approx(sample_time, rel=1e-3)
+    assert bool(facts["doubts"]) == doubts
+    # The same motion lies in all of these files: set-points [rad] and pitch [deg] of the first rows.
+    np.testing.assert_allclose(frame.filter(like="motor_setpoint").to_numpy()[0], [0.75057, 2.3833, 1.6541], rtol=1e-3)
+    pitch = frame.filter(regex="^pitch ").iloc[:, 0].to_numpy()
+    pitch = pitch if "pitch [deg]" in frame else np.degrees(pitch)
+    np.testing.assert_allclose(pitch[:2], [-0.02027, -0.013899], atol=2e-4)
