@@ -75,11 +75,8 @@ def certificate_contents(
 ) -> dict[str, Any]:
     """Return the JSON values of a certificate.
 
-    Args:
-        kind: "verify" or "simulate".
-        holds: whether all requirements hold.
-        files: role -> (path, SHA-256) of every file that was read.
-        more: further entries, JSON values only (no NaN, no infinity).
+    `kind`: "verify" or "simulate". `holds`: whether all requirements hold. `files`: role -> (path, SHA-256) of every
+    file that was read. `more`: further entries, JSON values only (no NaN, no infinity).
     """
     contents = {
         "certificate": kind,

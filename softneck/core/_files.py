@@ -43,9 +43,7 @@ _LONG_KEY = re.compile(r"(?<![\w-])(?:[\w-]+[ \t]*\.[ \t]*){33}")
 def settings_text(path: str | Path, most: int = MOST_TOML) -> str:
     """Return the text of a file of settings.
 
-    Raises:
-        ValueError: not a text, larger than `most` bytes, or a key of too many parts.
-        OSError: no such file.
+    Raises ValueError: not a text, larger than `most` bytes, or a key of too many parts; OSError: no such file.
     """
     source = Path(path)
     size = source.stat().st_size
@@ -127,10 +125,8 @@ def open_zip(path: Path, *, verify: bool = False) -> zipfile.ZipFile:
     """Open an archive after checking its size; with `verify` also unpack each member and compare its size.
 
     Readers that trust the streams and not the directory need `verify`.
-
-    Raises:
-        FileFormatError: it unpacks to too much, has too many members, or a member is larger than declared.
-        zipfile.BadZipFile, OSError: not an archive.
+    Raises FileFormatError: it unpacks to too much, has too many members, or a member is larger than declared;
+    zipfile.BadZipFile, OSError: not an archive.
     """
     _require_directory(path)
     archive = zipfile.ZipFile(path)
