@@ -156,8 +156,10 @@ def _band(text: str | None) -> tuple[float, float] | None:
 
 
 def _robot_limits(robot: Robot) -> dict[str, float]:
-    """Return the bounds on set-points that a robot gives [rad], [rad/s]."""
+    """Return the bounds on set-points that a robot gives [rad], [rad/s]; the preset plays its signals as they are."""
     motors, scale = robot.motors, to_si(robot.motors.unit)[0]
+    if not robot.in_header():
+        return {}
     ends = [*(motors.setpoint_min or ()), *(motors.setpoint_max or ())]
     given = {"position": [abs(end) for end in ends], "speed": motors.rate_limit and [min(motors.rate_limit)]}
     return {name: scale * max(values) for name, values in given.items() if values}

@@ -218,8 +218,9 @@ class VirtualNeck(ReprMixin):
 def _ranges(robot: Robot, limit: float) -> Matrix:
     """Return lower and upper limit of each set-point [rad]; +-`limit` if none is given."""
     scale, motors = to_si(robot.motors.unit)[0], len(robot.motors.names)
-    given = zip((robot.motors.setpoint_min, robot.motors.setpoint_max), (-limit, limit), strict=True)
-    low, high = (np.full(motors, end) if side is None else scale * np.array(side) for side, end in given)
+    given = (robot.motors.setpoint_min, robot.motors.setpoint_max) if robot.in_header() else (None, None)
+    low, high = (np.full(motors, end) if side is None else scale * np.array(side)
+                 for side, end in zip(given, (-limit, limit), strict=True))  # fmt: skip
     return np.column_stack([low, high])
 
 
