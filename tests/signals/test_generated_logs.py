@@ -90,3 +90,15 @@ def test_a_reported_log_is_imported_as_its_title_says(
     pitch = frame.filter(regex="^pitch ").iloc[:, 0].to_numpy()
     pitch = pitch if "pitch [deg]" in frame else np.degrees(pitch)
     np.testing.assert_allclose(pitch[:2], [-0.02027, -0.013899], atol=2e-4)
+
+
+@pytest.mark.parametrize("command", ["import", "info"])
+@pytest.mark.parametrize("rows", [0, 1, 2])
+def test_too_few_rows_are_one_line(command: str, rows: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "log.csv"
+    titles = ["time [s]", *(f"motor_setpoint_{j} [rad]" for j in (1, 2, 3)), "pitch [deg]", "roll [deg]"]
+    lines = [f"{0.02 * k},{k},{k},{k},{k},{k}" for k in range(rows)]
+    log.write_text("\n".join([",".join(titles), *lines, ""]))
+    more = ["--guess", "--yes", "-o", str(tmp_path / "out.csv")] if command == "import" else []
+    assert run([command, str(log), *more]) in (0, 2)
+    assert not (tmp_path / "out.csv").exists()

@@ -140,6 +140,8 @@ def _change_sources(layout: Layout, channels: Sequence[str], *, unit: str | None
 _NO_CHANNELS = ("time", "run", "inclination", "orientation")
 # Longest lag of the platform behind its motors [samples]: half a second at 20 ms.
 _NECK_LAG = 25
+# Fewer rows have no step to compare with another.
+_MIN_ROWS = 3
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -208,7 +210,11 @@ def guess_layout(path: str | Path, *, robot: Robot = NECK) -> Guess:
 
 
 def _guess(path: Path, neck: Robot) -> Guess:
-    draft = Draft(sniff(path))
+    sniffed = sniff(path)
+    rows = max((values.size for values in sniffed.columns.values()), default=0)
+    if rows < _MIN_ROWS:
+        raise DataError(f"{path}: has {rows} row(s) of numbers, too few for a recording; record longer.")
+    draft = Draft(sniffed)
     by_names(draft)
     by_shapes(draft)
     use_positions_as_inputs(draft)
