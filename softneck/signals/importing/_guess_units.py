@@ -99,8 +99,8 @@ _TILT_CHANNELS = ("pitch", "roll", "inclination", *_REFERENCE_CHANNELS)
 # [s] The paper's sample time, the prior where data leave it open; two thirds of all loggers lie within a factor of
 # exp(1.2).
 _USUAL_STEP_S, _STEP_SPREAD = 0.02, 1.2
-# A sample time so many times longer or shorter than usual is doubted; the other reading is taken if it is this near.
-_FAR_STEP, _NEAR_STEP = 50.0, 5.0
+# A sample time this far from usual is doubted; outside these bounds [s] another reading of the clock is taken.
+_FAR_STEP, _STEP_BOUNDS_S = 50.0, (0.99e-4, 600.0)
 # What a clock's numbers may be, times what the title says: s for ms, us or min, and the other way round.
 _OTHER_READINGS = (1e3, 1e-3, 1e6, 1e-6, 60.0, 1.0 / 60.0)
 # Unit in the title of a time column -> unit `s` or `ms` of the layout, and factor.
@@ -194,17 +194,14 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
 
 
 def _doubt_clock(found: dict[str, Unit], step: float) -> None:
-    """Doubt a title whose sample time `step` [s] is far from usual; take another reading if that is near."""
+    """Doubt a title whose sample time `step` [s] is far from usual; take another reading if it is impossible."""
     if _USUAL_STEP_S / _FAR_STEP <= step <= _USUAL_STEP_S * _FAR_STEP:
         return
     times = min(_OTHER_READINGS, key=lambda times: abs(log(times * step / _USUAL_STEP_S)))
-    near = 1.0 / _NEAR_STEP <= times * step / _USUAL_STEP_S <= _NEAR_STEP
     name, factor, *_ = found["time"]
-    why = (
-        f"its title and its numbers disagree: {1e3 * step:.4g} ms a sample by the title, {1e3 * times * step:.4g} ms "
-        f"if the numbers are {times:.4g} times as large"
-    )
-    found["time"] = Unit(name, factor * (times if near else 1.0), why, _DOUBTFUL_CONFIDENCE)
+    a, b, possible = 1e3 * step, 1e3 * times * step, _STEP_BOUNDS_S[0] <= step <= _STEP_BOUNDS_S[1]
+    why = f"title and numbers disagree: {a:.4g} ms a sample, or {b:.4g} ms with numbers {times:.4g} times as large"
+    found["time"] = Unit(name, factor * (1.0 if possible else times), why, _DOUBTFUL_CONFIDENCE)
 
 
 def _angles(draft: Draft, found: dict[str, Unit], *, counted: bool) -> None:
