@@ -7,6 +7,7 @@ Every check raises AssertionError where the requirement is missed; `test_fault_t
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -305,6 +306,26 @@ def second_master_setpoints(bench: Bench) -> None:
 def second_master_guards(bench: Bench) -> None:
     bench.link.inject.append(Frame(0x703, b"", remote=True))
     stops(bench, "second_master", bench.now + T, T)
+
+
+def positions_twice(bench: Bench) -> None:
+    """A second device answers each SYNC with the position of node 2, as that drive itself does."""
+
+    def answer() -> None:
+        view = bench.master.bus.drives[1]
+        bench.link.inject.append(Frame(0x180 + view.node, struct.pack("<Hih", view.word, view.counts, view.current)))
+        if bench.phase is Phase.RUNNING:
+            bench.at(bench.now + T, lambda _: answer())
+
+    answer()
+    # The first one is on the wire in this cycle and read in the next.
+    begin = bench.now + T
+    bench.pass_time(0.45)
+    assert bench.phase is Phase.RUNNING
+    assert bench.master.counts["tpdo_twice"] >= 40
+    stops(bench, "node_twice", begin, 0.5)
+    assert bench.master.supervisor.fault is not None
+    assert bench.master.supervisor.fault.node == 2
 
 
 # -- limits -----------------------------------------------------------------------------------------------------------

@@ -10,8 +10,9 @@ import pytest
 
 from softneck.cli._main import run
 from softneck.core import CheckFailedError
-from softneck.drives import DrivesFile, default_drives, preflight, scan, simulated_neck
+from softneck.drives import DrivesFile, default_drives, preflight, reset, scan, simulated_neck
 from softneck.drives.bus._link import VirtualLink, reason
+from softneck.drives.bus._sdo import Objects
 from softneck.drives.commissioning._jog import jog_pilot
 from softneck.drives.master import Frame
 from softneck.drives.running._bus_loop import Session, run_session
@@ -59,6 +60,50 @@ def test_scan_of_two_devices_with_one_number_is_exit_code_1(
     said = capsys.readouterr()
     assert json.loads(said.out)["nodes"][0]["serials"] == [11, None]
     assert "node 1: 2 devices answer (serial numbers 11, not told)" in said.err
+
+
+@pytest.mark.parametrize(
+    "theirs", [Frame(0x080), Frame(0x203, b"\x0f\0\0\0\0\0"), Frame(0x705, remote=True)], ids=["sync", "rpdo", "guard"]
+)
+def test_scan_and_reset_listen_first_and_send_nothing_into_the_run_of_another_master(theirs: Frame) -> None:
+    for act in (lambda link: scan(link), lambda link: reset(link, default_drives())):
+        link, sent = linked(default_drives()), list[Frame]()
+        link.tap = lambda _now, from_master, frame, sent=sent: sent.append(frame) if from_master else None
+        link.inject.append(theirs)
+        with pytest.raises(
+            CheckFailedError, match=r"another master is on the bus \(.*\); stop it first\. Nothing was sent"
+        ):
+            act(link)
+        assert sent == []
+        # Alone, both speak.
+        act(link)
+        assert sent
+
+
+class Stranger(VirtualLink):
+    """Another SDO client reads as well: what its server answers precedes each answer to us."""
+
+    def __init__(self, link: VirtualLink, foreign: bytes) -> None:
+        super().__init__(link.neck)
+        self.foreign = foreign
+
+    def receive(self, timeout: float) -> list[Frame]:
+        frames = super().receive(timeout)
+        ours = [frame for frame in frames if frame.identifier == 0x582]
+        return [*([Frame(0x582, self.foreign)] if ours else []), *frames]
+
+
+# An abort of 6085h, a value of 6085h, a value of another subindex of what is read, a segment that nobody asked for.
+@pytest.mark.parametrize("foreign", ["8085600011000906", "43856000ffffffff", "4300100511223344", "0011223344556677"])
+def test_an_answer_about_another_object_is_not_ours(foreign: str) -> None:
+    link = Stranger(linked(default_drives()), bytes.fromhex(foreign))
+    objects = Objects(link, 2)
+    assert objects.read(0x1000) == Objects(linked(default_drives()), 2).read(0x1000)
+    objects.write(0x6065, 0, 1234)
+    assert objects.read(0x6065) == 1234
+    # Segments of a long value do not name their object (CiA 301): those of two clients cannot be told apart.
+    if foreign[:2] != "00":
+        assert objects.read_text(0x1008) == Objects(linked(default_drives()), 2).read_text(0x1008)
 
 
 class ShortQueue(VirtualLink):

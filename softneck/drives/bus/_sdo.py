@@ -38,6 +38,9 @@ NUMBERS: dict[tuple[int, int], str] = {
 _ANSWER_TIME = 0.3
 # Which of these a drive tells only hardware can say; that it took the value it did say, and none of them is a guard.
 _MAY_BE_UNTOLD = frozenset({0x6060, 0x6098, 0x60C2, 0x60FF})
+# First byte of an SDO frame: its command, of which these name index and subindex: download, upload, abort.
+_COMMAND, _ABORT = 0xE0, 0x80
+_NAMES_OBJECT, _SEGMENTS = (0x20, 0x40, _ABORT), (0x00, 0x20)
 # canopen logs each abort as an error; here an abort becomes one line for the user.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
@@ -142,20 +145,33 @@ class Objects:
 
 
 class _Network:
-    """The part of a network that canopen's client needs: sending, with the answer available afterwards."""
+    """The part of a network that canopen's client needs: sending, with the answer available afterwards.
+
+    An answer that names another object is one to another client, as is its abort, and is ignored (CiA 301, 7.2.4.3).
+    """
 
     def __init__(self, link: Link, client: SdoClient, answer: int) -> None:
         self._link, self._client, self._answer = link, client, answer
+        self._object = b""
 
     def send_message(self, identifier: int, data: bytes, remote: bool = False) -> None:
         """Send and wait for the answer."""
+        if data[0] & _COMMAND in _NAMES_OBJECT:
+            self._object = bytes(data[1:4])
         self._link.receive(0.0)
         self._link.send([Frame(identifier, bytes(data), remote)])
-        if data[0] == 0x80:
+        if data[0] == _ABORT:
             return
+        segment = data[0] & _COMMAND not in _NAMES_OBJECT
         until = self._link.now + _ANSWER_TIME
         while self._link.now < until:
             for frame in self._link.receive(max(0.0, until - self._link.now)):
-                if frame.identifier == self._answer and not frame.remote and not frame.error and len(frame.data) == 8:
+                if self._is_answer(frame, segment=segment):
                     self._client.on_response(frame.identifier, bytearray(frame.data), 0.0)
                     return
+
+    def _is_answer(self, frame: Frame, *, segment: bool) -> bool:
+        if frame.identifier != self._answer or frame.remote or frame.error or len(frame.data) != 8:
+            return False
+        # Only answers to the segments of a long value do not name their object.
+        return (segment and frame.data[0] & _COMMAND in _SEGMENTS) or frame.data[1:4] == self._object

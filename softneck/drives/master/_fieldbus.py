@@ -77,6 +77,10 @@ _LATE_MODE, _MODE_TAKEN = b"\x2f\x60\x60\0\x08\0\0\0", b"\x60\x60\x60\0"
 _LIMIT_CODES = (0xFF06, 0xFF07)
 
 
+# A second TPDO with each SYNC for so long comes from a second device [s].
+_TWICE_TIME = 0.5
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusSettings:
     """Settings of the cyclic traffic.
@@ -122,6 +126,8 @@ class DriveView:
         counts, current: last position and current in the drive's units.
         fresh: whether a TPDO came since the last step.
         silent: cycles without a TPDO.
+        received: TPDOs since the last step.
+        excess: TPDOs beyond one for each SYNC, accumulated; 0 where one device answers.
         answered: when guarding or heartbeat last came [s]; None before the first.
         nmt: NMT state in the last guarding answer or heartbeat.
         emergencies: (time, code, register) of the last 20.
@@ -129,8 +135,8 @@ class DriveView:
     """
 
     __slots__ = (
-        "answered", "counts", "current", "emergencies", "fresh", "heard", "mode", "nmt", "node", "silent", "state",
-        "toggle", "word",
+        "answered", "counts", "current", "emergencies", "excess", "fresh", "heard", "mode", "nmt", "node", "received",
+        "silent", "state", "toggle", "word",
     )  # fmt: skip
 
     def __init__(self, node: int, *, late_mode: bool = False) -> None:
@@ -140,6 +146,7 @@ class DriveView:
         self.word, self.state = 0, DriveState.UNKNOWN
         self.counts = self.current = 0
         self.fresh, self.heard, self.silent = False, False, 0
+        self.received = self.excess = 0
         self.answered: float | None = None
         self.nmt, self.toggle = NodeState.UNKNOWN, -1
         self.emergencies: list[tuple[float, int, int]] = []
@@ -150,17 +157,20 @@ class DriveView:
         return self.state is DriveState.ENABLED and self.fresh and self.mode == "taken"
 
 
+def _malformed(now: float, view: DriveView, what: str, data: bytes) -> Event:
+    return Event(now, "frame_length", view.node, f"{what} of {len(data)} byte(s)")
+
+
 class Fieldbus:
     """Reader and writer of the cyclic frames of all drives.
 
-    `settings`: as given. `drives`: the views. `malformed`: number of frames with a wrong length so far.
+    `settings`: as given. `drives`: the views.
     """
 
     def __init__(self, settings: BusSettings) -> None:
         """Build the table of identifiers."""
         self.settings = settings
         self.drives = tuple(DriveView(node, late_mode=node in settings.late_modes) for node in settings.nodes)
-        self.malformed = 0
         self._cycle = 0
         self._handlers = {}
         foreign = {0x000, 0x080, 0x100, 0x700 + settings.master}
@@ -179,7 +189,7 @@ class Fieldbus:
         """Process all frames since the last step and return the events."""
         events: list[Event] = []
         for view in self.drives:
-            view.fresh = False
+            view.fresh, view.received = False, 0
         for frame in frames:
             identifier, data, remote, error = frame
             if error:
@@ -196,17 +206,17 @@ class Fieldbus:
         return events
 
     def _tpdo(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
-        del now, events
-        if len(data) != 8:
-            self.malformed += 1
+        if len(data) != _TPDO.size:
+            events.append(_malformed(now, view, "TPDO", data))
             return
         view.word, view.counts, view.current = _TPDO.unpack(data)
         view.state = state_of(view.word)
         view.fresh = view.heard = True
+        view.received += 1
 
     def _emergency(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
-        if len(data) < 3:
-            self.malformed += 1
+        if len(data) < _EMERGENCY.size:
+            events.append(_malformed(now, view, "emergency", data))
             return
         code, register = _EMERGENCY.unpack_from(data)
         view.emergencies = [*view.emergencies[-19:], (now, code, register)]
@@ -217,7 +227,7 @@ class Fieldbus:
 
     def _error_control(self, now: float, view: DriveView, data: bytes, events: list[Event]) -> None:
         if len(data) != 1:
-            self.malformed += 1
+            events.append(_malformed(now, view, "heartbeat or guarding answer", data))
             return
         state = node_state(data[0])
         if state is NodeState.BOOT_UP:
@@ -251,6 +261,12 @@ class Fieldbus:
             else:
                 view.silent += 1
                 dead = dead and view.silent >= s.silent_cycles
+            # One that came late is followed by a cycle with two; one device never sends more than it got SYNCs.
+            view.excess = max(0, view.excess + view.received - 1)
+            if view.received > 1:
+                events.append(Event(now, "tpdo_twice", view.node, f"{view.received} TPDOs since the last SYNC"))
+            if view.excess * s.cycle >= _TWICE_TIME:
+                events.append(Event(now, "node_twice", view.node))
             if view.silent == s.missing_cycles or (view.silent > s.missing_cycles and view.silent % 100 == 0):
                 events.append(Event(now, "tpdo_missing", view.node))
             if view.answered is not None and now - view.answered > s.answer_time:

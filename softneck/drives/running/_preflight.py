@@ -53,9 +53,10 @@ def scan(link: Link, *, bit_rate: int = 1_000_000) -> list[dict[str, Any]]:
         bit_rate: of the bus [bit/s], by which requests are paced.
 
     Raises:
+        CheckFailedError: another master is on the bus; nothing was sent.
         BusError: the bus takes no frames.
     """
-    link.receive(0.0)
+    require_alone(link)
     pause = max(_SHORTEST_PAUSE, _PAUSE_FRAMES * _FRAME_BITS / bit_rate)
     answers: dict[int, int] = {}
 
@@ -245,6 +246,13 @@ def listen(link: Link, nodes: Collection[int], seconds: float = LISTEN) -> str:
         if found:
             return found
     return ""
+
+
+def require_alone(link: Link) -> None:
+    """Raise CheckFailedError if another master is on the bus: it would stop its run for one request of ours."""
+    other = listen(link, range(1, 127))
+    if other:
+        raise CheckFailedError(f"another master is on the bus ({other}); stop it first. Nothing was sent.")
 
 
 def preflight(

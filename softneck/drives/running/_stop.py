@@ -12,7 +12,7 @@ from ..bus._objects import disarm_writes
 from ..bus._sdo import Objects, SdoError
 from ..master import Frame
 from ..master._cia402 import OFF, DriveState, state_of
-from ._preflight import require_bus
+from ._preflight import require_alone, require_bus
 
 # Between two looks at a drive [s].
 _POLL_S = 0.02
@@ -51,8 +51,10 @@ def reset(link: Link, file: DrivesFile) -> dict[int, str]:
     """Acknowledge latched faults, the only place where that happens; return node -> state after it.
 
     Raises:
+        CheckFailedError: another master is on the bus; nothing was sent.
         BusError: the bus takes no frames.
     """
+    require_alone(link)
     states = {}
     for entry in file.drives:
         objects = Objects(link, entry.node)

@@ -84,6 +84,7 @@ def test_the_rules_are_those_of_the_fault_table() -> None:
         "bus_silent": (stop, 3, 0.0), "emergency": (stop, 2, 0.0), "drive_fault": (stop, 2, 0.0),
         "drive_left": (stop, 2, 0.0), "node_left": (stop, 0, 0.3), "tpdo_missing": (stop, 5, 0.0),
         "heartbeat_missing": (stop, 0, 0.3), "boot_up": (stop, 2, 0.0), "second_master": (stop, 1, 0.0),
+        "tpdo_twice": (count, 1, 0.0), "node_twice": (stop, 0, 0.5), "frame_length": (count, 1, 0.0),
         "sensor_lost": (retreat, 0, 0.1), "sensor_frozen": (retreat, 0, 0.1), "sensor_bad": (stop, 1, 0.0),
         "sample_discarded": (count, 1, 0.0), "controller_failed": (stop, 1, 0.0), "clamped": (count, 1, 0.0),
         "clamp_persistent": (stop, 0, 1.0), "drive_limit": (count, 1, 0.0), "following": (stop, 0, 0.2),
