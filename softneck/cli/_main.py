@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import logging
 import os
+import signal
 import sys
 import traceback
 import warnings
@@ -87,7 +89,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
     for name in _BLAS_THREADS:  # read where numpy is imported, which no command has done yet
         os.environ.setdefault(name, "1")
-    sys.exit(run(arguments))
+    code = run(arguments)
+    atexit.register(_ignore_signals)
+    sys.exit(code)
+
+
+def _ignore_signals() -> None:
+    """Let no signal change the exit code while the interpreter ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

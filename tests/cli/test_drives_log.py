@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from softneck.cli import main
-from softneck.cli.drives._target import Target, log_folder, opened_log
+from softneck.cli.drives._closing import log_folder
+from softneck.cli.drives._target import Target, opened_log
 from softneck.core import CheckFailedError, OutputFileError
 from softneck.drives import default_drives, read_run_log
 from softneck.drives.logs._run_log import run_facts

@@ -96,6 +96,11 @@ class World:
             words += [option, str(self.folder / name)]
         return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, first=40 * realtime)
 
+    def command(self, words: list[str]) -> Any:
+        """Start another `softneck` command."""
+        code = "from softneck.cli import main; main()"
+        return self._spawn("-c", code, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, first=0)
+
     def _spawn(
         self, *arguments: str, stdout: int = subprocess.DEVNULL, stderr: int = subprocess.DEVNULL, first: int = 41
     ) -> Any:
@@ -307,6 +312,116 @@ def terminated(world: World) -> dict[str, Any]:
     return {"reaction_s": None, "exit": code, "phase": result["phase"], **told, **rest(world, since)}
 
 
+def _emergency_then_interrupt(delay: float) -> Callable[[World], dict[str, Any]]:
+    """A drive's short-circuit emergency, and somebody who presses Ctrl-C `delay` [s] later."""
+
+    def act(world: World) -> dict[str, Any]:
+        since = time.monotonic()
+        _send(world, (0x082, bytes([0x10, 0x23, 0x01, 0, 0, 0, 0, 0])))
+        time.sleep(delay)
+        world.host.send_signal(signal.SIGINT)
+        return {"reaction_s": world.left(since), **_told(world), **rest(world, since)}
+
+    return act
+
+
+def _send(world: World, *frames: tuple[int, bytes]) -> None:
+    import can
+
+    interface, _, channel = world.bus.partition(":")
+    with can.Bus(interface=interface, channel=channel) as bus:
+        for identifier, data in frames:
+            bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+
+def _told(world: World) -> dict[str, Any]:
+    """Wait for the host; return exit code, event, and how many rows of the run were kept."""
+    code, result, line = world.ended()
+    recording = result.get("recording")
+    rows = len(Path(recording).read_text().splitlines()) - 1 if recording else 0
+    return {"exit": code, "event": (result["fault"] or {}).get("event"), "kept": rows > 5, "line": line}
+
+
+def interrupted_thrice(world: World) -> dict[str, Any]:
+    """Ctrl-C three times, 150 ms apart."""
+    since = time.monotonic()
+    for _ in range(3):
+        world.host.send_signal(signal.SIGINT)
+        time.sleep(0.15)
+    return {"reaction_s": world.left(since), **_told(world), **rest(world, since)}
+
+
+def terminated_while_writing(world: World) -> dict[str, Any]:
+    """Ctrl-C, and as soon as the drives are off SIGTERM again and again."""
+    since = time.monotonic()
+    world.host.send_signal(signal.SIGINT)
+    world.wait(lambda: world.all(OFF) or world.host.poll() is not None, "off", 20.0)
+    while world.host.poll() is None:
+        world.host.terminate()
+        time.sleep(0.01)
+    return {"reaction_s": None, **_told(world), **rest(world, since)}
+
+
+def descriptors_exhausted(world: World) -> dict[str, Any]:
+    """The host may open no further file from now on."""
+    import resource
+
+    since, opened = time.monotonic(), Path(f"/proc/{world.host.pid}/fd").iterdir()
+    most = max(int(one.name) for one in opened) + 1
+    resource.prlimit(world.host.pid, resource.RLIMIT_NOFILE, (most, most))
+    world.host.terminate()
+    return {"reaction_s": None, **_told(world), **rest(world, since)}
+
+
+def node_twice(world: World) -> dict[str, Any]:
+    """A second device answers each SYNC as node 2 does."""
+    import can
+
+    interface, _, channel = world.bus.partition(":")
+    since, done = time.monotonic(), threading.Event()
+
+    def answer() -> None:
+        with can.Bus(interface=interface, channel=channel) as bus:
+            last = b""
+            while not done.is_set():
+                frame = bus.recv(0.1)
+                if frame is None or frame.is_remote_frame:
+                    continue
+                if frame.arbitration_id == 0x182 and bytes(frame.data) != last:
+                    last = bytes(frame.data)
+                    bus.send(can.Message(arbitration_id=0x182, data=last, is_extended_id=False))
+
+    thread = threading.Thread(target=answer, daemon=True)
+    thread.start()
+    found = _told(world)
+    done.set()
+    thread.join()
+    return {"reaction_s": None, **found, **rest(world, since)}
+
+
+def foreign_abort(world: World) -> dict[str, Any]:
+    """While the drives are switched off, another client's aborts of object 6085h come from node 2."""
+    since = time.monotonic()
+    world.host.terminate()
+    while world.host.poll() is None:
+        _send(world, *[(0x582, bytes.fromhex("8085600011000906"))] * 5)
+        time.sleep(0.002)
+    return {"reaction_s": None, **_told(world), **rest(world, since)}
+
+
+def scan_beside(world: World) -> dict[str, Any]:
+    """`scan` beside a run says that another master is there, and the run goes on."""
+    since = time.monotonic()
+    words = ["drives", "commission", "--only", "scan", "--bus", world.bus, "--json"]
+    scan = world.command(words)
+    code, _, line = world.ended(scan, seconds=60.0)
+    went_on = world.all("ENABLED")
+    world.host.terminate()
+    found = _told(world)
+    return {"reaction_s": None, "scan_exit": code, "scan_line": line, "went_on": went_on, **found,
+            **rest(world, since)}  # fmt: skip
+
+
 def undisturbed(world: World) -> dict[str, Any]:
     """Nothing happens: the cycles."""
     code, result, _ = world.ended(seconds=120.0)
@@ -327,6 +442,19 @@ CASES: dict[str, tuple[Callable[[World], dict[str, Any]], dict[str, Any]]] = {
     "terminated": (terminated, {"exit": 143, "phase": "done", "fed": True, "ready": True, "stopping": True,
                                 "states": [OFF] * 3}),
     "undisturbed": (undisturbed, {"exit": 0, "states": [OFF] * 3}),
+    **{
+        f"emergency_then_interrupt_{round(1e3 * delay)}_ms": (
+            _emergency_then_interrupt(delay),
+            {"exit": 1, "event": "emergency", "kept": True, "states": [OFF] * 3},
+        )
+        for delay in (0.05, 0.15, 0.3)
+    },
+    "interrupted_thrice": (interrupted_thrice, {"exit": 130, "event": "operator", "kept": True, "states": [OFF] * 3}),
+    "terminated_while_writing": (terminated_while_writing, {"exit": 130, "kept": True, "states": [OFF] * 3}),
+    "descriptors_exhausted": (descriptors_exhausted, {"exit": 143, "kept": True, "states": [OFF] * 3}),
+    "node_twice": (node_twice, {"exit": 1, "event": "node_twice", "kept": True, "states": [OFF] * 3}),
+    "foreign_abort": (foreign_abort, {"exit": 143, "event": None, "kept": True, "states": [OFF] * 3}),
+    "scan_beside": (scan_beside, {"exit": 143, "scan_exit": 1, "went_on": True, "kept": True, "states": [OFF] * 3}),
 }  # fmt: skip
 # Only SocketCAN has error frames, and only a bus with a wire behind it wants the words typed.
 SOCKETCAN_CASES = {

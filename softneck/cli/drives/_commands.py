@@ -14,13 +14,13 @@ from softneck.core import SettingsError, refuse_existing
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._groups import NearGroup
 from ..shared._options import common_options, output_option, target, trust_option
+from ._closing import closing
 from ._commission import commission_command
 from ._record import record_command
 from ._target import (
     Asked,
     acting_files,
     drives_options,
-    leave_if_asked,
     open_link,
     opened_log,
     require_log,
@@ -119,33 +119,32 @@ def run_command(
         note(f"{certified[1].path}: {again:g} of {deployed.loop.duration:g} s run again on the loop's plant: the same")
     files = acting_files(setup, loop_file, controller, chosen.path)
     sensor: Any = None if chosen.simulated else sensor_of(chosen.file)
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as last, contextlib.ExitStack() as stack:
         link = None if chosen.simulated else cast("drives.CanLink", stack.enter_context(open_link(chosen, moves=True)))
         log = stack.enter_context(opened_log(chosen, "run", asked.log, force=force))
-        with progress("drives", quiet=as_json) as tell, drives.Keyboard() as keyboard:
+        end = stack.enter_context(closing(last, "run", log))
+        with progress("drives", quiet=as_json) as tell:
             report = lambda done: tell(done, controller.name)  # noqa: E731
             if link is None:
                 result = drives.run_simulated(
                     deployed, chosen.file, neck=virtual, override=asked.override, pace=asked.pace,
-                    report=report, operator=keyboard, log=log, files=files,
+                    report=report, operator=end.keyboard, log=log, files=files,
                 )  # fmt: skip
             else:
                 result = drives.run_on_bus(
-                    deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=keyboard,
+                    deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=end.keyboard,
                     log=log, files=files,
                 )  # fmt: skip
-        # Before the log is closed: a full disk must not cost the recording and the result as well.
+        where = None
         if len(result.signals.time) > 1:
-            signals.write_recording(path, result.recording(), force=replace)
-        _print_run(path, result, as_json=as_json)
-        leave_if_asked(keyboard)
-        result.require()
+            where = end.write(path, lambda to: signals.write_recording(to, result.recording(), force=replace))
+        _print_run(where, result, as_json=as_json)
+        end.conclude(result.fault, result.require)
 
 
-def _print_run(path: Path, result: drives.DrivesResult, *, as_json: bool) -> None:
-    values: dict[str, Any] = result.table()
+def _print_run(path: Path | None, result: drives.DrivesResult, *, as_json: bool) -> None:
     if as_json:
-        print_json(values)
+        print_json({"recording": path and str(path), **result.table()})
         return
     rows = [["phase", result.phase], ["bus cycles", str(result.cycles)]]
     rows += [[name, str(count)] for name, count in result.counts.items()]
@@ -154,7 +153,7 @@ def _print_run(path: Path, result: drives.DrivesResult, *, as_json: bool) -> Non
         rows.append(["cycle", f"{times} ms"])
         rows.append(["missed cycles", f"{times.missed} of {times.count + times.missed}"])
     rows.append(["real-time factor", f"{result.real_time_factor:.1f}"])
-    print_table(str(path), ["what", "value"], rows)
+    print_table("no recording" if path is None else str(path), ["what", "value"], rows)
 
 
 @command.command("stop")

@@ -12,7 +12,7 @@ from softneck.core import CheckFailedError, SettingsError
 
 from ..shared._console import note, print_json, print_table, progress
 from ..shared._options import common_options
-from ._target import SAMPLE_TIME, Asked, Target, drives_options, leave_if_asked, moving, open_link, require_log
+from ._target import SAMPLE_TIME, Asked, Target, drives_options, moving, open_link, require_log
 
 
 def scan_step(asked: Asked, *, as_json: bool) -> None:
@@ -46,7 +46,7 @@ def zero_step(asked: Asked, *, force: bool, as_json: bool) -> None:
     """Tension each tendon gently, set the encoders' zero there, and verify with the inclinometer."""
     chosen = asked.target()
     require_log(asked.log, force=force)
-    with moving(asked, chosen, "zero", force=force) as (session, keyboard):
+    with moving(asked, chosen, "zero", force=force) as (session, end):
         link, sensor = session.link, session.sensor
         report = drives.preflight(link, chosen.file, override=asked.override)
         report.require()
@@ -61,11 +61,11 @@ def zero_step(asked: Asked, *, force: bool, as_json: bool) -> None:
             return None if sensor is None else drives.look_at(sensor, link, drives.LOOK)
 
         try:
-            zeroed = drives.zero(link, chosen.file, look, guarding=report.guarding, operator=keyboard)
+            zeroed = drives.zero(link, chosen.file, look, guarding=report.guarding, operator=end.keyboard)
         except CheckFailedError as error:
-            if keyboard.interrupted or keyboard.terminated:
+            if end.keyboard.interrupted or end.keyboard.terminated:
                 note(str(error))
-            leave_if_asked(keyboard)
+            end.leave_if_asked()
             raise
         if as_json:
             print_json(zeroed.table())
@@ -86,15 +86,14 @@ def jog_step(asked: Asked, motor: int, amplitude: float, *, force: bool, as_json
     # A neck's tendons stand where its own file says.
     physics = drives.physics_of(chosen.file.moves) if plant.has_own_tendons(chosen.file.moves) else None
     angles = physics and plant.tendons_of(chosen.file.moves, physics)
-    with moving(asked, chosen, "jog", force=force, homed=True) as (session, keyboard):
+    with moving(asked, chosen, "jog", force=force, homed=True) as (session, end):
         with progress("jog", quiet=as_json) as tell:
             found = drives.jog(
                 motor, session, tendon_angles=angles, amplitude=amplitude,
                 report=lambda done: tell(done, f"motor {motor}"),
             )  # fmt: skip
         _print_jog(found, as_json=as_json)
-        leave_if_asked(keyboard)
-        found.require()
+        end.conclude(found.ended.master.supervisor.fault, found.require)
 
 
 def _print_jog(found: drives.JogResult, *, as_json: bool) -> None:
@@ -166,13 +165,12 @@ def _tendons(
     chosen = asked.target()
     guards = drives.Guards.of(chosen.file.watch.gain, travel=travel)
     drives.require_folder(folder, force=replace)
-    with moving(asked, chosen, "commission", force=force) as (session, keyboard):
+    with moving(asked, chosen, "commission", force=force) as (session, end):
         with progress("commission", quiet=as_json) as tell:
             result = drives.commission(session, guards=guards, motors=motors, report=tell, where=asked.bus or "the bus")
-        written = drives.write_files(folder, result, force=replace)
+        written = end.attempt(lambda: drives.write_files(folder, result, force=replace)) or {}
         _print(result, written, as_json=as_json)
-        leave_if_asked(keyboard)
-        result.require()
+        end.conclude(None if result.ended is None else result.ended.master.supervisor.fault, result.require)
 
 
 def _print(result: drives.Commissioned, written: dict[str, str], *, as_json: bool) -> None:

@@ -14,7 +14,7 @@ from softneck.signals import signal_names, write_recording
 
 from ..shared._console import note, print_json, progress
 from ..shared._options import common_options, output_option
-from ._target import Asked, drives_options, leave_if_asked, moving, require_log
+from ._target import Asked, drives_options, moving, require_log
 
 # From rest and out to it [s]: Eq. 22 begins at up to 1.9 rad, which a winch turns in half a second at the least.
 _RAMP_S = 2.0
@@ -56,7 +56,7 @@ def record_command(
     )  # fmt: skip
     prepared = experiment.prepare_runs()
     files = {"signal": signal_name} if Path(signal_name).is_file() else {}
-    with moving(asked, chosen, "record", force=force, homed=True, seed=seed, **files) as (session, keyboard):
+    with moving(asked, chosen, "record", force=force, homed=True, seed=seed, **files) as (session, end):
         if isinstance(session.link, drives.VirtualLink):
             session.link.neck.set(payload=payload)
         with progress("record", quiet=as_json) as tell:
@@ -65,25 +65,24 @@ def record_command(
                 replace(session, facts={"record": experiment.facts()}),
                 report=lambda done: tell(done, signal_name),
             )
-        # Before the log is closed: a full disk must not cost the recording as well.
-        if recorded.recording is not None:
-            write_recording(output, recorded.recording, force=force)
+        recording, where = recorded.recording, None
+        if recording is not None:
+            where = end.write(output, lambda path: write_recording(path, recording, force=force))
         facts: dict[str, Any] = {"signal": signal_name, "runs": len(prepared), "changes": prepared[0][1].as_dict()}
-        _print_record(output, recorded, facts, str(prepared[0][1]), as_json=as_json)
-        leave_if_asked(keyboard)
-        recorded.require()
+        _print_record(where, recorded, facts, str(prepared[0][1]), as_json=as_json)
+        end.conclude(recorded.ended.master.supervisor.fault, recorded.require)
 
 
 def _print_record(
-    output: Path, recorded: drives.ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
-) -> None:  # fmt: skip
+    path: Path | None, recorded: drives.ExperimentResult, facts: dict[str, Any], changes: str, *, as_json: bool
+) -> None:
     if as_json:
-        where = None if recorded.recording is None else str(output)
-        print_json({"recording": where, **facts, **recorded.table()})
+        print_json({"recording": path and str(path), **facts, **recorded.table()})
         return
     if recorded.recording is None:
-        note(f"{output}: nothing was recorded")
+        note("nothing was recorded")
         return
-    click.echo(f"{output}: {recorded.rows} of {recorded.planned} rows of {facts['signal']}; set-points: {changes}")
+    rows = f"{recorded.rows} of {recorded.planned} rows of {facts['signal']}"
+    click.echo(f"{path or 'no recording'}: {rows}; set-points: {changes}")
     for name, count in recorded.ended.master.counts.items():
         click.echo(f"{name}: {count}")

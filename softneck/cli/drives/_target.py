@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import platformdirs
 
 from softneck import cosim, plant
 from softneck.core import OutputFileError, SettingsError, SoftneckError, require_between
@@ -24,9 +23,10 @@ from softneck.drives import HARMLESS, OVERRIDES
 
 from ..shared._console import note
 from ..shared._options import COMMON
+from ._closing import Closing, closing, new_path
 
 if TYPE_CHECKING:
-    from softneck.drives import CanLink, DrivesFile, Keyboard, RunLogger, Sensor, Session, VirtualLink
+    from softneck.drives import CanLink, DrivesFile, RunLogger, Sensor, Session, VirtualLink
     from softneck.drives.master import Frame, Tilt
     from softneck.robot import Robot
 
@@ -191,38 +191,26 @@ def open_link(chosen: Target, *, moves: bool, homed: bool = False, seed: int = 0
 @contextlib.contextmanager
 def moving(
     asked: Asked, chosen: Target, command: str, *, force: bool, homed: bool = False, seed: int = 0, **files: Path | str
-) -> Iterator[tuple[Session, Keyboard]]:
-    """Yield the session of a master and the keyboard; both are closed after the results.
+) -> Iterator[tuple[Session, Closing]]:
+    """Yield the session of a master, and how its command ends; signals are taken until link and log are closed.
 
     `asked`, `chosen`: which drives. `command`: what runs, for its log. `force`: replace an existing log. `homed`,
     `seed`: of simulated drives. `files`: what acts beside the drives file, for the log.
     """
-    from softneck.drives import Keyboard, Session, VirtualLink
+    from softneck.drives import Session, VirtualLink
 
     with (
+        contextlib.ExitStack() as last,
         open_link(chosen, moves=True, homed=homed, seed=seed) as link,
         opened_log(chosen, command, asked.log, force=force) as log,
-        Keyboard() as keyboard,
+        closing(last, command, log) as end,
     ):
         link.tap = None if log is None else log.frame
         yield Session(
             file=chosen.file, link=link, sensor=None if isinstance(link, VirtualLink) else sensor_of(chosen.file),
-            override=asked.override, pace=asked.pace, operator=keyboard, log=log,
+            override=asked.override, pace=asked.pace, operator=end.keyboard, log=log,
             files={**drives_of(chosen.path), **files},
-        ), keyboard  # fmt: skip
-
-
-# Exit code of a process that SIGTERM ended: 128 + 15.
-_SIGTERM_EXIT = 143
-
-
-def leave_if_asked(keyboard: Keyboard) -> None:
-    """End the command after Ctrl-C or SIGTERM, when its results are printed."""
-    if keyboard.interrupted:
-        raise KeyboardInterrupt
-    if keyboard.terminated:
-        note("ended by SIGTERM; the drives are off.")
-        click.get_current_context().exit(_SIGTERM_EXIT)
+        ), end  # fmt: skip
 
 
 def sensor_of(file: DrivesFile) -> Any:
@@ -295,7 +283,7 @@ def opened_log(chosen: Target, command: str, wanted: str | None, *, force: bool)
     from softneck.drives import RunLogger
 
     own = wanted is None and not chosen.simulated and str(chosen.bus).partition(":")[0] not in HARMLESS
-    path = _new_path(command) if own else None if wanted in (None, _NO_LOG) else Path(wanted)
+    path = new_path(command, ".mcap") if own else None if wanted in (None, _NO_LOG) else Path(wanted)
     if path is None:
         yield None
         return
@@ -326,25 +314,6 @@ def _drop_empty(log: RunLogger, *, own: bool) -> None:
     if own and not log.described and log.path.is_file():
         log.path.unlink()
         note(f"log: {log.path} is removed: nothing moved")
-
-
-def log_folder() -> Path:
-    """Return the folder of automatic logs: systemd's LogsDirectory=, otherwise the user's own."""
-    given = os.environ.get("LOGS_DIRECTORY", "").partition(":")[0]
-    return Path(given) if given else platformdirs.user_log_path("softneck", appauthor=False)
-
-
-def _new_path(command: str) -> Path:
-    """Return a path that is free; names sort by time."""
-    from softneck.drives import partial
-
-    stem = f"{command}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
-    folder, number = log_folder(), 1
-    path = folder / f"{stem}.mcap"
-    while path.exists() or partial(path).exists():
-        number += 1
-        path = folder / f"{stem}_{number}.mcap"
-    return path
 
 
 def acting_files(

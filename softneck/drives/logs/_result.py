@@ -149,6 +149,7 @@ class DrivesResult(ReprMixin):
         terminated: whether SIGTERM ended it.
         speeds: of the motors at the rows of `signals`, (rows, motors) [rad/s].
         robot: of the run.
+        error: which ended the loop, or kept the drives from being switched off; None without one.
     """
 
     signals: LoopResult
@@ -166,6 +167,7 @@ class DrivesResult(ReprMixin):
     terminated: bool = False
     speeds: Matrix = field(default_factory=lambda: np.zeros((0, 3)))
     robot: Robot = NECK
+    error: Exception | None = None
 
     @property
     def completed(self) -> bool:
@@ -178,7 +180,9 @@ class DrivesResult(ReprMixin):
         return self.cycles * self.cycle / max(self.wall_time, 1e-9)
 
     def require(self) -> None:
-        """Raise CheckFailedError if a fault ended the run early."""
+        """Raise the error that ended the loop, or CheckFailedError if a fault ended the run early."""
+        if self.error is not None:
+            raise self.error
         require_unstopped(self.fault, rehome=self.rehome)
 
     def recording(self) -> Recording:

@@ -83,6 +83,7 @@ RULES: dict[str, Rule] = {
     "not_watched": Rule(_R.COUNT, 0, 5.0, "not all is compared with the experiments"),
     "stalled": Rule(_R.STOP, 1, 0.0, "the control loop stood still for 5 cycles or more"),
     "late_cycle": Rule(_R.COUNT, 1, 0.0, "a cycle came late"),
+    "loop_failed": Rule(_R.STOP, 1, 0.0, "the control loop failed"),
     "clock": Rule(_R.STOP, 1, 0.0, "the clock went backwards"),
     "enable_timeout": Rule(_R.STOP, 0, 2.0, "a drive did not reach Operation Enabled"),
     "ramp_timeout": Rule(_R.STOP, 0, 60.0, "a ramp did not end"),

@@ -11,16 +11,17 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from softneck.core import SettingsError, SoftneckError
+from softneck.core import SettingsError
 
 from ..bus._file import DrivesFile
-from ..bus._link import CanLink, VirtualLink
+from ..bus._link import CanLink, GuardedLink, VirtualLink
 from ..logs._cycle import LoggedPilot
 from ..logs._result import CycleTimes, fault_table, require_unstopped
 from ..logs._run_log import RunLogger, run_facts
 from ..master import Event, Frame, Master, MasterSettings
+from ..master._cia402 import OFF
 from ..master._fieldbus import Command as NmtCommand
 from ..master._fieldbus import nmt_frame
 from ..master._master import Pilot
@@ -83,6 +84,7 @@ class RunEnd:
         wall_time: [s].
         terminated: whether SIGTERM asked for the end.
         tensions: estimated when the drives last had power [N].
+        error: which ended the loop, or kept the drives from being switched off; None without one.
     """
 
     master: Master
@@ -90,9 +92,12 @@ class RunEnd:
     wall_time: float
     terminated: bool = False
     tensions: tuple[float, ...] = ()
+    error: Exception | None = None
 
     def require(self) -> None:
-        """Raise CheckFailedError if something stopped the drives."""
+        """Raise the error that ended the loop, or CheckFailedError if something else stopped the drives."""
+        if self.error is not None:
+            raise self.error
         supervisor = self.master.supervisor
         require_unstopped(supervisor.fault, rehome=supervisor.rehome)
 
@@ -143,6 +148,8 @@ def _run_session(
     notifier: Notifier,
 ) -> RunEnd:
     file, link = session.file, session.link
+    if not session.simulated and session.sensor is None:
+        raise SettingsError("drives on a bus need an inclinometer.")
     file.master_settings(sample_time)
     log = session.log
     if log is not None:
@@ -170,20 +177,43 @@ def _run_session(
     session = replace(session, watches=(remember, *session.watches))
     started = time.perf_counter()
     master.start()
-    if isinstance(link, VirtualLink):
-        link.receive(_START_TIME)
-        _in_virtual_time(session, link, master, times, most)
+    error: Exception | None = None
+    try:
+        if isinstance(link, VirtualLink):
+            link.receive(_START_TIME)
+            _in_virtual_time(session, link, master, times, most)
+        else:
+            time.sleep(_START_TIME)
+            link.receive(0.0)
+            notifier.ready()
+            _in_real_time(session, link, master, times, notifier)
+    except BaseException as failure:
+        # Whatever happens here must not leave a drive on, for this loop feeds them, and must not lose the recording.
+        fed = _emergency_stop(link, file, master)
+        if not isinstance(failure, Exception):
+            raise
+        error = failure
+        _take_back(master, Event(link.now, "loop_failed", 0, f"{type(failure).__name__}: {failure}"))
     else:
-        time.sleep(_START_TIME)
-        link.receive(0.0)
-        notifier.ready()
-        _in_real_time(session, link, master, times, notifier)
-    left = disarm(link, file, checked.guarding, () if master.starved else master.bus.signs_of_life())
+        fed = not master.starved
+    failed = _switch_off(link, file, checked.guarding, master, master.bus.signs_of_life() if fed else ())
+    terminated = bool(getattr(session.operator, "terminated", False))
+    return RunEnd(master, times, time.perf_counter() - started, terminated, tensions[0], error or failed)
+
+
+def _switch_off(
+    link: CanLink | VirtualLink, file: DrivesFile, guarding: str, master: Master, signs: Sequence[Frame]
+) -> Exception | None:
+    """End the guarding of the drives; a drive that is not off ends a run that looked done. Return what failed."""
+    error: Exception | None = None
+    try:
+        left = disarm(link, file, guarding, signs)
+    except Exception as failure:  # the recording must not be lost by it
+        error, left = failure, dict.fromkeys(file.nodes, f"{type(failure).__name__}: {failure}")
     if master.supervisor.fault is None:
         for node, why in left.items():
             _take_back(master, Event(link.now, "not_off", node, why))
-    terminated = bool(getattr(session.operator, "terminated", False))
-    return RunEnd(master, times, time.perf_counter() - started, terminated, tensions[0])
+    return error
 
 
 def _take_back(master: Master, event: Event) -> None:
@@ -214,37 +244,30 @@ def _in_virtual_time(
 
 def _in_real_time(session: Session, link: CanLink, master: Master, times: CycleTimes, notifier: Notifier) -> None:
     """Step the master at its period until it is done."""
-    sensor, operator = session.sensor, session.operator
-    if sensor is None:
-        raise SettingsError("drives on a bus need an inclinometer.")
+    sensor, operator = cast("Sensor", session.sensor), session.operator
     period = master.settings.bus.cycle
     due = link.now
-    try:
-        while not master.finished:
-            rest = due - link.now
-            if rest > 0.0:
-                time.sleep(rest)
-            now = link.now
-            # All that is there, so that one late TPDO does not leave a lag for ever.
-            frames = link.receive(0.0)
-            tilt = None
-            if master.sample_due:
-                tilt = sensor.read(now, frames)
-            else:
-                sensor.take(frames)
-            if operator is not None:
-                _ask(master, operator())
-            out = master.step(now, frames, tilt)
-            link.send(out)
-            times.take(now, link.now - now)
-            notifier.cycle(now, master)
-            for watch in session.watches:
-                watch(now, frames, out, tilt, master)
-            due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period
-    except BaseException:
-        # Whatever happens here must not leave a drive on: this loop is what feeds them.
-        _emergency_stop(link, session.file)
-        raise
+    while not master.finished:
+        rest = due - link.now
+        if rest > 0.0:
+            time.sleep(rest)
+        now = link.now
+        # All that is there, so that one late TPDO does not leave a lag for ever.
+        frames = link.receive(0.0)
+        tilt = None
+        if master.sample_due:
+            tilt = sensor.read(now, frames)
+        else:
+            sensor.take(frames)
+        if operator is not None:
+            _ask(master, operator())
+        out = master.step(now, frames, tilt)
+        link.send(out)
+        times.take(now, link.now - now)
+        notifier.cycle(now, master)
+        for watch in session.watches:
+            watch(now, frames, out, tilt, master)
+        due = max(due + period, now + 0.5 * period) if link.now - due > period else due + period
 
 
 def _ask(master: Master, ask: Ask | None) -> None:
@@ -254,8 +277,11 @@ def _ask(master: Master, ask: Ask | None) -> None:
         master.leave("asked to")
 
 
-def _emergency_stop(link: CanLink, file: DrivesFile) -> None:
+def _emergency_stop(link: CanLink | VirtualLink, file: DrivesFile, master: Master) -> bool:
+    """Stop all drives, guarded until they had the time to; return whether all are off."""
+    guarded = GuardedLink(link, master.bus.signs_of_life(), file.guard_cycles * file.cycle)
     try:
-        stop(link, file)
-    except SoftneckError:
-        return
+        states = stop(guarded, file)
+    except Exception:  # the drives' own guarding stops them where nothing can be sent any more
+        return False
+    return all(state in {one.name for one in OFF} for state in states.values())

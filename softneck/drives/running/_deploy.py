@@ -191,4 +191,5 @@ def _run(
         terminated=ended.terminated,
         speeds=log.speeds(),
         robot=session.file.moves,
+        error=ended.error,
     )

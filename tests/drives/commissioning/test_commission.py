@@ -252,7 +252,7 @@ def test_a_push_is_stopped_by_the_guard() -> None:
 
     def push(*_: object) -> None:
         # Half a second after the motors got power: 0.6 N at the platform.
-        link.neck.set(push_x=2.0 if link.now > 5.0 else 0.0)
+        link.neck.set(push_x=2.0 if link.now > 6.0 else 0.0)
 
     result = commission(Session(file=file, link=link, watches=(push,)), guards=guards)
     assert result.moves is not None

@@ -39,8 +39,9 @@ def test_every_guard_that_stops_has_a_scenario_that_needs_it() -> None:
     # Those of the plausibility supervisor have rows of their own, in tests/drives/plausible.py.
     needed |= {name for row in ROWS.values() for name in row.names} | {"sensor_rate"}
     # Tests of their own: `pushed` in test_jog.py, for it acts before a run begins, `not_off` in test_switched_off.py,
-    # for it acts after; the others in test_master.py.
-    assert acting - needed == {"clock", "enable_timeout", "ramp_timeout", "operator", "pushed", "not_off"}
+    # for it acts after, `loop_failed` in test_closing.py, for it acts beside the master; the others in test_master.py.
+    others = {"clock", "enable_timeout", "ramp_timeout", "operator", "pushed", "not_off", "loop_failed"}
+    assert acting - needed == others
 
 
 def test_a_short_dropout_is_bridged() -> None:

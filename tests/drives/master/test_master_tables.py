@@ -95,7 +95,8 @@ def test_the_rules_are_those_of_the_fault_table() -> None:
         "sensor_reversed": (stop, 0, 0.5), "sensor_swapped": (stop, 0, 0.5), "sensor_stuck": (retreat, 0, 0.5),
         "sensor_late": (retreat, 0, 0.5), "sensor_noise": (retreat, 0, 0.5), "sensor_rate": (retreat, 0, 0.5),
         "sensor_drift": (retreat, 0, 4.0), "not_watched": (count, 0, 5.0),
-        "late_cycle": (count, 1, 0.0), "clock": (stop, 1, 0.0), "enable_timeout": (stop, 0, 2.0),
+        "late_cycle": (count, 1, 0.0), "clock": (stop, 1, 0.0), "loop_failed": (stop, 1, 0.0),
+        "enable_timeout": (stop, 0, 2.0),
         "ramp_timeout": (stop, 0, 60.0), "not_off": (stop, 0, 1.0), "left": (count, 1, 0.0), "operator": (stop, 1, 0.0),
     }  # fmt: skip
     assert {name: (rule.reaction, rule.cycles, rule.seconds) for name, rule in RULES.items()} == expected
