@@ -4,6 +4,8 @@ from .linear._custom import CustomSettings as CustomSettings
 from .linear._fopi import FopiSettings as FopiSettings
 from .linear._fopi import fopi as fopi
 from .linear._lqg import LqgSettings as LqgSettings
+from .linear._margins import Margins as Margins
+from .linear._margins import loop_margins as loop_margins
 from .linear._own import OwnController as OwnController
 from .linear._pi import PiSettings as PiSettings
 from .linear._pid import PidSettings as PidSettings
@@ -26,6 +28,9 @@ from .varying._adaptive import VaryingController as VaryingController
 from ._design import linear_plant as linear_plant
 from .linear._axis_loop import least_rise as least_rise
 from .linear._controller import assumed_lines as assumed_lines
+from .linear._margins import LoopMargins as LoopMargins
+from .linear._margins import margins_of_loops as margins_of_loops
+from .linear._margins import polynomials_at as polynomials_at
 from .linear._own import own_attributes as own_attributes
 from .linear._own import own_controller as own_controller
 from .linear._own import own_module as own_module

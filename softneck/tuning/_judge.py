@@ -29,7 +29,6 @@ from softneck.verification import (
     crossings,
     data_margins,
     direction,
-    frequency_grid,
     judge_loop,
     loops_under_test,
     make_simulation_model,
@@ -190,13 +189,12 @@ LARGE = LARGE
 class Ready:
     """Objects that a worker prepares once per task.
 
-    `plants`: linear ones, without the delay that a loop's order adds. `frequency`: grid of the margins [rad/s].
-    `weights`: of the motors in each axis's input. `uncertain`: plant of the linear designs. `own`: simulation models.
-    `all`: loops of the level `all`. `kept`: designs by kind and settings.
+    `plants`: linear ones, without the delay that a loop's order adds. `weights`: of the motors in each axis's input.
+    `uncertain`: plant of the linear designs. `own`: simulation models. `all`: loops of the level `all`. `kept`: designs
+    by kind and settings.
     """
 
     plants: Plants
-    frequency: Vector
     weights: Any
     uncertain: UncertainPlant
     own: tuple[SimulationModel, ...]
@@ -229,8 +227,7 @@ def prepare(task: Task) -> Ready:
         plants = all_plants(sources, _PLANT_COUNT, int(certificate.sampling["seed"]))
         own = tuple(make_simulation_model(thing, name, task.robot) for name, thing in task.own.items())
         kept["ready"] = Ready(
-            plants, frequency_grid(plants.sample_time, certificate.scale.time), sources[0].weights,
-            uncertain_plant(task.plant), own,
+            plants, sources[0].weights, uncertain_plant(task.plant), own,
             cases(own, task.asked, task.robot),
         )  # fmt: skip
     return kept["ready"]
@@ -278,7 +275,7 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
     found: dict[str, float] = {}
     steep = float(asked.uncertainty["rolloff_db_per_decade"])
     for law in judged_one.laws.values():
-        for name, values in margins(plants, law, ready.frequency).items():
+        for name, values in margins(plants, law).items():
             axis, _, last = name.partition(".")
             value = float(values.min() if last in LARGE else values.max())
             keep_worse(found, name, value)

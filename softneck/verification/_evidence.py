@@ -104,7 +104,7 @@ def gather(
     linear = []
     for number, (name, law) in enumerate(controller.laws.items()):
         progress(0.5 * number / len(controller.laws), "margins" + (f" at {name}" if name else ""))
-        linear.append(_linear(name, law, plants, sources, controller.extra, w, asked))
+        linear.append(_linear(name, law, plants, sources, controller.extra, asked))
     progress(0.5, "steps against every plant")
     stepped = join([plants, *(part.plants.take(np.arange(len(plants), len(part.plants))) for part in linear)])
     test, weights = asked.step_test(seed), sources[0].weights
@@ -133,12 +133,12 @@ def gather(
 
 
 def _linear(
-    name: str, law: LinearLaw, plants: Plants, necks: list[PlantSource], extra: int, w: Vector, asked: Requirements
+    name: str, law: LinearLaw, plants: Plants, necks: list[PlantSource], extra: int, asked: Requirements
 ) -> LinearEvidence:
     seed, generations = int(asked.sampling["seed"]), int(asked.sampling["search_generations"])
-    found = search(necks, law, w, extra=extra, generations=generations, seed=seed) if generations else None
+    found = search(necks, law, extra=extra, generations=generations, seed=seed) if generations else None
     tried = plants if found is None else join([plants, found.plants.later(extra)])
-    table = margins(tried, law, w)
+    table = margins(tried, law)
     parts = [structured_singular_value(neck, law, extra=extra, scale=asked.scale) for neck in necks]
     return LinearEvidence(name, law, tried, table, found, parts)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, require_one_of
-from softneck.design import two_scalars
+from softneck.design import LoopMargins, margins_of_loops, two_scalars
 from softneck.estimation import robot_of
 from softneck.identification import AxisMeasured, response_of
 from softneck.loop import ORDERS
@@ -26,8 +26,6 @@ SMALL = ("sensitivity", "complementary", "control_sensitivity")
 _LOWEST_FREQUENCY = 0.02
 # Plants whose responses are in memory at once.
 _CHUNK_SIZE = 64
-# The cosine of pi, up to 1e-6 rad.
-_COS_PI = -1.0 + 5e-13
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,6 +96,11 @@ def frequency_grid(sample_time: float, time: float = 1.0, points: int = 360) -> 
 
 def radii(plants: Plants, law: LinearLaw) -> Vector:
     """Return the spectral radius (n,) of every closed loop, its delay exact."""
+    return np.abs(closed_poles(plants, law)).max(axis=1)
+
+
+def closed_poles(plants: Plants, law: LinearLaw) -> np.ndarray:
+    """Return the poles (n, N) of every closed loop, its delay exact."""
     A, B, C = _plant_matrices(plants)
     n, order, nc = len(plants), A.shape[1], law.A.shape[0]
     closed = np.zeros((n, order + nc, order + nc))
@@ -105,7 +108,7 @@ def radii(plants: Plants, law: LinearLaw) -> Vector:
     closed[:, :order, order:] = B @ law.C
     closed[:, order:, :order] = law.By @ C
     closed[:, order:, order:] = law.A
-    return np.abs(np.linalg.eigvals(closed)).max(axis=1)
+    return np.linalg.eigvals(closed)
 
 
 def _plant_matrices(plants: Plants) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -152,43 +155,57 @@ def inverse(M: np.ndarray) -> np.ndarray:
     return found / (a * d - b * c)[..., None, None]
 
 
-def margins(plants: Plants, law: LinearLaw, w: Vector, radius: Vector | None = None) -> dict[str, Vector]:
+def margins(plants: Plants, law: LinearLaw) -> dict[str, Vector]:
     """Return name -> (n,) margins of every plant: `pitch.disk_margin`, ..., `mimo.disk_margin`, `stability.radius`.
 
-    A loop that is not stable has margin 0 (gain margin 1) and infinite peaks.
+    A loop that is not stable has margin 0 (gain margin 1) and infinite peaks. Gain and phase margins are the smaller of
+    both directions.
     """
-    size = radii(plants, law) if radius is None else radius
     parts = [
-        _margins(plants.take(np.arange(k, min(k + _CHUNK_SIZE, len(plants)))), law, w)
+        _margins(plants.take(np.arange(k, min(k + _CHUNK_SIZE, len(plants)))), law)
         for k in range(0, len(plants), _CHUNK_SIZE)
     ]
-    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    unstable = size >= 1.0
-    for name in found:
-        last = name.partition(".")[2]
-        found[name][unstable] = math.inf if last in SMALL else 1.0 if last == "gain_margin" else 0.0
-    return {"stability.radius": size, **found}
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _margins(plants: Plants, law: LinearLaw, w: Vector) -> dict[str, Vector]:
-    P, L = loops(plants, law, w)
-    eye = np.eye(len(plants.axes))
-    S = inverse(eye + L)
-    CS = -law.feedback(w) @ S
-    found: dict[str, Vector] = {}
+def loops_of(plants: Plants, law: LinearLaw, *, peaks: bool = True) -> tuple[LoopMargins, Vector]:
+    """Return the margins of the loops of each axis, the others closed, and the spectral radius (n,) of each plant.
+
+    With `peaks` the sizes `more` are |CS| of each axis and the structured singular value of S - I/2 of all axes.
+    """
+    m = len(plants.axes)
+    eye, X, own = np.eye(m), mixing_matrix(plants.cross, m), np.arange(m)
+
+    def evaluate(rows: np.ndarray, w: Vector) -> tuple[np.ndarray, np.ndarray]:
+        each, back = np.unique(w, return_inverse=True)
+        Ky = law.feedback(each)[back]
+        P = X[rows] * plants.response_at(rows, w)[..., None]
+        S = inverse(eye - P @ Ky)
+        if not peaks:
+            return S[:, own, own], np.zeros((w.size, 0))
+        at_input = inverse(eye - Ky @ P)
+        joint = np.maximum(*(_scalars(M - 0.5 * eye) for M in (S, at_input)))
+        return S[:, own, own], np.column_stack([np.abs((Ky @ S)[:, own, own]), joint])
+
+    poles = closed_poles(plants, law)
+    made = margins_of_loops(evaluate, poles, plants.sample_time, int(plants.delay.max(initial=0)))
+    return made, np.abs(poles).max(axis=1)
+
+
+def _margins(plants: Plants, law: LinearLaw) -> dict[str, Vector]:
+    made, radius = loops_of(plants, law)
+    found: dict[str, Vector] = {"stability.radius": radius}
+    # S - T = 2 S - 1; radius of the balanced disk is 2 / max |S - T|.
+    with np.errstate(divide="ignore"):
+        gain = np.minimum(made.gain, 1.0 / made.gain_down)
     for i, axis in enumerate(plants.axes):
-        own = S[..., i, i]
-        found[f"{axis}.sensitivity"] = np.abs(own).max(axis=1)
-        found[f"{axis}.complementary"] = np.abs(1.0 - own).max(axis=1)
-        found[f"{axis}.control_sensitivity"] = np.abs(CS[..., i, i]).max(axis=1)
-        # S - T = 2 S - 1; radius of the balanced disk is 2 / max |S - T|.
-        found[f"{axis}.disk_margin"] = 2.0 / np.abs(2.0 * own - 1.0).max(axis=1)
-        for name, values in classical_margins(1.0 / own - 1.0, w).items():
-            found[f"{axis}.{name}"] = values
-    at_input = inverse(eye - law.feedback(w) @ P)
-    sizes = [_scalars(M - 0.5 * eye).max(axis=1) for M in (S, at_input)]
-    found["mimo.disk_margin"] = 1.0 / np.maximum(*sizes)
-    return found
+        found |= {
+            f"{axis}.sensitivity": made.sensitivity[:, i], f"{axis}.complementary": made.complementary[:, i],
+            f"{axis}.control_sensitivity": made.more[:, i], f"{axis}.disk_margin": 2.0 / made.difference[:, i],
+            f"{axis}.gain_margin": gain[:, i], f"{axis}.phase_margin_deg": np.degrees(made.phase[:, i]),
+            f"{axis}.delay_margin_ms": 1e3 * made.delay[:, i],
+        }  # fmt: skip
+    return {**found, "mimo.disk_margin": 1.0 / made.more[:, -1]}
 
 
 def _scalars(M: np.ndarray) -> np.ndarray:
@@ -199,36 +216,6 @@ def _scalars(M: np.ndarray) -> np.ndarray:
     if M.shape[-1] == 2:
         return two_scalars(M)
     return np.abs(np.linalg.eigvals(np.abs(M))).max(axis=-1)
-
-
-def classical_margins(L: np.ndarray, w: Vector) -> dict[str, Vector]:
-    """Return gain, phase [deg] and delay margins [ms] of scalar loops (n, m), by straight lines between frequencies.
-
-    Gain and phase margins are the smaller of both directions.
-    """
-    n = L.shape[0]
-    x = np.log(w)
-    phase = np.unwrap(np.angle(L), axis=1)
-    size = np.log(np.maximum(np.abs(L), 1e-300))
-    gain = np.full(n, math.inf)
-    # Where the phase passes an odd multiple of pi.
-    turns = np.floor((phase + math.pi) / (2.0 * math.pi))
-    for i, k in np.argwhere(turns[:, 1:] != turns[:, :-1]):
-        border = 2.0 * math.pi * max(turns[i, k], turns[i, k + 1]) - math.pi
-        part = (border - phase[i, k]) / (phase[i, k + 1] - phase[i, k])
-        gain[i] = min(gain[i], abs(size[i, k] + part * (size[i, k + 1] - size[i, k])))
-    # A loop is real at Nyquist: where it is negative, its phase reaches such a multiple without passing it.
-    ends = np.cos(phase[:, -1]) < _COS_PI
-    gain[ends] = np.minimum(gain[ends], np.abs(size[ends, -1]))
-    least, delay = np.full(n, math.inf), np.full(n, math.inf)
-    for i, k in np.argwhere((size[:, 1:] > 0.0) != (size[:, :-1] > 0.0)):
-        part = size[i, k] / (size[i, k] - size[i, k + 1])
-        angle = phase[i, k] + part * (phase[i, k + 1] - phase[i, k])
-        left = (angle + math.pi) % (2.0 * math.pi)
-        at = math.exp(x[k] + part * (x[k + 1] - x[k]))
-        least[i] = min(least[i], left, 2.0 * math.pi - left)
-        delay[i] = min(delay[i], left / at)
-    return {"gain_margin": np.exp(gain), "phase_margin_deg": np.degrees(least), "delay_margin_ms": 1e3 * delay}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

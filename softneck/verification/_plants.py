@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from softneck.core import Matrix, SettingsError, Vector, to_si
+from softneck.design import polynomials_at
 from softneck.estimation import AxisPlant, axis_plant, directions_of, robot_of
 from softneck.identification import AxisMeasured, response_of
 from softneck.robot import Robot
@@ -183,6 +184,12 @@ class Plants:
         z = np.exp(1j * frequency * self.sample_time)
         powers = z[None, :] ** np.arange(self.numerator.shape[2] - 1, -1, -1)[:, None]
         return (self.numerator @ powers) / (self.denominator @ powers) * z ** -self.delay[:, :, None].astype(float)
+
+    def response_at(self, rows: np.ndarray, frequency: Vector) -> np.ndarray:
+        """Return the responses (k, axes) of the plants `rows` (k,), each at its own `frequency` (k,) [rad/s]."""
+        z = np.exp(1j * frequency * self.sample_time)
+        ratio = polynomials_at(self.numerator[rows], z) / polynomials_at(self.denominator[rows], z)
+        return ratio * z[:, None] ** -self.delay[rows].astype(float)
 
 
 def source_of_family(family: Any, name: str) -> PlantSource:

@@ -23,7 +23,7 @@ from softneck.core import Matrix, Vector
 from softneck.design import mu_upper
 from softneck.identification import response_of
 
-from ._linear import LinearLaw, inverse, loops, radii
+from ._linear import LinearLaw, loops_of, radii
 from ._metrics import Scale
 from ._plants import AxisBox, Plants, PlantSource, join, make_plants, measured_plant, mixing_matrix
 
@@ -43,19 +43,17 @@ class SearchResult:
     radius: float
 
 
-def search(
-    necks: list[PlantSource], law: LinearLaw, w: Vector, *, extra: int, generations: int, seed: int
-) -> SearchResult:
+def search(necks: list[PlantSource], law: LinearLaw, *, extra: int, generations: int, seed: int) -> SearchResult:
     """Return the plants inside the boxes with the smallest disk margin, unstable ones first.
 
     Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis, or of all coupled axes;
-    `w` (m,) in rad/s, `extra` samples of delay from the loop's order.
+    `extra` samples of delay from the loop's order.
     """
     worst: list[Plants] = []
     largest = 0.0
     for source, neck in enumerate(necks):
         for axes in coupled_axes(neck, law):
-            task = _Task(neck, source, axes, law, w, extra)
+            task = _Task(neck, source, axes, law, extra)
             found = _evolve(task.badness, 3 * len(axes), generations, seed)
             label = axes_name(neck, axes) + (" axes" if len(axes) > 1 else "")
             worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({label})"))
@@ -78,10 +76,8 @@ def axes_name(neck: PlantSource, axes: Sequence[int]) -> str:
 class _Task:
     """The objective of the search in one source, and the largest radius."""
 
-    def __init__(
-        self, neck: PlantSource, source: int, axes: tuple[int, ...], law: LinearLaw, w: Vector, extra: int
-    ) -> None:
-        self.neck, self.source, self.axes, self.law, self.w, self.extra = neck, source, axes, law, w, extra
+    def __init__(self, neck: PlantSource, source: int, axes: tuple[int, ...], law: LinearLaw, extra: int) -> None:
+        self.neck, self.source, self.axes, self.law, self.extra = neck, source, axes, law, extra
         self.radius = 0.0
 
     def plants(self, x: Matrix, name: str = "") -> Plants:
@@ -95,10 +91,9 @@ class _Task:
     def badness(self, x: Matrix) -> Vector:
         """Return the objective (n,) at x (3 axes, n), which scipy minimises."""
         plants = self.plants(x.T).later(self.extra)
-        size = radii(plants, self.law)
+        found, size = loops_of(plants, self.law, peaks=False)
         self.radius = max(self.radius, float(size.max()))
-        S = inverse(np.eye(len(self.neck.axes)) + loops(plants, self.law, self.w)[1])
-        peaks = np.stack([np.abs(2.0 * S[..., i, i] - 1.0).max(axis=1) for i in self.axes]).max(axis=0)
+        peaks = found.difference[:, list(self.axes)].max(axis=1)
         # The radius of unstable loops, else the peak of |S - T|, which is infinite at the stability limit.
         return -np.where(size >= 1.0, _UNSTABLE_BADNESS * size, np.minimum(peaks, _UNSTABLE_BADNESS))
 

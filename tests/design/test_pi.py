@@ -13,8 +13,7 @@ import pytest
 from scipy.io import loadmat
 
 from softneck.core import FileFormatError, SettingsError, Vector, load, read_archive, write_archive
-from softneck.design import LinearController, PiSettings
-from softneck.design.linear._axis_loop import loop_margins
+from softneck.design import LinearController, PiSettings, loop_margins
 from softneck.design.linear._controller import AxisController, pi_axis
 from softneck.estimation import KalmanSettings, LinearNeck
 from softneck.loop import BlockPart, Loop, LoopResult, StepReference, metrics, run_loop

@@ -24,12 +24,10 @@ from softneck.verification._experiments import (
     crossing_values,
     crossings,
 )
-from softneck.verification._linear import LinearLaw, frequency_grid, margins
+from softneck.verification._linear import LinearLaw, margins
 from softneck.verification._plants import Plants, all_plants, source_of_family
 
 from .necks import TS, family, pi
-
-W = frequency_grid(TS, 20_000)
 
 
 def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
@@ -57,7 +55,7 @@ def first(loop: LoopUnderTest, axes: str, what: str) -> float:
 @pytest.mark.parametrize("row", [0, 3])
 def test_on_linear_plants_the_margins_are_the_closed_forms_to_one_percent(row: int) -> None:
     plants = all_plants([source_of_family(family(), "f")], 12, 0)
-    expected = margins(plants.take([row]), LinearLaw.of(pi().ss()), W)
+    expected = margins(plants.take([row]), LinearLaw.of(pi().ss()))
     loop = over(plants, row)
     up = first(loop, "pitch", "gain_up")
     assert up == pytest.approx(expected["pitch.gain_margin"][0], rel=0.01)

@@ -15,7 +15,7 @@ from softneck.core._certificate import required_rows
 from softneck.loop import LoopResult, metrics
 from softneck.robot import Robot
 from softneck.verification import make_requirements, metric_names, metric_title
-from softneck.verification._linear import LinearLaw, classical_margins, frequency_grid
+from softneck.verification._linear import LinearLaw, frequency_grid
 from softneck.verification._plants import (
     all_plants,
     join,
@@ -248,26 +248,6 @@ def test_the_static_gain_of_a_plant_is_its_number() -> None:
     w = 0.01
     turned = -np.angle(plants.response(np.array([w]))[0, :, 0] / numbers[0, :, 0]) / w
     np.testing.assert_allclose(turned, [0.05 + TS / 2 + 1 / 5.0, 0.071 + TS / 2 + 1 / 3.0], rtol=1e-3)
-
-
-# -- margins ----------------------------------------------------------------------------------------------------------
-
-
-def test_margins_of_an_integrator_with_delay_are_the_textbooks() -> None:
-    """L = k exp(-s T)/s: crosses at k, phase margin pi/2 - k T, gain margin pi/(2 k T), delay margin pm/k."""
-    w = np.geomspace(1e-2, 20.0, 4000)
-    k, T = np.array([0.5, 1.0, 2.5]), 0.5
-    L = k[:, None] * np.exp(-1j * w * T) / (1j * w)
-    found = classical_margins(L, w)
-    crossing = math.pi / 2 - k * T
-    np.testing.assert_allclose(found["phase_margin_deg"], np.degrees(crossing), rtol=1e-4)  # straight lines between
-    np.testing.assert_allclose(found["gain_margin"], np.pi / (2 * k * T), rtol=1e-4)
-    np.testing.assert_allclose(found["delay_margin_ms"], 1e3 * crossing / k, rtol=1e-4)
-    # Upside down: where the gain may fall by so much, an unstable plant's loop for example.
-    upside = classical_margins(1.0 / np.conj(L), w)
-    np.testing.assert_allclose(upside["gain_margin"], found["gain_margin"], rtol=1e-4)
-    # A loop that crosses neither has no margin to lose.
-    assert all(np.isinf(values).all() for values in classical_margins(np.full((1, 4000), 0.5 + 0j), w).values())
 
 
 def test_a_controller_is_coupled_where_one_angle_moves_the_others_input() -> None:

@@ -13,12 +13,10 @@ from softneck.cosim import load_loop
 from softneck.robot import Robot
 from softneck.verification import make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
-from softneck.verification._linear import LinearLaw, frequency_grid, margins
+from softneck.verification._linear import LinearLaw, margins
 from softneck.verification._worst import write_neck
 
-from .necks import QUICK, TS, family, pi
-
-W = frequency_grid(TS)
+from .necks import QUICK, family, pi
 
 
 def _values(*numbers: float) -> dict[str, Values]:
@@ -55,7 +53,7 @@ def test_no_plant_of_a_verification_is_worse_than_the_one_that_it_names() -> Non
     # The named plant is the one of that value: its own margins, computed alone.
     plants = found.evidence.linear[0].plants
     law = LinearLaw.of(pi().ss())
-    table = margins(plants, law, W)
+    table = margins(plants, law)
     for verdict in computed:
         axis, _, name = verdict.requirement.metric.partition(".")
         if axis == "axes" and f"pitch.{name}" in table:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,31 +15,10 @@ from softneck.runtime import load_functions
 
 from ..plants._uncertain import StepAndLoad, StepAndLoadResult, judge
 from ._controller import AxisController, ReferenceFilter
-
-if TYPE_CHECKING:
-    import control
+from ._margins import LoopMargins, margins_of_loops, polynomials_at, sensitivity_of
 
 # Lowest frequency on which a neck's loop is judged [rad/s]; loops of slower robots are from where their times are.
 LOWEST = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Margins:
-    """How far a loop is from instability.
-
-    Attributes:
-        gain: factor on the loop gain until instability; inf where there is none.
-        phase: [rad]; inf where the gain never reaches 1.
-        sensitivity: Ms, the largest `|1/(1 + L)|`.
-        crossover: gain crossover [rad/s]; NaN where there is none.
-        delay: [s] that the loop stands beyond its own.
-    """
-
-    gain: float
-    phase: float
-    sensitivity: float
-    crossover: float
-    delay: float
 
 
 def frequencies(sample_time: float, *, lowest: float = LOWEST) -> Vector:
@@ -48,42 +26,6 @@ def frequencies(sample_time: float, *, lowest: float = LOWEST) -> Vector:
     # 1 % apart: the peak of |S| of a well-damped loop changes by less than 1e-4 between two of them.
     highest = math.pi / sample_time
     return np.geomspace(lowest, highest, math.ceil(math.log(highest / lowest) / 0.01))
-
-
-def loop_margins(loop: control.TransferFunction, *, lowest: float = LOWEST) -> Margins:
-    """Return the margins of the discrete open loop `loop`, verified to be stable when closed.
-
-    Gain and phase margin are python-control's, from the exact z^-d; Ms is from the frequency response.
-    Raises SettingsError: the closed loop is not stable.
-    """
-    import control
-
-    dt: Any = loop.dt
-    closed: Any = control.feedback(loop, 1)
-    poles = np.asarray(closed.poles())
-    radius = float(np.abs(poles).max(initial=0.0))
-    if radius >= 1.0:
-        raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
-    with warnings.catch_warnings():
-        # It looks at the integrator's own frequency, zero, as well.
-        warnings.filterwarnings("ignore", "(divide by zero|invalid value)", RuntimeWarning)
-        # It says that polynomials of this order are inaccurate and that it takes the frequency response instead.
-        warnings.filterwarnings("ignore", "stability_margins: Falling back", UserWarning)
-        gain, phase, _, _, crossover, _ = control.stability_margins(loop)
-    response = np.asarray(loop(np.exp(1j * frequencies(dt, lowest=lowest) * dt)))
-    sensitivity = float(np.abs(1.0 / (1.0 + response)).max())
-    angle = math.radians(float(phase))
-    delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
-    return Margins(nearest_gain_margin(float(gain), response[-1]), angle, sensitivity, float(crossover), delay)
-
-
-def nearest_gain_margin(gain: float, last: complex) -> float:
-    """Return the nearer of a gain margin and of that at the Nyquist frequency, which python-control leaves out.
-
-    `gain`: a factor. `last`: the open loop at the Nyquist frequency, where it is real.
-    """
-    there = -1.0 / last.real if last.real < 0.0 else math.inf
-    return min(gain, there, key=lambda factor: abs(math.log(max(factor, 1e-300))))
 
 
 # Samples are judged on a coarser grid than margins: 4 % apart, a peak of |S| changes by less than 2e-3 between two.
@@ -177,12 +119,17 @@ def feedback_response(axis: AxisController, z: np.ndarray) -> np.ndarray:
     return -(np.einsum("in,knj->k", axis.C, x) + axis.Dy)
 
 
-def closed_radius(axis: AxisController, plant: AxisPlant, extra_delay: int) -> float:
-    """Return the spectral radius of the loop with its exact delay; below 1 is stable."""
-    A, B, C = delayed_form(plant, extra_delay)
-    n = A.shape[0]
-    whole = np.block([[A + axis.Dy * np.outer(B, C), np.outer(B, axis.C[0])], [axis.By @ C[None, :], axis.A]])
-    return float(np.abs(np.linalg.eigvals(whole)).max(initial=0.0)) if n else 0.0
+def closed_poles(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> np.ndarray:
+    """Return the poles (plants, n) of the loops with their exact delay, padded with zeros."""
+    found = []
+    for plant in plants:
+        A, B, C = delayed_form(plant, extra_delay)
+        whole = np.block([[A + axis.Dy * np.outer(B, C), np.outer(B, axis.C[0])], [axis.By @ C[None, :], axis.A]])
+        found.append(np.linalg.eigvals(whole).astype(complex))
+    poles = np.zeros((len(found), max(item.size for item in found)), complex)
+    for row, item in zip(poles, found, strict=True):
+        row[: item.size] = item
+    return poles
 
 
 def delayed_form(plant: AxisPlant, extra_delay: int = 0) -> tuple[Matrix, Vector, Vector]:
@@ -198,33 +145,27 @@ def delayed_form(plant: AxisPlant, extra_delay: int = 0) -> tuple[Matrix, Vector
     return whole, entry, np.concatenate([C, np.zeros(d)])
 
 
-def axis_margins(axis: AxisController, plant: AxisPlant, extra_delay: int) -> Margins:
-    """Return the margins of the loop with its exact delay, verified to be stable.
+def axis_margins(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> LoopMargins:
+    """Return the margins of the loops around `plants` with their exact delay; a loop that is not stable has none."""
+    dt, order = plants[0].sample_time, max(plant.order for plant in plants)
+    above, below = np.zeros((len(plants), order)), np.zeros((len(plants), order + 1))
+    for k, plant in enumerate(plants):
+        above[k, order - plant.order :], below[k, order - plant.order :] = plant.numerator, plant.denominator
+    delays = np.array([plant.delay + extra_delay for plant in plants])
 
-    Raises:
-        SettingsError: the closed loop is not stable.
-    """
-    import control
+    def evaluate(rows: np.ndarray, w: Vector) -> tuple[np.ndarray, np.ndarray]:
+        z = np.exp(1j * w * dt)
+        each, back = np.unique(w, return_inverse=True)
+        K = feedback_response(axis, np.exp(1j * each * dt))[back]
+        L = K * polynomials_at(above[rows], z) / polynomials_at(below[rows], z) * z ** -delays[rows].astype(float)
+        return sensitivity_of(L)[:, None], np.zeros((w.size, 0))
 
-    radius = closed_radius(axis, plant, extra_delay)
-    if radius >= 1.0:
-        raise SettingsError(f"the closed loop is not stable (spectral radius {radius:.4f}); ask for less.")
-    w = frequencies(plant.sample_time, lowest=LOWEST / plant.second)
-    loop = feedback_response(axis, np.exp(1j * w * plant.sample_time)) * plant.response(w, extra_delay=extra_delay)
-    data = (np.abs(loop), np.degrees(np.unwrap(np.angle(loop))), w)
-    gain, phase, _, _, crossover, _ = (float(value) for value in control.stability_margins(data))
-    angle = math.radians(phase)
-    delay = angle / crossover if math.isfinite(angle) and crossover > 0 else math.inf
-    gain = nearest_gain_margin(gain, loop[-1])
-    return Margins(gain, angle, float(np.max(1.0 / np.abs(1.0 + loop))), crossover, delay)
+    return margins_of_loops(evaluate, closed_poles(axis, plants, extra_delay), dt, int(delays.max()))
 
 
 def sensitivities(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> Vector:
-    """Return Ms of every plant (plants,); the loops are taken to be stable."""
-    w = coarse_frequencies(plants[0])
-    K = feedback_response(axis, np.exp(1j * w * plants[0].sample_time))
-    loops = np.array([K * plant.response(w, extra_delay=extra_delay) for plant in plants])
-    return np.max(1.0 / np.abs(1.0 + loops), axis=1)
+    """Return Ms of every plant (plants,); inf where the loop is not stable."""
+    return axis_margins(axis, plants, extra_delay).sensitivity[:, 0]
 
 
 def coarse_frequencies(plant: AxisPlant) -> Vector:
@@ -234,7 +175,8 @@ def coarse_frequencies(plant: AxisPlant) -> Vector:
 
 def unstable_samples(axis: AxisController, plants: Sequence[AxisPlant], extra_delay: int) -> list[int]:
     """Return the indices of the plants around which the loop is not stable."""
-    return [i for i, plant in enumerate(plants) if closed_radius(axis, plant, extra_delay) >= 1.0]
+    radius = np.abs(closed_poles(axis, plants, extra_delay)).max(axis=1, initial=0.0)
+    return np.flatnonzero(~(radius < 1.0)).tolist()
 
 
 _SWEEP_RUNTIME = "softneck.design.linear._sweep_runtime"

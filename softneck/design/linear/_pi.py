@@ -14,7 +14,7 @@ from softneck.estimation import AxisPlant
 from softneck.loop.default_limits import DESIGN_OVERSHOOT_PCT
 
 from ..plants._uncertain import UncertainAxis, UncertainPlant
-from ._axis_loop import LOWEST, coarse_frequencies, frequencies, loop_margins, sensitivities, unstable_samples
+from ._axis_loop import LOWEST, axis_margins, coarse_frequencies, frequencies, unstable_samples
 from ._controller import AxisController, ReferenceFilter, pi_axis
 from ._settings import PLANT, AxisDesign, AxisSettings, margins_json
 
@@ -65,17 +65,10 @@ class PiSettings(AxisSettings):
         return axis.apply_assumptions()
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
-        small, extra = self._nominal_plants(axis), self.extra_delay
-        gains = tune_pi(self._tuning_plants(axis), extra, self.max_sensitivity, self.phase_margin)
-        controller, lowest = pi_axis(gains.gain, gains.integral_time, axis.sample_time), LOWEST / axis.nominal.second
-        margins = [margins_json(loop_margins(open_loop(plant, extra, gains), lowest=lowest)) for plant in small]
-        lost = unstable_samples(controller, axis.samples, extra)
-        notes = {
-            "margins": margins[0],
-            "margins_small_moves": margins[-1],
-            "samples_unstable": len(lost),
-            "worst_sensitivity": None if lost else float(sensitivities(controller, axis.samples, extra).max()),
-        }
+        gains = tune_pi(self._tuning_plants(axis), self.extra_delay, self.max_sensitivity, self.phase_margin)
+        controller = pi_axis(gains.gain, gains.integral_time, axis.sample_time)
+        faster = axis_margins(controller, self._nominal_plants(axis)[-1:], self.extra_delay)
+        notes = {"margins_small_moves": margins_json(faster.of(0))}
         return AxisDesign(controller, {"K": gains.gain, "Ti_s": gains.integral_time}, notes)
 
     def _require_stable(self, controller: AxisController, axis: UncertainAxis) -> None:

@@ -32,10 +32,10 @@ from ..plants._uncertain import (
     uncertain_plant,
 )
 from ._axis_loop import (
-    Margins,
     Sweep,
     axis_margins,
     check_rise,
+    closed_poles,
     conditioning_candidates,
     filter_for,
     leading_filter,
@@ -44,6 +44,7 @@ from ._axis_loop import (
     unstable_samples,
 )
 from ._controller import AxisController, LinearController, ReferenceFilter, assemble
+from ._margins import Margins, require_stable
 from ._ports import ControllerLimits, limits_of
 
 #: Of `reference_time`: as slow as the plant's main pole.
@@ -253,18 +254,22 @@ class AxisSettings(LoopSettings, ABC):
     def _design_axis(self, axis: UncertainAxis, name: str) -> tuple[AxisController, ReferenceFilter, dict[str, Any]]:
         found = self._synthesise(axis, name)
         controller = found.controller
-        margins = axis_margins(controller, axis.nominal, self.extra_delay)
+        plants = (axis.nominal, *axis.samples)
+        require_stable(closed_poles(controller, plants[:1], self.extra_delay))
         self._require_stable(controller, axis)
         led = self._choose_filter(controller, axis)
         controller = self._choose_conditioning(controller, led, axis)
-        worst = float(sensitivities(controller, axis.samples, self.extra_delay).max())
+        margins = axis_margins(controller, plants, self.extra_delay)
+        worst = margins.worst()
         findings = {
             "gains": {**found.gains, **filter_numbers(led)},
             "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
-            "margins": margins_json(margins),
+            "margins": margins_json(margins.of(0)),
+            "margins_samples": margins_json(worst),
             "states": int(controller.A.shape[0]),
             "samples": len(axis.samples),
-            "worst_sensitivity": worst,
+            "samples_unstable": int(np.isinf(margins.sensitivity[1:]).sum()),
+            "worst_sensitivity": worst.sensitivity if math.isfinite(worst.sensitivity) else None,
             **found.notes,
         }
         return controller, led, findings
@@ -340,8 +345,7 @@ class AxisSettings(LoopSettings, ABC):
 
     def _keeps_sensitivity(self, controller: AxisController, axis: UncertainAxis) -> bool:
         """Return whether every sample is stable and keeps `max_sensitivity`."""
-        worst = sensitivities(controller, axis.samples, self.extra_delay).max()
-        return bool(worst <= self.max_sensitivity) and not unstable_samples(controller, axis.samples, self.extra_delay)
+        return bool(sensitivities(controller, axis.samples, self.extra_delay).max() <= self.max_sensitivity)
 
     def _fastest(
         self, build: Callable[[float], AxisDesign], axis: UncertainAxis, *, low: float, high: float, what: str
