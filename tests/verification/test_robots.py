@@ -56,7 +56,8 @@ def test_margins_of_axes_apart_are_those_of_each_alone(outputs: int) -> None:
     # L = 0.5 * 0.1 z^-4 / (1 - 0.9 z^-1), whatever the units.
     alone = loop_margins(control.TransferFunction([0.05], [1.0, -0.9, 0.0, 0.0, 0.0], 0.02))
     for axis in robot.outputs.names:
-        assert table[f"{axis}.sensitivity"][0] == pytest.approx(alone.sensitivity, rel=1e-9)
+        # Both end at the vertex of a parabola through three frequencies of their own grid.
+        assert table[f"{axis}.sensitivity"][0] == pytest.approx(alone.sensitivity, rel=1e-4)
     # Loops that do not meet have the disk margin of each.
     assert table["mimo.disk_margin"][0] == pytest.approx(table[f"{robot.outputs.names[0]}.disk_margin"][0], rel=1e-9)
 
