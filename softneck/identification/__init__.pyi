@@ -17,6 +17,8 @@ from .set_membership._set_membership import SetMembership as SetMembership
 from .set_membership._set_membership import is_extrapolating as is_extrapolating
 from .structured._greybox import GreyBox as GreyBox
 from .structured._play import Play as Play
+from .uncertainty._draws import Draws as Draws
+from .uncertainty._draws import make_draws as make_draws
 from .uncertainty._family import Family as Family
 from .uncertainty._family_fit import FamilySettings as FamilySettings
 from .uncertainty._frf_fit import FrequencyResponse as FrequencyResponse

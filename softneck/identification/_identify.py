@@ -40,6 +40,7 @@ from .models._fitting import check_training, payload_of
 from .models._model import Model
 from .models._validity import with_tolerance
 from .selection._auto import Choice, choose
+from .uncertainty._draws import make_draws
 from .uncertainty._family import Family
 from .uncertainty._family_fit import FamilySettings
 from .validation._score_tables import INFINITE
@@ -251,6 +252,8 @@ def family(
     recordings: RecordingLike,
     *,
     robot: Robot | str | Path | None = None,
+    draws: int = 0,
+    seed: int = 0,
     progress: Progress | None = None,
     **settings: Any,
 ) -> Family:
@@ -259,6 +262,8 @@ def family(
     Args:
         recordings: as for `identify`; each of a list may have a payload of its own.
         robot: as for `identify`.
+        draws: nonlinear models for each certificate (`softneck.identification.make_draws`); the command makes 59.
+        seed: of the draws.
         progress: called with the part done and a word; by default a bar in a terminal.
         **settings: those of `FamilySettings`.
 
@@ -281,6 +286,13 @@ def family(
     parts = [open_recording(part, robot) for part in listed]
     files = [part for part in listed if isinstance(part, str | Path)]
     with shown_progress("family", progress) as tell:
-        found = chosen.fit(parts, names=recording_names(listed), progress=tell)
+        part = 0.5 if draws else 1.0
+        found = chosen.fit(parts, names=recording_names(listed), progress=lambda done, text: tell(part * done, text))
+        if draws:
+            late = lambda done, text: tell(part + part * done, text)  # noqa: E731
+            try:
+                found = replace(found, draws=make_draws(parts, count=draws, seed=seed, progress=late))
+            except DataError as error:  # the linear plant stands by itself
+                found.findings["caution"] = f"no draws were made: {error}"
     found.findings["files"] = {str(source): file_hash(source) for source in files}
     return found

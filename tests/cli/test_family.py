@@ -23,7 +23,7 @@ def test_a_family_is_written_described_and_designed_on(call: Call, tmp_path: Pat
     for number, scale in enumerate((0.9, 1.2)):
         truth = Truth(gain=(0.011 * scale, 0.008 * scale))
         write_recording(tmp_path / f"{number}.csv", neck_recording(900, seed=number, truth=truth))
-    said = call("family", "0.csv", "1.csv", "-o", "f.npz", "--html", "f.html", "--json")
+    said = call("family", "0.csv", "1.csv", "-o", "f.npz", "--html", "f.html", "--json", "--draws", "0")
     assert said.code == 0, said.err
     facts = json.loads(said.out)
     for axis in ("pitch", "roll"):
@@ -53,10 +53,12 @@ def test_a_recording_that_the_family_lacks_is_found_out_by_test(
     monkeypatch.setattr(FamilySettings, "fit", lambda *_, **__: family)
     for name, plant in (("same", TWO), ("late", replace(TWO, delay=0.15))):
         write_recording(tmp_path / f"{name}.csv", played(plant, seed=7))
-    passed = call("family", "same.csv", "--test", "same.csv", "-o", "f.npz")
+    passed = call("family", "same.csv", "--test", "same.csv", "-o", "f.npz", "--draws", "0")
     assert passed.code == 0, passed.err
     assert "not invalidated by --test (which does not say that the family explains it)" in passed.out
-    failed = call("family", "same.csv", "--test", "same.csv", "--test", "late.csv", "-o", "g.npz", "--json")
+    failed = call(
+        "family", "same.csv", "--test", "same.csv", "--test", "late.csv", "-o", "g.npz", "--json", "--draws", "0"
+    )
     assert failed.code == 1
     assert failed.error.count("\n") <= 1
     assert "pitch: late.csv needs " in failed.error
@@ -68,7 +70,7 @@ def test_a_recording_that_the_family_lacks_is_found_out_by_test(
 @pytest.mark.slow
 def test_the_page_of_another_robots_family_is_in_its_units(call: Call) -> None:
     assert call("record", "mixed", "--robot", "antagonist", "--duration", "60", "-o", "a.csv").code == 0
-    said = call("family", "a.csv", "-o", "f.npz", "--html", "f.html", "--json")
+    said = call("family", "a.csv", "-o", "f.npz", "--html", "f.html", "--json", "--draws", "0")
     assert said.code == 0, said
     gain = json.loads(said.out)["axes"]["pitch"]["nominal"]["static_gain"]
     page = Path("f.html").read_text(encoding="utf-8")

@@ -25,6 +25,7 @@ from softneck.signals import Recording, require_same_robot
 
 from ..linear._srivc_fit import Continuous
 from ..models._directions import Directions
+from ._draws import Draws
 from ._frf_fit import SUPPORTED
 from ._measured import (
     AxisMeasured,
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 
 
 SCOPES = ("window", "point", "recording")
+# Arrays of the draws in a file begin with this.
+_DRAWS = "draws."
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -80,6 +83,7 @@ class Family(ReprMixin):
         robot: whose plant it is; its outputs and motors in their SI units where a neck's are in rad.
         directions: (outputs, motors) weights of the motors in each axis's input; None: those that the robot gives.
         measured: by the names of the outputs, what the recordings themselves show of it; empty in files of before.
+        draws: nonlinear models of the same recordings, by which `verify` decides; None if none were made.
     """
 
     sample_time: float
@@ -93,6 +97,7 @@ class Family(ReprMixin):
     robot: Robot = field(default_factory=Robot.preset)
     directions: Matrix | None = None
     measured: dict[str, AxisMeasured] = field(default_factory=dict)
+    draws: Draws | None = None
 
     def __post_init__(self) -> None:
         if self.directions is None:
@@ -204,6 +209,7 @@ class Family(ReprMixin):
             K *= 1e3 * to_si(per)[0]
             lines.append(f"compression: G_delta(s) = exp(-{L:.3f} s) {K * p:.4g}/(s + {p:.4g}) mm/{per}")
         lines += self._measured_lines()
+        lines += [] if self.draws is None else self.draws.summary(1.0 / to_si(shown)[0], shown)
         lines += [f"caution: {self.findings['caution']}"] if "caution" in self.findings else []
         return "\n".join(lines)
 
@@ -266,11 +272,16 @@ class Family(ReprMixin):
             arrays["directions"] = weights
         for name, found in self.measured.items():
             arrays |= {f"{name}_measured_{key}": value for key, value in found.arrays().items()}
+        if self.draws is not None:
+            header["draws"], more = self.draws.to_archive()
+            arrays |= {f"{_DRAWS}{name}": value for name, value in more.items()}
         write_archive(path, header, arrays, force=force)
 
     @classmethod
     def from_archive(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> Family:
         """Return the family that `save` wrote."""
+        drawn = {name.removeprefix(_DRAWS): array for name, array in arrays.items() if name.startswith(_DRAWS)}
+        arrays = {name: array for name, array in arrays.items() if not name.startswith(_DRAWS)}
         for name, array in arrays.items():
             if array.dtype != np.float64:
                 raise FileFormatError(f"its array `{name}` is not of floats.")
@@ -303,6 +314,7 @@ class Family(ReprMixin):
             robot=robot,
             directions=weights,
             measured=measured,
+            draws=Draws.from_archive(header["draws"], drawn) if "draws" in header else None,
         )
 
     def _axis(self, output: str) -> AxisFamily:

@@ -1,0 +1,364 @@
+"""Draws of a robot: nonlinear models that explain its recordings, and the disturbance that they leave over."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from softneck.core import (
+    DataError,
+    FileFormatError,
+    Matrix,
+    Progress,
+    SettingsError,
+    Vector,
+    one_blas_thread,
+    require_whole,
+    silent,
+)
+from softneck.signals import Recording, concatenate, conditions, merge_conditions
+
+from ..models._arrays import check_arrays
+from ..models._fitting import ScaledData
+from ..models._model import WARM_UP, Model, embed_model, embedded_model
+from ..structured._greybox_draws import GreyBoxDraws
+from ..structured._play_draws import PlayDraws
+
+#: Draws of one certificate: none of 59 failing means that 95 % of such plants hold, with 95 % confidence.
+DRAWS = 59
+#: Draws that a search may see, and certificates that a family has draws for.
+SEARCH_DRAWS, ATTEMPTS = 8, 4
+#: Share of held-out samples that the band must cover.
+LEVEL = 0.95
+# Last part of each run, held out from the fit; rows of each run that are used at most [s of a neck's time].
+_HELD_OUT, _MOST_S = 0.25, 60.0
+# Segments of held-out motions [s of a neck's time], and least rows of one.
+_SEGMENT_S, _LEAST_ROWS = 2.0, 20
+# Factors on the deviations of the fit, of which the sharpest that explain the held-out motions are taken.
+_FACTORS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
+_CALIBRATION_DRAWS = 40
+# Factors on the disturbance, until the band covers the held-out samples.
+_MORE = tuple(1.1**k for k in range(25))
+# Deviations of the disturbance in the band: 95 % of a normal distribution.
+_DEVIATIONS = 1.96
+# Classes of amplitude, by the share of the largest motion of the segments.
+_CLASSES = (("small", 0.0, 0.25), ("middle", 0.25, 0.6), ("large", 0.6, math.inf))
+
+
+class Source(Protocol):
+    """What draws come from: `GreyBoxDraws` or `PlayDraws`."""
+
+    @property
+    def model(self) -> Model: ...
+    def draw(self, rng: np.random.Generator) -> Vector: ...
+    def arrays(self, draw: Vector, factor: float) -> dict[str, Matrix]: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Draws:
+    """Nonlinear models of a robot, drawn independently of each other.
+
+    Attributes:
+        model: fitted; each draw replaces some of its arrays.
+        arrays: name -> (n, ...) of all draws: `SEARCH_DRAWS` for a search, then `count` for each certificate.
+        count: of one certificate.
+        seed: of the draws.
+        factor: on the deviations of the fit.
+        share: (outputs,) of the disturbance that a motion makes: `d[k+1] = keep d[k] + share dy[k] n[k]`, n normal.
+        keep: of the disturbance, its colour.
+        level: share of held-out samples that were to be covered.
+        coverage: of each class of amplitude: "class", "motion", "covered", "width" and "segments", outputs in SI.
+        conditions: payload and co-contraction of the recordings, and "motion", the largest of the outputs [SI].
+    """
+
+    model: Model
+    arrays: Mapping[str, np.ndarray]
+    count: int
+    seed: int
+    factor: float
+    share: Vector
+    keep: float
+    level: float
+    coverage: list[dict[str, Any]]
+    conditions: Mapping[str, list[float]]
+
+    @property
+    def attempts(self) -> int:
+        """Certificates that there are draws for."""
+        return (len(next(iter(self.arrays.values()))) - SEARCH_DRAWS) // self.count
+
+    def for_search(self, count: int = SEARCH_DRAWS) -> list[Model]:
+        """Return the first draws of those that a search may see."""
+        return [self._draw(k) for k in range(min(count, SEARCH_DRAWS))]
+
+    def for_certificate(self, attempt: int = 1) -> list[Model]:
+        """Return the draws of a certificate, which no search and no other attempt has seen.
+
+        Raises:
+            SettingsError: more attempts than there are draws for.
+        """
+        require_whole("attempt", attempt, 1, 10_000)
+        if attempt > self.attempts:
+            raise SettingsError(
+                f"the family has draws for {self.attempts} certificates and this is attempt {attempt}; make it again "
+                "with another seed (`softneck family --seed`), better from more recordings."
+            )
+        first = SEARCH_DRAWS + (attempt - 1) * self.count
+        return [self._draw(k) for k in range(first, first + self.count)]
+
+    def _draw(self, number: int) -> Model:
+        own = {name: values[number] for name, values in self.arrays.items()}
+        return replace(self.model, arrays={**self.model.arrays, **own})
+
+    def summary(self, shown: float, unit: str) -> list[str]:
+        """Return lines on the draws; `shown` converts outputs from SI to `unit`."""
+        lines = [
+            f"draws: {self.count} of kind {self.model.kind} for each of {self.attempts} certificates, "
+            f"seed {self.seed}; deviations of the fit times {self.factor:g}, and a disturbance of "
+            f"{100.0 * float(self.share.max()):.2g} % of each sample's motion"
+        ]
+        for row in self.coverage:
+            lines.append(
+                f"  {row['class']} motions (held out, to {shown * row['motion']:.3g} {unit}): "
+                f"{100.0 * row['covered']:.0f} % within +-{shown * row['width']:.2g} {unit}, "
+                f"{100.0 * row['width'] / max(row['motion'], 1e-300):.0f} % of the motion"
+            )
+        return lines
+
+    def to_archive(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Return header and arrays."""
+        header, arrays = embed_model(self.model)
+        own = {f"drawn_{name}": values for name, values in self.arrays.items()}
+        facts = {
+            "model": header, "names": list(self.arrays), "count": self.count, "seed": self.seed, "factor": self.factor,
+            "keep": self.keep, "level": self.level, "coverage": self.coverage, "conditions": dict(self.conditions),
+        }  # fmt: skip
+        return facts, {**arrays, **own, "share": self.share}
+
+    @classmethod
+    def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Draws:
+        """Return the draws that `to_archive` described; raise FileFormatError for arrays that do not fit."""
+        model = embedded_model(header["model"], dict(arrays))
+        drawn = {str(name): arrays[f"drawn_{name}"] for name in header["names"]}
+        count, size = int(header["count"]), {len(values) for values in drawn.values()}
+        if len(size) != 1 or count < 1 or min(size) < SEARCH_DRAWS + count:
+            raise FileFormatError("its draws are fewer than one certificate needs, or not as many of each array.")
+        for name, values in drawn.items():
+            whole = name in model.arrays and values.shape[1:] == model.arrays[name].shape
+            if not whole or values.dtype != np.float64 or not np.isfinite(values).all():
+                raise FileFormatError(f"the draws of its array `{name}` do not fit its model.")
+        share = arrays["share"]
+        if share.shape != (len(model.robot.outputs.names),) or not (share >= 0.0).all():
+            raise FileFormatError("the disturbance of its draws must have one share for each output.")
+        if not 0.0 <= float(header["keep"]) < 1.0:
+            raise FileFormatError("the disturbance of its draws must have a colour below 1.")
+        found = cls(
+            model=model, arrays=drawn, count=count, seed=int(header["seed"]), factor=float(header["factor"]),
+            share=share, keep=float(header["keep"]), level=float(header["level"]), coverage=list(header["coverage"]),
+            conditions=dict(header["conditions"]),
+        )  # fmt: skip
+        for number in range(min(size)):
+            check_arrays(model.kind, found._draw(number).arrays)
+        return found
+
+
+@one_blas_thread
+def make_draws(
+    recordings: Sequence[Recording], *, count: int = DRAWS, seed: int = 0, progress: Progress = silent
+) -> Draws:
+    """Return draws of a robot from its recordings.
+
+    The model is fitted to the first three quarters of each run: for robots that tendons bend the grey box, else kind
+    `play`. Of the deviations of its numbers times a factor those are taken that predict the last quarters best, by the
+    continuous ranked probability score (Gneiting and Raftery 2007, J. Am. Stat. Assoc. 102:359). What the nearest draw
+    leaves over there is the disturbance; it is raised until the band covers `LEVEL` of the samples at every amplitude.
+
+    Args:
+        recordings: of one robot and sample time, the payload as a channel.
+        count: draws of one certificate.
+        seed: of the draws.
+        progress: called with the part done and a word.
+
+    Raises:
+        DataError: too little data to fit, or to hold a part of it out.
+    """
+    require_whole("count", count, 2, 10_000)
+    require_whole("seed", seed, 0, 2**31 - 2)
+    whole = concatenate(list(recordings))
+    second = ScaledData.of(whole).scaling.second
+    train, held = _split(whole, second)
+    source = _source(train, lambda done, text: progress(0.7 * done, f"draws: {text}"))
+    motions = _Motions.of(held, source.model, second)
+    rng = np.random.default_rng([seed, 0])
+    trial = [source.draw(rng) for _ in range(_CALIBRATION_DRAWS)]
+    best: tuple[float, float, np.ndarray] | None = None
+    for number, factor in enumerate(_FACTORS):
+        progress(0.7 + 0.15 * number / len(_FACTORS), f"draws: deviations times {factor:g}")
+        Y = motions.simulate([source.arrays(draw, factor) for draw in trial])
+        score = motions.score(Y)
+        if best is None or score < best[0]:
+            best = (score, factor, Y)
+    if best is None or not math.isfinite(best[0]):
+        raise DataError("no draw has a finite simulation on the held-out motions; record longer.")
+    factor, (share, keep) = best[1], motions.disturbance(best[2])
+    more = next((more for more in _MORE if motions.covers(best[2], more * share, keep)), _MORE[-1])
+    rows = []
+    rng = np.random.default_rng([seed, 1])
+    for number in range(SEARCH_DRAWS + ATTEMPTS * count):
+        progress(0.85 + 0.15 * number / (SEARCH_DRAWS + ATTEMPTS * count), "draws")
+        rows.append(source.arrays(source.draw(rng), factor))
+    made = merge_conditions([conditions(part) for part in recordings])
+    return Draws(
+        model=source.model, arrays={name: np.array([row[name] for row in rows]) for name in rows[0]}, count=count,
+        seed=seed, factor=factor, share=more * share, keep=keep, level=LEVEL,
+        coverage=motions.coverage(best[2], more * share, keep),
+        conditions={**made, "motion": _motion(whole)},
+    )  # fmt: skip
+
+
+def _motion(recording: Recording) -> list[float]:
+    """Return the largest motion of each output from its middle [SI]."""
+    middle = np.nanmedian(recording.outputs, axis=0)
+    return np.nanmax(np.abs(recording.outputs - middle), axis=0).tolist()
+
+
+def _source(train: Recording, progress: Progress) -> Source:
+    try:
+        return GreyBoxDraws.fit(train, progress=progress)
+    except SettingsError:  # a robot that no tendons on winches bend
+        return PlayDraws.fit(train, progress=progress)
+
+
+def _split(recording: Recording, second: float) -> tuple[Recording, Recording]:
+    """Return the rows to fit and to hold out of each run."""
+    most = round(_MOST_S * second / recording.sample_time)
+    train, held = [], []
+    for run in recording.runs():
+        rows = min(len(run), max(most, 8 * WARM_UP))
+        edge = round((1.0 - _HELD_OUT) * rows)
+        if edge > 2 * WARM_UP and rows - edge > WARM_UP + _LEAST_ROWS:
+            train.append(run.rows(0, edge))
+            held.append(run.rows(edge, rows))
+    if not train:
+        raise DataError(
+            f"no run has {8 * WARM_UP} rows, of which the last quarter could be held out from the draws; record longer."
+        )
+    return concatenate(train), concatenate(held)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Motions:
+    """Held-out motions in segments.
+
+    recording, model: to simulate; outputs: (rows, outputs) measured; groups: (rows,) segment, -1 in the warm-up;
+    motion: (segments,) largest motion of an output [SI]; classes: (segments,) of amplitude.
+    """
+
+    recording: Recording
+    model: Model
+    outputs: Matrix
+    groups: np.ndarray
+    motion: Vector
+    classes: np.ndarray
+
+    @classmethod
+    def of(cls, held: Recording, model: Model, second: float) -> _Motions:
+        length, groups, first = max(_LEAST_ROWS, round(_SEGMENT_S * second / held.sample_time)), [], 0
+        for run in held.runs():
+            number = first + np.arange(len(run)) // length
+            number[:WARM_UP] = -1
+            first = int(number.max(initial=first)) + 1
+            groups.append(number)
+        group, y = np.concatenate(groups), held.outputs
+        group[~np.isfinite(y).all(axis=1)] = -1
+        _, group[group >= 0] = np.unique(group[group >= 0], return_inverse=True)
+        if group.max() < 1:
+            raise DataError("the held-out rows have no two segments with outputs; record longer.")
+        motion = np.array([0.5 * np.ptp(y[group == k], axis=0).max() for k in range(group.max() + 1)])
+        part = motion / motion.max()
+        classes = np.searchsorted([low for _, low, _ in _CLASSES], part, side="right") - 1
+        return cls(held, model, y, group, motion, classes)
+
+    def simulate(self, draws: Sequence[Mapping[str, Matrix]]) -> np.ndarray:
+        """Return the simulations (draws, rows, outputs)."""
+        outputs = self.outputs.shape[1]
+        found = []
+        for own in draws:
+            model = replace(self.model, arrays={**self.model.arrays, **own})
+            with np.errstate(all="ignore"):
+                found.append(np.asarray(model.simulate(self.recording))[:, :outputs])
+        return np.array(found)
+
+    def score(self, Y: np.ndarray) -> float:
+        """Return the continuous ranked probability score of the draws, relative to the motion of each segment."""
+        weight = 1.0 / np.maximum(self.motion, 0.05 * self.motion.max())[self.groups][:, None]
+        half = len(Y) // 2
+        with np.errstate(all="ignore"):
+            away, apart = np.abs(Y - self.outputs), np.abs(Y[:half] - Y[half : 2 * half])
+            each = (away.mean(axis=0) - 0.5 * apart.mean(axis=0)) * weight
+        value = float(each[self.groups >= 0].mean())
+        return value if math.isfinite(value) else math.inf
+
+    def disturbance(self, Y: np.ndarray) -> tuple[Vector, float]:
+        """Return share (outputs,) and colour of what the nearest draw of each segment leaves over."""
+        keep, parts, total = self._colour(Y), [], []
+        for k in range(len(self.motion)):
+            e, moved = self._left(Y, k, keep)
+            parts.append((e**2).sum(axis=0))
+            total.append(moved.sum(axis=0))
+        return np.sqrt(np.sum(parts, axis=0) / np.maximum(np.sum(total, axis=0), 1e-300)), keep
+
+    def _left(self, Y: np.ndarray, k: int, keep: float) -> tuple[Matrix, Matrix]:
+        """Return what the nearest draw leaves over (rows, outputs), and what a disturbance of share 1 would have."""
+        at = self.groups == k
+        errors = self.outputs[at] - Y[:, at]
+        nearest = int(np.argmin(np.nan_to_num((errors**2).sum(axis=(1, 2)), nan=np.inf)))
+        return errors[nearest], _filtered(np.diff(Y[nearest], axis=0, prepend=Y[nearest][:1]), keep)[at]
+
+    def _colour(self, Y: np.ndarray) -> float:
+        """Return the factor by which what is left over decays in one sample."""
+        top = bottom = 0.0
+        for k in range(len(self.motion)):
+            e = self._left(Y, k, 0.0)[0]
+            top += float((e[1:] * e[:-1]).sum())
+            bottom += float((e[:-1] ** 2).sum())
+        return float(np.clip(top / max(bottom, 1e-300), 0.0, 0.999))
+
+    def band(self, Y: np.ndarray, share: Vector, keep: float) -> tuple[Matrix, Matrix]:
+        """Return the lowest and highest outputs (rows, outputs) of the draws with their disturbance."""
+        middle = np.median(Y, axis=0)
+        sigma = share * np.sqrt(_filtered(np.diff(middle, axis=0, prepend=middle[:1]), keep))
+        # What the sensor rounds and adds is in no draw: the least difference of its values.
+        steps = np.abs(np.diff(self.outputs, axis=0))
+        noise = np.array([np.median(s[s > 0.0]) if (s > 0.0).any() else 0.0 for s in steps.T])
+        away = _DEVIATIONS * sigma + noise
+        return Y.min(axis=0) - away, Y.max(axis=0) + away
+
+    def coverage(self, Y: np.ndarray, share: Vector, keep: float) -> list[dict[str, Any]]:
+        """Return the covered share of samples and the width of the band for each class of amplitude."""
+        low, high = self.band(Y, share, keep)
+        inside, rows = (self.outputs >= low) & (self.outputs <= high), []
+        for number, (name, _, _) in enumerate(_CLASSES):
+            chosen = np.flatnonzero(self.classes == number)
+            at = np.isin(self.groups, chosen)
+            if chosen.size:
+                rows.append({
+                    "class": name, "motion": float(self.motion[chosen].max()), "covered": float(inside[at].mean()),
+                    "width": float(0.5 * (high - low)[at].mean()), "segments": int(chosen.size),
+                })  # fmt: skip
+        return rows
+
+    def covers(self, Y: np.ndarray, share: Vector, keep: float) -> bool:
+        """Return whether the band covers the level at every amplitude."""
+        return all(row["covered"] >= LEVEL for row in self.coverage(Y, share, keep))
+
+
+def _filtered(moves: Matrix, keep: float) -> Matrix:
+    """Return the variance (rows, outputs) of a disturbance of share 1 that `moves` (rows, outputs) make."""
+    from scipy.signal import lfilter
+
+    return np.asarray(lfilter([1.0], [1.0, -(keep**2)], moves**2, axis=0))

@@ -1,0 +1,124 @@
+"""Draws of a robot: independent by seed, kept by a file, and wide enough for motions that the fit has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck.core import FileFormatError, SettingsError, load
+from softneck.identification import Draws, Family, Model, make_draws
+from softneck.identification.structured._play import Play
+from softneck.identification.structured._play_draws import PlayDraws
+from softneck.identification.uncertainty import _draws
+from softneck.plant import NeckParameters, VirtualNeck, record
+from softneck.signals import Recording, signal
+
+from ...data import neck_recording
+
+QUICK = Play(rate=6.0, order=3, widths=(), degree=1)
+GOLDEN = Path(__file__).parents[2] / "golden" / "family.npz"
+
+
+@pytest.fixture(scope="module")
+def recordings() -> list[Recording]:
+    return [neck_recording(900, seed=seed) for seed in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def made(recordings: list[Recording]) -> Callable[..., Draws]:
+    """Make draws of kind `play`, whose fit takes a second where that of the grey box takes a minute."""
+    source = PlayDraws.fit(_draws._split(_draws.concatenate(recordings), 1.0)[0], settings=QUICK)
+
+    @cache
+    def make(seed: int = 0) -> Draws:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(_draws, "_source", lambda *_: source)
+            patch.setattr(_draws, "_FACTORS", (1.0, 2.0))
+            patch.setattr(_draws, "_CALIBRATION_DRAWS", 10)
+            return make_draws(recordings, count=3, seed=seed)
+
+    return make
+
+
+def bits(models: list[Model]) -> list[bytes]:
+    return [model.arrays["weights"].tobytes() for model in models]
+
+
+def test_draws_follow_their_seed_and_no_two_are_the_same(made: Callable[..., Draws]) -> None:
+    one, other = made(), made(seed=1)
+    same = made.__wrapped__()  # pyright: ignore[reportFunctionMemberAccess] - computed again, not from the cache
+    assert bits(one.for_certificate(1)) == bits(same.for_certificate(1))
+    every = [*bits(one.for_search()), *(b for k in range(one.attempts) for b in bits(one.for_certificate(k + 1)))]
+    # A search, and each attempt at a certificate, have draws of their own.
+    assert len(set(every)) == len(every) == _draws.SEARCH_DRAWS + _draws.ATTEMPTS * 3
+    assert not set(every) & set(bits(other.for_certificate(1)))
+    with pytest.raises(SettingsError, match="has draws for 4 certificates and this is attempt 5"):
+        one.for_certificate(5)
+
+
+def test_every_amplitude_is_covered_and_its_width_is_said(made: Callable[..., Draws]) -> None:
+    found = made()
+    assert {row["class"] for row in found.coverage} <= {"small", "middle", "large"}
+    for row in found.coverage:
+        assert row["covered"] >= found.level
+        # A band as wide as the motion says nothing; this neck is linear and `play` fits it.
+        assert 0.0 < row["width"] < 0.5 * row["motion"]
+    said = "\n".join(found.summary(180.0 / np.pi, "deg"))
+    assert f"{100 * found.coverage[-1]['covered']:.0f} % within" in said
+
+
+def test_a_family_file_keeps_its_draws_to_the_bit(made: Callable[..., Draws], tmp_path: Path) -> None:
+    plain = load(GOLDEN, role="family")
+    assert isinstance(plain, Family)
+    assert plain.draws is None  # a file of before
+    found = made()
+    replace(plain, draws=found).save(tmp_path / "f.npz")
+    again = load(tmp_path / "f.npz", role="family").draws
+    assert bits(again.for_certificate(2)) == bits(found.for_certificate(2))
+    np.testing.assert_array_equal(again.share, found.share)
+    assert (again.keep, again.factor, again.coverage) == (found.keep, found.factor, found.coverage)
+    start = recordings_start(found)
+    np.testing.assert_array_equal(again.for_search()[0].simulate(start), found.for_search()[0].simulate(start))
+
+
+def recordings_start(found: Draws) -> np.ndarray:
+    return np.ones((50, len(found.model.robot.motors.names)))
+
+
+@pytest.mark.parametrize("spoil", ["shape", "nan", "few", "share"])
+def test_draws_that_do_not_fit_their_model_are_refused(made: Callable[..., Draws], spoil: str) -> None:
+    found = made()
+    header, arrays = found.to_archive()
+    if spoil == "shape":
+        arrays["drawn_weights"] = arrays["drawn_weights"][:, :, :-1]
+    elif spoil == "nan":
+        arrays["drawn_weights"] = np.full_like(arrays["drawn_weights"], np.nan)
+    elif spoil == "few":
+        arrays["drawn_weights"] = arrays["drawn_weights"][:4]
+    else:
+        arrays["share"] = -found.share
+    with pytest.raises(FileFormatError, match="draws"):
+        Draws.from_archive(header, arrays)
+
+
+@pytest.mark.slow
+def test_draws_of_a_neck_are_grey_boxes_that_cover_a_new_recording() -> None:
+    """A recording of another signal of the same kind lies within the band, without its disturbance being raised."""
+    neck = VirtualNeck(NeckParameters.paper())
+    parts = [record(signal("eq22", duration=40.0), neck, seed=1), record(signal("aprbs", duration=40.0), neck, seed=2)]
+    found = make_draws(parts, count=10)
+    assert found.model.kind == "greybox"
+    numbers = np.array([model.arrays["neck"] for model in found.for_certificate()])
+    assert (numbers.std(axis=0) > 0.0).sum() >= 12  # all but those that have no meaning here or are held at a bound
+    new = record(signal("aprbs", duration=20.0, seed=7), neck, seed=3)
+    _, held = _draws._split(new, 1.0)
+    motions = _draws._Motions.of(held, found.model, 1.0)
+    Y = motions.simulate([{name: values[k] for name, values in found.arrays.items()} for k in range(20)])
+    for row in motions.coverage(Y, found.share, found.keep):
+        # A tenth less than the level: twenty draws have a narrower range than the forty of the calibration.
+        assert row["covered"] >= found.level - 0.1
