@@ -112,7 +112,7 @@ def _rows(choice: identification.Choice) -> list[list[str]]:
 def _row(one: identification.KindTrial, chosen: bool) -> list[str]:
 
     if one.model is None:
-        return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", one.failure[:60]]
+        return [one.kind, *["-"] * 5, f"{one.seconds:.1f} s", "-", f"not identified: {one.failure}"[:76]]
     scores, error = one.scores, one.errors.get(one.worst)
     return [
         one.kind,
@@ -137,7 +137,7 @@ def _facts(choice: identification.Choice, path: Path) -> dict:
             {
                 "kind": one.kind,
                 "seconds": one.seconds,
-                "failure": one.failure or None,
+                "failure": f"not identified: {one.failure}" if one.failure else None,
                 "fit": one.fit,
                 "worst": one.worst or None,
                 "scores": dict(one.scores),

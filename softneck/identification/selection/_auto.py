@@ -115,6 +115,11 @@ def _failure_reasons(ranking: Sequence[KindTrial]) -> str:
     return "; ".join(f"{', '.join(kinds)}: {why}" for why, kinds in said.items())
 
 
+def _reason(error: Exception) -> str:
+    """Return why a kind was not identified; an internal error is named by its type."""
+    return str(error) if isinstance(error, SoftneckError) else f"{type(error).__name__}: {error}"
+
+
 def _progress_text(kind: str, tried: list[KindTrial]) -> str:
     """Return the kind being tried and the best so far."""
     best = max(tried, key=lambda one: one.fit, default=None)
@@ -153,10 +158,11 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
             "The rows held out are of the excitation that was trained on: this ranking may not hold for other "
             "motions. Give a second recording with another signal; the last one is held out."
         )
-    if ranking[0].fit < _POOR_FIT_PCT:
+    # Of the rows held out alone: motions that were left out may lie far outside what was trained on.
+    if not any(one.hold_out_fit >= _POOR_FIT_PCT for one in ranking):
         remarks.append(
-            f"No kind reaches {_POOR_FIT_PCT:g} % in simulation. Look for a drifting sensor, a wrong sample time or "
-            "sign, motors that were not logged, or an excitation that hardly moves the robot."
+            f"No kind reaches {_POOR_FIT_PCT:g} % in simulation of the rows held out. Look for a drifting sensor, a "
+            "wrong sample time or sign, motors that were not logged, or an excitation that hardly moves the robot."
         )
     failed = [one.kind for one in ranking if one.fit == float("-inf")]
     if failed:
@@ -294,8 +300,8 @@ class _Race:
             model = self.short[kind] = self._short(kind, fold.train)
             seconds = time.perf_counter() - begin
             found = {part.name: part.fit(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
-        except (SoftneckError, np.linalg.LinAlgError) as error:
-            self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=str(error))
+        except Exception as error:  # one kind never ends the search
+            self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=_reason(error))
             return
         self.tried[kind] = _with(KindTrial(kind, seconds, model, whole=False), found)
 
@@ -329,7 +335,7 @@ class _Race:
         try:
             model = self._short(kind, fold.train)
             found = {part.name: part.fit(model) for part in fold.judged}
-        except (SoftneckError, np.linalg.LinAlgError):
+        except Exception:  # one kind never ends the search
             found = {part.name: (float("-inf"), float("nan")) for part in fold.judged}
         one = self.tried[kind]
         self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin), found)
@@ -367,8 +373,8 @@ class _Race:
                 parts = [best.model, self.short[best.kind]]
                 model = replace(settings, members=len(parts)).around(base, parts, self.train)
             judged = self._validate("guarded", model)
-        except (SoftneckError, np.linalg.LinAlgError) as error:
-            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=str(error))
+        except Exception as error:  # one kind never ends the search
+            self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=_reason(error))
             return best
         one = KindTrial("guarded", time.perf_counter() - begin, model, judged, "", best.left_out, best.errors)
         self.tried["guarded"] = one
@@ -390,8 +396,8 @@ class _Race:
             model = _settings(kind, self.seed, {}).fit(self.train)
             judged = self._validate(kind, model)
             error = all_rows(HOLD_OUT, self.hold_out).fit(model)[1]
-        except (SoftneckError, np.linalg.LinAlgError) as error:
-            self.tried[kind] = KindTrial(kind, one.seconds, failure=str(error))
+        except Exception as error:  # one kind never ends the search
+            self.tried[kind] = KindTrial(kind, one.seconds, failure=_reason(error))
             return
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
         self.tried[kind] = replace(one, model=model, judged=judged, whole=True)

@@ -89,6 +89,24 @@ def test_a_hold_out_of_the_same_excitation_and_a_hopeless_one_are_remarked() -> 
     assert any("No kind reaches 70 %" in remark for remark in lost.remarks)
 
 
+def test_an_internal_error_of_one_kind_is_its_reason_and_the_others_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fit(*_: object, **__: object) -> Model:
+        raise IndexError("index 2 is out of bounds")
+
+    monkeypatch.setattr(OutputError, "fit", fit)
+    found = choose(TRAIN, OTHER, kinds=("rls", "oe"), other_excitation=True)
+    assert found.chosen.kind == "rls"
+    failed = {one.kind: one.failure for one in found.ranking if one.model is None}
+    assert failed == {"oe": "IndexError: index 2 is out of bounds"}
+
+
+@pytest.mark.parametrize(("held_out", "said"), [(92.0, False), (60.0, True), (float("nan"), True)])
+def test_that_no_kind_is_good_is_said_of_the_rows_held_out_alone(held_out: float, said: bool) -> None:
+    one = KindTrial("rls", 0.0, left_out={"largest motions": 40.0, HOLD_OUT: held_out})
+    remarks = _auto._remarks((one,), other_excitation=True)
+    assert any("No kind reaches 70 %" in remark for remark in remarks) is said
+
+
 def test_nothing_to_try_and_nothing_that_works_are_errors() -> None:
     assert {"rls", "play", "nn", "greybox"} <= set(kinds_to_try())
     with pytest.raises(SettingsError, match="`magic` cannot be tried"):
