@@ -64,3 +64,6 @@ from ._files import settings_text as settings_text
 from ._kinds import fitting as fitting
 from ._kinds import kinds_of as kinds_of
 from ._kinds import make_settings as make_settings
+from ._metrics import METRICS as METRICS
+from ._metrics import metric_of as metric_of
+from ._metrics import worst as worst

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import DataError, ReprMixin, SettingsError, Vector, require_one_of, to_si
+from softneck.core import DataError, ReprMixin, SettingsError, Vector, metric_of, require_one_of, to_si
 from softneck.robot import Robot
 
 
@@ -65,8 +65,6 @@ _RISE_LEVELS = (0.1, 0.9)
 # The steady state is the last quarter of the time after the step.
 _STEADY_SHARE = 0.25
 
-# Metrics whose limit is a lower one.
-_LOWER_LIMITS = ("validity.min",)
 _AXIS_METRICS = ("rise_s", "settling_s", "overshoot_pct", "rms_error_deg", "iae", "ise", "itae", "steady_rms_deg")
 _MOTOR_METRICS = ("max_rad", "max_rate_rad_s", "effort", "total_variation_rad", "limit_violation_s", "slack_s")
 Metrics = dict[str, dict[str, float | None]]
@@ -134,7 +132,8 @@ def _outside_range(P: np.ndarray, robot: Robot) -> int:
     if low is None or high is None:
         return 0
     rounding = 1e-9 * np.abs([low, high]).max()
-    return int(((np.array(low) - rounding > P) | (np.array(high) + rounding < P)).any(axis=1).sum())
+    inside = (np.array(low) - rounding <= P) & (np.array(high) + rounding >= P)
+    return int((~inside).any(axis=1).sum())
 
 
 def _word(unit: str) -> str:
@@ -163,7 +162,7 @@ def check_limits(values: Mapping[str, Any], limits: Mapping[str, float]) -> list
         if isinstance(limit, bool) or not isinstance(limit, int | float) or math.isnan(limit):
             raise SettingsError(f"the limit of `{name}` must be a number; got {limit!r}.")
         value = known[name]
-        holds = value is not None and (value >= limit if name in _LOWER_LIMITS else value <= limit)
+        holds = value is not None and (value >= limit if metric_of(name).larger else value <= limit)
         rows.append({"metric": name, "limit": float(limit), "value": value, "holds": bool(holds)})
     return rows
 
@@ -178,7 +177,8 @@ def _axis_metrics(result: LoopResult, axis: str, angle: str) -> dict[str, float 
         step = (0, rest, step[2])
     first = 0 if step is None else step[0]
     error = r - y
-    known = np.isfinite(error)
+    # Missing samples are NaN; an infinite one is an error without bound.
+    known = ~np.isnan(error)
     tail = error[first + math.floor((1.0 - _STEADY_SHARE) * (r.size - first)) :]
     shape: dict[str, float | None] = {"rise_s": None, "settling_s": None, "overshoot_pct": None}
     if step is not None and known[step[0] :].any() and step[2] != step[1]:
@@ -187,19 +187,18 @@ def _axis_metrics(result: LoopResult, axis: str, angle: str) -> dict[str, float 
         shape = _step_shape(_fill_missing(response), result.sample_time)
     size, since = np.abs(error[known]), result.time[known] - result.time[first]
     unit, factor = error_unit(result.robot)
+    integrals = {"iae": size, "ise": size**2, "itae": size[since > 0.0] * since[since > 0.0]}
     return {
         **shape,
         f"rms_error_{unit}": _rms(error, factor),
-        "iae": float(np.sum(size) * result.sample_time),
-        "ise": float(np.sum(size**2) * result.sample_time),
-        "itae": float(np.sum(size * np.maximum(since, 0.0)) * result.sample_time),
+        **{name: float(np.sum(part) * result.sample_time) if size.size else None for name, part in integrals.items()},
         f"steady_rms_{unit}": _rms(tail, factor),
     }
 
 
 def _fill_missing(y: Vector) -> Vector:
     """Return `y` (n,) with missing samples filled by the last known one, at the start by the first known one."""
-    known = np.flatnonzero(np.isfinite(y))
+    known = np.flatnonzero(~np.isnan(y))
     return y[known[np.maximum(np.searchsorted(known, np.arange(y.size), side="right") - 1, 0)]]
 
 
@@ -208,7 +207,7 @@ def _slack(result: LoopResult) -> float | None:
     names = [f"tension_{j}" for j in motors if f"tension_{j}" in result.signals]
     if not names:
         return None
-    slack = np.any([result[name] <= _SLACK_TENSION_N for name in names], axis=0)
+    slack = ~np.all([result[name] > _SLACK_TENSION_N for name in names], axis=0)
     return float(slack.sum() * result.sample_time)
 
 
@@ -228,6 +227,8 @@ def _find_step(r: Vector) -> tuple[int, float, float] | None:
 
 def _step_shape(y: Vector, sample_time: float) -> dict[str, float | None]:
     """Return rise, settling and overshoot of a response `y` (n,) to a step from 0 to 1."""
+    if not np.isfinite(y).all():
+        return {"rise_s": None, "settling_s": None, "overshoot_pct": None}
     low, high = (np.flatnonzero(y >= level) for level in _RISE_LEVELS)
     outside = np.flatnonzero(np.abs(y - 1.0) >= SETTLING_BAND)
     settled = 0 if outside.size == 0 else int(outside[-1]) + 1
@@ -245,7 +246,7 @@ def error_unit(robot: Robot) -> tuple[str, float | None]:
 
 
 def _rms(error: Vector, factor: float | None) -> float | None:
-    known = error[np.isfinite(error)]
+    known = error[~np.isnan(error)]
     if not known.size:
         return None
     rms = math.sqrt(float(np.mean(known**2)))

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import KINDS, DataError, SoftneckError, Vector, make_settings, resolve, to_si
+from softneck.core import KINDS, DataError, SoftneckError, Vector, make_settings, resolve, to_si, worst
 from softneck.design import AxisSettings, UncertainPlant, uncertain_plant
 from softneck.identification import payloads
 from softneck.loop import Loop, LoopResult, Reference, RobotReference, SensorFault, run_loop
@@ -97,7 +97,9 @@ def run_case(
     )
     names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
     name_of = asked.scale.name_of
-    found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
+    # Without tension outputs there is no slack to know.
+    known = [name for name in names if name != "slack_s" or not math.isnan(values[name])]
+    found = {f"sim.{name_of(name)}": values[name] for name in known}
     if case.noise and case.part < 1.0:
         found[f"track.{name_of('variation_rad_s')}"] = math.inf if result is None else variation(result)
     if case.part < 1.0:
@@ -277,7 +279,7 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
     for law in judged_one.laws.values():
         for name, values in margins(plants, law).items():
             axis, _, last = name.partition(".")
-            value = float(values.min() if last in LARGE else values.max())
+            value = worst(name, values)
             keep_worse(found, name, value)
             if last in (*LARGE, *SMALL) and axis != "mimo":
                 keep_worse(found, f"axes.{last}", value)
@@ -291,13 +293,13 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
     steps = run_steps(
         plants, judged_one.block, asked.step_test(task.seed), workers=1, robot=task.robot, weights=ready.weights
     )
-    return found | {f"step.{asked.scale.name_of(name)}": float(values.max()) for name, values in steps.metrics.items()}
+    names = {name: f"step.{asked.scale.name_of(name)}" for name in steps.metrics}
+    return found | {names[name]: worst(name, values) for name, values in steps.metrics.items()}
 
 
 def keep_worse(found: dict[str, float], name: str, value: float) -> None:
     """Store a value of a metric where it is worse than the stored one."""
-    pick = min if name.rpartition(".")[2] in LARGE else max
-    found[name] = pick(found[name], value) if name in found else value
+    found[name] = worst(name, [found.get(name, value), value])
 
 
 def loop_metrics(
@@ -314,7 +316,7 @@ def loop_metrics(
             shifts.append(distances)
     if shifts:
         # One lead for all plants: the one with the smallest worst distance.
-        most = np.max(shifts, axis=0)
+        most = np.nan_to_num(np.max(shifts, axis=0), nan=math.inf, posinf=math.inf)
         best = int(np.argmin(most))
         Ts = block.sample_time
         name_of = task.asked.certificate.scale.name_of
@@ -329,4 +331,4 @@ def margin_metrics(
     """Return the margins by experiment on the simulation models."""
     loops = loops_under_test(block, ready.own, task.asked.certificate, order=order, observer=observer)
     found = crossing_values(crossings(loops, overall=True)) if loops else {}
-    return {name: float(values.min()) for name, (values, _) in found.items() if name.startswith("axes.")}
+    return {name: worst(name, values) for name, (values, _) in found.items() if name.startswith("axes.")}

@@ -197,15 +197,15 @@ def _fill_metrics(evidence: Evidence, controller: ControllerUnderTest, asked: Re
     for name in evidence.necks[0].metrics:
         values = np.array([run.metrics[name] for run in evidence.necks])
         metrics[f"sim.{asked.scale.name_of(name)}"] = Values(values, describe)
-    if np.isnan(metrics["sim.slack_s"].values).any():
-        del metrics["sim.slack_s"]
-        absent["sim.slack_s"] = "a plant has no tension outputs; give a NECK, a file or a preset by its name"
-        return
+    slack = metrics.pop("sim.slack_s").values
+    known = np.isfinite(slack) | [run.result is None for run in evidence.necks]
     # A heavier payload takes the pretension, whatever the controller does.
-    light = [k for k, run in enumerate(evidence.necks) if run.payload <= asked.sim["taut_up_to_kg"]]
-    slack = metrics.pop("sim.slack_s").values[light]
-    if light:
-        metrics["sim.slack_s"] = Values(slack, lambda row: describe(light[row]))
+    light = [k for k, run in enumerate(evidence.necks) if known[k] and run.payload <= asked.sim["taut_up_to_kg"]]
+    # A plant without tension outputs hides no slack tendon of another.
+    if not known.all() and not slack[light].any():
+        absent["sim.slack_s"] = "a plant has no tension outputs; give a NECK, a file or a preset by its name"
+    elif light:
+        metrics["sim.slack_s"] = Values(slack[light], lambda row: describe(light[row]))
     else:
         absent["sim.slack_s"] = "all of `payloads_kg` are above `taut_up_to_kg`"
 

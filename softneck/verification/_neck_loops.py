@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from softneck.core import DataError, Progress, SettingsError, SoftneckError, to_si
+from softneck.core import DataError, Progress, SettingsError, SoftneckError, to_si, worst
 from softneck.cosim import FmuPart
 from softneck.estimation import robot_of
 from softneck.loop import BlockPart, Loop, LoopResult, Part, RobotReference, metrics, run_loop
@@ -348,9 +348,7 @@ def judge_loop(
     values = {}
     for name in _AXIS_METRICS:
         found = [table[axis][names(name)] for axis in stepped]
-        values[name] = (
-            math.inf if any(value is None for value in found) else max(float(value or 0.0) for value in found)
-        )
+        values[name] = worst(name, [math.nan if value is None else value for value in found])
     told = {name: table["motors"][names(name)] for name in _MOTOR_METRICS}
     # A plant without tension outputs has no slack metric.
     values |= {name: math.nan if value is None else float(value) for name, value in told.items()}

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from softneck.core import Matrix, Vector
+from softneck.core import Matrix, Vector, worst
 from softneck.design import mu_upper
 from softneck.identification import response_of
 
@@ -49,16 +49,16 @@ def search(necks: list[PlantSource], law: LinearLaw, *, extra: int, generations:
     Differential evolution (Storn and Price 1997) over gain, pole and dead time of each axis, or of all coupled axes;
     `extra` samples of delay from the loop's order.
     """
-    worst: list[Plants] = []
+    hardest: list[Plants] = []
     largest = 0.0
     for source, neck in enumerate(necks):
         for axes in coupled_axes(neck, law):
             task = _Task(neck, source, axes, law, extra)
             found = _evolve(task.badness, 3 * len(axes), generations, seed)
             label = axes_name(neck, axes) + (" axes" if len(axes) > 1 else "")
-            worst.append(task.plants(found.reshape(1, -1), f"worst that a search found ({label})"))
-            largest = max(largest, task.radius)
-    return SearchResult(join(worst), largest)
+            hardest.append(task.plants(found.reshape(1, -1), f"worst that a search found ({label})"))
+            largest = worst("stability.radius", [largest, task.radius])
+    return SearchResult(join(hardest), largest)
 
 
 def coupled_axes(neck: PlantSource, law: LinearLaw) -> list[tuple[int, ...]]:
@@ -92,7 +92,7 @@ class _Task:
         """Return the objective (n,) at x (3 axes, n), which scipy minimises."""
         plants = self.plants(x.T).later(self.extra)
         found, size = loops_of(plants, self.law, peaks=False)
-        self.radius = max(self.radius, float(size.max()))
+        self.radius = worst("stability.radius", [self.radius, *size])
         peaks = found.difference[:, list(self.axes)].max(axis=1)
         # The radius of unstable loops, else the peak of |S - T|, which is infinite at the stability limit.
         return -np.where(size >= 1.0, _UNSTABLE_BADNESS * size, np.minimum(peaks, _UNSTABLE_BADNESS))

@@ -259,15 +259,17 @@ def group_runs(runs: pd.DataFrame, by: Sequence[str], metrics: Sequence[str]) ->
     """Return for each combination of values of `by`: runs, failed runs, share that holds, spread of the metrics."""
     import pandas as pd
 
-    rows = []
+    rows, limited = [], bool(runs["holds"].notna().any())
     for values, part in runs.groupby(list(by), sort=False):
         row: dict[str, Any] = dict(zip(by, values if isinstance(values, tuple) else (values,), strict=True))
         failed = np.array([bool(error) for error in part["error"].tolist()])
-        held = part["holds"].dropna().tolist()
+        # A failed run holds no limit, and no metric of it is known.
+        held = [False if bad else bool(holds) for holds, bad in zip(part["holds"], failed, strict=True)
+                if limited and (bad or not pd.isna(holds))]  # fmt: skip
         row |= {"runs": len(part), "failed": int(failed.sum())}
         row["holds [%]"] = 100.0 * sum(held) / len(held) if held else math.nan
         for metric in metrics:
-            y = part[metric].to_numpy(float)[~failed]
+            y = np.where(failed, np.inf, part[metric].to_numpy(float))
             row |= {f"{metric} {name}": value for name, value in _spread(y).items()}
         rows.append(row)
     return pd.DataFrame(rows)

@@ -59,7 +59,7 @@ def timing(now: float, before: float | None, bus: BusSettings) -> list[Event]:
     if before is None:
         return []
     gap = (now - before) / bus.cycle
-    if gap <= 0.0:
+    if not gap > 0.0:
         return [Event(now, "clock", 0, f"{before:.6f} s, then {now:.6f} s")]
     if gap >= bus.stalled_cycles:
         return [Event(now, "stalled", 0, f"{gap * bus.cycle * 1e3:.0f} ms")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -79,7 +80,7 @@ def require_certified(
         _require_robot(found, robot or NECK)
     covered = float(simulated.contents.get("duration_s") or 0.0)
     # Half a sample: a duration is a whole number of them.
-    if covered < setup.loop.duration - 0.5 * setup.loop.controller.sample_time:
+    if not covered >= setup.loop.duration - 0.5 * setup.loop.controller.sample_time:
         raise CheckFailedError(
             f"{simulated.path}: is for {covered:g} s, the run takes {setup.loop.duration:g} s; simulate it again."
         )
@@ -160,18 +161,24 @@ def require_same_again(loop: Loop, certificate: Certificate) -> float:
     if not isinstance(trace, dict) or not trace.get("row"):
         raise CheckFailedError(f"{certificate.path}: is of an earlier softneck and keeps no rows; simulate it again.")
     again = _run_for(loop, _REPLAY_TIME)
-    for said, expected in trace.items():
+    for said, certified in trace.items():
         if said == "row":
             continue
         name = loop.robot.own(said)
         values = again.angle(name) if name in loop.robot.outputs.names else again[name]
-        for row, value in zip(trace["row"], expected, strict=True):
-            if value is not None and row < len(values) and not abs(values[row] - value) <= SAME:
+        for row, value in zip(trace["row"], certified, strict=True):
+            if row < len(values) and not _same(values[row], value):
+                expected = math.nan if value is None else value
                 raise CheckFailedError(
                     f"{certificate.path}: the loop does not do again what was certified: `{name}` is {values[row]:.6g} "
-                    f"instead of {value:.6g} rad at t = {again.time[row]:.2f} s. Simulate it again, {_OVERRIDE_WAY}"
+                    f"instead of {expected:.6g} rad at t = {again.time[row]:.2f} s. Simulate it again, {_OVERRIDE_WAY}"
                 )
     return float(again.time[-1] + again.sample_time)
+
+
+def _same(value: float, certified: float | None) -> bool:
+    """Return whether a value is the certified one; None there is a sample that was missing."""
+    return math.isnan(value) if certified is None else abs(value - certified) <= SAME
 
 
 def _run_for(loop: Loop, seconds: float) -> LoopResult:

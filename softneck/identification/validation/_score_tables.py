@@ -274,7 +274,8 @@ def _terms(measured: Matrix, errors: Matrix) -> Matrix:
     """Return the terms of a fit per row: 1, y, y^2 and e^2 of each axis (time, 8); 0 for rows not scored."""
     columns = []
     for y, e in zip(measured.T, errors.T, strict=True):
-        there = np.isfinite(y) & np.isfinite(e)
+        # A prediction that is no number leaves no interval, as it leaves no fit.
+        there = np.isfinite(y)
         z = np.where(there, y - (y[there].mean() if there.any() else 0.0), 0.0)
         columns += [there.astype(float), z, z**2, np.where(there, e, 0.0) ** 2]
     return np.column_stack(columns)

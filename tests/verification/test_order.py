@@ -1,0 +1,309 @@
+"""Worst means worst: over axes, plants, payloads, directions and searches, for every metric of a verification."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import DataError, metric_of
+from softneck.loop import LoopResult
+from softneck.robot import Robot
+from softneck.verification import _evidence, _experiments, _neck_loops, _steps, metric_names
+from softneck.verification._evidence import Evidence, Values, worst_row
+from softneck.verification._experiments import Crossing, crossing_values
+from softneck.verification._linear import LARGE, SMALL, margins
+from softneck.verification._neck_loops import LoopRun, judge_loop
+from softneck.verification._plants import nominal_plants, source_of_family
+from softneck.verification._requirements import Requirement, make_requirements
+from softneck.verification._steps import StepTest, _metrics, run_steps
+from softneck.verification._structured import StructuredResult, _Task
+from softneck.verification._verify import _verdict
+
+from ..order import check_worst, is_worse
+from .necks import TS, family, pi
+
+ALL = metric_names(Robot.preset())
+CONTROLLER = cache(pi)
+
+
+def _bound(name: str) -> str:
+    return "min" if metric_of(name).larger else "max"
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_the_row_of_a_verdict_is_the_worst(name: str) -> None:
+    def of(values: Any) -> float:
+        table = {name: Values(np.array(values, float), lambda row: {"row": row})}
+        return float(table[name].values[worst_row(table, name, _bound(name))])
+
+    check_worst(name, of)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_verdict_is_that_of_the_worst_and_no_number_holds_nothing(name: str) -> None:
+    """A verdict has the value and the plant of the worst; NaN on either side of the comparison fails."""
+    worse, better = (1.2, 1.7) if metric_of(name).larger else (1.7, 1.2)
+
+    def verdict(values: list[float], limit: float) -> Any:
+        table = {name: Values(np.array(values), lambda row: {"row": row})}
+        evidence: Any = SimpleNamespace(
+            metrics=table, not_computed={}, foreign=False, tested=[], crossings=[], plants=SimpleNamespace(axes=())
+        )
+        return _verdict(Requirement(name, _bound(name), limit, True), evidence, {})
+
+    for values in ([worse, better], [better, worse]):
+        assert verdict(values, worse).holds
+        assert verdict(values, worse).value == worse
+        assert verdict(values, worse).worst == {"row": values.index(worse)}
+        assert verdict(values, better).holds is False
+        assert verdict(values, math.nan).holds is False
+        assert verdict([*values, math.nan], worse).holds is False
+        assert verdict([math.nan, *values], worse).holds is False
+
+
+# -- steps ------------------------------------------------------------------------------------------------------------
+
+TEST = StepTest(step=0.2, duration=1.0, noise=0.0, load=0.0, seed=0)
+HALF = 50
+
+
+def response(size: float, lag: float, peak: float = 0.0) -> np.ndarray:
+    """Rows of a step and of the load after it; a slower lag, a larger peak and a larger offset are worse."""
+    t = np.arange(2 * HALF) * TS
+    y = 1.0 - np.exp(-t / lag) + peak * np.exp(-((t - 0.3) ** 2) / 0.005)
+    return TEST.step * (y + 0.1 * size * (t >= 0.9))
+
+
+def stepped(monkeypatch: pytest.MonkeyPatch, members: list[np.ndarray], others: list[float]) -> _steps.Steps:
+    """Return the steps of one plant whose axes respond as `members`, moving the other axis by `others`."""
+    plants = nominal_plants([source_of_family(family(), "f")])[0].take(np.array([0]))
+    runs = iter(zip(members, others, strict=True))
+
+    def run(plants: Any, block: Any, signals: np.ndarray, *_: Any) -> tuple[np.ndarray, np.ndarray]:
+        axis = int(np.flatnonzero(signals[-1, :2])[0])
+        member, other = next(runs)
+        y = np.full((1, len(signals), 2), other)
+        y[0, :, axis] = member
+        return y, np.zeros((1, len(signals), 3))
+
+    monkeypatch.setattr(_steps, "_run", run)
+    return run_steps(plants, CONTROLLER().block(), TEST, workers=1)
+
+
+@pytest.mark.parametrize("name", _steps.METRICS)
+def test_the_worse_axis_of_a_step_counts_and_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The first is worse by every metric: slower, with a peak, an offset, and more of the other axis.
+    bad, good = (response(1.0, 0.12, 0.4), 0.02), (response(0.2, 0.06, 0.2), 0.005)
+    alone = {}
+    for label, (y, other) in {"bad": bad, "good": good}.items():
+        alone[label] = _metrics(y[None], np.full((1, HALF), other), TEST, HALF, TS)[name][0]
+    assert is_worse(name, alone["bad"], alone["good"])
+    for members, at in (((bad, good), 0), ((good, bad), 1)):
+        found = stepped(monkeypatch, [y for y, _ in members], [other for _, other in members])
+        assert found.metrics[name][0] == alone["bad"]
+        assert found.worse[name][0] == at
+    for lost in (math.nan, math.inf):
+        for place in (0, 1):
+            y = good[0].copy()
+            y[60] = lost
+            members = [good[0], good[0]]
+            members[place] = y
+            found = stepped(monkeypatch, members, [0.0, 0.0])
+            assert found.metrics[name][0] == math.inf
+            assert found.worse[name][0] == place
+
+
+def test_each_metric_of_a_step_follows_its_own_row() -> None:
+    """Each plant has its own value: no row of an array takes that of another, in whatever order they stand."""
+    rows = [response(1.0, 0.12, 0.4), response(0.2, 0.06, 0.2), response(0.0, 0.3), response(0.5, 0.05)]
+    others = [0.02, -0.03, 0.0, 0.01]
+    y, other = np.stack(rows), np.stack([np.full(HALF, value) for value in others])
+    whole = _metrics(y, other, TEST, HALF, TS)
+    for name, values in whole.items():
+        for row in range(len(rows)):
+            assert values[row] == _metrics(y[[row]], other[[row]], TEST, HALF, TS)[name][0]
+        np.testing.assert_array_equal(_metrics(y[::-1], other[::-1], TEST, HALF, TS)[name], values[::-1])
+        assert len(set(values.tolist())) > 2, name
+
+
+# -- loops over simulation models -------------------------------------------------------------------------------------
+
+
+def loop_result(pitch: np.ndarray, roll: np.ndarray, sizes: tuple[float, float] = (0.2, 0.1)) -> LoopResult:
+    rows = pitch.size
+    signals = {"pitch": pitch, "roll": roll}
+    signals |= {f"{axis}_reference": np.full(rows, s) for axis, s in zip(("pitch", "roll"), sizes, strict=True)}
+    signals |= {f"motor_setpoint_{j}": np.full(rows, 0.1 * j) for j in (1, 2, 3)}
+    for axis in ("pitch", "roll"):
+        signals[f"{axis}_reference"][0] = 0.0
+    return LoopResult(np.arange(rows) * TS, signals, {}, TS)
+
+
+def judged(monkeypatch: pytest.MonkeyPatch, result: Any) -> tuple[dict[str, float], Any]:
+    def run(loop: Any, *, compiled: bool) -> LoopResult:
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    monkeypatch.setattr(_neck_loops, "run_loop", run)
+    return judge_loop(SimpleNamespace())  # pyright: ignore[reportArgumentType]
+
+
+AXIS = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg")
+
+
+@pytest.mark.parametrize("name", AXIS)
+def test_the_worse_axis_of_a_loop_counts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad, good = (response(1.0, 0.12, 0.4) / 0.2, response(0.2, 0.06, 0.2) / 0.2)
+    sizes = (0.2, 0.2)
+    both = [judged(monkeypatch, loop_result(0.2 * a, 0.2 * b, sizes))[0][name] for a, b in ((bad, good), (good, bad))]
+    alone = [judged(monkeypatch, loop_result(0.2 * y, 0.2 * y, sizes))[0][name] for y in (bad, good)]
+    assert is_worse(name, alone[0], alone[1])
+    assert both == [alone[0]] * 2
+    # An axis that never arrives, or whose output is no number at all, is worse than any that does.
+    for lost in (np.full(2 * HALF, math.nan), np.full(2 * HALF, math.inf)):
+        for pair in ((lost, 0.2 * good), (0.2 * good, lost)):
+            found = judged(monkeypatch, loop_result(*(y.copy() for y in pair), sizes=sizes))[0][name]
+            assert is_worse(name, found, alone[1])
+
+
+def test_a_loop_that_diverged_is_infinitely_bad_in_every_metric(monkeypatch: pytest.MonkeyPatch) -> None:
+    values, result = judged(monkeypatch, DataError("overflow"))
+    assert result is None
+    assert set(values) == {*AXIS, "max_rad", "limit_violation_s", "slack_s"}
+    assert all(value == math.inf for value in values.values())
+
+
+def test_only_an_axis_that_hardly_moves_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+    good, still = 0.2 * (response(0.2, 0.06) / 0.2), np.zeros(2 * HALF)
+    tiny = judged(monkeypatch, loop_result(good.copy(), still.copy(), (0.2, 0.2 * 0.05)))[0]
+    assert tiny["rise_s"] < math.inf
+    larger = judged(monkeypatch, loop_result(good.copy(), still.copy(), (0.2, 0.2 * 0.051)))[0]
+    assert larger["rise_s"] == math.inf
+
+
+def evidence_of(slack: list[tuple[float, float]], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return the evidence of loops with (slack, payload); NaN: no tension outputs, inf: diverged."""
+    names = (*AXIS, "max_rad", "limit_violation_s")
+    runs = [
+        LoopRun(f"run {k}", None, kg, 0.0, k, {**dict.fromkeys(names, 1.0 + k), "slack_s": value},
+                None if math.isinf(value) else SimpleNamespace())  # pyright: ignore[reportArgumentType]
+        for k, (value, kg) in enumerate(slack)
+    ]  # fmt: skip
+    asked = make_requirements({"sim": {"taut_up_to_kg": 0.5, "payloads_kg": [0.0, 0.5, 1.0]}})
+    empty: Any = SimpleNamespace(metrics={}, worse={})
+    evidence = Evidence(None, None, [], empty, None, runs)  # pyright: ignore[reportArgumentType]
+    controller: Any = SimpleNamespace(why="", block=SimpleNamespace(inputs=()), robot=Robot.preset())
+    monkeypatch.setattr(_evidence, "_neck_describer", lambda *_: lambda row: {"name": runs[row].name})
+    _evidence._fill_metrics(evidence, controller, asked, observer=False)
+    return evidence
+
+
+@pytest.mark.parametrize("name", [*AXIS, "max_rad", "limit_violation_s"])
+def test_every_run_counts(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = evidence_of([(0.0, 0.0), (0.1, 0.5), (0.0, 1.0)], monkeypatch).metrics[f"sim.{name}"]
+    assert found.values.tolist() == [1.0, 2.0, 3.0]
+    assert found.describe(2) == {"name": "run 2"}
+
+
+@pytest.mark.parametrize(
+    ("slack", "values", "last"),
+    [
+        ([(0.1, 0.0), (0.3, 0.5), (0.2, 0.0)], [0.1, 0.3, 0.2], 2),
+        # Above 0.5 kg the payload takes the pretension, whatever the controller does.
+        ([(0.1, 0.0), (9.0, 0.51), (0.2, 0.5)], [0.1, 0.2], 2),
+        # A plant that does not tell its tensions hides no slack of another, and a diverged loop is none that does not.
+        ([(math.nan, 0.0), (0.3, 0.0)], [0.3], 1),
+        ([(math.nan, 0.0), (0.0, 0.0), (math.inf, 0.0)], [0.0, math.inf], 2),
+        ([(math.nan, 0.0), (0.0, 0.0)], None, 0),
+        ([(9.0, 0.6)], None, 0),
+    ],
+)  # fmt: skip
+def test_slack_is_judged_wherever_it_is_known(
+    slack: list[tuple[float, float]], values: list[float] | None, last: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = evidence_of(slack, monkeypatch)
+    if values is None:
+        assert "sim.slack_s" not in found.metrics
+        assert found.not_computed["sim.slack_s"]
+        return
+    assert found.metrics["sim.slack_s"].values.tolist() == values
+    assert found.metrics["sim.slack_s"].describe(len(values) - 1) == {"name": f"run {last}"}
+
+
+def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> None:
+    evidence: Any = SimpleNamespace(metrics={})
+    for start in (0, 2, 5):
+        _evidence._add(evidence, "m", Values(np.arange(start, start + 2.0), lambda row, s=start: {"row": s + row}))
+    found = evidence.metrics["m"]
+    assert found.values.tolist() == [0.0, 1.0, 2.0, 3.0, 5.0, 6.0]
+    assert [found.describe(row)["row"] for row in range(6)] == [0, 1, 2, 3, 5, 6]
+
+
+# -- margins ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_loop_whose_radius_is_no_number_has_no_margin() -> None:
+    from softneck.verification._linear import LinearLaw, frequency_grid
+
+    plants = nominal_plants([source_of_family(family(), "f")])[0].take(np.array([0, 0, 0]))
+    law = LinearLaw.of(CONTROLLER().ss(), Robot.preset())
+    found = margins(plants, law, frequency_grid(TS, 1.0)[::20], np.array([0.9, math.nan, 1.0]))
+    for name, values in found.items():
+        last = name.partition(".")[2]
+        if last in (*LARGE, *SMALL):
+            none = math.inf if last in SMALL else 1.0 if last == "gain_margin" else 0.0
+            assert values[1] == values[2] == none
+            assert is_worse(name, values[1], values[0]), name
+
+
+def test_margins_by_experiment_are_those_of_their_axes() -> None:
+    def crossing(axes: str, what: str, value: float) -> Crossing:
+        return Crossing("p", axes, what, 0.1, (0.0, 0.0), value, 0.0)
+
+    found = [
+        crossing("pitch", "gain_up", 3.0), crossing("roll", "gain_up", 2.5), crossing("both", "gain_down", 4.0),
+        crossing("pitch", "gain_down", 5.0), crossing("roll", "delay", 0.2), crossing("both", "delay", 0.1),
+    ]  # fmt: skip
+    table = {name: sorted(values.tolist()) for name, (values, _) in crossing_values(found).items()}
+    assert table == {
+        "pitch.gain_margin": [3.0, 5.0], "roll.gain_margin": [2.5], "axes.gain_margin": [2.5, 3.0, 4.0, 5.0],
+        "roll.delay_margin_ms": [200.0], "axes.delay_margin_ms": [100.0, 200.0],
+    }  # fmt: skip
+    assert all(
+        [item.value * (1e3 if "delay" in name else 1.0) for item in items] == values.tolist()
+        for name, (values, items) in crossing_values(found).items()
+    )
+
+
+def test_mu_is_the_largest_bound_and_the_searched_radius_the_largest_met(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_worst("robust.mu", lambda v: StructuredResult("pitch", np.arange(1.0, len(v) + 1), np.array(v)).mu)
+    source = source_of_family(family(), "f")
+    from softneck.verification import _structured
+    from softneck.verification._linear import LinearLaw
+
+    law = LinearLaw.of(CONTROLLER().ss(), Robot.preset())
+
+    def of(values: Any) -> float:
+        sizes = iter(values)
+        task = _Task(source, 0, (0,), law, np.array([1.0, 2.0]), 0)
+        monkeypatch.setattr(_structured, "radii", lambda *_: np.array([next(sizes)]))
+        for _ in values:
+            task.badness(np.full((3, 1), 0.5))
+        return task.radius
+
+    check_worst("stability.radius", of)
+
+
+def test_an_oscillation_is_the_largest_of_all_outputs() -> None:
+    y = np.array([0.0, 1.0, 0.2, 0.9, 0.1])
+    assert _experiments._oscillation(y, 10.0) == pytest.approx(0.9)
+    # Creep is none, and a motion beyond the limit counts in full.
+    assert _experiments._oscillation(np.arange(5.0), 10.0) == 0.0
+    assert _experiments._oscillation(np.arange(5.0), 4.0) == 4.0
+    assert math.isnan(_experiments._oscillation(np.array([0.0, math.nan]), 1.0))
