@@ -277,7 +277,7 @@ def _terms(measured: Matrix, errors: Matrix) -> Matrix:
         # A prediction that is no number leaves no interval, as it leaves no fit.
         there = np.isfinite(y)
         z = np.where(there, y - (y[there].mean() if there.any() else 0.0), 0.0)
-        columns += [there.astype(float), z, z**2, np.where(there, e, 0.0) ** 2]
+        columns += [there.astype(float), z, z**2, np.where(there, np.where(np.isfinite(e), e, np.nan), 0.0) ** 2]
     return np.column_stack(columns)
 
 
