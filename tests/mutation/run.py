@@ -5,7 +5,9 @@ tried. Cosmic-ray's own runner starts an interpreter for each mutant, which take
 forks from a process that has numpy, scipy and numba already. Nothing of the tree that it is started in is touched: it
 works in a copy.
 
-    python tests/mutation/run.py [AREA ...] [--count 40] [--seed 0] [--out build/mutation.json] [--again FILE]
+    python tests/mutation/run.py [AREA ...] [--count 40] [--seed SEED] [--out build/mutation.json] [--again FILE]
+
+Without a seed a new one is drawn and printed: tests that were written against one sample say little about the next.
 """
 
 from __future__ import annotations
@@ -80,9 +82,15 @@ def cosmic_ray(name: str) -> Any:
     return importlib.import_module(f"cosmic_ray.{name}")
 
 
+def operator_of(name: str) -> Any:
+    """Return an operator: one of ours beside this file, or one of cosmic-ray's."""
+    own = importlib.import_module("operators").OWN
+    return own.get(name) or cosmic_ray("plugins").get_operator(f"core/{name}")
+
+
 def mutants_of(root: Path, area: Area, settings: dict[str, Any]) -> Iterator[Mutant]:
     """Yield every mutant of an area, in the order of files, operators and places."""
-    plugins, ast = cosmic_ray("plugins"), cosmic_ray("ast")
+    ast = cosmic_ray("ast")
     files = sorted({path for pattern in area.files for path in root.glob(pattern)})
     if not files:
         raise SystemExit(f"area {area.name}: no file fits {area.files}")
@@ -90,33 +98,35 @@ def mutants_of(root: Path, area: Area, settings: dict[str, Any]) -> Iterator[Mut
         tree = ast.get_ast_from_path(path)
         lines = path.read_text(encoding="utf-8").splitlines()
         for name in settings["operators"]:
-            operator = plugins.get_operator(f"core/{name}")()
+            operator = operator_of(name)()
             places = [start for node in ast.ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
             for occurrence, (line, column) in enumerate(places):
                 before = lines[line - 1][:column].rstrip()
                 # A star that opens a signature or unpacks is no product, though cosmic-ray takes it for one.
-                star = lines[line - 1][column] in "*/" and (not before or before[-1] in "(,[{")
-                if star or any(word in lines[line - 1] for word in settings["skip_lines_with"]):
+                star = lines[line - 1][column : column + 1] in ("*", "/") and (not before or before[-1] in "(,[{")
+                words = () if name == "NotRaised" else settings["skip_lines_with"]
+                if star or any(word in lines[line - 1] for word in words):
                     continue
-                yield Mutant(str(path.relative_to(root)), f"core/{name}", {}, occurrence, line)
+                yield Mutant(str(path.relative_to(root)), name, {}, occurrence, line)
 
 
 def sample(mutants: list[Mutant], count: int, seed: int) -> list[Mutant]:
-    """Return `count` of them: first a line, then one of its mutants, so that no crowded line takes the sample."""
+    """Return `count` of them: a line, then an operator, then a place, so that nothing crowded takes the sample."""
     generator = random.Random(seed)
-    by_line: dict[tuple[str, int], list[Mutant]] = {}
+    by_line: dict[tuple[str, int], dict[str, list[Mutant]]] = {}
     for mutant in mutants:
-        by_line.setdefault((mutant.path, mutant.line), []).append(mutant)
+        by_line.setdefault((mutant.path, mutant.line), {}).setdefault(mutant.operator, []).append(mutant)
     keys = sorted(by_line)
     generator.shuffle(keys)
-    return [generator.choice(by_line[key]) for key in keys[:count]]
+    chosen = (generator.choice(list(by_line[key].values())) for key in keys[:count])
+    return [generator.choice(places) for places in chosen]
 
 
 def mutated(root: Path, mutant: Mutant) -> tuple[str, str]:
     """Return the file's text before and after."""
-    plugins, mutate_code = cosmic_ray("plugins"), cosmic_ray("mutating").mutate_code
+    mutate_code = cosmic_ray("mutating").mutate_code
     before = (root / mutant.path).read_text(encoding="utf-8")
-    after = mutate_code(before, plugins.get_operator(mutant.operator)(**mutant.arguments), mutant.occurrence)
+    after = mutate_code(before, operator_of(mutant.operator)(**mutant.arguments), mutant.occurrence)
     if after is None:
         raise SystemExit(f"{mutant} does not change anything")
     return before, after
@@ -228,18 +238,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Mutate areas and see which mutants survive their tests.")
     parser.add_argument("areas", nargs="*", help=f"of {', '.join(areas)}; all if not given")
     parser.add_argument("--count", type=int, default=settings["count"], help="mutants an area")
-    parser.add_argument("--seed", type=int, default=settings["seed"], help="of the sample")
+    parser.add_argument("--seed", type=int, help="of the sample; a new one each time if not given")
     parser.add_argument("--out", type=Path, help="JSON of every mutant and what came of it")
     parser.add_argument("--again", type=Path, help="try only what survived there, a file that --out wrote")
     asked = parser.parse_args()
     before = json.loads(asked.again.read_text(encoding="utf-8")) if asked.again else {}
+    seed = random.SystemRandom().randrange(2**31) if asked.seed is None else asked.seed
+    print(f"seed {seed}", flush=True)
+    importlib.import_module("operators")
     sys.path[:] = [entry for entry in sys.path if Path(entry or ".").resolve() not in (HERE, ROOT)]
     for name in HEAVY:
         importlib.import_module(name)
     table, everything = [], {}
     for name in asked.areas or list(before or areas):
         possible = list(mutants_of(ROOT, areas[name], settings))
-        chosen = sample(possible, asked.count, asked.seed)
+        chosen = sample(possible, asked.count, seed)
         if asked.again:
             lived = [item["mutant"] for item in before[name] if item["outcome"] == "survived"]
             chosen = [mutant for mutant in chosen if asdict(mutant) in lived]

@@ -1,0 +1,492 @@
+"""Every row of the pre-flight and every comparison that guards the drives has the case that it refuses."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from softneck.core import CheckFailedError
+from softneck.drives import default_drives
+from softneck.drives.bus._objects import CSP, GUARDING_OBJECTS, HOMED_MARK
+from softneck.drives.bus._sdo import SdoError
+from softneck.drives.master import Frame, MasterSettings, Phase, Tilt
+from softneck.drives.master._cia402 import DriveState
+from softneck.drives.master._events import Event
+from softneck.drives.master._fieldbus import Fieldbus, NodeState
+from softneck.drives.master._gate import BAD, DROPOUT, FROZEN, Gate
+from softneck.drives.master._master import Master, Measurement
+from softneck.drives.master._settings import LimitSettings, WatchSettings
+from softneck.drives.master._watches import Watches, timing
+from softneck.drives.running import _certified, _preflight
+from softneck.drives.running._certified import SAME, _as_strict, require_same_again
+from softneck.drives.running._preflight import PreflightCheck, Report, foreign_master, set_points_of_others
+from softneck.drives.running._stop import require_reset, require_stopped
+
+FILE = default_drives()
+ENTRY = FILE.drives[0]
+NODE = ENTRY.node
+# A CiA 402 drive with the cyclic mode, life guarding, a neutral factor group, switched on and ready.
+GOOD: dict[tuple[int, int], int] = {
+    (0x1000, 0): 0x00020192, (0x1018, 1): 0x2B, (0x1018, 2): 7, (0x1018, 4): 99, (0x6041, 0): 0x0240,
+    (0x6502, 0): 0x80, (0x6061, 0): 0, (0x100C, 0): 0, (0x100D, 0): 0, (0x607C, 0): HOMED_MARK,
+    **{(index, sub): 1 for index in (0x6093, 0x6094, 0x6097) for sub in (1, 2)},
+}  # fmt: skip
+
+
+class Told:
+    """The objects of one drive, without a bus: what is not in the table is aborted, as is a write to `refused`."""
+
+    def __init__(self, changes: dict[tuple[int, int], int | None] | None = None, **more: Any) -> None:
+        table: dict[tuple[int, int], Any] = GOOD | (changes or {})
+        self.table = {key: value for key, value in table.items() if value is not None}
+        self.refused: dict[int, int] = more.get("refused", {})
+        self.kept: dict[int, int] = more.get("kept", {})
+        self.silent: int | None = more.get("silent")
+        self.node, self.untold, self.written = NODE, set[str](), list[tuple[int, int, int]]()
+
+    def read(self, index: int, subindex: int = 0) -> int:
+        if index == self.silent:
+            raise SdoError("no answer")
+        if (index, subindex) not in self.table:
+            raise SdoError(f"{index:04X}h is not there", aborted=True, code=0x06020000)
+        return self.table[index, subindex]
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        return (index, subindex) in self.table
+
+    def read_text(self, index: int) -> str:
+        if index not in (0x1008, 0x100A):
+            raise SdoError("no text", aborted=True)
+        return "F1"
+
+    def write(self, index: int, subindex: int, value: int) -> None:
+        if index == self.silent:
+            raise SdoError("no answer")
+        if index in self.refused:
+            raise SdoError("refused", aborted=True, code=self.refused[index])
+        self.written.append((index, subindex, value))
+
+    def write_checked(self, index: int, subindex: int, value: int) -> int:
+        self.write(index, subindex, value)
+        return self.kept.get(index, value)
+
+
+def checked(objects: Told, entry: Any = ENTRY, guarding: str = "auto") -> dict[str, PreflightCheck]:
+    rows = Report()
+    _preflight._check_drive(objects, FILE, entry, guarding, rows)  # pyright: ignore[reportArgumentType]
+    return {row.name: row for row in rows.rows}
+
+
+def test_a_good_drive_passes_every_row_and_all_is_written() -> None:
+    objects = Told()
+    rows = checked(objects)
+    assert set(rows) == {"present", "identity", "firmware", "factor group", "state", "modes", "slow loop", "options",
+                         "limits", "guarding", "mapping"}  # fmt: skip
+    assert all(row.holds for row in rows.values())
+    assert all(not row.advice for row in rows.values())
+    assert all(row.node == NODE for row in rows.values())
+    assert (0x6060, 0, CSP) in objects.written
+    assert {0x607D, 0x6065, 0x100C, 0x100D} <= {index for index, _, _ in objects.written}
+
+
+@pytest.mark.parametrize("index", [0x6093, 0x6094, 0x6097])
+@pytest.mark.parametrize("sub", [1, 2])
+def test_each_factor_that_is_not_neutral_is_named(index: int, sub: int) -> None:
+    row = checked(Told({(index, sub): 2}))["factor group"]
+    assert not row.holds
+    pair = "2/1" if sub == 1 else "1/2"
+    assert row.found == f"{index:04X}h is {pair}"
+    assert "1/1" in row.advice
+    # Equal numbers cancel, and an object that a drive lacks scales nothing.
+    assert checked(Told({(index, 1): 5, (index, 2): 5}))["factor group"].holds
+    assert checked(Told({(index, sub): None}))["factor group"].holds
+
+
+@pytest.mark.parametrize(
+    ("kind", "holds"), [(0x192, True), (0x20192, True), (0x191, False), (0x1920000, False), (0, False)]
+)
+def test_only_a_drive_is_a_drive(kind: int, holds: bool) -> None:
+    assert checked(Told({(0x1000, 0): kind}))["present"].holds is holds
+
+
+@pytest.mark.parametrize(("field", "sub"), [("vendor", 1), ("product", 2), ("serial", 4)])
+def test_each_number_of_the_identity_must_be_the_one_of_the_file(field: str, sub: int) -> None:
+    right = GOOD[0x1018, sub]
+    for wanted, holds in ((None, True), (right, True), (right + 1, False), (0, False)):
+        entry = SimpleNamespace(**{name: getattr(ENTRY, name) for name in ("node", "scale")}, vendor=None, product=None,
+                                serial=None, firmware=None)  # fmt: skip
+        setattr(entry, field, wanted)
+        rows = Report()
+        _preflight._check_identity(Told(), entry, rows)  # pyright: ignore[reportArgumentType]
+        assert rows.rows[0].holds is holds
+        assert (f"{field} {right} instead of {wanted}" in rows.rows[0].found) is not holds
+        assert rows.rows[1].holds
+
+
+@pytest.mark.parametrize(("wanted", "holds"), [(None, True), ("F1", True), ("F2", False)])
+def test_the_firmware_must_be_the_one_of_the_file(wanted: str | None, holds: bool) -> None:
+    entry: Any = SimpleNamespace(node=NODE, vendor=None, product=None, serial=None, firmware=wanted)
+    rows = Report()
+    _preflight._check_identity(Told(), entry, rows)  # pyright: ignore[reportArgumentType]
+    assert [row.holds for row in rows.rows] == [True, holds]
+
+
+@pytest.mark.parametrize(
+    ("word", "holds", "advice"),
+    [(0x0240, True, ""), (0x0221, True, ""), (0x0223, True, ""), (0x0227, False, "drives stop"),
+     (0x0207, False, "drives stop"), (0x0208, False, "drives reset"), (0x020F, False, "drives stop")],
+)  # fmt: skip
+def test_a_drive_with_power_or_a_fault_is_not_taken(word: int, holds: bool, advice: str) -> None:
+    row = checked(Told({(0x6041, 0): word}))["state"]
+    assert row.holds is holds
+    assert advice in row.advice
+
+
+@pytest.mark.parametrize(
+    ("modes", "code", "now", "kept", "holds", "late"),
+    [
+        (0x80, None, 0, CSP, True, False), (0x001F0065, None, 0, CSP, True, False), (0x7F, None, 0, CSP, False, False),
+        (0, None, 0, CSP, False, False), (0x80, None, 0, 3, False, False),
+        # A drive that has the mode may refuse it while it is off, if until then it holds its motor.
+        (0x80, 0x08000022, 0, CSP, True, True), (0x80, 0x08000020, 1, CSP, True, True),
+        (0x80, 0x08000021, 8, CSP, True, True), (0x80, 0x08000000, 6, CSP, True, True),
+        (0x80, 0x08000022, 3, CSP, True, True), (0x80, 0x08000022, 4, CSP, False, True),
+        (0x80, 0x08000022, -1, CSP, False, True), (0x80, 0x06090030, 0, CSP, False, False),
+        (0x7F, 0x08000022, 0, CSP, False, False),
+    ],
+)  # fmt: skip
+def test_the_cyclic_mode_is_needed(modes: int, code: int | None, now: int, kept: int, holds: bool, late: bool) -> None:
+    objects = Told({(0x6502, 0): modes, (0x6061, 0): now}, refused={} if code is None else {0x6060: code},
+                   kept={0x6060: kept})  # fmt: skip
+    rows = Report()
+    _preflight._check_modes(objects, NODE, rows)  # pyright: ignore[reportArgumentType]
+    assert rows.rows[0].holds is holds
+    assert rows.late_modes == [NODE] * late
+    # Until it takes the mode, a speed is none.
+    assert ((0x60FF, 0, 0) in objects.written) is (late and now in (0, 1, 3, 6, 8))
+
+
+def test_a_drive_that_falls_silent_is_no_refusal() -> None:
+    for silent in (0x6060, 0x6502, 0x1000, 0x6041):
+        with pytest.raises(SdoError, match="no answer"):
+            checked(Told(silent=silent))
+
+
+@pytest.mark.parametrize(
+    ("lacks", "wanted", "kind"),
+    [((0x1016, 0x1017), "auto", "life"), ((0x100C,), "auto", "heartbeat"), ((), "auto", "heartbeat"),
+     ((), "life", "life"), ((0x100D,), "life", ""), ((0x1017,), "heartbeat", ""), ((0x1016, 0x100C), "auto", ""),
+     ((0x100D,), "heartbeat", "heartbeat")],
+)  # fmt: skip
+def test_a_drive_must_be_able_to_notice_that_its_master_is_gone(lacks: tuple[int, ...], wanted: str, kind: str) -> None:
+    objects = Told({(index, sub): None if index in lacks else 0 for index, sub in GUARDING_OBJECTS})
+    rows = Report()
+    found, has = _preflight._guarding(objects, wanted, rows)  # pyright: ignore[reportArgumentType]
+    assert found == kind
+    assert has == {index for index, _ in GUARDING_OBJECTS} - set(lacks)
+    assert [row.holds for row in rows.rows] == ([] if kind else [False])
+    if not kind:
+        assert all(f"{index:04X}h" in rows.rows[0].found for index in lacks)
+        assert "limits" not in checked(objects, guarding=wanted)
+
+
+@pytest.mark.parametrize("index", [0x607D, 0x6065, 0x100C, 0x605E, 0x1A00])
+def test_a_value_that_is_refused_or_not_kept_fails_its_topic(index: int) -> None:
+    for objects in (Told(refused={index: 0x06090030}), Told(kept={index: 0x55})):
+        failed = [row for row in checked(objects).values() if not row.holds]
+        assert len(failed) == 1
+        assert failed[0].name in ("limits", "guarding", "options", "mapping")
+        assert failed[0].advice
+    with pytest.raises(SdoError):
+        checked(Told(silent=index))
+
+
+def test_a_negative_number_that_reads_back_as_its_bits_is_kept() -> None:
+    rows = Report()
+    for found, holds in ((0xFFFFFFFE, True), (-2, True), (2, False), (-1, False)):
+        write: Any = SimpleNamespace(at=0x607D, sub=1, value=-2)
+
+        class One(Told):
+            def write_checked(self, *_: Any, found: int = found) -> int:
+                return found
+
+        class Write(tuple):
+            at, sub, value = write.at, write.sub, write.value
+
+        _preflight._apply(One(), "limits", [Write((0x607D, 1, -2))], rows)  # pyright: ignore[reportArgumentType]
+        assert rows.rows[-1].holds is holds
+
+
+# -- the report -------------------------------------------------------------------------------------------------------
+
+
+def test_one_row_that_fails_refuses_unless_it_is_let_pass_by_name() -> None:
+    rows = Report(("firmware",))
+    rows.add(1, "present", "x", True, "advice")
+    rows.require()
+    assert rows.holds
+    rows.add(2, "firmware", "old", False, "update")
+    assert rows.holds
+    rows.require()
+    rows.add(3, "state", "FAULT", False, "reset.")
+    rows.add(0, "second master", "a SYNC", False, "stop.")
+    assert not rows.holds
+    with pytest.raises(CheckFailedError, match=r"^node 3: state: FAULT\. reset\. \(2 checks failed in all\) Nothing"):
+        rows.require()
+    assert rows.table()["holds"] is False
+    assert [row["advice"] for row in rows.table()["rows"]] == ["", "update", "reset.", "stop."]
+
+
+@pytest.mark.parametrize(
+    ("frame", "told"),
+    [
+        (Frame(0x000, b"\1\1"), "an NMT command"), (Frame(0x080, b""), "a SYNC"), (Frame(0x600, b""), ""),
+        (Frame(0x601, b""), "an SDO request to node 1"), (Frame(0x67F, b""), "an SDO request to node 127"),
+        (Frame(0x680, b""), ""), (Frame(0x701, b"", remote=True), "a guarding request to node 1"),
+        (Frame(0x77F, b"", remote=True), "a guarding request to node 127"), (Frame(0x701, b"\5"), ""),
+        (Frame(0x77F, b"\5"), "a master's heartbeat"), (Frame(0x081, bytes(8)), ""), (Frame(0x581, bytes(8)), ""),
+        (Frame(0x080, b"", error=True), ""),
+    ],
+)  # fmt: skip
+def test_a_frame_that_only_a_master_sends_is_told(frame: Frame, told: str) -> None:
+    assert foreign_master([Frame(0x181, bytes(8)), frame]) == told
+
+
+def test_set_points_of_others_are_those_to_our_nodes() -> None:
+    assert set_points_of_others([Frame(0x203, bytes(6))], [1, 2, 3]) == "set-points to node 3"
+    for frame in (Frame(0x204, bytes(6)), Frame(0x303, bytes(6)), Frame(0x203, bytes(6), error=True)):
+        assert set_points_of_others([frame], [1, 2, 3]) == ""
+
+
+@pytest.mark.parametrize(
+    ("tilt", "holds"),
+    [(None, False), (Tilt(0.1, -0.2), True), (Tilt(0.1, -0.2, valid=False), False), (Tilt(math.nan, 0.0), False),
+     (Tilt(0.0, math.nan), False), (Tilt(math.inf, 0.0), False), (Tilt(FILE.sensor_angle, 0.0), True),
+     (Tilt(0.0, -FILE.sensor_angle), True), (Tilt(0.0, FILE.sensor_angle * 1.001), False),
+     (Tilt(-FILE.sensor_angle * 1.001, 0.0), False)],
+)  # fmt: skip
+def test_a_sensor_must_give_an_angle_that_the_neck_can_have(
+    tilt: Tilt | None, holds: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_preflight, "look_at", lambda *_: tilt)
+    rows, link = Report(), SimpleNamespace(send=lambda _: None)
+    _preflight._check_sensor(link, FILE, SimpleNamespace(), rows)  # pyright: ignore[reportArgumentType]
+    assert [row.holds for row in rows.rows] == [holds]
+    assert bool(rows.rows[0].advice) is not holds
+
+
+def test_a_drive_that_may_have_power_is_not_stopped_and_one_in_fault_not_reset() -> None:
+    require_stopped({1: "DISABLED", 2: "READY", 3: "FAULT", 4: "SWITCHED_ON"})
+    for state in ("ENABLED", "QUICK_STOP", "REACTION", "no answer", "UNKNOWN"):
+        with pytest.raises(CheckFailedError, match=f"node 2: {state}"):
+            require_stopped({1: "DISABLED", 2: state})
+    require_reset({1: "DISABLED", 2: "READY"})
+    for state in ("FAULT", "no answer"):
+        with pytest.raises(CheckFailedError, match=f"node 2: {state}"):
+            require_reset({1: "DISABLED", 2: state})
+
+
+# -- certificates -----------------------------------------------------------------------------------------------------
+
+
+def _again(monkeypatch: pytest.MonkeyPatch, trace: dict[str, list[Any]], signals: dict[str, Any]) -> float:
+    time = np.arange(4) * 0.02
+
+    class Result(dict):
+        sample_time = 0.02
+
+        def angle(self, name: str) -> Any:
+            return self[name]
+
+    found = Result({name: np.array(values, float) for name, values in signals.items()})
+    found.time = time  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setattr(_certified, "_run_for", lambda *_: found)
+    robot = SimpleNamespace(own=lambda name: name, outputs=SimpleNamespace(names=("pitch",)))
+    certificate: Any = SimpleNamespace(path="c.json", contents={"trace": trace})
+    return require_same_again(SimpleNamespace(robot=robot), certificate)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_run_again_is_the_certified_one_row_by_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = {"row": [0, 2, 3], "pitch": [0.0, None, 0.3], "motor_setpoint_1": [1.0, 2.0, 3.0]}
+    same = {"pitch": [0.0, 9.0, math.nan, 0.3], "motor_setpoint_1": [1.0, 9.0, 2.0, 3.0]}
+    assert _again(monkeypatch, trace, same) == pytest.approx(0.08)
+    nearly = {**same, "motor_setpoint_1": [1.0 + 0.99 * SAME, 9.0, 2.0 - 0.99 * SAME, 3.0]}
+    _again(monkeypatch, trace, nearly)
+    for name, row, value in (
+        ("motor_setpoint_1", 0, 1.0 + 1.01 * SAME), ("motor_setpoint_1", 2, 2.0 - 1.01 * SAME), ("pitch", 3, 0.31),
+        ("motor_setpoint_1", 3, math.nan), ("pitch", 0, math.nan), ("pitch", 0, math.inf), ("pitch", 2, 0.0),
+    ):  # fmt: skip
+        other = {key: list(values) for key, values in same.items()}
+        other[name][row] = value
+        with pytest.raises(CheckFailedError, match=rf"`{name}` is .* at t = {0.02 * row:.2f} s"):
+            _again(monkeypatch, trace, other)
+    for certified in (math.nan, None, math.inf):
+        with pytest.raises(CheckFailedError, match="`pitch` is"):
+            _again(monkeypatch, {**trace, "pitch": [certified, None, 0.3]}, same)
+    # Rows that the time was not enough for are not compared; no rows at all certify nothing.
+    _again(monkeypatch, {**trace, "row": [0, 2, 7]}, same)
+    for nothing in ({}, {"row": []}, None):
+        with pytest.raises(CheckFailedError, match="keeps no rows"):
+            _again(monkeypatch, nothing, same)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("bound", ["min", "max"])
+def test_a_requirement_is_as_strict_up_to_the_default_itself(bound: str) -> None:
+    stricter, looser = (2.1, 1.9) if bound == "min" else (1.9, 2.1)
+    row = {"bound": bound, "limit": 2.0, "holds": True}
+    assert _as_strict(row, bound, 2.0)
+    assert _as_strict(row | {"limit": stricter}, bound, 2.0)
+    for change in ({"limit": looser}, {"limit": math.nan}, {"limit": None}, {"limit": "2"}, {"holds": False},
+                   {"holds": None}, {"bound": "max" if bound == "min" else "min"}):  # fmt: skip
+        assert not _as_strict(row | change, bound, 2.0)
+    assert not _as_strict(row, bound, math.nan)
+    assert _as_strict(row | {"bound": "below"}, bound, 2.0) is (bound == "max")
+
+
+# -- the master -------------------------------------------------------------------------------------------------------
+
+
+class Pilot:
+    """Raises in `start`, or returns what it is told."""
+
+    def __init__(self, answer: Any = (0.0, 0.0, 0.0), *, start: Exception | None = None) -> None:
+        self.answer, self.problem = answer, start
+
+    def start(self) -> None:
+        if self.problem is not None:
+            raise self.problem
+
+    def step(self, _: Measurement, /) -> Any:
+        if isinstance(self.answer, Exception):
+            raise self.answer
+        return self.answer
+
+    def is_finished(self, index: int) -> bool:
+        return index < -1
+
+
+def _master(pilot: Pilot) -> Master:
+    master = Master(MasterSettings(counts_per_radian=(1000.0,) * 3), pilot)
+    master.supervisor.phase = Phase.RUNNING
+    master._gate.last = Tilt(0.0, 0.0)
+    return master
+
+
+def test_a_pilot_that_cannot_start_stops_the_drives() -> None:
+    calm = _master(Pilot())
+    calm._begin()
+    assert calm.supervisor.phase is Phase.RUNNING
+    for problem in (ValueError("no"), RuntimeError("x"), OSError()):
+        master = _master(Pilot(start=problem))
+        master._begin()
+        assert master.counts["controller_failed"] == 1
+        assert master.supervisor.phase is Phase.STOPPING
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [(math.nan, 0.0, 0.0), (0.0, 0.0, math.inf), (0.0, -math.inf, 0.0), (0.0, 0.0), (0.0,) * 4, RuntimeError("x")],
+    ids=str,
+)
+def test_set_points_that_are_no_numbers_or_of_another_count_stop_the_drives(answer: Any) -> None:
+    master, events = _master(Pilot(answer)), list[Event]()
+    master._consult(0.0, True, events)
+    assert master.counts["controller_failed"] == 1
+    assert master.supervisor.phase is Phase.STOPPING
+    assert master.wanted == (0.0, 0.0, 0.0)
+
+
+def test_a_pilot_that_is_late_holds_and_one_in_time_is_followed() -> None:
+    master, events = _master(Pilot(None)), list[Event]()
+    master._consult(0.0, True, events)
+    assert (master._missing, master.supervisor.phase) == (1, Phase.RUNNING)
+    master.pilot = Pilot((1.0, 2.0, 3.0))
+    master._consult(0.0, True, events)
+    assert (master._missing, master.wanted) == (0, (1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("code", "register", "name"),
+    [(0x8130, 0x11, "emergency"), (0x8130, 0, "emergency"), (0x1000, 0, "emergency"), (0, 0x81, ""), (0, 0, "")],
+)
+def test_an_emergency_counts_by_its_code_whatever_its_register(code: int, register: int, name: str) -> None:
+    bus = Fieldbus(MasterSettings(counts_per_radian=(1.0,) * 3).bus)
+    node = bus.drives[1].node
+    events = bus.receive(0.5, [Frame(0x080 + node, code.to_bytes(2, "little") + bytes([register]) + bytes(5))])
+    found = [event for event in events if event.name in ("emergency", "drive_limit")]
+    assert [event.name for event in found] == [name] * bool(name)
+    assert all(event.node == node for event in found)
+    assert bus.drives[1].emergencies == [(0.5, code, register)]
+    assert bus.drives[0].emergencies == []
+
+
+def test_a_short_emergency_is_malformed() -> None:
+    bus = Fieldbus(MasterSettings(counts_per_radian=(1.0,) * 3).bus)
+    node = bus.drives[0].node
+    events = bus.receive(0.5, [Frame(0x080 + node, b"\x30\x81")])
+    assert [(event.name, event.node) for event in events if "emergency" in event.detail] == [("malformed", node)]
+    assert bus.drives[0].state is DriveState.UNKNOWN
+    assert NodeState.OPERATIONAL is not bus.drives[0].nmt
+
+
+CYCLE = MasterSettings(counts_per_radian=(1.0,)).bus
+
+
+@pytest.mark.parametrize(
+    ("gap", "name"),
+    [(1.0, ""), (1.499, ""), (1.501, "late_cycle"), (CYCLE.stalled_cycles - 0.01, "late_cycle"),
+     (CYCLE.stalled_cycles + 1e-6, "stalled"), (0.0, "clock"), (-1.0, "clock"), (math.nan, "clock"), (1e-6, "")],
+)  # fmt: skip
+def test_the_time_between_two_steps(gap: float, name: str) -> None:
+    found = timing(10.0 + gap * CYCLE.cycle, 10.0, CYCLE)
+    assert [event.name for event in found] == [name] * bool(name)
+    assert timing(10.0, None, CYCLE) == []
+
+
+@pytest.mark.parametrize("motor", [0, 1, 2])
+def test_each_motor_and_tendon_is_watched_up_to_its_limit(motor: int) -> None:
+    watch, limits = WatchSettings(), LimitSettings()
+
+    def seen(gap: float, tension: float, *, signs: bool = False) -> set[tuple[str, int]]:
+        watches, events = Watches(watch, limits), list[Event]()
+        P, F = [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]
+        P[motor], F[motor] = gap, tension
+        for k in range(40):
+            if signs:
+                watches.signs(0.01 * k, (1, 2, 3), F, events)
+            else:
+                watches.motors(0.01 * k, P, (0.0, 0.0, 0.0), (1, 2, 3), F, events)
+        return {(event.name, event.node) for event in events}
+
+    node = motor + 1
+    for sign in (-1.0, 1.0):
+        assert seen(sign * watch.following, 1.0) == set()
+        assert seen(sign * watch.following * 1.001, 1.0) == {("following", node)}
+        assert seen(0.0, sign * limits.tension) == set()
+        assert seen(0.0, sign * limits.tension * 1.001) == {("tension", node)}
+    assert seen(0.0, -watch.pushed, signs=True) == set()
+    assert seen(0.0, -watch.pushed * 1.001, signs=True) == {("pushed", node)}
+
+
+def test_the_gate_takes_what_may_be_and_nothing_else() -> None:
+    def passed(*samples: Tilt | None, step: float = 0.02) -> tuple[list[bool], list[str]]:
+        gate, events = Gate(1.2), list[Event]()
+        return [gate.step(step * k, sample, events) for k, sample in enumerate(samples)], [e.name for e in events]
+
+    assert passed(Tilt(0.0, 0.0), Tilt(0.01, 0.0)) == ([True, True], [])
+    for bad in (Tilt(math.nan, 0.0), Tilt(0.0, math.inf), Tilt(1.21, 0.0), Tilt(0.0, -1.21), Tilt(0.5, 0.0)):
+        assert passed(Tilt(0.0, 0.0), bad) == ([True, False], ["sample_discarded"])
+    assert passed(Tilt(1.2, 0.0)) == ([True], [])
+    assert passed(Tilt(0.0, 0.0), Tilt(0.01, 0.0, valid=False)) == ([True, False], [])
+    far = [Tilt(math.nan, 0.01 * k) for k in range(BAD)]
+    assert passed(Tilt(0.0, 0.0), *far)[1].count("sensor_bad") == 1
+    assert "sensor_bad" not in passed(Tilt(0.0, 0.0), *far[:-1])[1]
+    same = passed(*[Tilt(0.1, 0.0)] * FROZEN)
+    assert (same[0], same[1]) == ([True] * (FROZEN - 1) + [False], ["sensor_frozen"])
+    gone = round(DROPOUT / 0.02)
+    assert passed(Tilt(0.0, 0.0), *[None] * (gone - 1))[1] == []
+    assert passed(Tilt(0.0, 0.0), *[None] * gone)[1] == ["sensor_lost"]
