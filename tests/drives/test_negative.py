@@ -11,7 +11,7 @@ import pytest
 
 from softneck.core import CheckFailedError
 from softneck.drives import default_drives
-from softneck.drives.bus._objects import CSP, GUARDING_OBJECTS, HOMED_MARK
+from softneck.drives.bus._objects import CSP, GUARDING_OBJECTS, HOMED_MARK, Write
 from softneck.drives.bus._sdo import SdoError
 from softneck.drives.master import Frame, MasterSettings, Phase, Tilt
 from softneck.drives.master._cia402 import DriveState
@@ -208,16 +208,8 @@ def test_a_value_that_is_refused_or_not_kept_fails_its_topic(index: int) -> None
 def test_a_negative_number_that_reads_back_as_its_bits_is_kept() -> None:
     rows = Report()
     for found, holds in ((0xFFFFFFFE, True), (-2, True), (2, False), (-1, False)):
-        write: Any = SimpleNamespace(at=0x607D, sub=1, value=-2)
-
-        class One(Told):
-            def write_checked(self, *_: Any, found: int = found) -> int:
-                return found
-
-        class Write(tuple):
-            at, sub, value = write.at, write.sub, write.value
-
-        _preflight._apply(One(), "limits", [Write((0x607D, 1, -2))], rows)  # pyright: ignore[reportArgumentType]
+        write: Any = Write(0x607D, 1, -2)
+        _preflight._apply(Told(kept={0x607D: found}), "limits", [write], rows)  # pyright: ignore[reportArgumentType]
         assert rows.rows[-1].holds is holds
 
 
@@ -360,7 +352,8 @@ class Pilot:
         if self.problem is not None:
             raise self.problem
 
-    def step(self, _: Measurement, /) -> Any:
+    def step(self, measured: Measurement) -> Any:
+        assert measured.index == -1
         if isinstance(self.answer, Exception):
             raise self.answer
         return self.answer
@@ -428,7 +421,7 @@ def test_a_short_emergency_is_malformed() -> None:
     bus = Fieldbus(MasterSettings(counts_per_radian=(1.0,) * 3).bus)
     node = bus.drives[0].node
     events = bus.receive(0.5, [Frame(0x080 + node, b"\x30\x81")])
-    assert [(event.name, event.node) for event in events if "emergency" in event.detail] == [("malformed", node)]
+    assert [(event.name, event.node) for event in events if event.name != "tpdo_missing"] == [("frame_length", node)]
     assert bus.drives[0].state is DriveState.UNKNOWN
     assert NodeState.OPERATIONAL is not bus.drives[0].nmt
 

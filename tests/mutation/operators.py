@@ -6,7 +6,10 @@ from collections.abc import Iterator
 from typing import Any
 
 import parso
-from cosmic_ray.operators.operator import Operator
+from cosmic_ray.operators import operator
+
+# Its methods are declared to return nothing.
+Operator: Any = operator.Operator
 
 # What stands for what else. A mean becomes the best: of most numbers here the smallest.
 OTHERS = {

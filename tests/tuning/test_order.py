@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -136,7 +137,7 @@ def test_margins_that_the_data_support_count_where_they_are_worse(monkeypatch: p
         monkeypatch.setattr(_judge, "data_margins", lambda *_: list(items))
         return linear_metrics(_task(), ready, None)
 
-    def tested(axis: str, margins: dict[str, float], mu: float) -> AxisMargins:
+    def tested(axis: str, margins: Mapping[str, float], mu: float) -> AxisMargins:
         return AxisMargins(source="f", axis=axis, band=(1.0, 9.0), crossover=3.0, margins=margins, mu=mu, at={})
 
     low = tested("pitch", {"gain_margin": 1.4, "disk_margin": 0.3, "sensitivity": 3.0}, 0.4)
