@@ -13,10 +13,10 @@ import pytest
 from softneck.core import DataError, metric_of
 from softneck.loop import LoopResult
 from softneck.robot import Robot
-from softneck.verification import _evidence, _experiments, _neck_loops, _steps, metric_names
+from softneck.verification import _evidence, _experiments, _linear, _neck_loops, _steps, _structured, metric_names
 from softneck.verification._evidence import Evidence, Values, worst_row
 from softneck.verification._experiments import Crossing, crossing_values
-from softneck.verification._linear import LARGE, SMALL, margins
+from softneck.verification._linear import LARGE, SMALL, LinearLaw, margins
 from softneck.verification._neck_loops import LoopRun, judge_loop
 from softneck.verification._plants import nominal_plants, source_of_family
 from softneck.verification._requirements import Requirement, make_requirements
@@ -248,13 +248,13 @@ def test_further_values_of_a_metric_are_appended_each_with_its_own_facts() -> No
 # -- margins ----------------------------------------------------------------------------------------------------------
 
 
-def test_a_loop_whose_radius_is_no_number_has_no_margin() -> None:
-    from softneck.verification._linear import LinearLaw, frequency_grid
-
+def test_a_loop_whose_radius_is_no_number_has_no_margin(monkeypatch: pytest.MonkeyPatch) -> None:
     plants = nominal_plants([source_of_family(family(), "f")])[0].take(np.array([0, 0, 0]))
     law = LinearLaw.of(CONTROLLER().ss(), Robot.preset())
-    found = margins(plants, law, frequency_grid(TS, 1.0)[::20], np.array([0.9, math.nan, 1.0]))
-    for name, values in found.items():
+    poles = _linear.closed_poles(plants, law).astype(complex)
+    poles[1, -1], poles[2, -1] = math.nan, 1.0
+    monkeypatch.setattr(_linear, "closed_poles", lambda *_: poles)
+    for name, values in margins(plants, law).items():
         last = name.partition(".")[2]
         if last in (*LARGE, *SMALL):
             none = math.inf if last in SMALL else 1.0 if last == "gain_margin" else 0.0
@@ -284,15 +284,13 @@ def test_margins_by_experiment_are_those_of_their_axes() -> None:
 def test_mu_is_the_largest_bound_and_the_searched_radius_the_largest_met(monkeypatch: pytest.MonkeyPatch) -> None:
     check_worst("robust.mu", lambda v: StructuredResult("pitch", np.arange(1.0, len(v) + 1), np.array(v)).mu)
     source = source_of_family(family(), "f")
-    from softneck.verification import _structured
-    from softneck.verification._linear import LinearLaw
-
     law = LinearLaw.of(CONTROLLER().ss(), Robot.preset())
 
     def of(values: Any) -> float:
         sizes = iter(values)
-        task = _Task(source, 0, (0,), law, np.array([1.0, 2.0]), 0)
-        monkeypatch.setattr(_structured, "radii", lambda *_: np.array([next(sizes)]))
+        task = _Task(source, 0, (0,), law, 0)
+        peaks: Any = SimpleNamespace(difference=np.ones((1, 2)))
+        monkeypatch.setattr(_structured, "loops_of", lambda *_, **__: (peaks, np.array([next(sizes)])))
         for _ in values:
             task.badness(np.full((3, 1), 0.5))
         return task.radius
