@@ -21,6 +21,7 @@ from softneck.verification import metric_title, nominal_plants, sources_of, writ
 
 if TYPE_CHECKING:
     from softneck.tuning import Candidate, Tuned
+    from softneck.verification import Requirement
 
 BEST, OBSERVER, CERTIFICATE, LOOP = "best.npz", "observer.npz", "best.certificate.json", "loop.toml"
 _LOOP_AT, _LOOP_TAUT = 1.0, 3.0
@@ -46,7 +47,8 @@ def write_tuned(
     )
     certificate = folder / CERTIFICATE
     if found.holds:  # includes [track], which `verify` does not check
-        write_certificate(certificate, {**verification.contents(), "loosened": _loosened_values(found)}, force=True)
+        more = {"loosened": _loosened_values(found), "judged_elsewhere": found.judged_elsewhere()}
+        write_certificate(certificate, {**verification.contents(), **more}, force=True)
     else:
         certificate.unlink(missing_ok=True)
     _write_loop(found, folder, steps)
@@ -69,6 +71,10 @@ def tuned_values(found: Tuned, path: Path) -> dict[str, Any]:
         "loosened": _loosened_values(found),
         "evaluations": found.evaluations,
         "dropped": dict(found.dropped),
+        "verdicts": [{"metric": item.metric, "bound": item.bound, "limit": item.limit, "holds": holds, "note": note,
+                      "value": value if value is not None and math.isfinite(value) else None}
+                     for item, value, holds, note in _verdicts(found)],
+        "judged_elsewhere": found.judged_elsewhere(),
     }  # fmt: skip
 
 
@@ -166,8 +172,8 @@ def tune_verdict(found: Tuned) -> str:
     return f"All requirements hold but {'; '.join(one.in_words(metric) for metric, one in found.loosened.items())}."
 
 
-def requirement_rows(found: Tuned) -> list[list[str]]:
-    """Return a row for each requirement: metric, bound, limit, value of the best, verdict, note."""
+def _verdicts(found: Tuned) -> list[tuple[Requirement, float | None, bool | None, str]]:
+    """Return requirement, value of the best, whether it holds and a note; what was not computed does not hold."""
     rows = []
     for verdict in found.verification.verdicts:
         item, value, holds = verdict.requirement, verdict.value, verdict.holds
@@ -179,11 +185,17 @@ def requirement_rows(found: Tuned) -> list[list[str]]:
     for item in found.task.asked.bounds:
         if item.metric.startswith("track."):
             value = found.best.metrics.get(item.metric)
-            rows.append((item, value, None if value is None else item.holds(value), ""))
+            why = "not computed: the budget ended before its loops were simulated" if value is None else ""
+            rows.append((item, value, value is not None and item.holds(value), why))
+    return rows
+
+
+def requirement_rows(found: Tuned) -> list[list[str]]:
+    """Return a row for each requirement: metric, bound, limit, value of the best, verdict, note."""
     return [
         [metric_title(item.metric), _SIGNS[item.bound], f"{item.limit:g}", cell(value, ".3g"),
-         "-" if holds is None else "holds" if holds else "fails", note]
-        for item, value, holds, note in rows
+         "not computed" if value is None else "-" if holds is None else "holds" if holds else "fails", note]
+        for item, value, holds, note in _verdicts(found)
     ]  # fmt: skip
 
 
@@ -194,6 +206,7 @@ def tune_notes(found: Tuned) -> list[str]:
         if row[5]:
             metrics_of.setdefault(row[5], []).append(row[0])
     reasons = [f"{', '.join(metrics)}: {note}." for note, metrics in metrics_of.items()]
+    reasons += [f"{condition}: {how}." for condition, how in found.judged_elsewhere().items()]
     limits = getattr(found.controller, "limits", None)
     motors = [] if limits is None else limits.lines(found.controller.sample_time)
     return reasons + [line.strip() for line in (*motors, *assumed_lines(found.assumed))]
@@ -206,7 +219,7 @@ def failing_requirement(found: Tuned) -> str:
     unknown = [item for item in found.verification.failed if item.value is None]
     if found.binding is None and unknown:
         metrics = ", ".join(verdict.requirement.metric for verdict in unknown)
-        return f"{metrics} of {found.best.kind} cannot be computed: {unknown[0].note}."
+        return f"{metrics} of {found.best.kind}: {unknown[0].note}."
     if found.binding is None:
         # Unlike `verify`, tuning has loops with noise, smaller steps and a circle.
         limits = dict.fromkeys(bound.metric for bound in found.task.asked.bounds)

@@ -30,6 +30,7 @@ from softneck.verification import (
     data_margins,
     direction,
     judge_loop,
+    judged_elsewhere,
     loops_under_test,
     make_simulation_model,
     margins,
@@ -126,8 +127,8 @@ def loop_of(
     if case.noise and track["noise_deg"] > 0.0:
         faults.append(SensorFault(kind="noise", std=asked.scale.si(track["noise_deg"]), seed=_seed(case, task)))
     Ts = block.sample_time
-    if case.late and round(track["delay_ms"] / 1e3 / Ts):
-        faults.append(SensorFault(kind="delay", delay=Ts * round(track["delay_ms"] / 1e3 / Ts)))
+    if case.late and track["delay_ms"] > 0.0:
+        faults.append(SensorFault(kind="delay", delay=judged_delay(track["delay_ms"], Ts)))
     reference = RobotReference(kind="step", values=ends, at=at)
     if case.circle:
         frequency = track["circle_rad_s"] / (2.0 * math.pi)
@@ -138,6 +139,20 @@ def loop_of(
         block, plant.quiet(Ts), plant, case.payload, _Together(reference, together), asked, duration=duration,
         order=order, observer=observer, faults=faults,
     )  # fmt: skip
+
+
+def judged_delay(asked_ms: float, sample_time: float) -> float:
+    """Return the additional delay of a loop [s]: the asked one in whole samples, at least one."""
+    return sample_time * max(1, round(asked_ms / 1e3 / sample_time))
+
+
+def told_conditions(task: Task, own: Sequence[SimulationModel], sample_time: float) -> dict[str, str]:
+    """Return condition -> what is judged instead of it, for each that was asked and is not judged as it is."""
+    found, late = judged_elsewhere(own, task.asked.certificate), task.asked.track["delay_ms"]
+    judged = 1e3 * judged_delay(late, sample_time)
+    if own and late > 0.0 and not math.isclose(judged, late, rel_tol=1e-6):
+        found[f"additional delay {late:g} ms"] = f"judged at {judged:g} ms, whole samples of the loop"
+    return found
 
 
 def _seed(case: Case, task: Task) -> int:

@@ -76,17 +76,17 @@ class Candidate:
     def ratios(self, bounds: Sequence[Requirement], *, tested: bool) -> dict[str, float]:
         """Return metric -> value over limit (for lower bounds limit over value).
 
-        Margins of a controller without linear form are not certified: beside recordings, or if stated, they fail as in
-        `verify`; otherwise they count as at their limit at best.
+        A margin that was not computed, as of a controller without linear form, does not hold; one of such a controller
+        by experiment alone fails beside recordings, or if stated, as in `verify`. A value that is no number fails.
         """
         found: dict[str, float] = {}
         blind = bool(self.metrics) and "axes.sensitivity" not in self.metrics
         for item in bounds:
-            value = self.metrics.get(item.metric, math.nan)
+            value = self.metrics.get(item.metric)
             if blind and item.metric.startswith(_LINEAR_GROUPS):
-                known = 1.0 if math.isnan(value) else max(1.0, ratio(item, value))
+                known = math.inf if value is None else max(1.0, ratio(item, value))
                 found[item.metric] = math.inf if tested or item.asked else known
-            elif not math.isnan(value):
+            elif value is not None:
                 found[item.metric] = max(found.get(item.metric, 0.0), ratio(item, value))
         return found
 
@@ -114,7 +114,9 @@ def _saturate(beyond: float) -> float:
 
 
 def ratio(item: Requirement, value: float) -> float:
-    """Return value over limit (for a lower bound limit over value); above 1 it fails."""
+    """Return value over limit (for a lower bound limit over value); above 1 it fails, as no number does."""
+    if math.isnan(value):
+        return math.inf
     if item.bound == "min":
         return item.limit / value if value > 0.0 else math.inf
     if item.limit <= 0.0:

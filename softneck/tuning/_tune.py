@@ -45,7 +45,7 @@ from softneck.verification import (
     with_robot,
 )
 
-from ._judge import LEVELS, Case, design_candidate, loop_of, make_observer, prepare
+from ._judge import LEVELS, Case, design_candidate, loop_of, make_observer, prepare, told_conditions
 from ._requirements import (
     USUAL_RISE,
     TuneRequirements,
@@ -110,6 +110,10 @@ class Tuned:
     task: Task
     own: Sequence[SimulationModel] = ()
     loosened: Mapping[str, Loosened] = field(default_factory=dict)
+
+    def judged_elsewhere(self) -> dict[str, str]:
+        """Return condition -> what was judged instead of it, for each that was asked and not judged as it is."""
+        return told_conditions(self.task, self.own, self.controller.block().sample_time)
 
 
 @one_blas_thread

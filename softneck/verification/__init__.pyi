@@ -27,6 +27,7 @@ from ._neck_loops import SimulationModel as SimulationModel
 from ._neck_loops import direction as direction
 from ._neck_loops import is_simulation_model as is_simulation_model
 from ._neck_loops import judge_loop as judge_loop
+from ._neck_loops import judged_elsewhere as judged_elsewhere
 from ._neck_loops import loops_under_test as loops_under_test
 from ._neck_loops import make_simulation_model as make_simulation_model
 from ._neck_loops import named_plants as named_plants

@@ -18,8 +18,8 @@ from ._neck_loops import (
     LoopRun,
     SimulationModel,
     direction,
+    judged_elsewhere,
     loops_under_test,
-    missing_payloads,
     neck_changes,
     preset_of,
     run_loops,
@@ -126,7 +126,7 @@ def gather(
     # A built-in plant does not count unless the user gives its file.
     foreign = not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
     evidence = Evidence(plants, w, linear, steps, stepped, runs, foreign=foreign, tested=tested, crossings=found)
-    evidence.not_computed.update({"sim": why} if why and not own else missing_payloads(own, asked))
+    evidence.not_computed.update({"sim": why} if why and not own else judged_elsewhere(own, asked))
     _fill_metrics(evidence, controller, asked, observer is not None)
     progress(1.0, "done")
     return evidence

@@ -51,11 +51,21 @@ class SimulationModel:
     conditions: Mapping[str, list[float]] = field(default_factory=dict)
 
     def payloads(self, asked: Sequence[float]) -> list[float]:
-        """Return those of the payloads [kg] that the plant can carry; 0 if it has no payload."""
-        if self.payload == "parameters":  # a model is valid between its recordings
-            seen = self.conditions["payload_kg"]
-            return [kg for kg in asked if _within(kg, seen)] or [min(seen)]
-        return list(asked) if self.payload else [0.0]
+        """Return the payloads [kg] that stand for those asked: the nearest known ones, and the ends of the recordings.
+
+        A plant without payload has 0 alone.
+        """
+        if self.payload != "parameters":
+            return sorted({float(kg) for kg in asked}) if self.payload else [0.0]
+        ends = {float(min(self.conditions["payload_kg"])), float(max(self.conditions["payload_kg"]))}
+        return sorted(ends | {self.nearest_payload(kg) for kg in asked})
+
+    def nearest_payload(self, asked: float) -> float:
+        """Return the payload [kg] at which one that is asked is judged: a model is valid between its recordings."""
+        if self.payload != "parameters":
+            return float(asked) if self.payload else 0.0
+        seen = self.conditions["payload_kg"]
+        return float(min(max(asked, min(seen)), max(seen)))
 
     def carrying(self, payload: float) -> dict[str, Any]:
         """Return the arguments of `Loop` that set a payload [kg]."""
@@ -168,15 +178,25 @@ def unrecorded_conditions(
     return found
 
 
-def missing_payloads(own: Sequence[SimulationModel], asked: Requirements) -> dict[str, str]:
-    """Return a note on the required payloads that a plant cannot carry."""
-    wanted = [kg for kg in asked.sim["payloads_kg"] if kg > 0.0]
-    left = {plant.name: [f"{kg:g}" for kg in wanted if kg not in plant.payloads(wanted)] for plant in own}
-    said = [f"{name} does not model {', '.join(heavy)} kg" for name, heavy in left.items() if heavy]
-    if not said or asked.robot.neck is None:
-        return {}
+def judged_elsewhere(own: Sequence[SimulationModel], asked: Requirements) -> dict[str, str]:
+    """Return condition -> what is judged instead of it, for each that was asked and is not judged as it is."""
+    found: dict[str, str] = {}
     way = "run `softneck identify greybox` on recordings with a column `payload [kg]`"
-    return {"loops with payload": f"{'; '.join(said)}; {way}"}
+    for plant in own:
+        seen = plant.conditions.get("payload_kg", [0.0])
+        span = f"{min(seen):g} kg" if min(seen) == max(seen) else f"{min(seen):g} to {max(seen):g} kg"
+        for kg in asked.sim["payloads_kg"]:
+            # Nobody loads another robot's plant that has no payload.
+            known = plant.payload == "parameters" or (not plant.payload and asked.robot.neck is not None)
+            if known and not _within(kg, seen):
+                at = f"judged at {plant.nearest_payload(kg):g} kg" if plant.payload else "judged as recorded"
+                found[f"payload {kg:g} kg of {plant.name}"] = f"{at}, it was recorded with {span}; {way}"
+    names, angles = asked.robot.outputs.names, asked.own.get("sim", {}).get("orientations_deg")
+    if len(names) == 1 and angles:
+        found["directions"] = f"{names[0]} is the only output, so all of `orientations_deg` are one step"
+    if len(names) > 2:
+        found["directions"] = f"simulated steps are of {names[0]} and {names[1]} alone, not of {', '.join(names[2:])}"
+    return found
 
 
 def _covers(plant: SimulationModel, kg: float, held: float) -> bool:

@@ -190,9 +190,9 @@ def _limit(verdict: Verdict) -> str:
 
 
 def _verdict_word(verdict: Verdict) -> str:
-    if verdict.holds is None and verdict.value is not None:
-        return "does not decide"
-    return {True: "holds", False: "fails", None: "not computed"}[verdict.holds]
+    if verdict.value is None:
+        return "not computed"
+    return {True: "holds", False: "fails", None: "does not decide"}[verdict.holds]
 
 
 def _worst_plant(verdict: Verdict, axes: tuple[str, ...]) -> str:

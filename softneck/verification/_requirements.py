@@ -147,7 +147,8 @@ class Requirement:
     """One bound on one metric.
 
     `metric`: such as `axes.sensitivity`. `bound`: "min", "max" or "below" (which excludes the limit itself). `limit`:
-    for the worst plant. `asked`: whether the user states it; a default that cannot be computed does not fail.
+    for the worst plant. `asked`: whether the user states it; a default of simulated loops that no plant shows
+    does not decide.
     """
 
     metric: str

@@ -49,8 +49,8 @@ class Verdict(ReprMixin):
     """The verdict on one requirement.
 
     `requirement`: metric, bound and limit. `value`: of the worst plant; inf where a level is never reached, None if not
-    computed. `holds`: None for a default that was not computed. `worst`: the worst plant, as JSON values. `note`: why
-    it was not computed, does not count or does not hold.
+    computed. `holds`: None for a default on simulated loops that no plant shows. `worst`: the worst plant, as JSON
+    values. `note`: why it was not computed, does not count or does not hold.
     """
 
     requirement: Requirement
@@ -105,8 +105,9 @@ class Verification(ReprMixin):
     def summary(self) -> str:
         """Return a summary of one line."""
         count, absent = len(self.verdicts), sum(verdict.value is None for verdict in self.verdicts)
-        text = f"{count - len(self.failed)} of {count}" if self.failed else f"all {count}"
-        text += " requirements hold" + (f", {absent} of them not computed" if absent else "")
+        held = sum(verdict.holds is True for verdict in self.verdicts)
+        text = f"{held} of {count} requirements hold" if held < count else f"all {count} requirements hold"
+        text += f", {absent} {'is' if absent == 1 else 'are'} not computed" if absent else ""
         return (
             f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} simulated loops, "
             f"{self.order_words()}; {self.wall_time:.1f} s"
@@ -287,7 +288,9 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
         group = item.metric.partition(".")[0]
         group = "axes" if group in evidence.plants.axes else group
         why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
-        return Verdict(item, None, False if item.asked else None, {}, f"not computed: {why}")
+        # No model may show it (a tension, a virtual plant), which decides nothing; any other does not hold.
+        open_ = group == "sim" and not item.asked
+        return Verdict(item, None, None if open_ else False, {}, f"not computed: {why}")
     row = worst_row(evidence.metrics, item.metric, item.bound)
     value = float(values.values[row])
     worst = to_json(values.describe(row))

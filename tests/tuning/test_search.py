@@ -16,12 +16,15 @@ from hypothesis import strategies as st
 
 from softneck.core import KINDS, OutputFileError, SettingsError, SoftneckError, resolve
 from softneck.core._kinds import make_settings
+from softneck.plant import NeckParameters
 from softneck.robot import Robot
-from softneck.tuning import tune
+from softneck.tuning import task_of, tune
+from softneck.tuning._judge import cases, judged_delay, keep_worse, told_conditions
 from softneck.tuning._search import Candidate, ratio, run_jobs
 from softneck.tuning._space import KINDS_SEARCHED, spaces
 from softneck.tuning._task import FILE, Job, Log
 from softneck.tuning._tune import Tuned, active_requirement, front
+from softneck.verification import make_simulation_model
 from softneck.verification._requirements import Requirement
 
 from .test_requirements import neck
@@ -240,6 +243,52 @@ def test_what_was_not_computed_does_not_bind(tested: bool) -> None:
     blind.metrics["sim.rise_s"] = 0.3
     assert blind.cost(bounds, tested=tested) > 1.0
     assert active_requirement([blind], bounds, tested=tested) == (None, None)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+@pytest.mark.parametrize("tested", [True, False])
+def test_a_margin_that_was_not_computed_does_not_hold(tested: bool, asked: bool) -> None:
+    """`adaptive` was picked with all its rows of margins empty: what nobody computed was taken to be at its limit."""
+    bounds = (Requirement("axes.sensitivity", "max", 2.5, asked), *BOUNDS[:2])
+    blind = candidate(sim__rise_s=0.3, sim__overshoot_pct=3.0)
+    del blind.metrics["axes.sensitivity"]
+    assert not blind.holds(bounds, tested=tested)
+    slow = candidate(sim__rise_s=0.52, sim__overshoot_pct=3.0)
+    # One that misses a limit by a third is the better one, and nothing is said about the blind one's other limits.
+    assert slow.cost(bounds, tested=tested) < blind.cost(bounds, tested=tested)
+    assert active_requirement([blind], bounds, tested=tested) == (None, None)
+
+
+@pytest.mark.parametrize(("asked", "judged"), [(0.0, None), (5.0, 20.0), (20.0, 20.0), (29.0, 20.0), (60.0, 60.0)])
+def test_each_condition_asked_is_judged_or_said(asked: float, judged: float | None) -> None:
+    """Directions, sizes and payloads are loops of their own; a delay is whole samples, at least one."""
+    table = {"track": {"delay_ms": asked}, "sim": {"payloads_kg": [0.0, 0.32], "orientations_deg": [0.0, 30.0, 90.0]}}
+    task, own = task_of({"neck": neck()}, table, 0), [make_simulation_model(NeckParameters.paper(), "own")]
+    every = cases(own, task.asked, task.robot)
+    assert {(case.payload, round(math.degrees(case.orientation)), case.part) for case in every} >= {
+        (kg, angle, 1.0) for kg in (0.0, 0.32) for angle in (0, 30, 90)
+    }
+    assert {case.part for case in every} == {1.0, task.asked.track["small_part"]}
+    assert {case.payload for case in every if case.late} == {0.0, 0.32}
+    told = told_conditions(task, own, 0.02)
+    if judged is None or judged == asked:
+        assert not told
+    else:
+        assert told == {f"additional delay {asked:g} ms": f"judged at {judged:g} ms, whole samples of the loop"}
+    assert judged is None or judged_delay(asked, 0.02) == pytest.approx(1e-3 * judged)
+
+
+def test_a_value_that_is_no_number_does_not_hold() -> None:
+    for bound in BOUNDS:
+        assert ratio(bound, math.nan) == math.inf
+    item = candidate(sim__rise_s=math.nan, sim__overshoot_pct=3.0)
+    assert not item.holds(BOUNDS[:2], tested=False)
+    for first, second in ((math.nan, 1.0), (1.0, math.nan)):
+        for name in ("axes.gain_margin", "sim.rise_s"):
+            found: dict[str, float] = {}
+            keep_worse(found, name, first)
+            keep_worse(found, name, second)
+            assert math.isnan(found[name])
 
 
 def test_few_requirements_are_broken_rather_than_all_a_little() -> None:

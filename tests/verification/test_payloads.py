@@ -10,8 +10,9 @@ import pytest
 
 from softneck.core import load, silent
 from softneck.plant import NeckParameters
-from softneck.verification import make_requirements
-from softneck.verification._neck_loops import SimulationModel, make_simulation_model, missing_payloads, run_loops
+from softneck.robot import Robot
+from softneck.verification import Scale, make_requirements
+from softneck.verification._neck_loops import SimulationModel, judged_elsewhere, make_simulation_model, run_loops
 
 from ..data import ROOT
 from ..identification.structured.test_payload import at
@@ -26,24 +27,43 @@ def plant_with(payload: str, seen: list[float]) -> SimulationModel:
     )
 
 
+ASKED = [0.0, 0.32, 0.5, 1.0]
+
+
 @pytest.mark.parametrize(
-    ("payload", "seen", "carried", "left"),
+    ("payload", "seen", "judged", "told"),
     [
-        ("inputs", [0.0, 0.0], [0.0, 0.5, 1.0], ""),
-        ("parameters", [0.0, 1.0], [0.0, 0.5, 1.0], ""),
-        ("parameters", [0.0, 0.6], [0.0, 0.5], "1"),
-        ("parameters", [0.7, 0.8], [0.7], "0.5, 1"),
-        ("", [0.0, 0.0], [0.0], "0.5, 1"),
+        ("inputs", [0.0, 0.0], ASKED, {}),
+        ("parameters", [0.0, 1.0], ASKED, {}),
+        ("parameters", [0.35, 1.0], [0.35, 0.5, 1.0], {0.0: "0.35", 0.32: "0.35"}),
+        # The ends of the recordings are judged, asked or not.
+        ("parameters", [0.0, 1.2], [*ASKED, 1.2], {}),
+        ("parameters", [0.7, 0.8], [0.7, 0.8], {0.0: "0.7", 0.32: "0.7", 0.5: "0.7", 1.0: "0.8"}),
+        ("parameters", [0.4, 0.4], [0.4], {0.0: "0.4", 0.32: "0.4", 0.5: "0.4", 1.0: "0.4"}),
+        ("", [0.0, 0.0], [0.0], {0.32: "", 0.5: "", 1.0: ""}),
+        ("", [0.3, 0.6], [0.0], {0.0: "", 1.0: ""}),
     ],
 )
-def test_a_plant_carries_the_payloads_that_it_knows_and_the_others_are_said(
-    payload: str, seen: list[float], carried: list[float], left: str
+def test_each_payload_asked_is_judged_at_the_nearest_known_and_said(
+    payload: str, seen: list[float], judged: list[float], told: dict[float, str]
 ) -> None:
     plant = plant_with(payload, seen)
-    assert plant.payloads([0.0, 0.5, 1.0]) == carried
-    told = missing_payloads([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0, 0.5, 1.0]}}))
-    assert [f"own does not model {left} kg" in why for why in told.values()] == [True] * bool(left)
-    assert not missing_payloads([plant], make_requirements({**QUICK, "sim": {"payloads_kg": [0.0]}}))
+    assert plant.payloads(ASKED) == judged
+    found = judged_elsewhere([plant], make_requirements({**QUICK, "sim": {"payloads_kg": ASKED}}))
+    assert list(found) == [f"payload {kg:g} kg of own" for kg in told]
+    for how, kg in zip(found.values(), told.values(), strict=True):
+        assert how.startswith(f"judged at {kg} kg, it was recorded with" if kg else "judged as recorded, ")
+    # Asked, judged and told: each payload is judged as it is, or told.
+    assert not payload or set(ASKED) <= set(judged) | set(told)
+
+
+def test_each_direction_asked_is_judged_or_said() -> None:
+    asked = {"sim": {"orientations_deg": [0.0, 90.0]}}
+    assert not judged_elsewhere([], make_requirements(asked))
+    one = make_requirements(asked, scale=Scale(robot=Robot.preset("finger")))
+    assert judged_elsewhere([], one) == {
+        "directions": f"{one.robot.outputs.names[0]} is the only output, so all of `orientations_deg` are one step"
+    }
 
 
 def test_loops_over_a_model_of_several_payloads_carry_each() -> None:

@@ -254,9 +254,11 @@ class LinearController(ReprMixin):
             gains = ", ".join(self._gain(name, value) for name, value in item.get("gains", {}).items())
             lines.append(f"  {axis}: {gains}; designed for a dead time of {1e3 * item.get('dead_time_s', 0.0):g} ms")
             lines += _findings(item)
-            for title, key in (("as identified", "margins"), ("small moves", "margins_small_moves")):
-                if key in item and (title == "as identified" or item[key] != item.get("margins")):
-                    lines.append(f"    {title}: {_margins(item[key])}")
+            if "margins_family" in item:
+                lines.append(f"    worst of its {item['family']} plants: {_margins(item['margins_family'])}")
+            for title, key in (("", "margins"), (", small moves", "margins_small_moves")):
+                if key in item and (key == "margins" or item[key] != item.get("margins")):
+                    lines.append(f"    nominal model only{title}: {_margins(item[key])}")
         return "\n".join(lines)
 
     def _gain(self, name: str, value: float) -> str:
@@ -331,4 +333,6 @@ def _margins(values: Mapping[str, float | None]) -> str:
     for title, key, factor, unit in units:
         value = values.get(key)
         parts.append(f"{title} inf" if value is None else f"{title} {factor * value:.3g}{unit}")
+        if key == "gain" and values.get("gain_down"):
+            parts.append(f"down {values['gain_down']:.3g}")
     return ", ".join(parts)

@@ -265,13 +265,14 @@ class AxisSettings(LoopSettings, ABC):
             "gains": {**found.gains, **filter_numbers(led)},
             "dead_time_s": (axis.nominal.delay + self.extra_delay) * axis.sample_time,
             "margins": margins_json(margins.of(0)),
-            "margins_samples": margins_json(worst),
             "states": int(controller.A.shape[0]),
             "samples": len(axis.samples),
             "samples_unstable": int(np.isinf(margins.sensitivity[1:]).sum()),
             "worst_sensitivity": worst.sensitivity if math.isfinite(worst.sensitivity) else None,
             **found.notes,
         }
+        if axis.family > 1:
+            findings |= {"family": axis.family, "margins_family": margins_json(worst)}
         return controller, led, findings
 
     def _require_stable(self, controller: AxisController, axis: UncertainAxis) -> None:

@@ -165,13 +165,14 @@ class UncertainAxis:
 
     `nominal`: the plant that synthesis takes. `samples`: every plant that the controller must hold on; the nominal one
     is the first. `test`: what a controller is judged by on all of them; None where nobody judges. `uncertainty`: what
-    is allowed for besides.
+    is allowed for besides. `family`: how many plants were given, 1 for a model alone.
     """
 
     nominal: AxisPlant
     samples: tuple[AxisPlant, ...]
     test: StepAndLoad | None = None
     uncertainty: ModelUncertainty = _NO_UNCERTAINTY
+    family: int = 1
 
     @property
     def sample_time(self) -> float:
@@ -356,7 +357,9 @@ def _combine_axes(axes: Mapping[str, list[AxisPlant]]) -> UncertainPlant:
                     f"{plants[0].static_gain:.4g}: no controller with integral action holds both signs. "
                     "Leave that sample out, or check the signs of its recording."
                 )
-    return UncertainPlant({axis: UncertainAxis(plants[0], tuple(plants)) for axis, plants in axes.items()})
+    return UncertainPlant(
+        {axis: UncertainAxis(plants[0], tuple(plants), family=len(plants)) for axis, plants in axes.items()}
+    )
 
 
 def _axis_from_system(system: Any, axis: str, what: str) -> AxisPlant:

@@ -261,7 +261,7 @@ class MpcController(ReprMixin):
             f"observer {d.get('observer_bandwidth_rad_s', 0.0):.3g} rad/s, reference filter "
             f"{d.get('reference_time_s', 0.0):.3g} s; Ms "
             + " and ".join(f"{value:.3g}" for value in d.get("sensitivity", []))
-            + (" (as identified, small moves)" if len(d.get("sensitivity", [])) > 1 else " (as identified)"),
+            + f" (nominal model only{', small moves' * (len(d.get('sensitivity', [])) > 1)})",
         ]
         lines += _observer_line(settings)
         if d.get("worst_sensitivity") is not None:
