@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from softneck.core import SettingsError
-from softneck.design import Margins, loop_margins, margins_of_loops
+from softneck.design import Margins, PiSettings, loop_margins, margins_of_loops
 from softneck.design.linear._margins import frequency_grid
 
 
@@ -72,7 +72,7 @@ def mode(wn: float, damping: float, lag: float, Ts: float, delay: int) -> Any:
     return G / float(np.abs(response(G, np.array([wn]))[0]))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     Ts=st.floats(-3.0, 0.0).map(lambda x: 10.0**x),
     turn=st.floats(-2.0, 0.3).map(lambda x: 10.0**x),
@@ -217,3 +217,32 @@ def test_the_grid_turns_little_between_two_frequencies() -> None:
     assert np.diff(w).max() * 0.02 * 81 <= 0.51
     inner = w[w > 2e-3 * w[-1]]
     assert (inner[1:] / inner[:-1]).max() < 1.026
+
+
+@pytest.mark.parametrize("tuning", ["nominal", "samples"])
+def test_a_design_keeps_its_bounds_exactly_and_its_worst_is_no_better_than_the_nominal(
+    tuning: str,
+) -> None:
+    plants = []
+    for wn, damping in ((12.0, 0.05), (12.5, 0.06), (11.5, 0.07)):
+        G: Any = 0.1 * control.tf([wn**2], [1.0, 2.0 * damping * wn, wn**2])
+        plants.append(control.c2d(G, 0.005) * control.TransferFunction([1.0], [1.0, 0.0, 0.0], 0.005))
+    found = PiSettings(tuning=tuning).design({"pitch": plants, "roll": plants}).design["pitch"]
+    assert found["family"] == 3
+    nominal, worst = found["margins"], found["margins_family"]
+    assert nominal["sensitivity"] <= found["worst_sensitivity"] == worst["sensitivity"]
+    assert all((worst[key] or math.inf) <= (nominal[key] or math.inf) for key in ("gain", "phase", "delay"))
+    kept = nominal if tuning == "nominal" else worst
+    assert kept["sensitivity"] <= 1.005 * 1.5
+
+
+def test_a_design_says_what_its_margins_are_of() -> None:
+    G: Any = control.TransferFunction([0.01], [1.0, -0.9, 0.0, 0.0], 0.02)
+    for plants, lines in (
+        (G, ["nominal model only: "]),
+        ([G, 1.1 * G], ["worst of its 2 plants: ", "nominal model only: "]),
+    ):
+        text = PiSettings().design({"pitch": plants, "roll": plants}).summary().splitlines()
+        margins = [line.strip() for line in text if "gain margin" in line and "small moves" not in line]
+        assert len(margins) == 2 * len(lines)
+        assert all(line.startswith(start) for line, start in zip(margins, 2 * lines, strict=True))

@@ -65,11 +65,37 @@ class PiSettings(AxisSettings):
         return axis.apply_assumptions()
 
     def _synthesise(self, axis: UncertainAxis, name: str) -> AxisDesign:  # noqa: ARG002
-        gains = tune_pi(self._tuning_plants(axis), self.extra_delay, self.max_sensitivity, self.phase_margin)
+        gains = self._keep_exactly(
+            axis, tune_pi(self._tuning_plants(axis), self.extra_delay, self.max_sensitivity, self.phase_margin)
+        )
         controller = pi_axis(gains.gain, gains.integral_time, axis.sample_time)
         faster = axis_margins(controller, self._nominal_plants(axis)[-1:], self.extra_delay)
         notes = {"margins_small_moves": margins_json(faster.of(0))}
         return AxisDesign(controller, {"K": gains.gain, "Ti_s": gains.integral_time}, notes)
+
+    def _keep_exactly(self, axis: UncertainAxis, gains: Gains) -> Gains:
+        """Return the gains with K lowered until the exact margins keep both bounds, which a grid may have missed."""
+
+        def keeps(part: float) -> bool:
+            controller = pi_axis(part * gains.gain, gains.integral_time, axis.sample_time)
+            found = axis_margins(controller, self._tuning_plants(axis), self.extra_delay).worst()
+            return (
+                found.sensitivity <= _GRID_TOLERANCE * self.max_sensitivity
+                and found.phase * _GRID_TOLERANCE >= self.phase_margin
+            )
+
+        low, high = 0.0, 1.0
+        if keeps(high):
+            return gains
+        for _ in range(_REFINEMENT_STEPS + 4):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if keeps(middle) else (low, middle)
+        if low == 0.0:
+            raise SettingsError(
+                f"no PI gains keep Ms <= {self.max_sensitivity:g} and the phase margin around so light a mode; "
+                "ask for less."
+            )
+        return Gains(low * gains.gain, gains.integral_time)
 
     def _require_stable(self, controller: AxisController, axis: UncertainAxis) -> None:
         if self.tuning == "samples" and unstable_samples(controller, axis.samples, self.extra_delay):
@@ -104,6 +130,8 @@ class PiSettings(AxisSettings):
 # Loop gains that are tried, in units of the plant's static gain, 5 % apart and refined to 0.1 % at the border.
 _SIZES = np.geomspace(1e-2, 1e2, 190)
 _REFINEMENT_STEPS = 6
+# Between its frequencies the grid misses this much of a well-damped peak.
+_GRID_TOLERANCE = 1.005
 # Integral times that are tried, in units of the plant's lag and delay together.
 _TIMES = np.geomspace(0.2, 3.0, 40)
 # A step response is judged over this long [s]; slower than any neck settles.
