@@ -66,6 +66,7 @@ class _Job:
         as_json: print JSON.
         sample_time: to resample at: a number [s], "robot", or None.
         clock: the sample time [s] of a log without a clock, given by the user.
+        robot: as the user named it.
         named: the columns that the user named.
         texts: file -> text to write beside the recording, and whether it may be replaced.
     """
@@ -79,6 +80,7 @@ class _Job:
     as_json: bool = False
     sample_time: str | None = None
     clock: float | None = None
+    robot: str | None = None
     named: signals.NamedColumns | None = None
     texts: dict[Path, tuple[str, bool]] = field(default_factory=dict)
 
@@ -111,7 +113,7 @@ def _writer(text: str) -> Callable[[Path], object]:
     "--robot-out",
     type=click.Path(path_type=Path),
     metavar="ROBOT.toml",
-    help="Propose a robot by the log's titles, write it here, and import the log as its recording.",
+    help="Propose a robot by the log's columns, write it here, and import the log as its recording.",
 )
 @click.option("--guess", is_flag=True, help="Propose a layout, say why, and write it beside the recording.")
 @click.option("--sample-time", "clock", metavar="S", help="Of a log without a clock, with --guess or named columns.")
@@ -160,11 +162,11 @@ def command(
     ours = log.suffix.lower() == ".mcap" and (not asked or signals.is_run_log(log))
     path, replace = target(output, f"recordings/{log.stem}.csv", force=force)
     known = None if clock is None else sample_time_of(clock, "--sample-time")
-    if known is not None and not guess and named is None:
+    if known is not None and not guess and named is None and robot_out is None:
         raise SettingsError("--sample-time goes with --guess; a layout says it as `sample_time_s` in [time].")
     if named is not None and (guess or layout_file is not None):
         raise SettingsError("--motor, --position and --output are the layout; leave out --guess and --layout.")
-    job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known, named)
+    job = _Job(log, path, replace, force, html, yes, as_json, sample_time, known, robot, named)
     alone = ours or (not asked and sample_time is not None)
     if ours and asked:
         raise SettingsError(f"{log}: is a log of softneck, whose columns are known; leave out --layout and --guess.")
@@ -190,11 +192,14 @@ def command(
         _finish(job, *(_run_log(log) if ours else _read_recorded(log, robot)))
         return
     facts: dict[str, Any] = {}
-    whose = find_robot(robot, beside=log)
-    if robot_out is not None or named is not None or (layout_file is None and not _can_guess(whose)):
-        imported, layout, facts = _of_robot(
-            job, whose, robot_out, known=robot is not None or robot_file_of(log) is not None
-        )
+    given = robot is not None or robot_file_of(log) is not None
+    stored = None if given else signals.robot_in_file(log, log.suffix.lower())
+    whose = stored or find_robot(robot, beside=log)
+    known_robot = given or stored is not None
+    propose = named is not None or robot_out is not None
+    propose |= layout_file is None and not known_robot and signals.is_of_another_robot(log)
+    if propose or (layout_file is None and not _can_guess(whose)):
+        imported, layout, facts = _of_robot(job, whose, robot_out, known=known_robot, propose=propose)
         proposed = None
     elif layout_file is None:
         proposed, imported, facts = _by_guess(job, whose)
@@ -286,6 +291,7 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[signals.Guess, signals.ImportRes
         for line in guess.missing[1:]:
             note(f"not found either: {line}")
         note(f"the layout, as far as it goes, is in {proposal}: fill in what is MISSING, and use --layout {proposal}")
+        note(f"or name the columns: {signals.columns_line(job.log)}")
         raise DataError(f"{job.log}: not found: {guess.missing[0]}.")
     facts = {"layout_file": str(proposal), "layout": tomllib.loads(guess.text), "reasons": list(guess.lines),
              "doubts": [doubt.as_dict() for doubt in guess.doubts]}  # fmt: skip
@@ -298,38 +304,42 @@ def _by_guess(job: _Job, whose: Robot) -> tuple[signals.Guess, signals.ImportRes
         return guess, signals.import_log(job.log, guess.layout), facts
     except DataError as error:
         job.write()
+        note(f"if the columns are wrong, name them: {signals.columns_line(job.log)}")
         raise DataError(f"{error} (The proposed layout is in {proposal}.)") from error
 
 
 def _of_robot(
-    job: _Job, robot: Robot, robot_out: Path | None, *, known: bool
+    job: _Job, robot: Robot, robot_out: Path | None, *, known: bool, propose: bool
 ) -> tuple[signals.ImportResult, signals.Layout, dict[str, Any]]:
-    """Import by columns or titles a log of `robot`, or of the one that they speak of; propose that, to be written.
+    """Import a log by named or recognised columns, or by the titles of `robot`; write the robot that is proposed.
 
-    `known` is whether somebody said that it is of `robot`.
+    `known`: whether somebody, or the log itself, said that it is of `robot`.
     """
     import tomli_w
+
+    from softneck.robot import find_robot
 
     proposal = job.beside(".layout.toml")
     facts: dict[str, Any] = {"layout_file": str(proposal)}
     remarks: dict[str, str] = {}
-    found = None
-    if job.named is not None:
-        found = signals.robot_of_columns(job.log, job.named, robot=robot if known else None, sample_time=job.clock)
-    elif robot_out is not None:
-        refuse_existing(robot_out, force=job.force)
-        found = signals.guess_robot(job.log)
+    if propose:
+        if robot_out is not None:
+            refuse_existing(robot_out, force=job.force)
+        whose = robot if known and job.named is not None else None
+        found = signals.guess_robot(job.log, job.named, robot=whose, sample_time=job.clock)
         remarks[found.robot.set_points[0]] = found.remark
         facts["reasons"] = list(found.lines)
         for line in found.lines:
             note(line)
-    layout = signals.layout_for(job.log, robot) if found is None else found.layout
-    if found is not None and (robot_out is not None or found.robot.hash != robot.hash):
+        layout = found.layout
+    else:
+        layout = signals.layout_for(job.log, robot, sample_time=job.clock)
+    if robot_out is not None or layout.robot.hash != find_robot(job.robot, beside=job.log).hash:
         file = robot_out or job.beside(".robot.toml")
         force = job.replace if robot_out is None else job.force
         refuse_existing(file, force=force)
         text = f"# Proposed by softneck import for {job.log.name!r}; edit it.\n"
-        job.texts[file] = (text + tomli_w.dumps(found.robot.as_dict()), force)
+        job.texts[file] = (text + tomli_w.dumps(layout.robot.as_dict()), force)
         facts["robot_file"] = str(file)
     text = signals.layout_toml(layout, remarks=remarks)
     job.texts[proposal] = (text, job.replace)

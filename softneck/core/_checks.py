@@ -100,6 +100,8 @@ def _in(unit: str) -> str:
 _TO_SI: dict[str, tuple[float, str]] = {
     "rad": (1.0, "rad"),
     "deg": (math.pi / 180.0, "rad"),
+    "mrad": (1e-3, "rad"),
+    "turns": (2.0 * math.pi, "rad"),
     "rad/s": (1.0, "rad/s"),
     "deg/s": (math.pi / 180.0, "rad/s"),
     "rpm": (math.pi / 30.0, "rad/s"),
@@ -119,6 +121,11 @@ _TO_SI: dict[str, tuple[float, str]] = {
     "V": (1.0, "V"),
     "mV": (1e-3, "V"),
     "A": (1.0, "A"),
+    "mA": (1e-3, "A"),
+    "mbar": (1e2, "Pa"),
+    "hPa": (1e2, "Pa"),
+    "us": (1e-6, "s"),
+    "%": (1e-2, "1"),
     "1": (1.0, "1"),
 }
 

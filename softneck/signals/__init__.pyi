@@ -36,10 +36,10 @@ from .importing._layout import doubts_in as doubts_in
 from .importing._log import ImportResult as ImportResult
 from .importing._log import read_log as read_log
 from .importing._robot_guess import NamedColumns as NamedColumns
+from .importing._robot_guess import columns_line as columns_line
 from .importing._robot_guess import guess_robot as guess_robot
 from .importing._robot_guess import is_of_another_robot as is_of_another_robot
 from .importing._robot_guess import layout_for as layout_for
-from .importing._robot_guess import robot_of_columns as robot_of_columns
 from .importing.formats._mcap import LARGEST_RECORD as LARGEST_RECORD
 from .importing.formats._mcap import is_run_log as is_run_log
 from .importing.formats._mcap import require_chunks as require_chunks

@@ -15,7 +15,7 @@ from softneck.core import MOST_TOML, SettingsError, settings_text
 from softneck.robot import Robot, find_robot
 
 from ..shared._console import note
-from ._possible import FILE, backend, lacking, possible, propose_sensor, require_known
+from ._possible import FILE, backend, lacking, possible, propose_missing, require_known
 
 #: In the order of the work, as they are counted for the user.
 STAGES = ("import", "robot", "quality", "identification", "observer", "tune", "verify", "FMUs", "loop", "study",
@@ -139,8 +139,9 @@ def steps(options: Options) -> Iterator[Step]:
 
 
 def _with_sensor(recordings: list[str], options: Options) -> Iterator[Step]:
-    """Add missing sensor values to `robot.toml`, and import again the logs of a given robot."""
-    proposed = propose_sensor(Path("robot.toml"), [signals.read_recording(recording) for recording in recordings])
+    """Add missing values of sensor and proposed motors to `robot.toml`; import again the logs of a given robot."""
+    read = [signals.read_recording(recording) for recording in recordings]
+    proposed = propose_missing(Path("robot.toml"), read, motors=options.robot is None)
     if proposed and options.robot is not None:
         yield from (_import(log, recording, options) for log, recording in zip(options.logs, recordings, strict=True))
 
@@ -160,8 +161,10 @@ def _import(log: str, recording: str, options: Options) -> Step:
     else:
         guess = ["--guess", *(["--yes"] if options.yes else [])]
         guess += [] if options.sample_time is None else ["--sample-time", options.sample_time]
-        if options.robot is None and options.sample_time is None and signals.is_of_another_robot(log):
-            guess = ["--robot-out", robot.as_posix()]
+        stored = signals.robot_in_file(Path(log), Path(log).suffix.lower())
+        if options.robot is None and stored is None and signals.is_of_another_robot(log):
+            guess[:1] = ["--robot-out", robot.as_posix()]
+            guess = [word for word in guess if word != "--yes"]
         by_layout = layout.is_file() and not (options.sample_time is not None and _lacks_clock(layout))
         words = ["--layout", layout.as_posix()] if by_layout else guess
         columns = (("--motor", options.motors), ("--position", options.positions), ("--output", options.outputs))

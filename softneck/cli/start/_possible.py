@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import tomli_w
 
 from softneck import signals, tuning, verification
-from softneck.core import OutputFileError, SettingsError, atomic_write, settings_text, to_si
+from softneck.core import OutputFileError, SettingsError, atomic_write, to_si
 from softneck.robot import OPTIONAL_KEYS, ROBOT_KEYS, Robot
 from softneck.signals import Recording
 
@@ -107,36 +108,67 @@ def impossible(plants: tuple[str, ...]) -> dict[str, str]:
 _LEAST_NOISE_RATIO = 1e-3
 
 
-def propose_sensor(file: Path, recordings: Sequence[Recording]) -> list[str]:
-    """Add the missing keys of table [sensor] to a robot file, and return them."""
-    robot, table = Robot.read(file), tomllib.loads(settings_text(file))
-    told = robot.as_dict().get("sensor", {})
-    found = {
+def propose_missing(file: Path, recordings: Sequence[Recording], *, motors: bool) -> list[str]:
+    """Add what a robot file lacks of the sensor and, if `motors`, of the motors' limits; return the keys.
+
+    Each value comes from the recordings and is marked as not sure.
+    """
+    robot = Robot.read(file)
+    told = robot.as_dict()
+    sensor = {
         "noise_std": (_noise(robot, recordings), 80, "white noise of the recordings, by their fourth differences"),
         "delay_s": (0.0, 50, "recordings show only its sum with the plant's dead time; all of it counts as dead time"),
         "rate_hz": (_digits(1.0 / recordings[0].sample_time), 80, "one measurement a sample of the recordings"),
     }
-    proposed = {key: entry for key, entry in found.items() if key not in told}
-    if not proposed:
-        return []
-    lines = [f"# NOT SURE ({sure} %): {why}\n{key} = {value}\n" for key, (value, sure, why) in proposed.items()]
+    proposed: list[str] = []
+    for name, found in (("motors", _limits(robot, recordings) if motors else {}), ("sensor", sensor)):
+        missing = {key: entry for key, entry in found.items() if key not in told.get(name, {})}
+        if missing:
+            _add(file, name, missing)
+            said = ", ".join(f"{key} = {value:g}" for key, (value, *_) in missing.items())
+            note(f"not sure: {file} lacks values of {name}: {said} from the recordings; correct them there")
+        proposed += missing
+    return proposed
+
+
+def _add(file: Path, name: str, entries: dict[str, tuple[float, int, str]]) -> None:
+    """Add key -> (value, certainty in %, reason) to a table of a TOML file."""
     text = file.read_text(encoding="utf-8")
-    if "sensor" in table and "\n[sensor]" in f"\n{text}":
-        head, mark, rest = f"\n{text}".partition("\n[sensor]")
+    table = tomllib.loads(text)
+    lines = [f"# NOT SURE ({sure} %): {why}\n{key} = {value}\n" for key, (value, sure, why) in entries.items()]
+    if name in table and f"\n[{name}]" in f"\n{text}":
+        head, mark, rest = f"\n{text}".partition(f"\n[{name}]")
         first, end, after = rest.partition("\n")
         text = f"{head}{mark}{first}{end}{''.join(lines)}{after}".lstrip("\n")
     else:
-        text = f"{text.rstrip()}\n\n[sensor]\n{''.join(lines)}"
+        text = f"{text.rstrip()}\n\n[{name}]\n{''.join(lines)}"
     try:
         tomllib.loads(text)
-    except ValueError:  # [sensor] stood in another form, such as `sensor.delay_s = 0.1`
-        sensor = table.get("sensor", {}) | {key: value for key, (value, *_) in proposed.items()}
-        text = tomli_w.dumps(table | {"sensor": sensor})
+    except ValueError:  # the table stood in another form, such as `sensor.delay_s = 0.1`
+        values = table.get(name, {}) | {key: value for key, (value, *_) in entries.items()}
+        text = tomli_w.dumps(table | {name: values})
     with atomic_write(file, force=True) as temporary:
         temporary.write_text(text, encoding="utf-8")
-    said = ", ".join(f"{key} = {value:g}" for key, (value, *_) in proposed.items())
-    note(f"not sure: {file} lacks values of the sensor: {said} from the recordings; correct them there")
-    return list(proposed)
+
+
+def _limits(robot: Robot, recordings: Sequence[Recording]) -> dict[str, tuple[float, int, str]]:
+    """Return the range and the rate of the motors in the recordings, in the robot's unit."""
+    unit = to_si(robot.motors.unit)[0]
+    lowest = min(float(recording.set_points.min()) for recording in recordings) / unit
+    highest = max(float(recording.set_points.max()) for recording in recordings) / unit
+    rates = []
+    for recording in recordings:
+        moved = recording.motor_positions if recording.has_motor_positions else recording.set_points
+        inside = np.diff(recording.run) == 0
+        rates.append(float(np.nanmax(np.abs(np.diff(moved, axis=0))[inside], initial=0.0)) / recording.sample_time)
+    measured = any(recording.has_motor_positions for recording in recordings)
+    how = "fastest measured move" if measured else "largest step of a set-point in a sample"
+    range_why = "range of the set-points in the recordings"
+    return {
+        "setpoint_min": (_digits(lowest), 70, range_why),
+        "setpoint_max": (_digits(highest), 70, range_why),
+        "rate_limit": (_digits(max(rates) / unit), 50, f"{how} in the recordings"),
+    }
 
 
 def _noise(robot: Robot, recordings: Sequence[Recording]) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,6 +26,7 @@ from ._clocks import (
     read_times,
 )
 from ._layout import Column, Layout, Source
+from ._robot_guess import NamedColumns, guess_robot
 from ._table_format import without_remarks
 from .formats._mat import mat_arrays, table_of
 from .formats._mcap import mcap_table
@@ -54,8 +55,21 @@ class ImportResult:
     notes: tuple[str, ...] = field(default=())
 
 
-def import_log(path: str | Path, layout: Layout) -> ImportResult:
-    """Read a log as a recording.
+def import_log(
+    path: str | Path,
+    layout: Layout | None = None,
+    *,
+    motors: Sequence[str] = (),
+    positions: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+    sample_time: float | None = None,
+) -> ImportResult:
+    """Read a log as a recording, by a layout or by its columns.
+
+    Args:
+        layout: of the log; None: `motors` and the like name its columns by title or index, and those that are not
+            named follow from titles, units and motion.
+        sample_time: of a log without a clock [s], if columns are named.
 
     Raises:
         FileFormatError: no such file or no table.
@@ -73,8 +87,16 @@ def import_log(path: str | Path, layout: Layout) -> ImportResult:
         (200, 0.02)
     """
     source = as_path(path)
-    if not isinstance(layout, Layout):
-        raise SettingsError(f"a layout is needed (`read_layout`, `guess_layout`); got a {type(layout).__name__}.")
+    named = NamedColumns(tuple(motors), tuple(outputs), tuple(positions))
+    if layout is None and named != NamedColumns():
+        found = guess_robot(source, named, sample_time=sample_time)
+        done = import_log(source, found.layout)
+        return ImportResult(done.recording, (*found.lines, *done.notes))
+    if not isinstance(layout, Layout) or named != NamedColumns():
+        raise SettingsError(
+            "either a layout (`read_layout`, `guess_layout`) or columns (`motors=`, `outputs=`) are needed; got a "
+            f"{type(layout).__name__}{' and columns' if named != NamedColumns() else ''}."
+        )
     frame = read_log(source, layout)
     if layout.rows is not None:
         frame = frame.iloc[layout.rows[0] : layout.rows[1]].reset_index(drop=True)

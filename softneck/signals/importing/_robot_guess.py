@@ -1,8 +1,9 @@
-"""A robot and a layout proposed from the column titles of a log of another robot than the neck."""
+"""A robot and a layout of a log of any robot, from the roles of its columns."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,250 +13,297 @@ import numpy as np
 from softneck.core import DataError, SettingsError, SoftneckError, did_you_mean, to_si
 from softneck.robot import Robot
 
+from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS, parse_column
 from ._column_titles import read_title
+from ._draft import Draft
+from ._guess_names import by_names
 from ._layout import Column, Layout, Source, Term
+from ._roles import NOTHING_NEW, Roles, find_roles, names_a_place, unit_of
 from ._table_format import SniffResult, sniff
 from .formats._text import DATE
 
-# Words for motors; other columns that move are outputs.
-_MOTOR_WORDS = {
-    "motor", "motors", "setpoint", "set", "target", "command", "cmd", "input", "u", "pressure", "pump", "valve",
-    "voltage", "volt", "chamber", "tendon", "cable", "servo", "actuator", "winch", "pwm", "duty", "control", "force",
-    "torque", "heater",
-}  # fmt: skip
-# These move no winch: a log with one of them and without any channel of a neck is another robot's.
-_NO_WINCH = {"pressure", "pump", "valve", "voltage", "volt", "chamber", "pwm", "duty", "heater"}
-_OF_A_NECK = ("pitch", "roll", "inclination", "orientation", "pitch_reference", "roll_reference", "position",
-              "set-point", "velocity")  # fmt: skip
+_OF_A_NECK = ("pitch", "roll", "inclination", "orientation")
 _UNIT = re.compile(r"[\[(]\s*([^\])]+?)\s*[\])]\s*$")
 _WORD = re.compile(r"[a-z]+|\d+")
+_RANGE = re.compile(r"(\d+)-(\d+)")
 
 
 @dataclass(frozen=True, slots=True)
 class NamedColumns:
-    """Columns named by a user, by title or index."""
+    """Columns named by a user, by title, index or, without titles, a range of indices such as `0-3`."""
 
-    motors: tuple[str, ...]
-    outputs: tuple[str, ...]
+    motors: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
     positions: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class RobotGuess:
-    """A robot, whose directions are to be identified, a layout of its log, and the reasons for each column."""
+    """A robot, whose directions are to be identified, a layout of its log, and the reasons for each column.
+
+    `remark`: for the layout file, where the columns are guessed.
+    """
 
     robot: Robot
     layout: Layout
     lines: tuple[str, ...]
-
-    @property
-    def remark(self) -> str:
-        """Return the remark for the layout file."""
-        moved, outputs = (", ".join(part.names) for part in (self.robot.motors, self.robot.outputs))
-        return f"NOT SURE: robot: {moved} move, {outputs} are outputs (80 % sure): by words in the titles"
+    remark: str = ""
 
 
 def is_of_another_robot(path: str | Path) -> bool:
-    """Return whether titles name pressures, pumps or voltages, and no motor or angle of a neck."""
+    """Return whether a log names no three motors of a neck, and a robot can be proposed from its titles."""
     try:
-        titles = [title for title in sniff(path, fewest=2).columns if isinstance(title, str)]
-        spoken = any(_words(title) & _NO_WINCH for title in titles)
-        return spoken and not any(read_title(t).role in _OF_A_NECK for t in titles) and bool(guess_robot(path))
+        table = sniff(path, fewest=2)
+        draft = Draft(table)
+        with np.errstate(all="ignore"):
+            by_names(draft)
+        roles = find_roles(table, {})
+        motors = any(draft.has(names) for names in (SET_POINTS, MOTOR_POSITIONS, MOTOR_VELOCITIES))
+        angles = draft.quaternion is not None or any(name in draft.picks for name in _OF_A_NECK)
+        # Three motors are a neck's, unless titles name other outputs than angles.
+        if motors and (angles or not any(names_a_place(table, column) for column in roles.outputs)):
+            return False
+        return bool(guess_robot(path, sample_time=1.0 if roles.time is None else None))
     except SoftneckError:
         return False
 
 
-def guess_robot(path: str | Path) -> RobotGuess:
-    """Propose a robot by a log's titles: words for motors, and all other moving columns as outputs."""
-    table = sniff(path, fewest=2)
-    time, run, rest = _clock(table)
-    motors = [title for title in rest if _words(title) & _MOTOR_WORDS]
-    outputs = [title for title in rest if title not in motors]
-    if not motors:
-        raise DataError(
-            f"{path}: no title names a motor, pressure, valve or set-point; it has {', '.join(rest) or 'none'}. "
-            "Write a robot.toml (`softneck robot new`) and a layout."
-        )
-    if not outputs:
-        raise DataError(f"{path}: beside {', '.join(motors)} no column moves that could be an output.")
-    robot, units = _propose_robot(path, table, motors, outputs)
-    layout = _layout(table, robot, motors, outputs, (time, run))
-    unknown = [
-        f"{title}: its unit is unknown here and taken as 1"
-        for title in rest
-        if _UNIT.search(title) and not _unit_of(table, title)
-    ]
-    lines = (
-        *table.lines,
-        *(f"{title}: its unit is unknown here and taken as 1" for title in unknown),
-        f"motors [{units[0]}]: {', '.join(motors)}: because of words in their titles",
-        f"outputs [{units[1]}]: {', '.join(outputs)}: because they move and have no other role",
-        "directions: to be identified; write tendon angles or a matrix into the robot file if you know them",
-    )
-    return RobotGuess(robot, layout, lines)
-
-
-def robot_of_columns(
-    path: str | Path, named: NamedColumns, *, robot: Robot | None = None, sample_time: float | None = None
+def guess_robot(
+    path: str | Path,
+    named: NamedColumns | None = None,
+    *,
+    robot: Robot | None = None,
+    sample_time: float | None = None,
 ) -> RobotGuess:
-    """Return robot and layout of a log whose columns the user named.
+    """Propose the robot and the layout of a log; what is not named follows from titles, units and motion.
 
-    `named`: its columns, in the order of the robot's channels. `robot`: None takes the neck if the columns fit it, else
-    proposes a robot. `sample_time`: [s] of a log without a clock.
+    Args:
+        named: columns that the user named, in the order of the robot's channels.
+        robot: of the log; None takes the neck if the named columns fit it, else proposes a robot.
+        sample_time: of a log without a clock [s].
+
+    Raises:
+        DataError: no motors or outputs were found; the message names the columns of the best candidates.
+        SettingsError: names that contradict each other, or a sample time of a log that has a clock.
     """
     table = sniff(path, fewest=2)
-    if not named.motors or not named.outputs:
-        raise SettingsError("name the columns of motors and outputs, by --motor COL and --output COL.")
-    every = (*named.motors, *named.outputs, *named.positions)
-    if twice := next((title for title in every if every.count(title) > 1), None):
-        raise SettingsError(f"column `{twice}` is named twice.")
-    motors, outputs, positions = (
-        [_column(path, table, title) for title in titles] for titles in (named.motors, named.outputs, named.positions)
-    )
-    taken = {*motors, *outputs, *positions}
-    roles = {title: read_title(str(title)).role for title in table.columns if title not in taken}
-    time, run = (next((title for title in roles if roles[title] == role), None) for role in ("time", "run"))
-    if time is None and sample_time is None:
+    given = _given(path, table, named or NamedColumns())
+    roles = find_roles(table, given)
+    if not roles.motors or not roles.outputs:
+        what = "motor" if not roles.motors else "output"
+        raise DataError(f"{path}: no column was recognised as {what}. Name them: {columns_line(path, table, roles)}")
+    if roles.time is None and sample_time is None:
         raise DataError(f"{path}: no column is a time; say its sample time: --sample-time S.")
-    if time is not None and sample_time is not None:
+    if roles.time is not None and sample_time is not None:
         raise SettingsError(
-            f"{path}: has a clock, `{time}`; leave out --sample-time, or say --resample {sample_time:g}."
+            f"{path}: has a clock, `{roles.time}`; leave out --sample-time, or say --resample {sample_time:g}."
         )
+    whole = bool(given["motors"] and given["outputs"])
     if robot is None:
-        robot = Robot.preset() if _of_neck(table, motors, outputs) else _propose_robot(path, table, motors, outputs)[0]
-    for count, needed, what in (
-        (len(motors), len(robot.motors.names), "motor"),
-        (len(outputs), len(robot.outputs.names), "output"),
-        (len(positions), len(robot.motors.names) if positions else 0, "position"),
-    ):
-        if count != needed:
-            raise DataError(f"{path}: robot {robot.label()} needs {needed} --{what}; {count} were given.")
-    layout = _layout(table, robot, motors, outputs, (time, run))
-    logged = {name: Source((Term(title),), _unit_of(table, title) or robot.motors.unit)
-              for name, title in zip(robot.motor_positions, positions, strict=False)}  # fmt: skip
-    layout = replace(layout, channels={**layout.channels, **logged}, sample_time=sample_time or layout.sample_time)
-    return RobotGuess(robot, layout, table.lines)
+        neck = whole and _of_neck(table, roles)
+        robot = Robot.preset() if neck else _propose_robot(path, table, roles)
+    _require_counts(path, robot, roles)
+    channels = [
+        *zip(robot.set_points, roles.motors, strict=True),
+        *zip(robot.outputs.names, roles.outputs, strict=True),
+    ]
+    channels += zip(robot.motor_positions, roles.positions, strict=False)  # of no motor or of all
+    layout = replace(_layout(table, robot, channels, roles), sample_time=sample_time)
+    taken = [f"motors: {_list(roles.motors)}{f': {roles.why}' if roles.why else ''}"]
+    taken += [f"measured positions: {_list(roles.positions)}"] if roles.positions else []
+    taken += [f"outputs: {_list(roles.outputs)}"]
+    unknown = [(column, unit_of(table, column)) for column in (*roles.motors, *roles.outputs)]
+    doubts = [f"{column}: unit `{text}` is unknown here and taken as 1" for column, (unit, text) in unknown
+              if text and unit is None]  # fmt: skip
+    remark = f"NOT SURE: robot: {_list(roles.motors)} move, {_list(roles.outputs)} are outputs (80 % sure): by titles"
+    lines = (*table.lines, *taken, *doubts, *roles.lines)
+    return RobotGuess(robot, layout, lines, "" if whole else remark)
+
+
+def columns_line(path: str | Path, table: SniffResult | None = None, roles: Roles | None = None) -> str:
+    """Return the command that names a log's columns, with the best candidates filled in."""
+    table = sniff(path, fewest=2) if table is None else table
+    roles = find_roles(table, {}) if roles is None else roles
+    spent = [name for name, why in roles.left_out.items() if why.startswith(NOTHING_NEW)]
+    moving = [name for name in table.columns if name not in (roles.time, roles.run, *spent)]
+    motors, outputs = list(roles.motors), list(roles.outputs) if roles.motors else []
+    motors = motors or _first_block(table, moving)
+    free = [name for name in moving if name not in (*motors, *roles.positions)]
+    outputs = outputs or [name for name in free if name not in roles.left_out or not roles.motors][:4]
+    words = ["softneck", "import", str(path)]
+    for option, columns in (
+        ("--motor", motors or ["COL"]), ("--position", roles.positions), ("--output", outputs or ["COL"])
+    ):  # fmt: skip
+        words += [word for text in _ranges(columns) for word in (option, text)]
+    words += [] if roles.time is not None else ["--sample-time", "S"]
+    return f"`{shlex.join(words)} -o rec.csv`; for its limits see `softneck robot new`"
+
+
+def _ranges(columns: Sequence[Column]) -> list[str]:
+    """Return columns as options name them; successive indices as one range."""
+    if all(isinstance(one, int) for one in columns) and len(columns) > 1:
+        first, last = int(columns[0]), int(columns[-1])
+        if list(columns) == list(range(first, last + 1)):
+            return [f"{first}-{last}"]
+    return [str(one) for one in columns]
+
+
+def _first_block(table: SniffResult, columns: Sequence[Column]) -> list[Column]:
+    """Return the first columns whose motions are of one size, as a log's inputs stand before its outputs."""
+    found: list[Column] = []
+    for column in columns[:-1]:
+        spans = [float(np.nanstd(table.columns[one])) for one in (*found, column)]
+        if max(spans) > 5.0 * min(spans):
+            break
+        found.append(column)
+    return found
+
+
+def _list(columns: Sequence[Column]) -> str:
+    return ", ".join(map(str, columns))
+
+
+def _given(path: str | Path, table: SniffResult, named: NamedColumns) -> dict[str, list[Column]]:
+    """Return the columns that were named, by role."""
+    found: dict[str, list[Column]] = {}
+    for role, titles in (("motors", named.motors), ("outputs", named.outputs), ("positions", named.positions)):
+        found[role] = [column for title in titles for column in _columns(path, table, title)]
+    every = [column for columns in found.values() for column in columns]
+    if twice := next((column for column in every if every.count(column) > 1), None):
+        raise SettingsError(f"column `{twice}` is named twice.")
+    return found
+
+
+def _columns(path: str | Path, table: SniffResult, asked: str) -> list[Column]:
+    """Return a column by its title or index, or those of a range of indices."""
+    known = [*table.columns, *table.words]
+    span = _RANGE.fullmatch(asked)
+    if span is not None and asked not in known:
+        return [_column(path, table, str(k)) for k in range(int(span[1]), int(span[2]) + 1)]
+    return [_column(path, table, asked)]
 
 
 def _column(path: str | Path, table: SniffResult, asked: str) -> Column:
-    """Return a column by its title or index."""
     column: Column = int(asked) if asked.isdecimal() and asked not in table.columns else asked
+    if isinstance(column, int) and column not in table.columns and column < len(table.frame.columns):
+        column = table.frame.columns[column]  # an index of a log with titles
     if column in table.words:
         raise DataError(f"{path}: column `{asked}` holds no numbers.")
     if column not in table.columns:
         known = [str(title) for title in table.columns]
         hint = did_you_mean(asked, known) or f"it has {', '.join(known)}."
-        raise DataError(f"{path}: there is no column `{asked}`; {hint.rstrip()}")
+        raise DataError(f"{path}: there is no column `{asked}`; {hint.strip()}")
     return column
 
 
-def _of_neck(table: SniffResult, motors: Sequence[Column], outputs: Sequence[Column]) -> bool:
+def _require_counts(path: str | Path, robot: Robot, roles: Roles) -> None:
+    motors = len(robot.motors.names)
+    for count, needed, what in (
+        (len(roles.motors), motors, "motor"),
+        (len(roles.outputs), len(robot.outputs.names), "output"),
+        (len(roles.positions), motors if roles.positions else 0, "position"),
+    ):
+        if count != needed:
+            raise DataError(f"{path}: robot {robot.label()} needs {needed} --{what}; {count} were given.")
+
+
+def _of_neck(table: SniffResult, roles: Roles) -> bool:
     """Return whether columns are three winches in angles, pitch and roll."""
-    units = [_unit_of(table, column) or "rad" for column in motors]
-    named = [read_title(str(column)).role for column in outputs]
-    return len(motors) == 3 and named == ["pitch", "roll"] and all(to_si(unit)[1] == "rad" for unit in units)
+    units = [unit_of(table, column)[0] or "rad" for column in roles.motors]
+    titled = [read_title(str(column)).role for column in roles.outputs]
+    return len(units) == 3 and titled == ["pitch", "roll"] and all(to_si(unit)[1] == "rad" for unit in units)
 
 
-def _propose_robot(
-    path: str | Path, table: SniffResult, motors: Sequence[Column], outputs: Sequence[Column]
-) -> tuple[Robot, list[str]]:
-    """Propose a robot for such columns; return it with the units of its motors and outputs."""
-    units = [_common_unit(path, table, titles) for titles in (motors, outputs)]
+def _propose_robot(path: str | Path, table: SniffResult, roles: Roles) -> Robot:
     content = {
         "name": re.sub(r"[^A-Za-z0-9_ ]+", "_", Path(path).stem),
-        "motors": {"names": _names(motors), "unit": units[0]},
-        "outputs": {"names": _names(outputs), "unit": units[1]},
+        "motors": {"names": _names(roles.motors), "unit": _common_unit(path, table, roles.motors)},
+        "outputs": {"names": _names(roles.outputs), "unit": _common_unit(path, table, roles.outputs)},
         "directions": {"kind": "identified"},
     }
     try:
-        robot = Robot.from_dict(content)
+        return Robot.from_dict(content)
     except SettingsError as error:
-        raise DataError(
-            f"{path}: {str(error).removesuffix('.')}. Leave out columns by a layout of your own."
-        ) from error
-    return robot, units
+        raise DataError(f"{path}: {str(error).removesuffix('.')}. Name fewer: --motor COL, --output COL.") from error
 
 
-def layout_for(path: str | Path, robot: Robot) -> Layout:
-    """Return the layout of a log titled by the robot's channels, or by the names of its motors and outputs."""
+def layout_for(path: str | Path, robot: Robot, *, sample_time: float | None = None) -> Layout:
+    """Return the layout of a log titled by the robot's channels, or by the names of its motors and outputs.
+
+    `sample_time`: of a log without a clock [s].
+    """
     table = sniff(path, fewest=2)
-    time, run, rest = _clock(table)
+    roles = find_roles(table, {})
+    rest = [title for title in table.columns if isinstance(title, str) and title not in (roles.time, roles.run)]
+    if not rest:
+        raise DataError(f"{path}: has no titles; name its columns: {columns_line(path, table, roles)}")
     found = {" ".join(_WORD.findall(_UNIT.sub("", title).lower())): title for title in rest}
 
     def title_of(*names: str) -> str:
         keys = [" ".join(_WORD.findall(name.lower())) for name in names]
         title = next((found[key] for key in keys if key in found), None)
         if title is None:
-            raise DataError(f"{path}: no column is titled `{names[-1]}`; it has {', '.join(rest)}. Write a layout.")
+            raise DataError(
+                f"{path}: no column is titled `{names[-1]}`; it has {', '.join(rest)}. Name its columns by --motor COL "
+                "and --output COL."
+            )
         return title
 
-    motors = [
-        title_of(f"motor_setpoint_{j}", channel, name)
+    channels = [
+        (channel, title_of(f"motor_setpoint_{j}", channel, name))
         for j, (channel, name) in enumerate(zip(robot.set_points, robot.motors.names, strict=True), start=1)
     ]
-    outputs = [title_of(name) for name in robot.outputs.names]
-    return _layout(table, robot, motors, outputs, (time, run))
+    channels += [(name, title_of(name)) for name in robot.outputs.names]
+    layout = _layout(table, robot, [*channels, *_own_channels(rest, robot, dict(channels))], roles)
+    return layout if sample_time is None else replace(layout, sample_time=sample_time)
 
 
-def _clock(table: SniffResult) -> tuple[Column | None, Column | None, list[str]]:
-    """Return the columns of time and run, and the titles of all others that move."""
-    titles = [column for column in table.columns if isinstance(column, str)]
-    if len(titles) < len(table.columns):
-        raise DataError("the log has no titles; name its columns in a layout, and its robot in a robot.toml.")
-    roles = {title: read_title(title).role for title in titles}
-    time = next((title for title in titles if roles[title] == "time"), None)
-    run = next((title for title in titles if roles[title] == "run"), None)
-    moving = [t for t in titles if t not in (time, run) and np.nanmax(table.columns[t]) > np.nanmin(table.columns[t])]
-    return time, run, moving
+def _own_channels(titles: Sequence[str], robot: Robot, taken: dict[str, str]) -> list[tuple[str, str]]:
+    """Return the other channels of a recording of `robot`, each with its title."""
+    found: dict[str, str] = {}
+    for title in titles:
+        try:
+            channel, _ = parse_column(title, robot)
+        except SoftneckError:
+            continue
+        if channel not in taken and title not in taken.values():
+            found.setdefault(channel, title)
+    return list(found.items())
 
 
-def _layout(
-    table: SniffResult,
-    robot: Robot,
-    motors: Sequence[Column],
-    outputs: Sequence[Column],
-    clock: tuple[Column | None, Column | None],
-) -> Layout:
-    pairs = [*zip(robot.set_points, motors, strict=True), *zip(robot.outputs.names, outputs, strict=True)]
-    default = dict.fromkeys(robot.set_points, robot.motors.unit) | dict.fromkeys(
-        robot.outputs.names, robot.outputs.display_unit
-    )
+def _layout(table: SniffResult, robot: Robot, channels: Sequence[tuple[str, Column]], roles: Roles) -> Layout:
+    default = dict.fromkeys(robot.outputs.names, robot.outputs.display_unit)
     time = None
-    if clock[0] is not None:
-        unit = DATE if clock[0] in table.dates else read_title(str(clock[0])).unit or "s"
-        time = Source((Term(clock[0]),), unit)
+    if roles.time is not None:
+        clock = DATE if roles.time in table.dates else read_title(str(roles.time)).unit or "s"
+        time = Source((Term(roles.time),), clock)
+
+    def unit(name: str, title: Column) -> str:
+        bracket = _UNIT.search(str(title))
+        known = unit_of(table, title)[0]
+        if known is None and bracket is not None and name not in default and bracket[1].endswith("/s"):
+            known = bracket[1]
+        return known or default.get(name, robot.motors.unit)
+
     return replace(
         table.form,
-        channels={name: Source((Term(title),), _unit_of(table, title) or default[name]) for name, title in pairs},
+        channels={name: Source((Term(title),), unit(name, title)) for name, title in channels},
         time=time,
         sample_time=robot.sample_time_s if time is None else None,
-        run=clock[1],
+        run=roles.run,
         robot=robot,
     )
 
 
 def _common_unit(path: str | Path, table: SniffResult, titles: Sequence[Column]) -> str:
     """Return the common unit in the titles; 1 without any."""
-    named = [_unit_of(table, title) or "1" for title in titles]
-    if len({to_si(unit)[1] for unit in named}) > 1:
+    units = [unit_of(table, title)[0] or "1" for title in titles]
+    if len({to_si(unit)[1] for unit in units}) > 1:
         raise DataError(
-            f"{path}: {', '.join(map(str, titles))} are in {', '.join(named)}, and a robot has one unit for all of "
-            "them; leave out columns by a layout of your own."
+            f"{path}: {_list(titles)} are in {', '.join(units)}, and a robot has one unit for all of them; name those "
+            "of one unit by --motor COL and --output COL."
         )
-    return named[0]
-
-
-def _unit_of(table: SniffResult, title: Column) -> str | None:
-    match = _UNIT.search(str(title))
-    unit = match[1] if match else table.units.get(title)
-    try:
-        return None if unit is None else unit if to_si(unit) else None
-    except DataError:
-        return None
-
-
-def _words(title: str) -> set[str]:
-    return set(_WORD.findall(_UNIT.sub("", title).lower()))
+    return units[0]
 
 
 def _names(titles: Sequence[Column]) -> list[str]:

@@ -1,0 +1,198 @@
+"""Motors, measured positions and outputs of any robot's log, by the words, units and motion of its columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from softneck import import_log
+from softneck.core import DataError, SettingsError, Vector
+from softneck.signals import columns_line, is_of_another_robot
+from softneck.signals.importing._robot_guess import NamedColumns, RobotGuess, guess_robot
+
+ROWS = 400
+
+
+def steps(seed: int, low: float, high: float) -> Vector:
+    """Return levels of 20 samples."""
+    return np.repeat(np.random.default_rng(seed).uniform(low, high, ROWS // 20), 20)
+
+
+def lagged(u: Vector, pole: float) -> Vector:
+    x = np.zeros(ROWS)
+    for k in range(1, ROWS):
+        x[k] = pole * x[k - 1] + (1.0 - pole) * u[k - 1]
+    return x
+
+
+A, B, C = steps(0, 0.0, 90.0), steps(1, 0.0, 90.0), steps(2, 0.0, 90.0)
+NOISE = np.random.default_rng(9).standard_normal((4, ROWS))
+BENT = lagged(A - 0.4 * B, 0.9) + 0.05 * NOISE[0]
+TURNED = lagged(0.3 * A + B, 0.92) + 0.05 * NOISE[1]
+ONE = lagged(A, 0.93) + 0.05 * NOISE[0]
+REACHED_A, REACHED_B = lagged(A, 0.6) + 0.3 * NOISE[2], lagged(B, 0.6) + 0.3 * NOISE[3]
+WARM = 22.0 + np.round(np.cumsum(0.02 * NOISE[2]), 1)
+SAGGING = 12.6 - 0.001 * np.arange(ROWS) + 0.01 * NOISE[3]
+TIME = 0.02 * np.arange(ROWS)
+
+# name -> (columns, motors, positions, outputs, unit of motors, unit of outputs); what is in no list is left out.
+ROBOTS: dict[str, tuple[dict[str, Vector], list[str], list[str], list[str], str, str]] = {
+    "a pneumatic finger": (
+        {"clk ms": 1e3 * TIME, "Pcmd_kPa": A, "P_meas_kPa": REACHED_A, "flexion(deg)": ONE, "T_amb": WARM},
+        ["Pcmd_kPa"], ["P_meas_kPa"], ["flexion(deg)"], "kPa", "deg"),
+    "bellows in bar, in German": (
+        {"Zeit [s]": TIME, "Solldruck 1 [bar]": A, "Solldruck 2 [bar]": B, "Istdruck 1 [bar]": REACHED_A,
+         "Istdruck 2 [bar]": REACHED_B, "Biegewinkel [deg]": BENT, "Umgebungstemperatur": WARM},
+        ["Solldruck 1 [bar]", "Solldruck 2 [bar]"], ["Istdruck 1 [bar]", "Istdruck 2 [bar]"], ["Biegewinkel [deg]"],
+        "bar", "deg"),
+    "a hydraulic cylinder with a valve and a reference of its own": (
+        {"t": TIME, "valve_cmd [V]": A, "pos_ref [mm]": np.roll(B, 3), "pos_meas [mm]": ONE, "pA [bar]": REACHED_A,
+         "oil temp [°C]": WARM},
+        ["valve_cmd [V]"], [], ["pos_meas [mm]"], "V", "mm"),
+    "a servo by its pulses": (
+        {"millis": 1e3 * TIME, "servo_us": 1000.0 + A, "horn angle (deg)": ONE, "vbat": SAGGING},
+        ["servo_us"], [], ["horn angle (deg)"], "us", "deg"),
+    "two servos in angles": (
+        {"time": TIME, "q1_des [deg]": A, "q2_des [deg]": B, "q1_meas [deg]": REACHED_A, "q2_meas [deg]": REACHED_B,
+         "i1 [A]": 0.01 * REACHED_A + NOISE[0], "i2 [A]": 0.01 * REACHED_B + NOISE[1], "tip_x [mm]": BENT,
+         "tip_y [mm]": TURNED},
+        ["q1_des [deg]", "q2_des [deg]"], ["q1_meas [deg]", "q2_meas [deg]"], ["tip_x [mm]", "tip_y [mm]"],
+        "deg", "mm"),
+    "cables, in Spanish": (
+        {"tiempo (s)": TIME, "consigna cable 1 (mm)": A, "consigna cable 2 (mm)": B, "medida cable 1 (mm)": REACHED_A,
+         "medida cable 2 (mm)": REACHED_B, "flexion (deg)": BENT, "bateria (V)": SAGGING},
+        ["consigna cable 1 (mm)", "consigna cable 2 (mm)"], ["medida cable 1 (mm)", "medida cable 2 (mm)"],
+        ["flexion (deg)"], "mm", "deg"),
+    "wires of a shape memory alloy": (
+        {"time [s]": TIME, "I_cmd [mA]": A, "I_meas [mA]": REACHED_A, "T_wire [degC]": 20.0 + ONE,
+         "bend [rad]": 0.01 * ONE, "supply [V]": SAGGING},
+        ["I_cmd [mA]"], ["I_meas [mA]"], ["bend [rad]"], "mA", "rad"),
+    "wires heated by a duty cycle": (
+        {"time [s]": TIME, "duty [%]": A, "current [A]": 0.02 * REACHED_A, "temperature": 20.0 + ONE,
+         "stroke [mm]": ONE},
+        ["duty [%]"], [], ["stroke [mm]"], "%", "mm"),
+    "chambers in psi, in French": (
+        {"temps (s)": TIME, "pression consigne 1 (psi)": A, "pression consigne 2 (psi)": B,
+         "pression mesuree 1 (psi)": REACHED_A, "pression mesuree 2 (psi)": REACHED_B, "fleche (mm)": BENT},
+        ["pression consigne 1 (psi)", "pression consigne 2 (psi)"],
+        ["pression mesuree 1 (psi)", "pression mesuree 2 (psi)"], ["fleche (mm)"], "psi", "mm"),
+    "a pump, in Italian": (
+        {"tempo [s]": TIME, "pompa comando [V]": A, "pressione misurata [bar]": REACHED_A, "angolo [deg]": ONE,
+         "corrente [A]": 0.1 * REACHED_A},
+        ["pompa comando [V]"], [], ["angolo [deg]"], "V", "deg"),
+    "pressures without a word for command or measurement": (
+        {"t_s": TIME, "a [kPa]": A, "b [kPa]": B, "am [kPa]": REACHED_A, "bm [kPa]": REACHED_B, "bend (deg)": BENT},
+        ["a [kPa]", "b [kPa]"], ["am [kPa]", "bm [kPa]"], ["bend (deg)"], "kPa", "deg"),
+    "inputs and outputs of a textbook": (
+        {"t": TIME, "u1": A, "u2": B, "y1": BENT, "y2": TURNED},
+        ["u1", "u2"], [], ["y1", "y2"], "1", "1"),
+    "a joint whose measured angle is all there is": (
+        {"time": TIME, "joint_target [deg]": A, "joint_encoder [deg]": ONE},
+        ["joint_target [deg]"], [], ["joint_encoder [deg]"], "deg", "deg"),
+    "four tendons, the angles as outputs": (
+        {"time": TIME, **{f"motor_cmd_{j} [rad]": one for j, one in enumerate((A, B, C, A[::-1]), start=1)},
+         "pitch [deg]": BENT, "roll [deg]": TURNED, "pitch_ref [deg]": C},
+        [f"motor_cmd_{j} [rad]" for j in range(1, 5)], [], ["pitch [deg]", "roll [deg]"], "rad", "deg"),
+    "pressures by words alone, a tip": (
+        {"time": TIME, "pressure_1": A, "pressure_2": B, "x": BENT, "y": TURNED, "vx": np.gradient(BENT)},
+        ["pressure_1", "pressure_2"], [], ["x", "y"], "1", "1"),
+}  # fmt: skip
+
+
+def write(path: Path, columns: dict[str, Vector]) -> Path:
+    rows = np.column_stack(list(columns.values()))
+    path.write_text(";".join(columns) + "\n" + "\n".join(";".join(f"{v:.6g}" for v in row) for row in rows) + "\n")
+    return path
+
+
+def taken(guess: RobotGuess) -> tuple[list[str], list[str], list[str]]:
+    """Return the columns of set-points, positions and outputs."""
+    robot, channels = guess.robot, guess.layout.channels
+    groups = (robot.set_points, robot.motor_positions, robot.outputs.names)
+    motors, positions, outputs = (
+        [str(channels[name].terms[0].column) for name in names if name in channels] for names in groups
+    )
+    return motors, positions, outputs
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_columns_of_any_robot_get_their_roles(tmp_path: Path, name: str) -> None:
+    columns, motors, positions, outputs, unit, shown = ROBOTS[name]
+    path = write(tmp_path / "log.csv", columns)
+    guess = guess_robot(path)
+    assert taken(guess) == (motors, positions, outputs), guess.lines
+    assert (guess.robot.motors.unit, guess.robot.outputs.display_unit) == (unit, shown)
+    assert is_of_another_robot(path)
+    # Every other column is named with a reason.
+    clock = next(iter(columns))
+    for title in set(columns) - {clock, *motors, *positions, *outputs}:
+        assert any(line.startswith(f"left out: {title}: ") for line in guess.lines), (title, guess.lines)
+    recording = import_log(path, guess.layout).recording
+    assert recording.sample_time == pytest.approx(0.02, rel=1e-6)  # six digits are written
+
+
+def test_the_order_of_columns_changes_no_role(tmp_path: Path) -> None:
+    for name, (columns, motors, positions, outputs, *_) in ROBOTS.items():
+        turned = dict(sorted(columns.items(), key=lambda one: one[0][::-1]))
+        found = taken(guess_robot(write(tmp_path / "log.csv", turned)))
+        assert [sorted(one) for one in found] == [sorted(one) for one in (motors, positions, outputs)], name
+
+
+def test_copies_sums_rates_and_constants_are_named_and_left_out(tmp_path: Path) -> None:
+    columns = {
+        "time": TIME, "valve_1 [V]": A, "valve_2 [V]": B, "valve_3 [V]": np.full(ROWS, 4.0), "tip_x": BENT,
+        "tip_y": TURNED, "pose_x": BENT, "tip_diff": TURNED - BENT, "valve_sum [V]": A + B,
+    }  # fmt: skip
+    guess = guess_robot(write(tmp_path / "log.csv", columns))
+    assert taken(guess)[2] == ["tip_x", "tip_y"]
+    for line in (
+        "left out: valve_3 [V]: constant at 4 (a command that moves nothing)",
+        "left out: pose_x: a copy of tip_x",
+        "left out: tip_diff: exactly tip_y minus tip_x",
+        "valve_sum [V]: exactly valve_1 [V] plus valve_2 [V]",
+    ):
+        assert line in guess.lines, guess.lines
+
+
+def test_what_moves_by_itself_is_no_output(tmp_path: Path) -> None:
+    columns = {"time": TIME, "valve [V]": A, "x": ONE, "z": NOISE[2]}
+    guess = guess_robot(write(tmp_path / "log.csv", columns))
+    assert taken(guess)[2] == ["x"]
+    assert "left out: z: does not follow the motors" in guess.lines
+
+
+def test_references_and_angles_alone_are_no_robot(tmp_path: Path) -> None:
+    columns = {"time": TIME, "target_inclination": A, "sensor_inclination": ONE}
+    path = write(tmp_path / "log.csv", columns)
+    assert not is_of_another_robot(path)
+    with pytest.raises(DataError, match=r"no column was recognised as motor\. Name them: `softneck import"):
+        guess_robot(path)
+
+
+def test_named_columns_are_the_layout_and_the_rest_is_recognised(tmp_path: Path) -> None:
+    columns, motors, positions, outputs, *_ = ROBOTS["a pneumatic finger"]
+    path = write(tmp_path / "log.csv", columns)
+    by_name = import_log(path, motors=motors, positions=positions, outputs=outputs).recording
+    by_guess = import_log(path, guess_robot(path).layout).recording
+    np.testing.assert_array_equal(by_name.outputs, by_guess.outputs)
+    np.testing.assert_array_equal(by_name.motor_positions, by_guess.motor_positions)
+    half = import_log(path, motors=motors)
+    np.testing.assert_array_equal(half.recording.outputs, by_guess.outputs)
+    assert any(note.startswith("left out: T_amb") for note in half.notes)
+    with pytest.raises(SettingsError, match=r"either a layout .* or columns"):
+        import_log(path)
+    with pytest.raises(DataError, match=r"no column `Pcmd`.*did you mean"):
+        import_log(path, motors=["Pcmd"])
+
+
+def test_a_log_without_titles_offers_the_line_that_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    values = np.column_stack([A, B, 0.01 * BENT, 0.01 * TURNED])
+    path.write_text("\n".join(",".join(f"{v:.6g}" for v in row) for row in values) + "\n")
+    assert columns_line(path).startswith(
+        f"`softneck import {path} --motor 0-1 --output 2-3 --sample-time S -o rec.csv`"
+    )
+    guess = guess_robot(path, NamedColumns(motors=("0-1",)), sample_time=0.02)
+    assert [term.column for source in guess.layout.channels.values() for term in source.terms] == [0, 1, 2, 3]
