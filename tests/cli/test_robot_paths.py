@@ -219,6 +219,18 @@ def test_named_columns_of_a_neck_are_the_neck_s(call: Call, tmp_path: Path) -> N
     assert not Path("rec.robot.toml").exists()
 
 
+def test_a_recording_of_ours_keeps_all_its_channels(call: Call) -> None:
+    assert call("record", "steps", "--robot", "finger", "-o", "rec.csv").code == 0
+    said = call("import", "rec.csv", "--guess", "--yes", "-o", "again.csv")
+    assert said.code == 0, said.err
+    before, after = read_recording("rec.csv"), read_recording("again.csv")
+    assert "motor_position_1" in before.channels
+    assert list(after.channels) == list(before.channels)
+    assert after.robot.hash == before.robot.hash
+    for name, values in before.channels.items():
+        np.testing.assert_array_equal(after.channels[name], values)
+
+
 @pytest.mark.parametrize(
     ("words", "line"),
     [

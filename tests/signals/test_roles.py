@@ -196,3 +196,30 @@ def test_a_log_without_titles_offers_the_line_that_reads_it(tmp_path: Path) -> N
     )
     guess = guess_robot(path, NamedColumns(motors=("0-1",)), sample_time=0.02)
     assert [term.column for source in guess.layout.channels.values() for term in source.terms] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("name", "roles", "left_out"),
+    [
+        (
+            "finger.csv",
+            (["Pcmd_kPa"], ["P_meas_kPa"], ["flexion(deg)"]),
+            ["left out: T_amb: 'amb' is neither motor nor output"],
+        ),
+        (
+            "outputs_copied.csv",
+            ([f"valve_{j} [V]" for j in (1, 2, 3)], [], ["tip_x [cm]", "tip_y [cm]"]),
+            ["left out: pose_x [cm]: a copy of tip_x [cm]", "left out: pose_y [cm]: a copy of tip_y [cm]"],
+        ),
+    ],
+)
+def test_the_reported_logs_are_read_as_their_readme_says(
+    shared_data: Path, name: str, roles: tuple[list[str], ...], left_out: list[str]
+) -> None:
+    path = shared_data / "reports" / name
+    if not path.is_file():
+        pytest.skip(f"{path} is absent on this machine")
+    guess = guess_robot(path)
+    assert taken(guess) == roles
+    assert set(left_out) <= set(guess.lines)
+    assert is_of_another_robot(path)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from softneck.cli.start import _possible, _start
-from softneck.cli.start._possible import propose_sensor
+from softneck.cli.start._possible import propose_missing
 from softneck.core import OutputFileError
 from softneck.fmu.compiled import _library
 from softneck.robot import Robot
@@ -46,7 +46,7 @@ def recorded(file: Path) -> Recording:
 def test_what_a_file_does_not_say_of_the_sensor_is_proposed_and_marked(tmp_path: Path, said: str) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(said + ROBOT if said.startswith("\nsensor.") else ROBOT + said, encoding="utf-8")
-    keys = propose_sensor(file, [recorded(file)])
+    keys = propose_missing(file, [recorded(file)], motors=False)
     assert keys == [key for key in ("noise_std", "delay_s", "rate_hz") if key not in said]
     robot = Robot.read(file)
     # The median of 2,000 fourth differences: 3 % is two of its standard errors.
@@ -56,7 +56,7 @@ def test_what_a_file_does_not_say_of_the_sensor_is_proposed_and_marked(tmp_path:
         assert len(doubts_in(file)) == len(keys)
         assert "# An arm." in file.read_text(encoding="utf-8")
     before = file.read_text(encoding="utf-8")
-    assert propose_sensor(file, [recorded(file)]) == []
+    assert propose_missing(file, [recorded(file)], motors=False) == []
     assert file.read_text(encoding="utf-8") == before
 
 
@@ -65,7 +65,7 @@ def test_a_sensor_without_noise_is_as_uncertain_as_its_steps(tmp_path: Path) -> 
     file.write_text(ROBOT, encoding="utf-8")
     clean = recorded(file)
     channels = {**clean.channels, "x": 1e-4 * np.round(10.0 * np.sin(clean.time))}
-    propose_sensor(file, [Recording(clean.time, 0.05, channels, clean.run, clean.robot)])
+    propose_missing(file, [Recording(clean.time, 0.05, channels, clean.run, clean.robot)], motors=False)
     noise = Robot.read(file).noise_std
     assert noise is not None
     assert noise >= 0.1 / math.sqrt(12.0) * 0.99  # steps of 0.1 mm; three digits are written
