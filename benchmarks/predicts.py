@@ -1,12 +1,17 @@
 """Print how well `identify auto` predicts: its scores beside what the kinds are then worth on tests it never saw.
 
-`python benchmarks/predicts.py [--necks NECK...] [--seed N] [--workers N] [--fresh]`
+`python benchmarks/predicts.py [--necks NECK...] [--seed N] [--workers N] [--fresh] [--each [--kinds KIND...]]`
 
 On each neck `choose` gets 140 s of Eq. 22, the last 30 % held out. What a kind is truly worth is its worst axis of
 steps, sine and rotation in free run, trained with its defaults on the whole 140 s: from `benchmarks/baseline.py`, which
 computes what is not kept. Printed for each neck: the rank correlation (Spearman) over the kinds between the scores and
 the truth, that of the hold-out alone, and the regret: the best kind's worst axis less that of the chosen model.
 Choices are kept in `build/predicts`; they are of the code that made them: use --fresh after a change.
+
+`--each`: how well the first figure that `identify KIND` prints predicts. Each kind is identified from 140 s of Eq. 22,
+and from these and 60 s of `mixed`. Printed: that figure and its part, what it expects of other motions, the hold-out,
+and the truth of this very model: its worst axis of steps, sine and rotation; then the share of neck x kind within 5
+points of it.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from __future__ import annotations
 import argparse
 import os
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, cast
@@ -22,12 +28,14 @@ import numpy as np
 from scipy.stats import rankdata
 from threadpoolctl import threadpool_limits
 
-from benchmarks.baseline import Job, compute, records_of_tests, training
-from softneck.identification import INFINITE, Model, SetMembership, choose, validate
+from benchmarks.baseline import MODELS, Job, compute, recorded, records_of_tests, training
+from softneck.identification import INFINITE, Model, SetMembership, choose, identify, validate
+from softneck.signals import signal
+from tests.foreign_necks.held_out import HELD_OUT
 from tests.foreign_necks.kept import keep, kept_lines
 from tests.foreign_necks.necks import CHOOSING
 
-SHOWN = (*CHOOSING, "paper", "rough")
+SHOWN = (*CHOOSING, "paper", "rough", *HELD_OUT)
 OUT = Path("build/predicts")
 # What is judged; `residual` and `ensemble` are made of these, and the baseline has the paper's form of `nlsm`.
 KINDS = ("rls", "oe", "greybox", "play", "nn")
@@ -84,6 +92,61 @@ def choices(necks: list[str], seed: int, workers: int, *, fresh: bool) -> dict[s
     return {neck: known[neck] for neck in necks}
 
 
+# What a score may be off [points].
+NEAR = 5.0
+
+
+def each(neck: str, kind: str, motions: int, seed: int) -> dict[str, Any]:
+    """Return what `identify KIND` prints of its model and what this model is worth, worst axis [%]."""
+    parts = [training(neck, seed), recorded(neck, signal("mixed", duration=60.0), 10 * seed + 5)][:motions]
+    begin = processor_seconds()
+    with threadpool_limits(1):
+        model = identify(kind, parts)
+    seconds = processor_seconds() - begin
+    said = model.findings["examination"]
+    # An examination that failed says nothing: it counts as one that says 0 %.
+    least = {part: _least(fits.values()) for part, fits in said["parts"].items()}
+    return {"said": said, "least": least, "worth": worst_axis(model, neck, seed), "seconds": seconds}
+
+
+def print_each(necks: list[str], kinds: list[str], seed: int, *, fresh: bool) -> None:
+    """Print what each kind says of itself beside what it is worth; what an earlier run has computed is read."""
+    kept = OUT / f"each{seed}.jsonl"
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    if fresh:
+        kept.unlink(missing_ok=True)
+    known = {tuple(line["job"]): line["found"] for line in kept_lines(kept)}
+    for motions in (1, 2):
+        print(
+            f"\n{motions} motion(s)\n{'neck':9}{'kind':9}{'said':>6}{'expected':>17}{'hold-out':>10}{'truth':>7}  part"
+        )
+        table = []
+        for neck, kind in product(necks, kinds):
+            job = (neck, kind, motions)
+            if job not in known:
+                known[job] = each(*job, seed)
+                keep(kept, {"job": job, "found": known[job]})
+            one = known[job]
+            said, worth = one["said"], one["worth"]
+            fit, expected, low, high = (
+                -100.0 if said[key] is None else said[key] for key in ("fit", "expected", "low", "high")
+            )
+            table.append([abs(other - worth) for other in (fit, expected, one["least"]["hold-out"])])
+            table[-1].append(float(low <= worth <= high))
+            parts = ", ".join(f"{part} {value:.0f}" for part, value in one["least"].items())
+            print(
+                f"{neck:9}{kind:9}{fit:6.1f}{f'{expected:.1f} ({low:.0f}..{high:.0f})':>17}"
+                f"{one['least']['hold-out']:10.1f}{worth:7.1f}  {said['part']}; {parts}; {one['seconds']:.0f} s",
+                flush=True,
+            )
+        found = np.array(table)
+        near = [f"{100.0 * share:.0f} %" for share in (found[:, :3] <= NEAR).mean(axis=0)]
+        print(
+            f"within {NEAR:g} points of the truth, of {len(table)}: the worst part {near[0]}, what is expected "
+            f"{near[1]}, the hold-out {near[2]}; the interval holds {100.0 * found[:, 3].mean():.0f} % of the truths"
+        )
+
+
 def _rank_correlation(a: list[float], b: list[float]) -> float:
     return float(np.corrcoef(rankdata(a), rankdata(b))[0, 1])
 
@@ -95,7 +158,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of noise and of kinds that start at random (0)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
     parser.add_argument("--fresh", action="store_true", help="choose again; the baseline stays")
+    parser.add_argument("--each", action="store_true", help="what `identify KIND` prints of each kind")
+    parser.add_argument("--kinds", nargs="+", choices=MODELS, default=list(MODELS), help="of --each (all)")
     wanted = parser.parse_args()
+    if wanted.each:
+        print_each(wanted.necks, wanted.kinds, wanted.seed, fresh=wanted.fresh)
+        return
     jobs = [Job(neck, kind, wanted.seed) for neck in wanted.necks for kind in KINDS]
     truths = {
         job: _least(np.ravel(found["fits"]).tolist())

@@ -59,7 +59,7 @@ def identify_auto(
         model = _model(taken)
         if tolerance is not None:
             model = identification.with_tolerance(model, tolerance)
-        models.append(identification.with_fit(model, taken.chosen.judged))
+        models.append(identification.with_fit(model, taken.chosen.judged, taken.examination))
         models[-1].save(file, force=overwrite)
     for file in beside.values():
         if file not in saved:

@@ -40,6 +40,7 @@ from .models._fitting import check_training, payload_of
 from .models._model import Model
 from .models._validity import with_tolerance
 from .selection._auto import Choice, choose
+from .selection._examination import Examination, examine
 from .uncertainty._draws import make_draws
 from .uncertainty._family import Family
 from .uncertainty._family_fit import FamilySettings
@@ -137,7 +138,8 @@ def identify(
 ) -> Model:
     """Fit a model of `kind` to the first part of each run and validate it on the rest.
 
-    The command `softneck identify KIND` does the same. `summary()` and `findings["hold_out"]` give the fit on the rest.
+    The command `softneck identify KIND` does the same. `findings["examination"]` and the first line of `summary()` give
+    the worst fit on what was left out: the rest, and parts of the first part that the kind is trained again without.
 
     Args:
         kind: name in the table of kinds: "rls", "oe", "nlsm", "nn", ...; "auto" compares all of them and returns the
@@ -188,8 +190,11 @@ def fit_and_validate(
     model = model if tolerance is None else with_tolerance(model, tolerance)
     if tail is None or all(len(run) < _MIN_HELD_OUT_ROWS for run in tail.runs()):
         return model, None
+    examination = None
+    if why_at_rest(tail, whole) is None:
+        examination, model = examine(estimator, model, head, tail, progress)
     held_out = validate(model, tail, horizons=(1, INFINITE))
-    return with_fit(model, held_out), held_out
+    return with_fit(model, held_out, examination), held_out
 
 
 def _best_kind(
@@ -209,7 +214,8 @@ def _best_kind(
     if model is None:
         raise DataError("the kind chosen by `auto` has no model.")
     model = model if tolerance is None else with_tolerance(model, tolerance)
-    return with_fit(replace(model, findings={**model.findings, "chosen": choice.why}), choice.chosen.judged)
+    model = replace(model, findings={**model.findings, "chosen": choice.why})
+    return with_fit(model, choice.chosen.judged, choice.examination)
 
 
 def choose_kind(parts: Sequence[Recording], *, name: str, train: float, seed: int, progress: Progress) -> Choice:
@@ -234,10 +240,11 @@ def _split_for_choice(parts: Sequence[Recording], train: float) -> tuple[Recordi
     return head, tail, False
 
 
-def with_fit(model: Model, held_out: Validation | None) -> Model:
-    """Return the model with its fit on the rows held out, which `softneck design` requires."""
+def with_fit(model: Model, held_out: Validation | None, examination: Examination | None = None) -> Model:
+    """Return the model with its examination, and its fit on the rows held out, which `softneck design` requires."""
     if held_out is None:
         return model
+    examined = {} if examination is None else {"examination": examination.findings(model.kind, model.robot)}
     scores = {
         "fit": held_out.fits[INFINITE],
         "one_step": held_out.fits.get("1", {}),
@@ -245,7 +252,7 @@ def with_fit(model: Model, held_out: Validation | None) -> Model:
         "diverged": held_out.diverged,
         "rows": held_out.rows_scored,
     }
-    return replace(model, findings={**model.findings, "hold_out": scores})
+    return replace(model, findings={**model.findings, **examined, "hold_out": scores})
 
 
 def family(

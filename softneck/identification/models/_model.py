@@ -57,6 +57,8 @@ WARM_UP = 25
 _MOTOR_SOURCES = ("simulated", "measured")
 # A longer sample time, of a neck 10 s, is a mistake in the file.
 _MAX_SAMPLE_TIME_CONSTANTS = 50.0
+# Of bounds in simulation, which promise all samples only where their assumption holds.
+_BOUND_PCT = 90
 # Kinds without a symbolic form: they look their output up among the points of a set.
 _SET_BASED_KINDS = ("nlsm",)
 
@@ -327,7 +329,9 @@ class Model(ReprMixin):
 
     def summary(self) -> str:
         """Return a few lines on the model, in degrees."""
-        lines = [f"{self.kind}: {KINDS[self.kind].summary}", f"sample time {1e3 * self.sample_time:g} ms"]
+        lines = [f"{self.kind}: {KINDS[self.kind].summary}"]
+        lines += _examined_lines(self.findings.get("examination", {}), self.robot.outputs.display_unit)
+        lines.append(f"sample time {1e3 * self.sample_time:g} ms")
         if self.robot.in_header():
             outputs = ", ".join(self.robot.outputs.names)
             lines.append(f"robot {self.robot.label()}: {len(self.robot.motors.names)} motor(s), outputs {outputs}")
@@ -424,6 +428,23 @@ def _input_rows(run: Recording, source: str, *, outputs: bool = True) -> Matrix:
     if source == "measured" and run.has_motor_positions:
         rows[:, both:] = run.motor_positions
     return rows
+
+
+def _examined_lines(found: Mapping[str, Any], unit: str) -> list[str]:
+    """Return the line of a summary on the examination: the worst fit, and the one to be expected."""
+    if not found:
+        return []
+    worst = f"simulation fit {percent(found['fit'])} % at its worst ({found['part']}, {found['output']})"
+    if found["low"] is None:
+        return [worst]
+    expected = f"on other motions {found['expected']:.0f} % ({found['low']:.0f} to {found['high']:.0f} %)"
+    lacks = f": one motion is too little to say more; {found['record']}" if found.get("record") else ""
+    lines = [f"{worst}; {expected}{lacks}"]
+    if bounds := found.get("bounds"):
+        least, wide = min(bounds["held_pct"].values()), max(bounds["width"].values())
+        kept = "held" if least >= _BOUND_PCT else f"are no {_BOUND_PCT} % bounds: they held"
+        lines.append(f"bounds in simulation {kept} {least:.0f} % of motions left out, mean width {wide:.3g} {unit}")
+    return lines
 
 
 def _held_out_lines(found: Mapping[str, Any], names: Sequence[str]) -> list[str]:

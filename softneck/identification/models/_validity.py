@@ -98,6 +98,40 @@ def limit_validity(model: Model, errors: Matrix) -> Model:
     return replace(model, arrays={**model.arrays, "doubt": doubt})
 
 
+# Kinds that are right on nearly all rows of their training, so that these say nothing of v.
+_BLIND_TO_THEIR_ERROR = ("nlsm",)
+# Largest factor on v that is looked for, and halvings of its logarithm: it is then known to 1 %.
+_MAX_FACTOR, _HALVINGS = 1e5, 10
+
+
+def calibrate_validity(model: Model, again: Model, recording: Recording, unseen: np.ndarray) -> Model:
+    """Return the model with a v that holds on motions that a training did not see.
+
+    `again` is of the same kind, trained without the rows `unseen` (time,) of the recording. v is multiplied so that the
+    mean of its validity there is the share of rows with all errors within the tolerance; never made smaller. Other
+    kinds than set membership are returned as they are: the ratio of `TRUST` serves them as well.
+    """
+    allowed = tolerance_of(again)
+    if model.kind not in _BLIND_TO_THEIR_ERROR or allowed is None or not (has_validity(model) and has_validity(again)):
+        return model
+    doubt = again.arrays["doubt"].copy()
+    v, doubt[:, 0] = float(doubt[:, 0].max()), 0.0
+    outputs = np.asarray(replace(again, arrays={**again.arrays, "doubt": doubt}).simulate(recording))
+    errors = np.abs(recording.outputs - outputs[:, : allowed.size])
+    unseen = unseen & np.isfinite(recording.outputs).all(axis=1) & np.isfinite(outputs).all(axis=1)
+    if not unseen.any():
+        return model
+    share = float((errors[unseen] <= allowed).all(axis=1).mean())
+    outside = 1.0 / np.maximum(outputs[unseen, -1], 1e-9) - 1.0
+    low, high = 1.0, _MAX_FACTOR
+    for _ in range(_HALVINGS):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if np.mean(1.0 / (1.0 + outside + middle * v)) > share else (low, middle)
+    doubt = model.arrays["doubt"].copy()
+    doubt[:, 0] *= low
+    return replace(model, arrays={**model.arrays, "doubt": doubt})
+
+
 def tolerance_finding(robot: Robot, allowed: Vector) -> dict[str, Any]:
     """Return the finding with the error that `validity` allows, given as (outputs,) in SI, in the display unit."""
     unit = robot.outputs.display_unit

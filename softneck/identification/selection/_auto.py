@@ -26,13 +26,15 @@ from softneck.signals import Recording, poor_excitation
 from ..models._arrays import members
 from ..models._linear_systems import KINDS as LINEAR
 from ..models._model import Model
+from ..models._validity import calibrate_validity
 from ..set_membership._set_membership import noise_si
 from ..uncertainty._guarded import BASES, OF, Guarded, fitted_base
 from ..validation._score_tables import INFINITE
 from ..validation._validation import Rules, Validation, judge, judged_parts
+from ._examination import HOLD_OUT, SECOND, SHORT, Examination, Fits, other_motion, second_training, unseen_rows
 from ._left_out import Fold, agreement, all_rows, exams, folds, free_runs
 
-EXAM, HOLD_OUT, COLD = "agreement", "hold-out", "cold start"
+EXAM, COLD = "agreement", "cold start"
 # What is in a model file but was not found from data: sizes, tables, copies of rows in another order; and what says how
 # far a model is known, which every kind has.
 _NOT_FOUND = ("history", "memory", "table", "redefinition", "nodes", "frame", "scale", "input_scale", "output_scale",
@@ -46,7 +48,7 @@ class KindTrial:
     seconds: of training; model: None where it failed; judged: on the rows held out, None where it failed or stopped
     early; left_out, errors: what was left out of a training -> fit on it and standard error over blocks of
     2 s [%] ("agreement": with the other kinds on motions that nobody recorded, without error); whole: trained on all
-    rows.
+    rows; outputs: what was left out -> output -> fit on it [%].
     """
 
     kind: str
@@ -57,6 +59,7 @@ class KindTrial:
     left_out: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     whole: bool = True
+    outputs: Mapping[str, Fits] = field(default_factory=dict)
 
     @property
     def scores(self) -> dict[str, float]:
@@ -174,12 +177,8 @@ def _remarks(ranking: tuple[KindTrial, ...], other_excitation: bool) -> tuple[st
 _SIMPLE_FIRST = ("rls", "oe", "greybox", "play", "nlsm", "nn")
 # Settings other than the default: that form of set membership which can run free.
 _SETTINGS: dict[str, dict[str, Any]] = {"nlsm": {"form": "residual"}}
-# Cheaper settings of the same method, by which kinds are compared: fewer starts and steps.
-_SCREENED: dict[str, dict[str, Any]] = {
-    "greybox": {"evaluations": 15, "sensor_delay": 2},
-    "nn": {"starts": 1, "iterations": 8, "refine": 6},
-    "nlsm": {"output_weight": 5.0},
-}
+# Cheaper settings of the same method, by which kinds are compared.
+_SCREENED: dict[str, dict[str, Any]] = {**SHORT, "nlsm": {"output_weight": 5.0}}
 # Of the noise: the epsilon of screened sets, whose own choice among many takes several times as long.
 _EPSILON_SIGMAS = 8.0
 # What a guarded form may cost on the rows held out [points]: it is taken for what it does elsewhere.
@@ -197,12 +196,19 @@ class Choice(ReprMixin):
         chosen: the one to take.
         why: sentences for people.
         remarks: what to be wary of.
+        other_motion: whether something left out was another motion.
     """
 
     ranking: tuple[KindTrial, ...]
     chosen: KindTrial
     why: str
     remarks: tuple[str, ...]
+    other_motion: bool = False
+
+    @property
+    def examination(self) -> Examination:
+        """What was left out, and the fits of the chosen one on it."""
+        return Examination(self.chosen.outputs, self.other_motion)
 
 
 def kinds_to_try() -> tuple[str, ...]:
@@ -257,7 +263,8 @@ def choose(
     progress(1.0, f"chosen: {chosen.kind}")
     alike = [one for one in ranking if one.fit > best.fit - ALIKE and one not in (best, chosen)]
     wary = (*poor_excitation(train), *_remarks(ranking, other_excitation))
-    return Choice(ranking, chosen, _explain_choice(best, alike) + _explain_guarded(best, chosen), wary)
+    why = _explain_choice(best, alike) + _explain_guarded(best, chosen)
+    return Choice(ranking, chosen, why, wary, other_excitation or other_motion(train))
 
 
 def _kinds_in_order(kinds: Sequence[str]) -> list[str]:
@@ -299,7 +306,7 @@ class _Race:
         try:
             model = self.short[kind] = self._short(kind, fold.train)
             seconds = time.perf_counter() - begin
-            found = {part.name: part.fit(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
+            found = {part.name: part.fits(model) for part in (*fold.judged, all_rows(HOLD_OUT, self.hold_out))}
         except Exception as error:  # one kind never ends the search
             self.tried[kind] = KindTrial(kind, time.perf_counter() - begin, failure=_reason(error))
             return
@@ -318,7 +325,8 @@ class _Race:
         linear = sorted((kind for kind in self._worth if kind in LINEAR), key=lambda kind: -self._worth[kind])
         voters = {kind: fit for kind, fit in self._worth.items() if kind not in linear[1:]}
         for kind, fit in agreement(self._free, voters).items():
-            self.tried[kind] = _with(self.tried[kind], {EXAM: (fit, float("nan"))})
+            one = self.tried[kind]
+            self.tried[kind] = replace(one, left_out={**one.left_out, EXAM: fit})
 
     def leave_out(self, progress: Progress) -> None:
         """Go through the other folds with the better half of those that are left."""
@@ -334,9 +342,10 @@ class _Race:
         begin = time.perf_counter()
         try:
             model = self._short(kind, fold.train)
-            found = {part.name: part.fit(model) for part in fold.judged}
+            found = {part.name: part.fits(model) for part in fold.judged}
         except Exception:  # one kind never ends the search
-            found = {part.name: (float("-inf"), float("nan")) for part in fold.judged}
+            lost = dict.fromkeys(fold.train.robot.outputs.names, float("-inf"))
+            found = {part.name: (lost, float("nan")) for part in fold.judged}
         one = self.tried[kind]
         self.tried[kind] = _with(replace(one, seconds=one.seconds + time.perf_counter() - begin), found)
 
@@ -376,7 +385,11 @@ class _Race:
         except Exception as error:  # one kind never ends the search
             self.tried["guarded"] = KindTrial("guarded", time.perf_counter() - begin, failure=_reason(error))
             return best
-        one = KindTrial("guarded", time.perf_counter() - begin, model, judged, "", best.left_out, best.errors)
+        outputs = {**best.outputs, HOLD_OUT: all_rows(HOLD_OUT, self.hold_out).fits(model)[0]}
+        outputs.pop(SECOND, None)  # of its kind alone: where two trainings part, the base is taken
+        one = KindTrial(
+            "guarded", time.perf_counter() - begin, model, judged, "", best.left_out, best.errors, outputs=outputs
+        )
         self.tried["guarded"] = one
         return one if one.hold_out_fit > best.hold_out_fit - _GUARD_COST else best
 
@@ -394,13 +407,18 @@ class _Race:
             if one.model is None:
                 raise DataError(one.failure)
             model = _settings(kind, self.seed, {}).fit(self.train)
+            if self.folds[0].judged:
+                model = calibrate_validity(model, self.short[kind], *unseen_rows(self.folds[0]))
             judged = self._validate(kind, model)
-            error = all_rows(HOLD_OUT, self.hold_out).fit(model)[1]
+            fits, error = all_rows(HOLD_OUT, self.hold_out).fits(model)
+            outputs = {**one.outputs, HOLD_OUT: fits}
+            if self.folds[0].judged:
+                outputs[SECOND] = second_training(model, self.short[kind], self.folds[0])
         except Exception as error:  # one kind never ends the search
             self.tried[kind] = KindTrial(kind, one.seconds, failure=_reason(error))
             return
         one = replace(one, seconds=one.seconds + time.perf_counter() - begin, errors={**one.errors, HOLD_OUT: error})
-        self.tried[kind] = replace(one, model=model, judged=judged, whole=True)
+        self.tried[kind] = replace(one, model=model, judged=judged, whole=True, outputs=outputs)
 
     def _simplest_of_the_best(self) -> KindTrial:
         ranking = self.ranking()
@@ -421,11 +439,22 @@ class _Race:
         return judge(model, judged_parts(model, self.hold_out, rules, self._known), rules, names=(kind, HOLD_OUT))
 
 
-def _with(one: KindTrial, found: Mapping[str, tuple[float, float]]) -> KindTrial:
+def _with(one: KindTrial, found: Mapping[str, tuple[Fits, float]]) -> KindTrial:
     """Return the trial with more scores, each with its standard error."""
-    left_out = {name: fit for name, (fit, _) in found.items()}
+    outputs = {name: fits for name, (fits, _) in found.items()}
+    left_out = {name: _mean_of_moved(fits) for name, fits in outputs.items()}
     errors = {name: error for name, (_, error) in found.items() if np.isfinite(error)}
-    return replace(one, left_out={**one.left_out, **left_out}, errors={**one.errors, **errors})
+    return replace(
+        one,
+        left_out={**one.left_out, **left_out},
+        errors={**one.errors, **errors},
+        outputs={**one.outputs, **outputs},
+    )
+
+
+def _mean_of_moved(fits: Fits) -> float:
+    known = [fit for fit in fits.values() if not np.isnan(fit)]
+    return float(np.mean(known)) if known else float("-inf")
 
 
 def _settings(kind: str, seed: int, other: Mapping[str, Any]) -> Any:

@@ -88,15 +88,20 @@ class Judged:
     recording: Recording
     rows: np.ndarray
 
-    def fit(self, model: Model) -> tuple[float, float]:
-        """Return the simulation fit [%], mean over outputs, and its standard error over blocks; or -inf and NaN."""
+    def fits(self, model: Model) -> tuple[dict[str, float], float]:
+        """Return output -> simulation fit [%], NaN where it was at rest, and the standard error of their mean.
+
+        All are -inf where the simulation diverged.
+        """
         y = np.where(self.rows[:, None], self.recording.outputs, np.nan)
         free = model.simulate(self.recording)[:, : y.shape[1]]
-        fits = [nrmse_fit(y[:, i], free[:, i]) for i in range(y.shape[1])]
+        names = model.robot.outputs.names
+        if not np.isfinite(free).all():
+            return dict.fromkeys(names, float("-inf")), float("nan")
+        fits = np.array([nrmse_fit(y[:, i], free[:, i]) for i in range(y.shape[1])])
         moved = np.isfinite(fits)
-        if not np.isfinite(free).all() or not moved.any():
-            return float("-inf"), float("nan")
-        return float(np.mean(np.array(fits)[moved])), standard_error(y[:, moved], free[:, moved])
+        error = standard_error(y[:, moved], free[:, moved]) if moved.any() else float("nan")
+        return dict(zip(names, fits.tolist(), strict=True)), error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
