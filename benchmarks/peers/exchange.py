@@ -1,7 +1,8 @@
 """What a peer reads and writes: recordings in, free runs out, its choices made by the last fifth of the training rows.
 
 `python PEER.py DATA.npz RESULT.npz SEED` runs in the peer's own environment; DATA holds `u_NAME` (time, 3) and `y_NAME`
-(time, 2) for `train` and what to run free on. The first 25 outputs of each are given, as to every kind of ours.
+(time, 2) for `train_1`, `train_2`, .. and what to run free on. The first 25 outputs of each are given, as to every kind
+of ours.
 """
 
 from __future__ import annotations
@@ -17,6 +18,14 @@ HOLD_OUT = 0.2
 FARTHEST = 1e3
 
 FreeRun = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Runs = list[tuple[np.ndarray, np.ndarray]]
+
+
+def heads_and_tails(runs: Runs, share: float) -> tuple[Runs, Runs]:
+    """Return the first part of each run, and its last `share`."""
+    cuts = [round((1.0 - share) * len(u)) for u, _ in runs]
+    heads = [(u[:cut], y[:cut]) for (u, y), cut in zip(runs, cuts, strict=True)]
+    return heads, [(u[cut:], y[cut:]) for (u, y), cut in zip(runs, cuts, strict=True)]
 
 
 def fit(y: np.ndarray, free: np.ndarray) -> float:
@@ -30,17 +39,19 @@ def finite(free: np.ndarray) -> np.ndarray:
     return np.clip(np.nan_to_num(free, nan=FARTHEST), -FARTHEST, FARTHEST)
 
 
-def answer(train: Callable[[np.ndarray, np.ndarray, int], tuple[FreeRun, str]], *packages: str) -> None:
+def answer(train: Callable[[Runs, int], tuple[FreeRun, str]], *packages: str) -> None:
     """Train the peer, run it free on everything, and write the outputs.
 
     Args:
-        train: from set-points, outputs and a seed to a free run and a word on what was chosen.
+        train: from runs of set-points and outputs, and a seed, to a free run and a word on what was chosen.
         packages: whose versions to state.
     """
     source, target, seed = sys.argv[1:4]
     data = np.load(source)
-    names = [name[2:] for name in data.files if name.startswith("u_") and name != "u_train"]
-    run, chosen = train(data["u_train"], data["y_train"], int(seed))
+    names = [name[2:] for name in data.files if name.startswith("u_")]
+    runs = [(data[f"u_{name}"], data[f"y_{name}"]) for name in names if name.startswith("train_")]
+    run, chosen = train(runs, int(seed))
+    names = [name for name in names if not name.startswith("train_")]
     outputs = {name: finite(run(data[f"u_{name}"], data[f"y_{name}"])) for name in names}
     about = ", ".join(f"{package} {version(package)}" for package in packages)
     outputs["chosen"] = np.array(f"{about}: {chosen}")

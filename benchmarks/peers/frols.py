@@ -6,7 +6,7 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from exchange import HOLD_OUT, WARM_UP, FreeRun, answer, finite, fit
+from exchange import HOLD_OUT, WARM_UP, FreeRun, Runs, answer, finite, fit, heads_and_tails
 from sysidentpy.basis_function import Polynomial
 from sysidentpy.model_structure_selection import FROLS
 from sysidentpy.parameter_estimation import LeastSquares
@@ -16,7 +16,7 @@ FORMS = ((1, 5, 15), (2, 3, 15), (2, 5, 15), (2, 5, 25), (2, 3, 40))
 
 
 def fitted(u: np.ndarray, y: np.ndarray, form: tuple[int, int, int]) -> FROLS:
-    """Return one axis' model, y (time, 1)."""
+    """Return one axis' model, y (time, 1). It takes one run: several are joined."""
     degree, lag, terms = form
     model = FROLS(
         order_selection=False,
@@ -39,17 +39,20 @@ def free_run(model: FROLS, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.concatenate([y[:WARM_UP, 0], out[model.max_lag :, 0]])
 
 
-def train(u: np.ndarray, y: np.ndarray, seed: int) -> tuple[FreeRun, str]:
-    """Choose by free run on the last fifth, then fit on all rows; it has no random start."""
+def train(runs: Runs, seed: int) -> tuple[FreeRun, str]:
+    """Choose by free run on the last fifth of each run, then fit on all rows; it has no random start."""
     del seed
-    scale, cut = y.std(axis=0), round((1.0 - HOLD_OUT) * len(u))
+    heads, tails = heads_and_tails(runs, HOLD_OUT)
+    (u, y), (u_head, y_head) = (tuple(map(np.vstack, zip(*part, strict=True))) for part in (runs, heads))
+    scale = y.std(axis=0)
     models, chosen = [], []
     for axis in range(2):
-        z = y[:, axis : axis + 1] / scale[axis]
+        z = y[:, [axis]] / scale[axis]
         tried = []
         for form in FORMS:
-            free = finite(free_run(fitted(u[:cut], z[:cut], form), u[cut:], z[cut:]))
-            tried.append((fit(z[cut:], free[:, None]), form))
+            model = fitted(u_head, y_head[:, [axis]] / scale[axis], form)
+            free = [(w[:, [axis]] / scale[axis], v) for v, w in tails]
+            tried.append((np.mean([fit(w, finite(free_run(model, v, w))[:, None]) for w, v in free]), form))
         best = max(tried)[1]
         chosen.append(f"degree {best[0]}, lags {best[1]}, {best[2]} terms")
         models.append(fitted(u, z, best))

@@ -12,7 +12,7 @@ os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_thunk_runtime=false")
 
 import jax.numpy as jnp
 import numpy as np
-from exchange import HOLD_OUT, WARM_UP, FreeRun, answer, fit
+from exchange import HOLD_OUT, WARM_UP, FreeRun, Runs, answer, fit, heads_and_tails
 from jax_sysid.models import LinearModel, Model
 
 STATES, PENALTIES = (4, 6), (1e-5, 1e-4)
@@ -20,7 +20,7 @@ NEURONS = 10
 ADAM, LBFGS = 200, 600
 
 
-def trained(u: np.ndarray, y: np.ndarray, states: int, penalty: float, seed: int) -> Model:
+def trained(u: list[np.ndarray], y: list[np.ndarray], states: int, penalty: float, seed: int) -> Model:
     """Return a model of scaled data: `x+ = A x + B u + E tanh(F x + G u + h)`, `y = C x + c`."""
     linear = LinearModel(states, 2, 3, feedthrough=False)
     linear.loss(rho_x0=1e-4, rho_th=1e-5)
@@ -49,23 +49,31 @@ def trained(u: np.ndarray, y: np.ndarray, states: int, penalty: float, seed: int
     return model
 
 
+def separate(runs: Runs) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the inputs and the outputs of all runs: jax-sysid takes a list of each."""
+    return [u for u, _ in runs], [y for _, y in runs]
+
+
 def free_run(model: Model, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the free run (time, 2); its start is found from the given rows by jax-sysid's smoother."""
     x0 = model.learn_x0(u[:WARM_UP], y[:WARM_UP], RTS_epochs=10, verbosity=False)
     return np.asarray(model.predict(np.asarray(x0), u)[0])
 
 
-def train(u: np.ndarray, y: np.ndarray, seed: int) -> tuple[FreeRun, str]:
-    """Choose by free run on the last fifth, then train on all rows."""
-    spread, middle, size = u.std(axis=0), y.mean(axis=0), y.std(axis=0)
-    v, z, cut = u / spread, (y - middle) / size, round((1.0 - HOLD_OUT) * len(u))
+def train(runs: Runs, seed: int) -> tuple[FreeRun, str]:
+    """Choose by free run on the last fifth of each run, then train on all rows."""
+    U, Y = (np.vstack(part) for part in zip(*runs, strict=True))
+    spread, middle, size = U.std(axis=0), Y.mean(axis=0), Y.std(axis=0)
+    scaled = [(u / spread, (y - middle) / size) for u, y in runs]
+    heads, tails = heads_and_tails(scaled, HOLD_OUT)
     tried = []
     for states in STATES:
         for penalty in PENALTIES:
-            free = free_run(trained(v[:cut], z[:cut], states, penalty, seed), v[cut:], z[cut:])
-            tried.append((fit(z[cut:], np.nan_to_num(free, nan=1e3)), states, penalty))
+            model = trained(*separate(heads), states, penalty, seed)
+            fits = [fit(y, np.nan_to_num(free_run(model, u, y), nan=1e3)) for u, y in tails]
+            tried.append((np.mean(fits), states, penalty))
     _, states, penalty = max(tried)
-    model = trained(v, z, states, penalty, seed)
+    model = trained(*separate(scaled), states, penalty, seed)
 
     def run(u: np.ndarray, y: np.ndarray) -> np.ndarray:
         return middle + size * free_run(model, u / spread, (y - middle) / size)

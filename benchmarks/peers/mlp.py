@@ -7,7 +7,7 @@ import itertools
 import warnings
 
 import numpy as np
-from exchange import HOLD_OUT, WARM_UP, FreeRun, answer, fit
+from exchange import HOLD_OUT, WARM_UP, FreeRun, Runs, answer, fit, heads_and_tails
 from sklearn.neural_network import MLPRegressor
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -21,7 +21,7 @@ def lagged(u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:
     return np.column_stack([both[lags - i : len(both) - i] for i in range(1, lags + 1)])
 
 
-def trained(u: np.ndarray, y: np.ndarray, lags: int, alpha: float, seed: int):
+def trained(runs: Runs, lags: int, alpha: float, seed: int):
     """Return the network of scaled outputs."""
     network = MLPRegressor(
         hidden_layer_sizes=(25, 25), activation="tanh", solver="lbfgs", alpha=alpha, max_iter=400, random_state=seed
@@ -29,7 +29,7 @@ def trained(u: np.ndarray, y: np.ndarray, lags: int, alpha: float, seed: int):
     model = make_pipeline(StandardScaler(), network)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that 400 iterations were not enough, if so
-        model.fit(lagged(u, y, lags), y[lags:])
+        model.fit(np.vstack([lagged(u, y, lags) for u, y in runs]), np.vstack([y[lags:] for _, y in runs]))
     return model
 
 
@@ -46,16 +46,17 @@ def free_run(model, u: np.ndarray, y: np.ndarray, lags: int) -> np.ndarray:
     return out
 
 
-def train(u: np.ndarray, y: np.ndarray, seed: int) -> tuple[FreeRun, str]:
-    """Choose by free run on the last fifth, then train on all rows."""
-    scale, cut = y.std(axis=0), round((1.0 - HOLD_OUT) * len(u))
-    z = y / scale
+def train(runs: Runs, seed: int) -> tuple[FreeRun, str]:
+    """Choose by free run on the last fifth of each run, then train on all rows."""
+    scale = np.vstack([y for _, y in runs]).std(axis=0)
+    scaled = [(u, y / scale) for u, y in runs]
+    heads, tails = heads_and_tails(scaled, HOLD_OUT)
     tried = []
     for lags, alpha in itertools.product(LAGS, ALPHAS):
-        model = trained(u[:cut], z[:cut], lags, alpha, seed)
-        tried.append((fit(z[cut:], free_run(model, u[cut:], z[cut:], lags)), lags, alpha))
+        model = trained(heads, lags, alpha, seed)
+        tried.append((np.mean([fit(y, free_run(model, u, y, lags)) for u, y in tails]), lags, alpha))
     _, lags, alpha = max(tried)
-    model = trained(u, z, lags, alpha, seed)
+    model = trained(scaled, lags, alpha, seed)
 
     def run(u: np.ndarray, y: np.ndarray) -> np.ndarray:
         return scale * free_run(model, u, y / scale, lags)

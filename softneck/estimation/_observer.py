@@ -15,13 +15,13 @@ from softneck.identification import Model, known_rows
 from softneck.robot import Robot, load_for_robot
 from softneck.signals import Recording, RecordingLike, concatenate, open_recording
 
-from ._axis import HasTransferFunctions
+from ._axis import HasTransferFunctions, robot_of
 from ._kalman import KalmanObserver
 from ._kalman_parts_runtime import KALMAN_LAG, KALMAN_LEAD, KALMAN_MORE_LAGS, kalman_lag
 from ._noise import NoiseFit, cost_of, fit_noise, look_ahead_error
-from ._nonlinear import NonlinearObserver
+from ._nonlinear import NonlinearObserver, is_nonlinear
 from ._offline import measured_angles
-from ._settings import KalmanSettings
+from ._settings import KalmanSettings, find_sensor
 
 AnyObserver = KalmanObserver | NonlinearObserver
 
@@ -234,8 +234,18 @@ def observer(
 
 
 def design_observer(settings: KalmanSettings, model: Any, robot: Robot | str | Path | None) -> AnyObserver:
-    """Return the observer with the noise levels of its settings, sensor and robot."""
-    return settings.design(load_for_robot(model, None if hasattr(model, "tf") else "model", robot))
+    """Return the observer with the noise levels of its settings, sensor and robot.
+
+    It predicts over the delay of the sensor, else of the robot's file: set-points and angles determine only the sum of
+    the drives' delay and the sensor's. `KalmanSettings.design` leaves that out over a linear model.
+    """
+    known = load_for_robot(model, None if hasattr(model, "tf") else "model", robot)
+    if settings.sensor_delay is not None or settings.form != "model" or is_nonlinear(known):
+        return settings.design(known)
+    usual = find_sensor(settings.sensor).delay
+    delay = robot_of(known).delay_s if usual is None else usual
+    made = replace(settings, sensor_delay=delay).design(known)
+    return replace(made, delay_source="robot" if usual is None else "sensor") if delay else made
 
 
 def fit_observer(made: AnyObserver, recordings: list[Recording], named: Collection[str]) -> FittedObserver:

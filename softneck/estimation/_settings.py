@@ -116,9 +116,9 @@ class KalmanSettings:
         measurement_noise_std: [rad]; None for that of the sensor.
         disturbance_noise_std: "model": step of the disturbance in each sample [rad]; None: from the outputs' motion.
         sample_time: of the loop [s]; None for that of the model. Must divide the model's.
-        sensor_delay: delay of measurements [s]; the estimate is then of the output now. None estimates the output at
-            the instant of the measurement, for which controllers are designed; in form "nonlinear", None takes the
-            delay of the sensor, else of the robot's file.
+        sensor_delay: delay of measurements [s]; the estimate is then of the output now, with 0 of that at the instant
+            of the measurement. None takes the delay of the sensor, else of the robot's file; in form "gyro", and for
+            `KalmanSettings.design` over a linear model, 0.
         gyro_delay: delay of the gyro's rates [s], at most the sensor's delay; None for the same delay if `sensor_delay`
             is not given either, else 0.
         order: of the loop that it runs in; in "jacobi" the observer gets set-points one sample earlier.
