@@ -25,6 +25,7 @@ from ..models._validity import calibrate_validity
 from ._left_out import Fold, all_rows, exams, folds, free_runs
 
 HOLD_OUT, SECOND = "hold-out", "second training"
+WITHIN_A_MOTION = ("largest motions", "fastest motions", "later block")
 Fits = Mapping[str, float]
 # Cheaper settings of the same method: fewer starts and steps.
 SHORT: dict[str, dict[str, Any]] = {
@@ -54,9 +55,14 @@ class Examination:
     bounds: Mapping[str, Any] = field(default_factory=dict)
 
     @property
+    def deciding(self) -> dict[str, Fits]:
+        """The parts that count: where whole motions are left out, their own extremes say less of others."""
+        return {name: fits for name, fits in self.parts.items() if not (self.other_motion and name in WITHIN_A_MOTION)}
+
+    @property
     def worst(self) -> tuple[str, str, float]:
         """The part and the output of the lowest fit, and this fit [%]."""
-        each = [(part, name, fit) for part, fits in self.parts.items() for name, fit in fits.items() if fit == fit]
+        each = [(part, name, fit) for part, fits in self.deciding.items() for name, fit in fits.items() if fit == fit]
         return min(each, key=lambda one: one[2], default=("", "", float("nan")))
 
     def findings(self, kind: str, robot: Robot) -> dict[str, Any]:
@@ -70,7 +76,7 @@ class Examination:
             "fit": _number(fit), "part": part, "output": output, "one_motion": not self.other_motion,
             "expected": _number(expected), "low": _number(expected - half),
             "high": _number(min(expected + half, 100.0)),
-            "parts": {name: {axis: _number(one) for axis, one in fits.items()} for name, fits in self.parts.items()},
+            "parts": {name: {axis: _number(one) for axis, one in fits.items()} for name, fits in self.deciding.items()},
         }  # fmt: skip
         found = found if self.other_motion else {**found, "record": what_to_record(robot)}
         return {**found, "bounds": dict(self.bounds)} if self.bounds else found
