@@ -14,6 +14,7 @@ import pytest
 
 from softneck.cli.start import _plan, _start
 from softneck.cli.start._plan import STAGES, Options, Step
+from softneck.robot import Robot
 from softneck.signals import read_recording
 from softneck.signals.importing._robot_guess import is_of_another_robot
 
@@ -250,6 +251,10 @@ def test_a_log_whose_titles_are_of_another_robot_is_taken_for_one_and_that_is_do
     assert doubt.startswith("robot: ")
     recording = read_recording(tmp_path / "p" / "recordings" / "log.csv")
     assert recording.robot.outputs.names == outputs
+    # The range of the recording stands for the limits that nobody gave, and that is doubted too.
+    robot = Robot.read(tmp_path / "p" / "robot.toml")
+    assert robot.motors.setpoint_max[0] == pytest.approx(recording.set_points.max(), rel=1e-2)  # three digits
+    assert any("range of the set-points" in line for line in facts["doubts"]["robot.toml"])
     # What was proposed is read again by its layout, and nothing is done twice.
     again = json.loads(call("start", "log.csv", "-o", "p", "--yes", "--json").out)
     assert all(step["done_before"] for step in again["steps"][1:])
