@@ -189,13 +189,15 @@ def test_named_columns_are_the_layout_and_the_rest_is_recognised(tmp_path: Path)
 
 def test_a_log_without_titles_offers_the_line_that_reads_it(tmp_path: Path) -> None:
     path = tmp_path / "log.csv"
-    values = np.column_stack([A, B, 0.01 * BENT, 0.01 * TURNED])
+    smooth = lagged(BENT, 0.9)
+    values = np.column_stack([A, B, 0.01 * smooth, 0.01 * TURNED, np.gradient(smooth)])
     path.write_text("\n".join(",".join(f"{v:.6g}" for v in row) for row in values) + "\n")
     assert columns_line(path).startswith(
         f"`softneck import {path} --motor 0-1 --output 2-3 --sample-time S -o rec.csv`"
     )
     guess = guess_robot(path, NamedColumns(motors=("0-1",)), sample_time=0.02)
     assert [term.column for source in guess.layout.channels.values() for term in source.terms] == [0, 1, 2, 3]
+    assert "left out: 4: the rate of 2" in guess.lines
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def columns_options(function: Callable) -> Callable:
         ("--motor", "motors", "is the next motor's set-point"),
     ):
         function = click.option(
-            option, name, multiple=True, metavar="COL", help=f"Column, by title or index (`0-3`: four of them), that {what}."
+            option, name, multiple=True, metavar="COL", help=f"Column, by title or index (0-3: four), that {what}."
         )(function)
     return function
 

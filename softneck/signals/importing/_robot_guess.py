@@ -18,7 +18,7 @@ from ._column_titles import read_title
 from ._draft import Draft
 from ._guess_names import by_names
 from ._layout import Column, Layout, Source, Term
-from ._roles import NOTHING_NEW, Roles, find_roles, names_a_place, unit_of
+from ._roles import NOTHING_NEW, Roles, find_roles, may_be_motor, names_a_place, unit_of
 from ._table_format import SniffResult, sniff
 from .formats._text import DATE
 
@@ -127,7 +127,7 @@ def columns_line(path: str | Path, table: SniffResult | None = None, roles: Role
     spent = [name for name, why in roles.left_out.items() if why.startswith(NOTHING_NEW)]
     moving = [name for name in table.columns if name not in (roles.time, roles.run, *spent)]
     motors, outputs = list(roles.motors), list(roles.outputs) if roles.motors else []
-    motors = motors or _first_block(table, moving)
+    motors = motors or _first_block(table, [name for name in moving if may_be_motor(table, name)])
     free = [name for name in moving if name not in (*motors, *roles.positions)]
     outputs = outputs or [name for name in free if name not in roles.left_out or not roles.motors][:4]
     words = ["softneck", "import", str(path)]

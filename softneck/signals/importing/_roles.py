@@ -215,6 +215,12 @@ def names_a_place(table: SniffResult, column: Column) -> bool:
     return w.any(_OUTPUT) and not w.any(_PLATFORM)
 
 
+def may_be_motor(table: SniffResult, column: Column) -> bool:
+    """Return whether no word or unit speaks against a column as a motor's."""
+    w = _read(table, column)
+    return not (w.place or w.any(_ASIDE, _RATE, _PLATFORM))
+
+
 def _clock(table: SniffResult, columns: Iterable[Column]) -> Column | None:
     """Return the column of time: named or with a unit of time, else without a title; it rises."""
     found: list[tuple[float, Column]] = []
