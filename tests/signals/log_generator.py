@@ -42,6 +42,7 @@ class Log:
         write: writes it.
         set_points, angles: (rows, 3) and (rows, 2) [rad], as they were.
         sample_time: [s].
+        positions: (rows, 3) of the motors [rad], if the log has them.
         named: what the message or the doubt must name, where the log cannot be taken as it is.
     """
 
@@ -52,6 +53,7 @@ class Log:
     angles: np.ndarray
     sample_time: float = SAMPLE_TIME
     named: tuple[str, ...] = ()
+    positions: np.ndarray | None = None
 
 
 def neck(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -170,6 +172,18 @@ def wraps() -> Iterator[Log]:
                 for style in ("softneck", "round"):
                     frame = table(t, U, numbers, style=style, output=unit)
                     yield Log(f"{output} in {unit} wraps {name}, {style}", ".csv", as_csv(frame), U, Y)
+    # Encoders of one turn, in many units, beside set-points of any number of turns.
+    lagged = U.copy()
+    for k in range(1, ROWS):
+        lagged[k] = lagged[k - 1] + 0.3 * (U[k] - lagged[k - 1])
+    for offset, turns in ((0.0, 1.0), (2.0, 1.2), (-5.9, 1.9)):
+        for unit, size in ANGLES.items():
+            asked, reached = offset + turns * U, offset + turns * lagged
+            frame = table(t, asked / size, Y / ANGLES["deg"], motor=unit)
+            for j in range(3):
+                frame[f"motor_position_{j + 1} [{unit}]"] = (reached[:, j] % (2.0 * np.pi)) / size
+            yield Log(f"encoders of a turn in {unit}, about {offset:g}", ".csv", as_csv(frame), asked, Y,
+                      positions=reached)  # fmt: skip
 
 
 def formats() -> Iterator[Log]:

@@ -15,7 +15,7 @@ from softneck.cli._main import run
 from .log_generator import Log, clocks, formats, units, wraps
 
 #: Groups, and how many of each are imported as they were measured; the others are doubted or refused.
-GROUPS = {"units": (units, 64), "clocks": (clocks, 80), "wraps": (wraps, 0), "formats": (formats, 6)}
+GROUPS = {"units": (units, 64), "clocks": (clocks, 80), "wraps": (wraps, 40), "formats": (formats, 6)}
 
 
 def outcome(log: Log, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
@@ -34,14 +34,18 @@ def outcome(log: Log, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
     U = frame[[f"motor_setpoint_{j} [rad]" for j in (1, 2, 3)]].to_numpy()
     Y = frame[outputs].to_numpy() * [np.pi / 180.0 if "deg" in column else 1.0 for column in outputs]
     n = min(len(U), len(log.set_points))
-    # Angles differ by whole turns at most; cells have ten digits, and a resampled log is shifted by less than a step.
+    # Angles differ by half turns at most, as a sensor is mounted; cells have ten digits, and a resampled log is
+    # shifted by less than a step.
     off = Y[:n] - log.angles[:n]
     right = (
         abs(facts["sample_time_s"] / log.sample_time - 1.0) < 0.02
         and abs(len(U) - len(log.set_points)) <= 2
         and np.allclose(U[:n], log.set_points[:n], atol=2e-3)
-        and np.allclose(off - 2.0 * np.pi * np.round(np.median(off, axis=0) / (2.0 * np.pi)), 0.0, atol=2e-3)
+        and np.allclose(off - np.pi * np.round(np.median(off, axis=0) / np.pi), 0.0, atol=2e-3)
     )
+    if log.positions is not None and right:
+        X = frame[[f"motor_position_{j} [rad]" for j in (1, 2, 3)]].to_numpy()
+        right = bool(np.allclose(X[:n], log.positions[:n], atol=2e-3))
     doubted = "doubted" if facts["doubts"] else "sure"
     return f"right, {doubted}" if right else f"wrong, {doubted}"
 
@@ -71,6 +75,7 @@ def test_what_cannot_be_taken_is_refused_or_doubted_by_its_name(
         ("time_minutes.csv", 0.02, False),
         ("setpoints_in_turns.csv", 0.02, False),
         ("pitch_in_mrad.csv", 0.02, False),
+        ("roll_wraps_at_180.csv", 0.02, False),
     ],
 )
 def test_a_reported_log_is_imported_as_its_title_says(
@@ -90,6 +95,10 @@ def test_a_reported_log_is_imported_as_its_title_says(
     pitch = frame.filter(regex="^pitch ").iloc[:, 0].to_numpy()
     pitch = pitch if "pitch [deg]" in frame else np.degrees(pitch)
     np.testing.assert_allclose(pitch[:2], [-0.02027, -0.013899], atol=2e-4)
+    # Roll moves about 0, or about the edge of its sensor's range: no jumps, and its sign as logged.
+    roll = frame.filter(regex="^roll ").iloc[:, 0].to_numpy()
+    roll = roll if "roll [deg]" in frame else np.degrees(roll)
+    np.testing.assert_allclose(roll[:2], [0.0060942, 0.0038181], atol=1e-2)
 
 
 @pytest.mark.parametrize("command", ["import", "info"])

@@ -10,6 +10,7 @@ import numpy as np
 from softneck.core import Matrix, Vector
 
 from ..recording._channels import MOTOR_POSITIONS, OUTPUTS, SET_POINTS, known_channels
+from ..recording._wraps import unwrap
 from ._clocks import pitch_roll
 from ._column_titles import COUNTS_ROWS, Title, is_german, plain, read_title
 from ._layout import Column, Quaternion, Term
@@ -17,6 +18,10 @@ from ._table_format import SniffResult
 
 # Enough rows for a decision, whatever the length of the log.
 _MAX_ROWS = 20_000
+# A full turn in the units of titles, and roles whose jumps mean something else.
+_TURNS = {"deg": 360.0, "rad": 2.0 * np.pi, "mrad": 2e3 * np.pi, "turns": 1.0, "gon": 400.0, "cdeg": 36e3,
+          "mdeg": 36e4, "arcmin": 21_600.0, "arcsec": 1_296_000.0}  # fmt: skip
+_NEVER_WRAPPED = ("time", "run", "set-point", "ignored", "orientation")
 
 
 def take_moving_rows(columns: Mapping[Column, Vector]) -> dict[Column, Vector]:
@@ -63,16 +68,28 @@ class Draft:
     passed_over: dict[Column, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.moving = take_moving_rows(self.sniffed.columns)
         units = self.sniffed.units
         self.titles = {
             name: read_title(f"{name} [{units[name]}]" if name in units else name)
             for name in self.sniffed.columns
             if isinstance(name, str)
         }
+        self.moving = take_moving_rows({name: self._continuous(name) for name in self.sniffed.columns})
         for name, title in self.titles.items():
             if title.why == COUNTS_ROWS and name in self.moving and not (np.diff(self.moving[name]) == 1.0).all():
                 self.titles[name] = replace(title, role="unknown", why="it has no name")
+
+    def _continuous(self, name: Column) -> Vector:
+        """Return the first rows of a column, an angle without its jumps by a turn."""
+        values, title = self.sniffed.columns[name][:_MAX_ROWS], self.titles.get(name)
+        if title is not None and title.role in _NEVER_WRAPPED:
+            return values
+        named = None if title is None else _TURNS.get(title.unit or "")
+        for turn in (360.0, 2.0 * np.pi) if named is None else (named,):
+            unwrapped, jumps = unwrap(values, np.zeros(values.size), turn)
+            if jumps:
+                return unwrapped
+        return values
 
     def pick(self, channel: str, column: Column, why: str, *, sign: float = 1.0, confidence: float = 0.97) -> None:
         """Take one column for a channel."""

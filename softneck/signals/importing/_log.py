@@ -11,10 +11,11 @@ import numpy as np
 
 from softneck.core import DataError, SettingsError, SoftneckError, Vector, as_path, to_si
 
-from ..recording._channels import may_miss
+from ..recording._channels import may_miss, si_unit
 from ..recording._files import integers, numbers, read_table
 from ..recording._recording import Recording, check_rising, median_step, uneven_steps
 from ..recording._resampling import Samples, mean_step, resample, split_at_gaps, without_duplicates
+from ..recording._wraps import unwrap
 from ._clocks import (
     axis_rotations,
     estimate_sample_time,
@@ -36,6 +37,8 @@ from .formats._text import format_of
 if TYPE_CHECKING:
     import pandas as pd
 
+    from softneck.robot import Robot
+
 # Share of a channel's samples that may exceed a limit.
 _MAX_GLITCH_SHARE = 0.01
 # A wrong unit is off by a factor of 57. Up to half beyond the range it may be another winch, which gives a warning.
@@ -43,6 +46,8 @@ _WRONG_UNIT_RATIO = 1.5
 # A placeholder for missed samples is a repeated whole number of this magnitude, this many times larger than all other
 # values, of which there are several.
 _MIN_PLACEHOLDER, _PLACEHOLDER_RATIO, _MIN_VALUES = 90.0, 10.0, 20
+# [turns] Positions this close to whole turns from their set-points are of an encoder of one turn.
+_WHOLE_TURN_TOLERANCE = 0.02
 # [turns] Larger numbers are in no unit of angles.
 _MAX_TURNS = 60.0
 
@@ -200,15 +205,17 @@ def _make_equidistant(
         sample_time, notes = _sample_time(layout, channels, run, None)
         if sample_time is None:
             raise DataError("the layout gives neither a time column nor `sample_time_s`; give one.")
-        samples, more = integrate_rates(Samples(_row_numbers(run) * sample_time, run, channels), layout.channels)
-        return samples, sample_time, notes + more
+        samples, jumps = _unwrapped(Samples(_row_numbers(run) * sample_time, run, channels), layout.robot)
+        samples, more = integrate_rates(samples, layout.channels)
+        return samples, sample_time, notes + jumps + more
     time, notes = read_times([_column(frame, term.column, "time") for term in layout.time.terms], layout.time)
     if layout.new_run_at_restart and run.size:
         run[1:] = np.cumsum((np.diff(time) < 0) | (np.diff(run) != 0))
         run[0] = 0
         notes += (f"{run[-1] + 1} run(s), by restarts of the time column",)
     check_rising(time, run, may_stand=True)
-    samples = Samples(time, run, channels)
+    samples, jumps = _unwrapped(Samples(time, run, channels), layout.robot)
+    notes += jumps
     if layout.merge:
         samples, note = merge_clocks(samples, layout.robot.outputs.names)
         notes += (note,)
@@ -222,6 +229,34 @@ def _make_equidistant(
     if sample_time is None:
         return _resample_uneven(samples, nominal, notes)
     return _recount_times(layout, samples, nominal, sample_time, notes)
+
+
+def _unwrapped(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]]:
+    """Unwrap outputs and motor positions that jump by a full turn, and return notes; set-points may do so."""
+    channels, notes, turned = dict(samples.channels), [], False
+    for name in (*robot.outputs.names, *robot.motor_positions):
+        if name not in channels or si_unit(name, robot) != "rad":
+            continue
+        channels[name], jumps = unwrap(channels[name], samples.run, 2.0 * np.pi)
+        if not jumps:
+            continue
+        said = f"`{name}` jumps by a full turn at {jumps} row(s): unwrapped"
+        half = np.pi * np.round(np.nanmedian(channels[name]) / np.pi)
+        if name in robot.outputs.names and half and np.nanmax(np.abs(channels[name])) > np.pi:
+            # A recording's outputs stay within half a turn; a sensor mounted upside down moves about 180 deg.
+            channels[name] = channels[name] - half
+            said += f" and counted from {np.degrees(half):g} deg, about which it moves"
+        notes.append(said)
+        turned |= name in robot.motor_positions
+    for name, asked in zip(robot.motor_positions, robot.set_points, strict=True):
+        if name not in channels or asked not in channels or si_unit(name, robot) != "rad":
+            continue
+        # An encoder of one turn does not count turns: its set-point does.
+        ahead = np.nanmedian(channels[asked] - channels[name]) / (2.0 * np.pi)
+        if np.round(ahead) and (turned or abs(ahead - np.round(ahead)) < _WHOLE_TURN_TOLERANCE):
+            channels[name] = channels[name] + 2.0 * np.pi * np.round(ahead)
+            notes.append(f"`{name}` is {ahead:.0f} turn(s) behind its set-point: shifted")
+    return Samples(samples.time, samples.run, channels), tuple(notes)
 
 
 def _sample_time(

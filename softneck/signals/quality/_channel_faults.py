@@ -14,6 +14,7 @@ from softneck.core import Vector, to_si
 
 from ..recording._channels import file_unit
 from ..recording._recording import Recording
+from ..recording._wraps import count_wraps
 
 # A deployment calls 20 identical samples frozen as well (hardware facts, table of faults).
 FROZEN_SAMPLES = 20
@@ -71,6 +72,7 @@ class ChannelQuality:
         frozen: segments of at least 20 equal values while the input moves.
         clipped: flat tops at the channel's highest or lowest value.
         outliers: spikes of one or two samples.
+        wraps: jumps by a full turn at the edge of an angle's range.
         quantum: step between levels; None without one.
         repeats: share of samples that equal the one before.
         noise: standard deviation of white noise, from fourth differences; NaN for a short channel.
@@ -85,6 +87,7 @@ class ChannelQuality:
     frozen: tuple[Segment, ...]
     clipped: tuple[Segment, ...]
     outliers: tuple[Segment, ...]
+    wraps: int
     quantum: float | None
     repeats: float
     noise: float
@@ -119,6 +122,7 @@ class ChannelQuality:
             "quantum": quantum,
             "levels": self.levels,
             "repeats": self.repeats,
+            "wraps": self.wraps,
             "noise_std": self.in_file_unit(self.noise),
             **{f"{sort}_rows": count_rows(found) for sort, found in faults.items()},
             **{sort: [segment.as_dict() for segment in found[:20]] for sort, found in faults.items()},
@@ -132,11 +136,12 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
     missed = _segments_of(~good, recording)
     if not good.any():
         nan = float("nan")
-        return ChannelQuality(name, unit, y.size, nan, nan, missed, (), (), (), None, 0.0, nan)
+        return ChannelQuality(name, unit, y.size, nan, nan, missed, (), (), (), 0, None, 0.0, nan)
     equal = np.concatenate([[False], (y[1:] == y[:-1]) & (run[1:] == run[:-1])])
     repeats = float(equal[good].mean())
     quantum, (noise, noisy) = _quantum(y[good]), _noise(y, run)
     frozen = clipped = outliers = ()
+    wraps = 0
     if is_command(name):
         quantum = None
     elif y[good].min() < y[good].max():
@@ -162,10 +167,15 @@ def check_channel(recording: Recording, name: str) -> ChannelQuality:
         # Unlike rates, tensions and velocities, positions have inertia and cannot jump for one sample.
         if name.removesuffix("_measured") in (*recording.robot.motor_positions, *recording.robot.outputs.names):
             outliers = _find_spikes(recording, y, quantum or 0.0, 0.0 if np.isnan(noise) else noise)
+            if to_si(unit)[1] == "rad":
+                parts = np.split(y, np.flatnonzero(np.diff(run)) + 1)
+                wraps = sum(count_wraps(part, 2.0 * np.pi) for part in parts)
         edge = {(segment.start, segment.stop) for segment in clipped}
         frozen = tuple(segment for segment in frozen if (segment.start, segment.stop) not in edge)
     low, high = float(y[good].min()), float(y[good].max())
-    return ChannelQuality(name, unit, y.size, low, high, missed, frozen, clipped, outliers, quantum, repeats, noise)
+    return ChannelQuality(
+        name, unit, y.size, low, high, missed, frozen, clipped, outliers, wraps, quantum, repeats, noise
+    )
 
 
 def is_command(name: str) -> bool:

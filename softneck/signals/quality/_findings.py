@@ -216,6 +216,10 @@ def _channel(channel: ChannelQuality, quality: Quality) -> Iterator[Finding]:
             longest = max(segment.rows for segment in found) * quality.sample_time
             message = message.format(places=_places(found), longest=longest)
             yield Finding("warning", topic, channel.name, message, advice, found[0].time)
+    if channel.wraps:
+        message = f"jumps by a full turn at {channel.wraps} row(s)."
+        advice = "Unwrap it: softneck import LOG --guess does so."
+        yield Finding("warning", "outliers", channel.name, message, advice)
     yield from _resolution(channel, outputs)
 
 
