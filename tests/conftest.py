@@ -63,7 +63,7 @@ def models() -> dict[str, Model]:
         "residual": SetMembership(form="residual").fit(recording),
         "play": Play(rate=15.0, widths=(0.2,), degree=3, ridge=1e-4).fit(recording),
         "nn": Network(hidden=(4, 3), iterations=8).fit(recording),
-        "greybox": GreyBox(evaluations=4, sensor_delay=2).fit(recording),
+        "greybox": GreyBox(evaluations=4, sensor_delay=2, body="all").fit(recording),
     }
     return {**made, "guarded": guarded_of([made["rls"], made["play"], made["nn"]], recording)}
 

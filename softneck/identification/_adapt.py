@@ -25,7 +25,7 @@ from .models._fitting import row_hashes
 from .models._model import WARM_UP, Model
 from .models._scores import nrmse_fit
 from .models._validity import limit_validity
-from .structured._greybox import PARAMETERS
+from .structured._parameters import PARAMETERS
 
 # Kind -> the arrays that are moved; entries that are zero are structure and stay.
 _ADAPTED_ARRAYS = {
@@ -270,6 +270,8 @@ _PRIOR_STRENGTH = 0.1
 _HOLD_OUT_PERIOD, _BLOCK_S = 3, 2.0
 # Set-points that move less than this part of what they do along the reference teach nothing.
 _LEAST_MOTION = 0.1
+# A direction that moves less than this part of the one that moves most, both as parts of the reference, is missing.
+_LEAST_DIRECTION = 0.05
 # Fewer entries of an output than this on either side decide nothing.
 _LEAST_ROWS = 50
 # Parts of the way that are tried until no output is worse.
@@ -338,6 +340,11 @@ class Adaptation:
         motion = reference(model)
         if not _has_motion(window.set_points, motion.set_points):
             why = "the window hardly moves the neck, so that it teaches nothing"
+            return _keep_model(
+                model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum()))
+            )
+        if missing := _missing_direction(model, window.set_points, motion.set_points):
+            why = f"the window moves the robot along one direction; add motion of {missing}"
             return _keep_model(
                 model, AdaptationResult(adapted=False, why=why, seconds=seconds, rows=int(held.any(axis=1).sum()))
             )
@@ -415,6 +422,22 @@ def _split(window: Recording, seconds: float) -> tuple[np.ndarray, np.ndarray]:
 def _has_motion(window: Matrix, motion: Matrix) -> bool:
     """Return whether a motor moves enough over the window, compared with the reference motion."""
     return bool((window.std(axis=0) > _LEAST_MOTION * motion.std(axis=0)).any())
+
+
+def _missing_direction(model: Model, window: Matrix, motion: Matrix) -> str:
+    """Return the direction of the outputs that a window does not move, "" where it moves all that the motion does."""
+    weights = model.robot.weights()
+    if weights is None or len(weights) < 2:
+        return ""
+    moved, whole = (np.cov((rows @ weights.T).T) for rows in (window, motion))
+    scale = np.linalg.inv(np.linalg.cholesky(whole))
+    shares, directions = np.linalg.eigh(scale @ moved @ scale.T)
+    # The least share alone is missing: where all are small, the window is short of motion altogether.
+    if shares[0] > _LEAST_DIRECTION**2 * shares[-1]:
+        return ""
+    direction = np.abs(directions[:, 0])
+    names = [name for name, part in zip(model.robot.outputs.names, direction, strict=True) if part > 0.4]
+    return " and ".join(names) + (" across it" if len(names) > 1 else "")
 
 
 def _fits(measured: Matrix, free: Matrix, held: np.ndarray) -> tuple[float, ...]:

@@ -89,7 +89,7 @@ def _play() -> Block:
 
 
 def _greybox() -> Block:
-    return GreyBox(evaluations=3, sensor_delay=2).fit(recording()).block()
+    return GreyBox(evaluations=3, sensor_delay=2, body="all").fit(recording()).block()
 
 
 @cache

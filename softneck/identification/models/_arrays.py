@@ -27,8 +27,8 @@ _LOADED_GREYBOX = "softneck.identification.structured._loaded_greybox_runtime"
 
 # The arrays of the output `validity`: older files, models made by hand and members of others have none.
 VALIDITY = ("ground", "doubt")
-# Files also leave out the offset of a robot that rests at zero.
-_OPTIONAL = (*VALIDITY, "offset")
+# Files also leave out the offset of a robot that rests at zero, and a body of constant stiffness without creep.
+_OPTIONAL = (*VALIDITY, "offset", "body")
 
 
 def without_validity(arrays: Mapping[str, Matrix]) -> dict[str, Matrix]:
@@ -42,7 +42,10 @@ def runtime_arrays(kind: str, arrays: Mapping[str, Matrix]) -> dict[str, Matrix]
     history = own["history"]
     outputs = int(history[1]) if len(history) > 1 else 2
     motors = len(own["drive"]) if "drive" in own else int(history[2]) if len(history) > 2 else 3
-    empty = {"ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3)), "offset": np.zeros(outputs)}
+    empty = {
+        "ground": np.zeros((0, 1 + 2 * motors)), "doubt": np.zeros((outputs, 3)), "offset": np.zeros(outputs),
+        "body": np.array([1.0, 0.0, 0.0, 0.0, 1.0]),
+    }  # fmt: skip
     names = _names(_module_of(kind, arrays))
     found = {name: own[name] if name in own else empty[name] for name in names}
     for number, (member, part) in enumerate(members(arrays)):

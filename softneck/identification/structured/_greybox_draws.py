@@ -11,7 +11,9 @@ from softneck.signals import Recording
 
 from ..models._fitting import ScaledData, training_recording
 from ..models._model import Model
-from ._greybox import _DECIMATION, _SETTLING_S, GreyBox, _correlation_time, _FitProblem, _SearchProgress
+from ._greybox import GreyBox
+from ._output_error import DECIMATION, FitProblem, SearchProgress, correlation_time
+from ._parameters import PARTS
 
 # Length of a segment [s of a neck's time]: ten of its time constants.
 _SEGMENT_S = 2.0
@@ -44,7 +46,7 @@ class GreyBoxDraws:
     """
 
     model: Model
-    problem: _FitProblem
+    problem: FitProblem
     centres: dict[int, tuple[Vector, float]]
     hessian: Matrix
     push: Matrix
@@ -58,21 +60,22 @@ class GreyBoxDraws:
         """Fit the grey box to a recording, and what draws need."""
         model = GreyBox().fit(recording, progress=lambda done, text: progress(0.9 * done, text))
         scaled = ScaledData.of(training_recording(recording), amplitudes=False)
-        problem, second = _FitProblem.of(scaled), scaled.scaling.second
+        second = scaled.scaling.second
         table = {row["name"]: float(row["value"]) for row in model.findings["numbers"]}
+        kept = [part for part, numbers in PARTS.items() if numbers[0].name in table]
+        problem = FitProblem.of(scaled).with_parts(*kept)
         x = np.array([n.encode(table[n.name] * (second if n.is_rate else 1.0)) for n in problem.numbers])
         delay, count = int(model.findings["sensor_delay"]), x.size
         e = problem.errors(x, delay)[count:]
         steps = _STEP * np.eye(count)
         pairs = [(problem.errors(x + d, delay)[count:], problem.errors(x - d, delay)[count:]) for d in steps]
         J = np.array([above - below for above, below in pairs]).T / (2.0 * _STEP)
-        residuals = [y - Y for (_, Y), (_, _, _, y) in zip(problem.simulate(x, delay), problem.runs, strict=True)]
-        variance = float(e @ e) / e.size * _correlation_time(residuals)
+        variance = float(e @ e) / e.size * correlation_time(problem.misses(x, delay))
         least, centres = float(e @ e), {delay: (x, 0.0)}
         for other in (delay - 1, delay + 1):
             if other >= 0:
                 progress(0.95, f"dead time {other}")
-                tell = _SearchProgress(silent, 1)
+                tell = SearchProgress(silent, 1)
                 found = problem.search(x, other, _EVALUATIONS, tell).x
                 cost = problem.errors(found, other)[count:]
                 centres[other] = (found, float(cost @ cost) - least)
@@ -122,15 +125,16 @@ class GreyBoxDraws:
         drive = problem.drive.copy()
         drive[:, 0] = np.exp(-numbers[0] * problem.sample_time)
         found = {"neck": numbers, "drive": drive, "sensor": np.array([float(delay), problem.sample_time])}
-        return found | ({"payload": load} if load.size else {})
+        body = {"body": problem.body(x)} if "body" in self.model.arrays else {}
+        return found | body | ({"payload": load} if load.size else {})
 
 
-def _segments(problem: _FitProblem, size: int) -> np.ndarray:
+def _segments(problem: FitProblem, size: int) -> np.ndarray:
     """Return the segment (size,) of every error that the fit minimises."""
-    length = max(1, round(_SEGMENT_S / problem.sample_time / _DECIMATION))
-    skip, parts, first = round(_SETTLING_S / problem.sample_time), [], 0
-    for _, _, motors, outputs in problem.runs:
-        number = first + np.arange(len(outputs[skip::_DECIMATION])) // length
+    length = max(1, round(_SEGMENT_S / problem.sample_time / DECIMATION))
+    parts, first = [], 0
+    for (_, _, motors, outputs), rows in zip(problem.runs, problem.rows, strict=True):
+        number = first + np.arange(len(rows)) // length
         parts.append(np.repeat(number, outputs.shape[1]))
         if problem.logged:
             parts.append(np.repeat(number, motors.shape[1]))

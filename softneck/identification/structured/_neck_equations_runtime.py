@@ -4,12 +4,17 @@ Lengths of tendon are in radians of motor, tensions in radians of stretch, so th
 
 - drive: m_j lags its delayed set-point, and stops where its tension reaches `pull_limit`;
 - stretch: x_j = pretension + m_j - lever (e_j . b) - s, tension T_j = max(0, x_j): a tendon only pulls;
-- bend: b' = gain sum T_j e_j - stiffness (1 +- asymmetry) (b - rest) - stiffening |b|^2 b - friction z;
+- bend: b' = gain sum T_j e_j - stiffness F (1 +- asymmetry) (b - rest) - stiffening |b|^2 b - friction z
+  - stiffness creep (b - r);
+- softening: F = (1 - lasting (1 - exp(-2 B / reach))) (1 + a / 2) / (1 + a |b| / reach), B the largest bend of late,
+  forgotten over 300 time constants (Mullins 1969, Rubber Chem. Technol. 42:339), a the softening;
+- creep (a Maxwell branch): r' = creep_rate (b - r);
 - compression: s' = axial_rate (compliance (sum (T_j - pretension)) - s);
 - hysteresis (Dahl): z' = b' - |b'| z / friction_angle, so |z| <= friction_angle;
 - tilt: pitch = atan2(sin|b| b_1/|b|, cos|b|), roll likewise, through a dead time and a first-order lag.
 
-e_j points to tendon j: of a neck 120 deg apart, of another robot as its file says; with one output all lie in a plane.
+e_j points to tendon j: of a neck 120 deg apart or where it was found, times the arm of tendon j over that of the first;
+of another robot as its file says; with one output all lie in a plane.
 
 Bend and compression are taken half implicitly (Rosenbrock, one stage), stable for any rates, and |b| is kept below
 1.2 rad: no input moves the output further.
@@ -50,7 +55,16 @@ NECK_SIZE = 16
 # the sines of the tendons' angles; with one output the sines are zero.
 NECK_SHARE = 16
 NECK_TENDONS = 17
-NECK_STATES = 7
+NECK_STATES = 10
+# Numbers of `body`: what a body of foam or of coils does beside.
+BODY_REACH = 0
+BODY_SOFTENING = 1
+BODY_LASTING = 2
+BODY_CREEP = 3
+BODY_CREEP_RATE = 4
+BODY_SIZE = 5
+# The largest bend of late is forgotten over 60 s of a neck's time, 300 time constants.
+_FORGET_RATE = 1.0 / 60.0
 # A stalled drive gives way as the bend does: 4 ms at 20 ms follow that closely enough.
 _SUBSTEPS = 5
 _LARGEST_BEND = 1.2
@@ -63,67 +77,77 @@ class NeckState(StateVector):
     z = cells("2", "hysteresis [rad]")
     s = cells("", "compression [rad]")
     sensor = cells("2", "what the sensor says [rad]")
+    r = cells("2", "bend that has crept [rad]")
+    largest = cells("", "largest bend of late [rad]")
     tilts = rest("the dead time's line: tilts of pitch, newest first, then those of roll [rad]")
 
 
-def neck_cosine(neck: np.ndarray, j: int) -> float:
-    """Return e_j along the first axis, as mounted."""
-    if neck.shape[0] == NECK_SIZE:
-        return math.cos(neck[NECK_TWIST] + 2.0943951023931953 * j)  # 120 deg apart (Eq. 5)
-    sine = NECK_TENDONS + (neck.shape[0] - NECK_TENDONS) // 2
-    return math.cos(neck[NECK_TWIST]) * neck[NECK_TENDONS + j] - math.sin(neck[NECK_TWIST]) * neck[sine + j]
+def neck_directions(neck: np.ndarray, e: np.ndarray) -> None:
+    """Fill e (2, motors) with where the tendons pull, as mounted."""
+    motors = e.shape[1]
+    for j in range(motors):
+        if neck.shape[0] == NECK_SIZE:
+            e[0, j] = math.cos(neck[NECK_TWIST] + 2.0943951023931953 * j)  # 120 deg apart (Eq. 5)
+            e[1, j] = math.sin(neck[NECK_TWIST] + 2.0943951023931953 * j)
+        else:
+            c = math.cos(neck[NECK_TWIST])
+            s = math.sin(neck[NECK_TWIST])
+            e[0, j] = c * neck[NECK_TENDONS + j] - s * neck[NECK_TENDONS + motors + j]
+            e[1, j] = s * neck[NECK_TENDONS + j] + c * neck[NECK_TENDONS + motors + j]
 
 
-def neck_sine(neck: np.ndarray, j: int) -> float:
-    """Return e_j along the second axis, as mounted."""
-    if neck.shape[0] == NECK_SIZE:
-        return math.sin(neck[NECK_TWIST] + 2.0943951023931953 * j)
-    sine = NECK_TENDONS + (neck.shape[0] - NECK_TENDONS) // 2
-    return math.sin(neck[NECK_TWIST]) * neck[NECK_TENDONS + j] + math.cos(neck[NECK_TWIST]) * neck[sine + j]
+def neck_advance(
+    neck: np.ndarray,
+    body: np.ndarray,
+    e: np.ndarray,
+    sample_time: float,
+    targets: np.ndarray,
+    m: np.ndarray,
+    x: NeckState,
+) -> None:
+    """Move the motors `m` (motors,) towards `targets`, and the body in `x`, by one sample.
 
-
-def neck_limit(neck: np.ndarray, x: NeckState, j: int) -> float:
-    """Return the motor position at which tendon j reaches the pull limit."""
-    toward = neck_cosine(neck, j) * x.b[0] + neck_sine(neck, j) * x.b[1]
-    # x_j = pull_limit, solved for m_j.
-    return neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x.s
-
-
-def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: np.ndarray, x: NeckState) -> None:
-    """Move the motors `m` (motors,) towards `targets`, and bend, hysteresis and compression in `x`, by one sample."""
+    `e` (2, motors) is filled by `neck_directions`.
+    """
     dt = sample_time / _SUBSTEPS
     keep = math.exp(-neck[NECK_DRIVE_RATE] * dt)  # exact for a target that is held
+    share = 0.5 if neck.shape[0] == NECK_SIZE else neck[NECK_SHARE]
+    # Of a body that was not bent of late, at half of its reach.
+    whole = neck[NECK_STIFFNESS] * (1.0 + 0.5 * body[BODY_SOFTENING])
+    whole *= 1.0 - body[BODY_LASTING] * (1.0 - math.exp(-2.0 * x.largest / body[BODY_REACH]))
+    creep = neck[NECK_STIFFNESS] * body[BODY_CREEP]
+    softening = body[BODY_SOFTENING] / body[BODY_REACH]
+    size = math.sqrt(x.b[0] * x.b[0] + x.b[1] * x.b[1])
     for _ in range(_SUBSTEPS):
-        for j in range(m.shape[0]):
-            # Where the neck moves away a stalled drive gives way: the limit may fall below m.
-            m[j] = min(keep * m[j] + (1.0 - keep) * targets[j], neck_limit(neck, x, j))
         pull0 = 0.0
         pull1 = 0.0
         total = 0.0
         taut = 0
         for j in range(m.shape[0]):
-            c = neck_cosine(neck, j)
-            s = neck_sine(neck, j)
-            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * (c * x.b[0] + s * x.b[1]) - x.s
+            toward = e[0, j] * x.b[0] + e[1, j] * x.b[1]
+            # x_j = pull_limit, solved for m_j. Where the neck moves away a stalled drive gives way: below m.
+            limit = neck[NECK_PULL_LIMIT] - neck[NECK_PRETENSION] + neck[NECK_LEVER] * toward + x.s
+            m[j] = min(keep * m[j] + (1.0 - keep) * targets[j], limit)
+            stretch = neck[NECK_PRETENSION] + m[j] - neck[NECK_LEVER] * toward - x.s
             if stretch > 0.0:  # a slack tendon neither pulls nor adds to `rate`
-                pull0 += stretch * c
-                pull1 += stretch * s
+                pull0 += stretch * e[0, j]
+                pull1 += stretch * e[1, j]
                 total += stretch
                 taut += 1
         squared = x.b[0] * x.b[0] + x.b[1] * x.b[1]
         loss = neck[NECK_STIFFENING] * squared
-        k0 = neck[NECK_STIFFNESS] * (1.0 + neck[NECK_ASYMMETRY])
-        k1 = neck[NECK_STIFFNESS] * (1.0 - neck[NECK_ASYMMETRY])
+        stiffness = whole / (1.0 + softening * size)
+        k0 = stiffness * (1.0 + neck[NECK_ASYMMETRY])
+        k1 = stiffness * (1.0 - neck[NECK_ASYMMETRY])
         f0 = neck[NECK_GAIN] * pull0 - k0 * (x.b[0] - neck[NECK_REST]) - loss * x.b[0] - neck[NECK_FRICTION] * x.z[0]
         f1 = (
             neck[NECK_GAIN] * pull1 - k1 * (x.b[1] - neck[NECK_REST + 1]) - loss * x.b[1] - neck[NECK_FRICTION] * x.z[1]
         )
+        f0 -= creep * (x.b[0] - x.r[0])
+        f1 -= creep * (x.b[1] - x.r[1])
         # Minus the slope of f over b, one number for both directions: the cube's at its steepest, and half of each taut
         # tendon, as e e' of all three add up to 3/2.
-        share = 0.5 if neck.shape[0] == NECK_SIZE else neck[NECK_SHARE]
-        rate = (
-            neck[NECK_STIFFNESS] + 3.0 * loss + share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION]
-        )
+        rate = stiffness + 3.0 * loss + share * taut * neck[NECK_GAIN] * neck[NECK_LEVER] + neck[NECK_FRICTION] + creep
         d0 = dt * f0 / (1.0 + dt * rate)  # one stage: (1 + dt rate) d = dt f
         d1 = dt * f1 / (1.0 + dt * rate)
         x.b[0] += d0
@@ -133,6 +157,7 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
         if size > _LARGEST_BEND:
             x.b[0] *= _LARGEST_BEND / size
             x.b[1] *= _LARGEST_BEND / size
+            size = _LARGEST_BEND
         # Implicit in z: it cannot leave |z| <= friction_angle.
         forget = 1.0 + math.sqrt(d0 * d0 + d1 * d1) / neck[NECK_FRICTION_ANGLE]
         x.z[0] = (x.z[0] + d0) / forget
@@ -141,6 +166,16 @@ def neck_advance(neck: np.ndarray, sample_time: float, targets: np.ndarray, m: n
         rise = axial * (neck[NECK_COMPLIANCE] * (total - m.shape[0] * neck[NECK_PRETENSION]) - x.s)
         # Its slope again: s itself, and each taut tendon, which gets looser as the link gives way.
         x.s += dt * rise / (1.0 + dt * axial * (1.0 + neck[NECK_COMPLIANCE] * taut))
+    part = 1.0 - math.exp(-body[BODY_CREEP_RATE] * sample_time)
+    x.r[0] += part * (x.b[0] - x.r[0])
+    x.r[1] += part * (x.b[1] - x.r[1])
+    x.largest = max(size, x.largest * math.exp(-_FORGET_RATE * sample_time))
+
+
+def neck_crept(x: NeckState) -> None:
+    """Let the body creep to where it is, as it does at rest."""
+    x.r[0] = x.b[0]
+    x.r[1] = x.b[1]
 
 
 def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
@@ -165,6 +200,7 @@ def neck_sense(neck: np.ndarray, sample_time: float, x: NeckState) -> None:
 
 def neck_run(
     neck: np.ndarray,
+    body: np.ndarray,
     sample_time: float,
     delay: np.ndarray,
     lines: int,
@@ -178,13 +214,16 @@ def neck_run(
 
     `delay` (motors,) is that of the drives in samples, `lines` the sensor's; `settle` samples of rest come first.
     """
-    x = np.zeros(7 + 2 * lines)
+    x = np.zeros(NECK_STATES + 2 * lines)
     m = start.copy()
+    e = np.empty((2, m.shape[0]))
+    neck_directions(neck, e)
     held = np.empty(m.shape[0])
     axes = outputs.shape[1]
     # Under set-points that stay: a run begins at rest, as its recording is taken to.
     for _ in range(settle):
-        neck_advance(neck, sample_time, start, m, x)  # pyright: ignore[reportArgumentType]
+        neck_advance(neck, body, e, sample_time, start, m, x)  # pyright: ignore[reportArgumentType]
+        neck_crept(x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
     motors[0] = m
     outputs[0] = x[5 : 5 + axes]
@@ -192,7 +231,7 @@ def neck_run(
         for j in range(m.shape[0]):
             back = k + 1 - int(delay[j])
             held[j] = targets[back, j] if back >= 0 else start[j]
-        neck_advance(neck, sample_time, held, m, x)  # pyright: ignore[reportArgumentType]
+        neck_advance(neck, body, e, sample_time, held, m, x)  # pyright: ignore[reportArgumentType]
         neck_sense(neck, sample_time, x)  # pyright: ignore[reportArgumentType]
         motors[k + 1] = m
         outputs[k + 1] = x[5 : 5 + axes]
@@ -206,6 +245,7 @@ class GreyBoxArrays(NarxArrays):
     """The parameters of the equations and the arrays around them."""
 
     neck = array("numbers", "of the equations, in the order of NECK_*; of another robot its tendons behind them")
+    body = array("5", "reach [rad], softening, lasting softening, creep [1], rate of creep [1/s]; see BODY_*")
     sensor = array("2", "dead time [samples], and sample time in the time of a neck [s]")
     echo = array("outputs, p", "of what was measured above the equations, newest first")
     memory = array("1", "samples after which a held start has settled")
@@ -215,7 +255,9 @@ class GreyBoxArrays(NarxArrays):
 class GreyBoxState(NarxState):
     """Histories, then the state of the equations (see `NeckState`)."""
 
-    neck = cells("7 + 2 * dead", "bend, hysteresis, compression, sensor, and the dead time's line of tilts")
+    neck = cells(
+        "10 + 2 * dead", "bend, hysteresis, compression, sensor, creep, largest bend, and the dead time's line of tilts"
+    )
 
 
 def greybox_rest(
@@ -224,8 +266,11 @@ def greybox_rest(
     """Rest: motors at zero, the neck settled; the start's difference to the equations is kept as a measured error."""
     narx_rest(p, parameters, x, outputs)
     m = np.zeros(p.motors)
+    e = np.empty((2, p.motors))
+    neck_directions(neck, e)
     for _ in range(int(p.memory[0])):
-        neck_advance(neck, p.sensor[1], np.zeros(p.motors), m, x.neck)
+        neck_advance(neck, p.body, e, p.sensor[1], np.zeros(p.motors), m, x.neck)
+        neck_crept(x.neck)
         # The sensor settles with the neck: its dead time holds the tilt at rest.
         neck_sense(neck, p.sensor[1], x.neck)
     for axis in range(p.outputs):
@@ -252,7 +297,9 @@ def greybox_step(
     targets = np.empty(p.motors)
     for j in range(p.motors):
         targets[j] = x.u[int(p.drive[j, 1]) - 1, j]  # u(k+1-d); d >= 1 for this kind
-    neck_advance(neck, p.sensor[1], targets, m, x.neck)
+    e = np.empty((2, p.motors))
+    neck_directions(neck, e)
+    neck_advance(neck, p.body, e, p.sensor[1], targets, m, x.neck)
     neck_sense(neck, p.sensor[1], x.neck)
     ahead = np.empty(p.outputs)
     for axis in range(p.outputs):

@@ -184,6 +184,16 @@ def test_only_the_latest_seconds_count(old: Trained, window: Recording) -> None:
 
 
 @pytest.mark.slow
+def test_motion_of_one_direction_is_refused_and_the_missing_one_named(old: Trained, window: Recording) -> None:
+    theta = np.repeat(window.set_points[:, :1], 3, axis=1) * [1.0, -0.5, -0.5]
+    names = window.robot.set_points
+    one = window.with_channels(**dict(zip(names, theta.T, strict=True)))
+    new = old["oe"].adapt(one)
+    assert same_arrays(new, old["oe"])
+    assert new.findings["adaptation"]["why"] == "the window moves the robot along one direction; add motion of roll"
+    assert not old["oe"].adapt(window).findings["adaptation"]["why"].startswith("the window")
+
+
 def test_payload_and_a_biased_sensor_at_once(old: Trained, window: Recording) -> None:
     both = window.with_channels(pitch=window.channels["pitch"] + np.radians(2.0))
     judged = loaded("rotation", 1.0, 8)

@@ -12,7 +12,8 @@ import statsmodels.api as sm
 
 from softneck.core import load
 from softneck.identification import INFINITE, GreyBox, Model, validate
-from softneck.identification.structured._greybox import INTERRUPTED, PARAMETERS, _table
+from softneck.identification.structured._greybox import INTERRUPTED, PARAMETERS
+from softneck.identification.structured._output_error import intervals
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.robot import Robot
 from softneck.runtime import load_functions
@@ -25,11 +26,12 @@ FUNCTIONS = load_functions("softneck.identification.structured._neck_equations_r
 GUESS = np.array([number.guess for number in PARAMETERS])
 NAMES = [number.name for number in PARAMETERS]
 DELAY = np.full(3, 3.0)
+RIGID = np.array([1.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def run(numbers: np.ndarray, U: np.ndarray, lines: int = 2) -> tuple[np.ndarray, np.ndarray]:
     M, Y = np.empty(U.shape), np.empty((len(U), 2))
-    FUNCTIONS.neck_run(numbers, TS, DELAY, lines, 50, U, U[0].copy(), M, Y)
+    FUNCTIONS.neck_run(numbers, RIGID, TS, DELAY, lines, 50, U, U[0].copy(), M, Y)
     return M, Y
 
 
@@ -133,6 +135,11 @@ class _Line:
         del delay
         return self.A @ (x - np.array([number.encode(number.guess) for number in PARAMETERS])) - self.noise
 
+    def misses(self, x: np.ndarray, delay: int) -> list[np.ndarray]:
+        """Errors that change sign from row to row: every one counts."""
+        del x, delay
+        return [np.tile([[1.0], [-1.0]], (200, 2))]
+
 
 def tendons_of(*degrees: float, axes: int = 2) -> np.ndarray:
     """What stands behind the numbers for tendons at these angles, by its definition."""
@@ -142,7 +149,7 @@ def tendons_of(*degrees: float, axes: int = 2) -> np.ndarray:
 
 def run_tendons(numbers: np.ndarray, U: np.ndarray, axes: int) -> np.ndarray:
     M, Y = np.empty(U.shape), np.empty((len(U), axes))
-    FUNCTIONS.neck_run(numbers, TS, np.full(U.shape[1], 3.0), 2, 50, U, U[0].copy(), M, Y)
+    FUNCTIONS.neck_run(numbers, RIGID, TS, np.full(U.shape[1], 3.0), 2, 50, U, U[0].copy(), M, Y)
     return Y
 
 
@@ -170,13 +177,12 @@ def test_a_robot_of_one_output_bends_in_its_plane_as_one_with_two_tendons_there(
 def test_intervals_of_a_linear_problem_are_those_of_ordinary_least_squares() -> None:
     problem = _Line()
     x = np.array([number.encode(number.guess) for number in PARAMETERS])
-    # At the solution, with errors that change sign from row to row: every one counts.
+    # At the solution.
     x = x + np.linalg.lstsq(problem.A, problem.noise)[0]
-    white = np.tile([[1.0], [-1.0]], (200, 2))
     fit = sm.OLS(problem.noise, problem.A).fit()
     expected = np.asarray(fit.conf_int(0.05)) - np.asarray(fit.params)[:, None]
     # Student's quantile with 400 rows is 0.4 % above the normal one.
-    for row, number, value, half in zip(_table(problem, x, 0, [white]), PARAMETERS, x, expected[:, 1], strict=True):  # pyright: ignore[reportArgumentType]
+    for row, number, value, half in zip(intervals(problem, x, 0), PARAMETERS, x, expected[:, 1], strict=True):  # pyright: ignore[reportArgumentType]
         for side, sign in (("low", -1.0), ("high", 1.0)):
             bound = number.decode(value + sign * half)
             if number.low < bound < number.high:
@@ -188,7 +194,7 @@ def test_its_free_run_is_the_one_that_was_fitted(fitted: Model, truth: np.ndarra
     U = recording.set_points
     M, Y = np.empty(U.shape), np.empty((len(U), 2))
     arrays = fitted.arrays
-    FUNCTIONS.neck_run(arrays["neck"], TS, arrays["drive"][:, 1], 2, 50, U, U[0].copy(), M, Y)
+    FUNCTIONS.neck_run(arrays["neck"], RIGID, TS, arrays["drive"][:, 1], 2, 50, U, U[0].copy(), M, Y)
     free = fitted.simulate(recording, warm_up=1)
     # The echo of the first sample dies out; hysteresis keeps a trace of how the start was held.
     np.testing.assert_allclose(free[200:, :2], Y[200:], rtol=0, atol=1e-4)

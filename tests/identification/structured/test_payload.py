@@ -10,8 +10,8 @@ import pytest
 
 from softneck.core import DataError, FileFormatError, SettingsError, load
 from softneck.identification import GreyBox, Model
-from softneck.identification.structured._greybox import PARAMETERS
-from softneck.identification.structured._loaded_greybox_runtime import loaded_neck
+from softneck.identification.structured._loaded_greybox_runtime import effective_payload, loaded_neck
+from softneck.identification.structured._parameters import PARAMETERS, payload_parameters
 from softneck.plant import NeckParameters, VirtualNeck, record
 from softneck.signals import Recording, concatenate, signal
 
@@ -69,6 +69,23 @@ def test_what_the_link_itself_pulls_does_not_go_with_the_payload(model: Model) -
         np.testing.assert_allclose(loaded[place] * loaded[stiffness], neck[place] * neck[stiffness], rtol=1e-13)
 
 
+def test_the_law_meets_the_line_at_its_ends_and_saturates_between() -> None:
+    line, curve = np.array([0.2, 1.2, -3.0, -0.2]), np.array([0.2, 1.2, -3.0, -0.2, 4.0])
+    for payload in (0.2, 1.2):
+        # One quotient apart.
+        assert effective_payload(curve, payload) == pytest.approx(payload, rel=1e-14)
+    assert effective_payload(line, 0.6) == 0.6
+    # w of a third: (1 - exp(-4/3)) / (1 - exp(-4)), by its definition.
+    assert effective_payload(curve, 0.2 + 1.0 / 3.0) == pytest.approx(0.2 + 0.736403 / 0.981684, abs=1e-6)
+    nearly = effective_payload(np.array([0.2, 1.2, -3.0, -0.2, 1e-4]), 0.7)
+    # A quarter of c s (1 - s): what second order leaves of the line.
+    assert nearly == pytest.approx(0.7, abs=2e-5)
+
+
+def test_two_payloads_give_a_line_and_three_a_curve() -> None:
+    assert [len(payload_parameters(count)) for count in (1, 2, 3, 4)] == [0, 2, 3, 3]
+
+
 def test_a_recording_tells_its_payload(model: Model) -> None:
     run = log(0.5, 300)
     np.testing.assert_array_equal(model.simulate(run), at(model, 0.5).simulate(run))
@@ -118,7 +135,9 @@ def test_its_file_keeps_it(model: Model, tmp_path: Path) -> None:
     assert "0.2 to 0.8 kg" in payload.description
 
 
-@pytest.mark.parametrize("spoiled", [[0.8, 0.2, 0.0, 0.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 0.0, 99.0]])
+@pytest.mark.parametrize(
+    "spoiled", [[0.8, 0.2, 0.0, 0.0], [-1.0, 1.0, 0.0, 0.0], [0.0, 1.0, 0.0, 99.0], [0.0, 1.0, 0.0, 0.0, -1.0]]
+)
 def test_a_file_with_senseless_payloads_is_refused(model: Model, tmp_path: Path, spoiled: list[float]) -> None:
     replace(model, arrays={**model.arrays, "payload": np.array(spoiled)}).save(tmp_path / "m.npz")
     with pytest.raises(FileFormatError):
