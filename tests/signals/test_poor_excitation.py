@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from softneck.core import DataError
 from softneck.identification import Network, OutputError, Play
+from softneck.robot import Robot
 from softneck.signals import Recording, redefinition_matrix, signal
-from softneck.signals.quality._excitation import explained_variance, independent_motions, poor_excitation, why_at_rest
+from softneck.signals.quality._excitation import (
+    explained_variance,
+    independent_motions,
+    lightly_damped,
+    poor_excitation,
+    why_at_rest,
+)
 
 from ..data import neck_recording, recording_from
 
@@ -110,3 +118,75 @@ def test_kinds_that_learn_each_motor_refuse_motors_that_move_as_one(settings: Pl
 def test_a_linear_kind_takes_one_axis() -> None:
     model = OutputError().fit(one_axis(GOOD))
     assert model.kind == "oe"
+
+
+def _steps(rows: int, motors: int, seed: int) -> np.ndarray:
+    """Return levels held for 20 to 120 rows, another for each motor."""
+    rng = np.random.default_rng(seed)
+    columns = [np.repeat(rng.uniform(-2.0, 2.0, rows // 20), rng.integers(20, 120, rows // 20)) for _ in range(motors)]
+    return np.column_stack([column[:rows] for column in columns])
+
+
+def _ringing(drive: np.ndarray, turn: float, damping: float) -> np.ndarray:
+    """Return the motion of a mode of `turn` rad a sample that an input drives through a dead time of 3 samples."""
+    pole = np.exp(turn * (-damping + 1j * np.sqrt(1.0 - damping**2)))
+    motion = np.asarray(lfilter([0.0, 0.0, 0.0, 1.0], np.poly([pole, pole.conj()]).real, drive))
+    return motion / motion.std()
+
+
+def _arm(sample_time: float, U: np.ndarray, unit: str, **outputs: np.ndarray) -> Recording:
+    robot = Robot.from_dict({
+        "name": "arm", "motors": {"names": [f"m{i}" for i in range(U.shape[1])], "unit": unit},
+        "outputs": {"names": list(outputs), "unit": "mm"}, "directions": {"kind": "identified"},
+    })  # fmt: skip
+    return Recording.from_arrays(
+        U, 0.01 * np.column_stack(list(outputs.values())), sample_time=sample_time, robot=robot
+    )
+
+
+# Share of Nyquist, damping, sample time [s]: slow and fast modes, from 1 ms to 4 s a sample.
+MODES = [
+    (0.005, 0.003, 0.02),
+    (0.005, 0.001, 4.0),
+    (0.08, 0.003, 0.02),
+    (0.1, 0.001, 0.001),
+    (0.1, 0.02, 0.3),
+    (0.6, 0.01, 0.02),
+]
+
+
+@pytest.mark.parametrize(("share", "damping", "sample_time"), MODES)
+@pytest.mark.parametrize(("motors", "unit"), [(1, "kPa"), (3, "rad")])
+def test_a_lightly_damped_mode_is_named_and_the_output_beside_it_is_not(
+    share: float, damping: float, sample_time: float, motors: int, unit: str
+) -> None:
+    # Three motors have nine coefficients, which three periods of a half determine too badly.
+    U = _steps(5000 if share < 0.01 and motors > 1 else 2500, motors, seed=1)
+    motion = _ringing(U.sum(axis=1), share * np.pi, damping) + 0.05 * np.random.default_rng(0).standard_normal(len(U))
+    recording = _arm(sample_time, U, unit, tip=motion, lag=np.asarray(lfilter([0.1], [1.0, -0.9], U.sum(axis=1))))
+    said = [line for line in poor_excitation(recording) if "`tip`" in line or "`lag`" in line]
+    assert len(said) == 1
+    assert "`tip` is lightly damped" in said[0]
+    mode = lightly_damped(recording)["tip"]
+    # Three periods in each half determine a frequency within a few percent, and more periods better.
+    assert mode.frequency == pytest.approx(share * np.pi / sample_time, rel=0.02)
+    # A decay by less than a third within a half of the recording cannot be told from the noise of the levels.
+    periods = 0.25 * share * len(U)
+    assert mode.damping == pytest.approx(damping, rel=0.5, abs=0.4 / (2.0 * np.pi * periods))
+
+
+def test_a_mode_that_is_well_damped_is_not_called_lightly_damped() -> None:
+    U = _steps(2500, 1, seed=1)
+    assert poor_excitation(_arm(0.02, U, "rad", tip=_ringing(U[:, 0], 0.015, 0.4))) == ()
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("kind", ["noise", "drift", "slow wave", "mode of its own", "mode of its own, damped"])
+def test_an_output_that_the_motors_do_not_move_follows_through_no_mode(kind: str, seed: int) -> None:
+    U = _steps(2000, 1 + 2 * seed, seed)
+    e = np.random.default_rng(seed + 10).standard_normal(len(U))
+    wave = np.sin(np.linspace(0.0, 8.0, len(U))) + 0.05 * e
+    free = {"noise": e, "drift": np.cumsum(e), "slow wave": wave, "mode of its own": _ringing(e, 0.3, 0.003)}
+    recording = _arm(0.02, U, "bar", tip=free.get(kind, _ringing(e, 0.3, 0.1)))
+    assert any("`tip` does not follow the motors" in line for line in poor_excitation(recording))
+    assert lightly_damped(recording) == {}

@@ -14,6 +14,7 @@ from softneck.core import Matrix, Vector
 from softneck.robot import Robot, Scaling
 
 from ..recording._recording import Recording
+from ._followed import Mode, driven_mode
 
 # [rad/s] Bandwidth of the neck (paper, section 3.1).
 BANDWIDTH = 4.0
@@ -140,6 +141,12 @@ _FEW_CHANGES = 20
 _NO_MOTION = 0.02
 # Smallest R2 of an output by its motors; below it the output depends on something else.
 _MIN_EXPLAINED_SHARE = 0.2
+# Below this share a mode is searched; above it the lags of a regression last as long as the motion.
+_MAX_EXPLAINED_SHARE = 0.7
+# Smallest R2 of a mode on rows not fitted: 0.16 is the largest of 48 outputs of noise, drift and modes of their own.
+_MIN_MODE_SHARE = 0.3
+# Below this damping a step overshoots by half and rings visibly.
+_LIGHT_DAMPING = 0.2
 _BLOCK_COUNT = 10
 # Singular values below this share of the largest are cut in a fit. A motion that is small in the fitted blocks and
 # larger in the judged ones would be extrapolated by thousands of times. Several cuts are tried.
@@ -161,7 +168,7 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
     still = [name for name, span in zip(recording.robot.set_points, spans, strict=True) if span < least]
     if still:
         problems.append(f"{', '.join(still)} never moves: its effect cannot be learned. Move every motor.")
-    changes = sum(int((np.diff(run.set_points, axis=0) != 0.0).any(axis=1).sum()) for run in recording.runs())
+    changes = _changes(recording)
     if spans.max() >= least and changes < _FEW_CHANGES:
         problems.append(
             f"the set-points change in {changes} rows only: a model between them is a guess. Record `mixed`."
@@ -172,15 +179,44 @@ def poor_excitation(recording: Recording) -> tuple[str, ...]:
             f"the motors move along {independent_motions(recording)} direction(s) for {len(outputs)} outputs: their "
             "separate effects cannot be learned. Move all of them independently, as `eq22` and `mixed` do."
         )
-    if len(recording) < _FEW_ROWS or changes < _FEW_CHANGES:
-        return tuple(problems)  # too short to tell whether an output follows its motors
+    followed = _followed(recording)
+    problems += [
+        f"`{name}` is lightly damped: the motors make it {mode}. Take a kind with two poles or more, such as `oe`."
+        for name, _, mode in followed
+        if mode is not None and mode.damping < _LIGHT_DAMPING
+    ]
     problems += [
         f"`{name}` does not follow the motors (they explain {100.0 * max(share, 0.0):.0f} % of its variance): no model "
         "of set-points will predict it. Look for drift, a wrong column, or an output that nothing moves."
-        for name, share in zip(outputs, explained_variance(recording), strict=True)
-        if share < _MIN_EXPLAINED_SHARE
+        for name, share, mode in followed
+        if share < _MIN_EXPLAINED_SHARE and mode is None
     ]
     return tuple(problems)
+
+
+def lightly_damped(recording: Recording) -> dict[str, Mode]:
+    """Return the lightly damped mode of each output that the motors excite, by its name."""
+    followed = _followed(recording)
+    return {name: mode for name, _, mode in followed if mode is not None and mode.damping < _LIGHT_DAMPING}
+
+
+def _changes(recording: Recording) -> int:
+    """Count the rows in which a set-point changes."""
+    return sum(int((np.diff(run.set_points, axis=0) != 0.0).any(axis=1).sum()) for run in recording.runs())
+
+
+def _followed(recording: Recording) -> list[tuple[str, float, Mode | None]]:
+    """Return name, explained variance and the mode that explains more of each output; nothing of a short recording."""
+    if len(recording) < _FEW_ROWS or _changes(recording) < _FEW_CHANGES:
+        return []
+    found = []
+    for output, share in enumerate(explained_variance(recording)):
+        # What rings for longer than the lags shows in a mode with free frequency and damping only.
+        mode = driven_mode(recording, output) if share < _MAX_EXPLAINED_SHARE else None
+        if mode is not None and not mode.share >= max(_MIN_MODE_SHARE, share):
+            mode = None
+        found.append((recording.robot.outputs.names[output], float(share), mode))
+    return found
 
 
 def why_at_rest(held_out: Recording, whole: Recording) -> str | None:

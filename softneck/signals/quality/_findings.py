@@ -14,7 +14,8 @@ from softneck.robot import TIME_CONSTANT, Robot, Scaling
 
 from ..recording._recording import Recording
 from ._channel_faults import ChannelQuality, Segment, check_channel, count_rows
-from ._excitation import BANDWIDTH, Spectrum, correlation, independent_motions, spectrum
+from ._excitation import BANDWIDTH, Spectrum, correlation, independent_motions, lightly_damped, spectrum
+from ._followed import Mode
 
 SEVERITIES = ("ok", "note", "warning")
 # A loop must stop if the inclinometer is silent for longer (hardware facts), half a time constant of the neck; a model
@@ -66,6 +67,7 @@ class Quality(ReprMixin):
         spectrum: of the redefined inputs, or of the set-points of a robot without directions.
         directions: number of directions of the set-points, by `independent_motions`.
         correlation: (motors, motors) of the set-points.
+        modes: output -> its lightly damped mode, if it has one that the motors excite.
     """
 
     robot: Robot
@@ -75,12 +77,13 @@ class Quality(ReprMixin):
     spectrum: Spectrum
     directions: int
     correlation: Matrix
+    modes: dict[str, Mode]
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Return all findings, warnings first; a topic without a fault gives one "ok"."""
         found = [finding for channel in self.channels.values() for finding in _channel(channel, self)]
-        found += [*_excitation(self), *_directions(self), *_ranges(self), *_correlation(self)]
+        found += [*_excitation(self), *_directions(self), *_ranges(self), *_correlation(self), *_modes(self)]
         topics = {finding.topic for finding in found if finding.severity != "ok"}
         moved, bandwidth = ", ".join(self.spectrum.inputs), self.spectrum.bandwidth
         clean = _CLEAN | {"excitation": f"{moved} move up to the bandwidth of {bandwidth:.3g} rad/s."}
@@ -103,6 +106,9 @@ class Quality(ReprMixin):
             "excitation": self.spectrum.as_dict(),
             "directions": self.directions,
             "correlation": {"channels": self.robot.set_points, "matrix": self.correlation},
+            "modes": {
+                name: {"frequency_rad_s": mode.frequency, "damping": mode.damping} for name, mode in self.modes.items()
+            },
         }
 
     def lines(self) -> tuple[str, ...]:
@@ -164,6 +170,7 @@ def assess_quality(recording: Recording, *, bandwidth: float | None = None) -> Q
         spectrum=spectrum(recording, bandwidth),
         directions=independent_motions(recording),
         correlation=correlation(recording),
+        modes=lightly_damped(recording),
     )
 
 
@@ -310,6 +317,12 @@ def _correlation(quality: Quality) -> Iterator[Finding]:
             message = f"motors {names[0]} and {names[1]} move together (correlation {r:.2f})."
             advice = "Their effects cannot be separated well; move them independently."
             yield Finding("warning" if abs(r) > _COLLINEAR else "note", "correlation", "", message, advice)
+
+
+def _modes(quality: Quality) -> Iterator[Finding]:
+    for name, mode in quality.modes.items():
+        advice = "Identify it with two poles or more."
+        yield Finding("note", "damping", name, f"is lightly damped: the motors make it {mode}.", advice)
 
 
 def _places(segments: tuple[Segment, ...]) -> str:
