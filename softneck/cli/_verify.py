@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
 
 from softneck import estimation, verification
-from softneck.core import CERTIFICATE_ENDING, CheckFailedError, file_hash, refuse_existing, write_certificate
+from softneck.core import (
+    CERTIFICATE_ENDING,
+    CheckFailedError,
+    SoftneckError,
+    file_hash,
+    read_certificate,
+    refuse_existing,
+    write_certificate,
+)
 from softneck.loop import ORDERS
 from softneck.robot import load_for_robot
 
@@ -43,8 +53,12 @@ def command(
 ) -> None:
     """Verify CONTROLLER on every plant of the linear MODELs and FAMILYs, and in loops over simulation models.
 
-    Those are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are found by
-    experiment too. Without any the preset of the requirements is shown, which is a foreign plant and does not decide.
+    A FAMILY with draws (`softneck family`) decides by loops over these: of 59 none may fail. Its linear tests are then
+    shown beside. Attempts at a certificate over the same FAMILY are counted in it: it tells what the folder has.
+
+    Simulation models are nonlinear MODELs, NECKs (a neck file, or a preset by its name) and FMUs: on them margins are
+    found by experiment too. Without any, and without draws, the preset of the requirements is shown, which is a foreign
+    plant and does not decide.
 
     Of another robot on the virtual plant that its robot.toml names, if it does.
 
@@ -72,14 +86,18 @@ def command(
     files |= {} if observer is None else {"observer": observer}
     neck_file = verification.neck_file_of(whose, asked)
     files |= {"neck": neck_file} if neck_file.suffix == ".toml" else {}
+    hashed = {role: (str(item), file_hash(item)) for role, item in files.items()}
+    families = [digest for role, (_, digest) in hashed.items() if role.startswith("plant ")]
+    tried = _tried(path.parent, families) if any(getattr(t, "draws", None) is not None for t in things.values()) else []
+    this = _attempt_of(hashed)
+    earlier = tried if this not in tried else tried[: tried.index(this)]
     with progress("verify", quiet=as_json) as report:
         found = verification.verify(
-            judged, things, asked, order=order, observer=eyes, progress=report,
-            files={role: (str(item), file_hash(item)) for role, item in files.items()},
-        )  # fmt: skip
+            judged, things, asked, order=order, observer=eyes, progress=report, attempt=len(earlier) + 1, files=hashed
+        )
     folder = path.with_name(f"{path.name.removesuffix('.json').removesuffix('.certificate')}_worst")
     loops = found.write_worst(folder, controller=controller, observer=observer, force=True)
-    contents = found.contents(loops)
+    contents = {**found.contents(loops), "attempts": {"plants": families, "tried": [*earlier, this]}}
     write_certificate(path, contents, force=replace)
     if html is not None:
         from softneck.plots import write_page
@@ -95,10 +113,39 @@ def command(
         raise CheckFailedError(f"{controller}: {len(found.failed)} requirement(s) do not hold: {listed}.")
 
 
+def _attempt_of(files: Mapping[str, tuple[str, str]]) -> str:
+    """Return what tells an attempt at a certificate from another one: its controller, observer and requirements."""
+    told = [f"{role} {digest}" for role, (_, digest) in files.items() if not role.startswith("plant ")]
+    return hashlib.sha256("\n".join(sorted(told)).encode()).hexdigest()
+
+
+def _tried(folder: Path, families: list[str]) -> list[str]:
+    """Return the attempts at a certificate over the same plants that the certificates of a folder tell of."""
+    found: dict[str, None] = {}
+    lists = []
+    for item in sorted(folder.glob("*.json")):
+        try:
+            said = read_certificate(item).contents.get("attempts")
+        except SoftneckError:
+            continue  # another file
+        if isinstance(said, dict) and said.get("plants") == families and isinstance(said.get("tried"), list):
+            lists.append([str(each) for each in said["tried"]])
+    # The longest first: each tells of those before it.
+    for each in sorted(lists, key=len, reverse=True):
+        found |= dict.fromkeys(each)
+    return list(found)
+
+
 def _print(path: Path, found: verification.Verification, folder: Path) -> None:
 
     table = verification.verdict_table(found)
     print_table(str(path), table.head, table.rows)
+    for part in found.evidence.drawn:
+        for row in part.draws.coverage:
+            click.echo(
+                f"draws cover {100.0 * row['covered']:.0f} % of {row['class']} held-out motions, by a band of "
+                f"+-{100.0 * row['width'] / row['motion']:.0f} % of the motion"
+            )
     for name, why in found.evidence.not_computed.items():
         click.echo(f"not computed: {name}: {why}")
     click.echo(f"{found.summary()}; worst plants as loops in {folder}")

@@ -12,6 +12,7 @@ from softneck.core import Progress, ReprMixin, Vector
 from softneck.loop import error_unit
 from softneck.runtime import Block
 
+from ._drawn import Drawn, draws_of, run_drawn
 from ._experiments import Crossing, crossing_facts, crossing_values, crossings
 from ._linear import AxisMargins, ControllerUnderTest, LinearLaw, data_margins, frequency_grid, margins
 from ._neck_loops import (
@@ -77,6 +78,7 @@ class Evidence(ReprMixin):
         foreign: whether `necks` use a built-in plant.
         tested: margins that the data support, of each axis of each tested family.
         crossings: margins by experiment on the user's simulation models.
+        drawn: loops over the draws of each family that has them, which then decide.
     """
 
     plants: Plants
@@ -90,13 +92,18 @@ class Evidence(ReprMixin):
     foreign: bool = True
     tested: list[AxisMargins] = field(default_factory=list)
     crossings: list[Crossing] = field(default_factory=list)
+    drawn: list[Drawn] = field(default_factory=list)
 
 
 def gather(
     controller: ControllerUnderTest, necks: Sequence[PlantSource], asked: Requirements, *, observer: Block | None,
-    progress: Progress, families: Mapping[str, Any], own: Sequence[SimulationModel],
+    progress: Progress, families: Mapping[str, Any], own: Sequence[SimulationModel], attempt: int = 1,
 ) -> Evidence:  # fmt: skip
-    """Compute all evidence, including cheap metrics without a requirement; `own` are the user's simulation models."""
+    """Compute all evidence, including cheap metrics without a requirement; `own` are the user's simulation models.
+
+    `attempt`: whose draws are taken of families that have them.
+    """
+    drawn = draws_of(families)
     sources, seed = list(necks), int(asked.sampling["seed"])
     base = all_plants(sources, int(asked.sampling["plants"]), seed)
     plants = base.later(controller.extra)
@@ -113,7 +120,7 @@ def gather(
     runs = run_loops(
         controller.block, asked, order=controller.order, observer=observer, seed=seed,
         progress=lambda done, text: progress(0.6 + 0.2 * done, text), own=own,
-    ) if own or not why else []  # fmt: skip
+    ) if own or not (why or drawn) else []  # fmt: skip
     loops = loops_under_test(controller.block, own, asked, order=controller.order, observer=observer)
     # Margins of single axes are only computed if required.
     alone = {f"{axis}.{name}" for axis in plants.axes for name in ("gain_margin", "delay_margin_ms")}
@@ -124,10 +131,18 @@ def gather(
     laws = controller.laws.values()
     tested = [item for law in laws for item in data_margins(families, law, plants.axes, controller.extra, steep)]
     # A built-in plant does not count unless the user gives its file.
-    foreign = not (own or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
+    foreign = not (own or drawn or asked.sim["decides"] or preset_of(asked).endswith(".toml"))
     evidence = Evidence(plants, w, linear, steps, stepped, runs, foreign=foreign, tested=tested, crossings=found)
     evidence.not_computed.update({"sim": why} if why and not own else judged_elsewhere(own, asked))
     _fill_metrics(evidence, controller, asked, observer is not None)
+    for name, draws in drawn.items():
+        evidence.drawn.append(run_drawn(
+            name, draws, controller.block, asked, order=controller.order, observer=observer, attempt=attempt,
+            progress=late,
+        ))  # fmt: skip
+        if "sim.slack_s" not in evidence.metrics:
+            evidence.not_computed["sim.slack_s"] = "draws have no tension outputs; give a NECK, a file or a preset"
+    _add_drawn(evidence, {name for item in evidence.drawn for name in item.values})
     progress(1.0, "done")
     return evidence
 
@@ -160,6 +175,21 @@ def _add_data_margins(evidence: Evidence) -> None:
     if not evidence.crossings:
         why = "no simulation model was given (a nonlinear MODEL, a NECK, an FMU)"
         evidence.not_computed["margins by experiment"] = why
+
+
+def _add_drawn(evidence: Evidence, names: set[str]) -> None:
+    """Let the draws decide: margins are theirs and those by experiment on the user's models, not the linear ones."""
+    simulated = crossing_values(evidence.crossings)
+    for name in names:
+        if not name.startswith("sim."):
+            evidence.metrics.pop(name, None)
+        if name in simulated:
+            values, behind = simulated[name]
+            _add(evidence, name, Values(values, lambda row, behind=behind: crossing_facts(behind[row])))
+    for item in evidence.drawn:
+        for name, values in item.values.items():
+            about = lambda row, rows=item.conditions[name]: {"kind": "draw", **rows[row]}  # noqa: E731
+            _add(evidence, name, Values(values, about))
 
 
 def _tested_describer(item: AxisMargins, name: str) -> Describe:

@@ -46,9 +46,9 @@ _HUNTING_RAD = math.radians(1.0)
 # Shares of the step: smallest response of a loop, and smallest limit cycle that is reported.
 _RESPONSE_SHARE, _REPORTED_SHARE = 1e-3, 0.01
 # Scanned factors on the gain and samples of delay, and the relative tolerance of the bisection.
-_GAINS = tuple(2.0 ** (k / 4.0) for k in range(1, 17))
+GAIN_SCAN = tuple(2.0 ** (k / 4.0) for k in range(1, 17))
 _COARSE_GAINS = tuple(2.0 ** (k / 2.0) for k in range(1, 9))
-_DELAY_SAMPLES = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
+DELAY_SCAN = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 _BISECTION_TOLERANCE = 0.005
 # Peak to peak over the step: a linear loop at its stability limit swings by two, and more with overshoot.
 _MAX_SWING = 3.0
@@ -181,12 +181,12 @@ def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: 
     postures = loop.postures()[:1] if coarse or what == "gain_down" else loop.postures()
     for lean, amplitude in product(postures, loop.kicks):
         posture = tuple(loop.size * angle for angle in lean)
-        case = _Case(loop, axes, what, amplitude, posture)
+        case = Experiment(loop, axes, what, amplitude, posture)
         none = 1.0 if what != "delay" else 0.0
         if least <= none:
             break  # no smaller value exists
         floor, value = case.floor(), none
-        if floor <= loop.size * _HUNTING_RAD:
+        if case.comes_to_rest(floor):
             value = _first_crossing(case, floor, least, coarse, sparse)
         hunts = floor if _REPORTED_SHARE * amplitude < floor < math.inf else 0.0
         found.append(Crossing(loop.name, axes, what, amplitude, posture, value, hunts, loop.robot))
@@ -194,29 +194,29 @@ def _scan_group(loop: LoopUnderTest, axes: str, what: str, coarse: bool, least: 
     return found
 
 
-def _first_crossing(case: _Case, floor: float, least: float, coarse: bool, sparse: bool = False) -> float:
+def _first_crossing(case: Experiment, floor: float, least: float, coarse: bool, sparse: bool = False) -> float:
     """Return the smallest scanned value with an oscillation, bisected; inf if there is none below `least`."""
     calm = 0.0 if case.what == "delay" else 1.0
     for scanned in _scan_values(case, coarse, sparse):
         value = min(scanned, least)
         if case.oscillates(value, floor):
-            return calm if coarse else _bisect(case, calm, value, floor)
+            return calm if coarse else bisect(case, calm, value, floor)
         if value >= least:
             break
         calm = value
     return math.inf
 
 
-def _scan_values(case: _Case, coarse: bool, sparse: bool) -> Iterator[float]:
+def _scan_values(case: Experiment, coarse: bool, sparse: bool) -> Iterator[float]:
     if case.what == "delay":
         unit = case.loop.samples * case.sample_time
-        yield from (samples * unit for samples in (_DELAY_SAMPLES[1::2] if sparse else _DELAY_SAMPLES))
+        yield from (samples * unit for samples in (DELAY_SCAN[1::2] if sparse else DELAY_SCAN))
     else:
         # Down to a quarter: a loop with an unstable plant fails before, others never.
-        yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse or sparse else _GAINS
+        yield from _COARSE_GAINS[:4] if case.what == "gain_down" else _COARSE_GAINS if coarse or sparse else GAIN_SCAN
 
 
-def _bisect(case: _Case, calm: float, loud: float, floor: float) -> float:
+def bisect(case: Experiment, calm: float, loud: float, floor: float) -> float:
     """Return the largest value without oscillation between a calm and an oscillating one."""
     if case.what == "delay":
         while loud - calm > max(_BISECTION_TOLERANCE * loud, 0.02 * case.sample_time):
@@ -230,7 +230,7 @@ def _bisect(case: _Case, calm: float, loud: float, floor: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class _Case:
+class Experiment:
     """One scan: axes, raised quantity, step and posture."""
 
     loop: LoopUnderTest
@@ -248,13 +248,21 @@ class _Case:
         """Return the final motion at gain 1, peak to peak [rad]; inf if the loop does not respond."""
         return self._windows(1.0, 0.0)[1]
 
+    def comes_to_rest(self, floor: float) -> bool:
+        """Return whether a loop with this final motion at gain 1 has a margin that can be found."""
+        return floor <= self.loop.size * _HUNTING_RAD
+
     def oscillates(self, value: float, floor: float) -> bool:
         """Return whether the oscillation is sustained at a gain, its reciprocal, or a delay [s]."""
+        return self.try_at(value, floor)[0]
+
+    def try_at(self, value: float, floor: float) -> tuple[bool, float]:
+        """Return whether the oscillation is sustained, and its swing in the last window [rad]."""
         gain = {"gain_up": value, "gain_down": 1.0 / value, "delay": 1.0}[self.what]
         before, last = self._windows(gain, value / self.sample_time if self.what == "delay" else 0.0)
         sustained = last >= _SUSTAINED_RATIO * before or last >= _MAX_SWING * self.amplitude
         heard = (_AUDIBLE_SHARE_DOWN if self.what == "gain_down" else _AUDIBLE_SHARE) * self.amplitude
-        return sustained and last > max(heard, _ABOVE_FLOOR * floor)
+        return sustained and last > max(heard, _ABOVE_FLOOR * floor), last
 
     def _windows(self, gain: float, delay: float) -> tuple[float, float]:
         """Return the largest oscillation [rad] in the last two windows."""
@@ -351,6 +359,9 @@ def scale_loop_gain(
         parameters=(
             *(Port(name=f"gain_{axis}", start=1.0, minimum=0.0) for axis in outputs),
             *(Port(name=f"delay_{axis}", minimum=0.0, maximum=kept - 2.0) for axis in outputs),
+            *(Port(name=f"share_{axis}", minimum=0.0) for axis in outputs),
+            Port(name="keep", minimum=0.0, maximum=1.0), Port(name="noise", minimum=0.0),
+            Port(name="noise_seed", integer=True),
         ),
     )  # fmt: skip
     connections = {f"{role}.{seen[name]}": f"louder.{name}_measured_seen" for name in read}

@@ -132,8 +132,8 @@ def round_12_digits(value: float) -> float:
 _TRACK_METRICS = ("circle_rms_deg", "ahead_rms_deg", "variation_rad_s")
 _AXIS_METRICS = (*LARGE, *SMALL)
 _SIM_METRICS = (
-    "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "limit_violation_s",
-    "slack_s",
+    "overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "load_rms_deg", "max_rad",
+    "limit_violation_s", "slack_s",
 )  # fmt: skip
 
 

@@ -360,7 +360,14 @@ def judge_loop(
         result = run_loop(loop, compiled=compiled)
     except DataError:
         # Overflow: the loop is unstable.
-        return dict.fromkeys((*_AXIS_METRICS, *_MOTOR_METRICS), math.inf), None
+        return step_metrics(None), None
+    return step_metrics(result, angle=angle), result
+
+
+def step_metrics(result: LoopResult | None, *, angle: str = "true") -> dict[str, float]:
+    """Return the metrics of the worst stepped axis and of the motors; inf for a loop that diverged, None."""
+    if result is None:
+        return dict.fromkeys((*_AXIS_METRICS, *_MOTOR_METRICS), math.inf)
     table, robot = metrics(result, angle=angle), result.robot
     names = Scale(robot=robot).name_of
     sizes = {axis: float(np.abs(result[f"{axis}_reference"]).max()) for axis in robot.outputs.names}
@@ -372,7 +379,7 @@ def judge_loop(
     told = {name: table["motors"][names(name)] for name in _MOTOR_METRICS}
     # A plant without tension outputs has no slack metric.
     values |= {name: math.nan if value is None else float(value) for name, value in told.items()}
-    return values, result
+    return values
 
 
 def loops_under_test(

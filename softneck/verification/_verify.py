@@ -108,6 +108,7 @@ class Verification(ReprMixin):
         held = sum(verdict.holds is True for verdict in self.verdicts)
         text = f"{held} of {count} requirements hold" if held < count else f"all {count} requirements hold"
         text += f", {absent} {'is' if absent == 1 else 'are'} not computed" if absent else ""
+        text += "".join(f"; {part.statement()}" for part in self.evidence.drawn)
         return (
             f"{text}; {len(self.evidence.plants)} plants, {len(self.evidence.necks)} simulated loops, "
             f"{self.order_words()}; {self.wall_time:.1f} s"
@@ -143,6 +144,7 @@ class Verification(ReprMixin):
             "virtual_neck_loops": len(evidence.necks),
             "foreign_plants": evidence.foreign,
             **validity(evidence, self.tested),
+            "draws": [part.facts() for part in evidence.drawn],
             "settings": {name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")},
         }
         if robot.in_header():
@@ -212,10 +214,13 @@ def verify(
     *,
     order: str | None = None,
     observer: Any = None,
+    attempt: int = 1,
     files: Mapping[str, tuple[str, str]] | None = None,
     progress: Progress | None = None,
 ) -> Verification:
     """Verify a controller on all plants.
+
+    Loops over the draws of a family decide, if it has them; its linear tests are then shown beside.
 
     Args:
         controller: an object with `block()` or `step`, or its file; linear checks need `ss()`.
@@ -224,6 +229,7 @@ def verify(
             to the simulation models if there are any, else to the linear plants.
         order: of the loop; default that of the design.
         observer: in the simulated loops; default none.
+        attempt: at a certificate over the same family, from 1 on; each has draws of its own and is counted.
         files: role -> (path, SHA-256) of the files read, for the certificate.
         progress: called now and then; default a bar in a terminal.
 
@@ -270,9 +276,12 @@ def verify(
             )
     step = [make_simulation_model(thing, name, robot) for name, thing in own.items()]
     with shown_progress("verify", progress) as tell:
-        evidence = gather(judged, necks, asked, observer=eyes, progress=tell, families=linear, own=step)
+        evidence = gather(
+            judged, necks, asked, observer=eyes, progress=tell, families=linear, own=step, attempt=attempt
+        )
     tested = {name: thing.findings["tested"] for name, thing in linear.items() if getattr(thing, "measured", {})}
-    elsewhere = unrecorded_conditions(tested, step, evidence.steps, robot)
+    drawn = [make_simulation_model(item.draws.model, item.family, robot) for item in evidence.drawn]
+    elsewhere = unrecorded_conditions(tested, [*step, *drawn], evidence.steps, robot)
     if tested and not judged.laws:
         elsewhere["margins"] = ALONE
     verdicts = [_verdict(item, evidence, elsewhere) for item in asked.bounds]
@@ -295,6 +304,9 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
     value = float(values.values[row])
     worst = to_json(values.describe(row))
     why = unsupported_reason(item, evidence, elsewhere)
+    linear = bool(evidence.drawn) and all(item.metric not in part.values for part in evidence.drawn)
+    if linear and not item.asked:
+        return Verdict(item, value, None, worst, _LINEAR_NOTE)
     if why:
         return Verdict(item, value, False, worst, why)
     if item.metric.startswith("sim.") and evidence.foreign and not item.asked:
@@ -303,6 +315,7 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
 
 
 _BUILT_IN_NOTE = "shown only: this is a built-in plant; add a model of your robot to count it, or set `[sim] decides`"
+_LINEAR_NOTE = "shown only: linear, all amplitudes at once; the draws of the family decide"
 # Groups about the loop's response, which the data must support.
 _LINEAR_GROUPS = ("stability", "axes", "mimo", "robust")
 
@@ -312,7 +325,10 @@ def unsupported_reason(item: Requirement, evidence: Evidence, elsewhere: Mapping
     group, _, name = item.metric.partition(".")
     axes = evidence.plants.axes
     if group == "sim":
-        return "" if evidence.foreign else elsewhere.get("sim", "")
+        missing = [part.unreached["sim"] for part in evidence.drawn if "sim" in part.unreached]
+        return "" if evidence.foreign else [*missing, elsewhere.get("sim", "")][0]
+    if any(item.metric in part.values for part in evidence.drawn):
+        return elsewhere.get("loop", "")
     if group not in (*_LINEAR_GROUPS, "step", *axes):
         return ""
     parts = [part for part in evidence.tested if group not in axes or part.axis == group]

@@ -1,0 +1,383 @@
+"""Loops over the draws of a family: a controller holds if it holds on every draw, in every condition.
+
+Of N plants drawn independently, none of which fails, a share of at least `d^(1/N)` holds with confidence 1 - d (Wilks
+1941, Ann. Math. Stat. 12:91; Tempo, Calafiore and Dabbene 2013, Randomized Algorithms, sec. 8.3): 95 % with 95 % for
+N = 59, 99 % for N = 299. At attempt k of several d is divided by k (Bonferroni).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from softneck.core import DataError, Progress, Vector
+from softneck.estimation import directions_of
+from softneck.identification import Draws
+from softneck.loop import BlockPart, Loop, LoopResult, MotorFault, RobotReference, error_unit, run_loop
+from softneck.runtime import Block
+
+from ._experiments import (
+    DELAY_SCAN,
+    GAIN_SCAN,
+    Experiment,
+    LoopUnderTest,
+    bisect,
+    scale_loop_gain,
+)
+from ._neck_loops import SimulationModel, direction, make_simulation_model, step_metrics, step_time
+from ._requirements import Requirements
+
+_CONFIDENCE = 0.95
+# Draws whose margin is searched beyond the required one: those that swing most at it.
+_BISECTED = 3
+# Steps may be so much larger than the largest recorded motion.
+_BEYOND = 1.1
+_MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drawn:
+    """Results of the loops over the draws of one family.
+
+    Attributes:
+        family: its name.
+        draws: of the family.
+        attempt: whose draws these are, from 1 on.
+        count: of draws that were run.
+        values: metric -> (n,) of all loops that tell it; of margins those of the draws that swing most.
+        conditions: metric -> draw and condition of each value.
+        failed: numbers of the draws that fail a requirement.
+        unreached: metric -> why the recordings do not support it, and what to record.
+    """
+
+    family: str
+    draws: Draws
+    attempt: int
+    count: int
+    values: Mapping[str, Vector]
+    conditions: Mapping[str, list[dict[str, Any]]]
+    failed: tuple[int, ...]
+    unreached: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def content(self) -> float:
+        """Share of such plants that holds with 95 % confidence; 0 if a draw fails."""
+        return 0.0 if self.failed else certified_content(self.count, self.attempt)
+
+    def statement(self) -> str:
+        """Return what the loops over the draws say."""
+        if self.failed:
+            return f"{len(self.failed)} of {self.count} draws of {self.family} fail"
+        tries = "" if self.attempt == 1 else f" (attempt {self.attempt}, which is counted)"
+        return (
+            f"none of {self.count} draws of {self.family} fails: {100.0 * self.content:.1f} % of such plants hold, "
+            f"with {100.0 * _CONFIDENCE:.0f} % confidence{tries}"
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the certificate says of the draws."""
+        return {
+            "family": self.family, "count": self.count, "failed": list(self.failed), "attempt": self.attempt,
+            "content": self.content, "confidence": _CONFIDENCE, "seed": self.draws.seed, "kind": self.draws.model.kind,
+            "coverage": self.draws.coverage, "level": self.draws.level, "statement": self.statement(),
+        }  # fmt: skip
+
+
+def certified_content(count: int, attempt: int = 1) -> float:
+    """Return the share of plants that holds with 95 % confidence if none of `count` draws fails at an attempt."""
+    return ((1.0 - _CONFIDENCE) / attempt) ** (1.0 / count)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Task:
+    """What all draws share.
+
+    plants: of the draws; limits: metric -> least margin, in its unit; amplitudes: of the steps of margins [SI].
+    """
+
+    controller: Block
+    asked: Requirements
+    order: str
+    observer: Block | None
+    draws: Draws
+    plants: Sequence[SimulationModel]
+    limits: Mapping[str, float]
+    amplitudes: tuple[float, ...]
+    motors: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Margin:
+    """One experiment at a required margin: its swing there over the step, and whether it oscillates."""
+
+    number: int
+    metric: str
+    experiment: Experiment
+    floor: float
+    limit: float
+    swing: float
+    oscillates: bool
+
+
+def run_drawn(
+    name: str, draws: Draws, controller: Block, asked: Requirements, *, order: str, observer: Block | None,
+    attempt: int, progress: Progress, count: int | None = None, search: bool = False,
+) -> Drawn:  # fmt: skip
+    """Run all loops over the draws of a family.
+
+    Steps of every required direction at the lightest and the heaviest payload, with the disturbance of the draws, the
+    sensor's noise, and a load after the step; and each required margin at three amplitudes. Of the draws that swing
+    most there the margin itself is bisected. `search` takes the draws that a search may see, at most `count`.
+    """
+    models = draws.for_search(count or len(draws.for_search())) if search else draws.for_certificate(attempt)
+    plants = [make_simulation_model(model, f"draw {k + 1} of {name}", asked.robot) for k, model in enumerate(models)]
+    inverse = asked.robot.redefinition(directions_of(draws.model))[1]
+    task = _Task(
+        controller, asked, order, observer, draws, plants, _required_margins(asked), _amplitudes(draws, asked), inverse
+    )
+    done = 0
+
+    def one(number: int) -> tuple[dict[str, list[tuple[float, str]]], list[_Margin]]:
+        nonlocal done
+        found = _steps(task, number), _margins(task, number)
+        done += 1
+        progress(0.9 * done / len(plants), f"draw {done} of {len(plants)}")
+        return found
+
+    # The first draw compiles the loop, once instead of in every thread.
+    results = [one(0)]
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        results += list(pool.map(one, range(1, len(plants))))
+    failed = {m.number for _, margins in results for m in margins if m.oscillates}
+    values: dict[str, list[float]] = {}
+    conditions: dict[str, list[dict[str, Any]]] = {}
+    for number, (steps, _) in enumerate(results):
+        for metric, found in steps.items():
+            bounds = [item for item in asked.bounds if item.metric == metric]
+            for value, condition in found:
+                values.setdefault(metric, []).append(value)
+                conditions.setdefault(metric, []).append({"name": f"{plants[number].name}, {condition}"})
+                if not all(item.holds(value) for item in bounds):
+                    failed.add(number)
+    for metric in task.limits:
+        worst = sorted((m for _, margins in results for m in margins if m.metric == metric), key=_severity)[:_BISECTED]
+        for k, item in enumerate(worst):
+            progress(0.9 + 0.1 * k / len(worst), f"bisect {metric}")
+            values.setdefault(metric, []).append(_least_margin(item))
+            conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
+    return Drawn(
+        name, draws, attempt, len(plants), {metric: np.array(found) for metric, found in values.items()}, conditions,
+        tuple(sorted(failed)), _unreached(draws, asked),
+    )  # fmt: skip
+
+
+def _required_margins(asked: Requirements) -> dict[str, float]:
+    return {
+        metric: max(item.limit for item in asked.bounds if item.metric == metric and item.bound == "min")
+        for metric in _MARGINS if any(item.metric == metric and item.bound == "min" for item in asked.bounds)
+    }  # fmt: skip
+
+
+def _amplitudes(draws: Draws, asked: Requirements) -> tuple[float, ...]:
+    """Return three steps, small to large, none beyond the recorded motion."""
+    kicks = _under_test(draws, asked).kicks
+    most = min(draws.conditions["motion"])
+    small, large = min(kicks[0], most), min(kicks[-1], most)
+    return tuple(dict.fromkeys((small, math.sqrt(small * large), large)))
+
+
+def _under_test(draws: Draws, asked: Requirements) -> LoopUnderTest:
+    scale, block = asked.scale, draws.model.block()
+    return LoopUnderTest(
+        name="", plant=lambda: BlockPart(block), controller=block, robot=asked.robot, time=scale.time,
+        size=scale.si(scale.size) / math.radians(1.0), noise=scale.si(scale.noise) / math.radians(1.0),
+    )  # fmt: skip
+
+
+def _payloads(plant: SimulationModel, asked: Requirements) -> tuple[float, ...]:
+    """Return the lightest and the heaviest payload of a draw [kg]."""
+    found = [float(kg) for kg in plant.payloads(asked.sim["payloads_kg"])]
+    return tuple(dict.fromkeys((min(found), max(found))))
+
+
+def _steps(task: _Task, number: int) -> dict[str, list[tuple[float, str]]]:
+    """Return metric -> value and condition of every step of a draw."""
+    asked, plant, robot = task.asked, task.plants[number], task.asked.robot
+    angles = asked.sim["orientations_deg"] if len(robot.outputs.names) > 1 else [0.0]
+    found: dict[str, list[tuple[float, str]]] = {}
+    for kg, angle in product(_payloads(plant, asked), angles):
+        words = [f"{kg:g} kg"] * bool(plant.payload) + [f"{angle:g} deg"] * (len(robot.outputs.names) > 1)
+        for metric, value in _step(task, plant, number, kg, math.radians(angle)).items():
+            found.setdefault(metric, []).append((value, ", ".join(words)))
+    return found
+
+
+def _step(task: _Task, plant: SimulationModel, number: int, kg: float, orientation: float) -> dict[str, float]:
+    """Return the metrics of one step, and of the load that comes after it."""
+    asked, draws, scale, robot = task.asked, task.draws, task.asked.scale, task.asked.robot
+    outputs, at = robot.outputs.names, step_time(task.controller, task.asked)
+    half = float(asked.sim["duration_s"])
+    size = scale.si(float(asked.sim["size_deg"]))
+    shares = direction(orientation, robot)
+    block, connections = scale_loop_gain(task.controller, task.observer, outputs)
+    parameters = {f"share_{axis}": float(s) for axis, s in zip(outputs, draws.share, strict=True)}
+    parameters |= {"keep": draws.keep, "noise": scale.si(float(asked.step["noise_deg"])), "noise_seed": float(number)}
+    loop = Loop(
+        plant=plant.quiet(task.controller.sample_time), controller=BlockPart(task.controller),
+        observer=None if task.observer is None else BlockPart(task.observer),
+        reference=RobotReference(kind="step", values=tuple(size * s for s in shares), at=at),
+        duration=at + half + (half if _has_load(task) else 0.0), order=task.order, robot=robot,
+        **plant.carrying(kg), others={"louder": BlockPart(block)}, other_parameters={"louder": parameters},
+        connections=connections, faults=tuple(_load(task, int(np.argmax(np.abs(shares))), at + half)),
+        other_inputs={"louder": {p.name: 0.0 for p in block.inputs if p.name.endswith("_wanted")}},
+    )  # fmt: skip
+    name_of = scale.name_of
+    try:
+        result = _with_disturbance(run_loop(loop, compiled=True))
+    except DataError:  # numbers overflowed
+        result = None
+    names = ("overshoot_pct", "rise_s", "settling_s", "steady_rms_deg", "rms_error_deg", "max_rad", "slack_s")
+    rows = 0 if result is None else round((at + half) / result.sample_time)
+    values = step_metrics(None if result is None else _rows(result, 0, rows))
+    found = {f"sim.{name_of(name)}": values[name] for name in names if not math.isnan(values[name])}
+    if _has_load(task):
+        found[f"sim.{name_of('load_rms_deg')}"] = math.inf if result is None else _load_rms(result, rows, asked)
+    return found
+
+
+def _has_load(task: _Task) -> bool:
+    return float(task.asked.step["load_rad"]) != 0.0
+
+
+def _load(task: _Task, axis: int, start: float) -> Iterable[MotorFault]:
+    """Yield the faults that add the load of the linear steps to the input of an axis."""
+    if not _has_load(task):
+        return
+    load = task.asked.step_test(0).load * task.motors[:, axis]
+    for motor, size in enumerate(load, start=1):
+        if abs(size) > 1e-12:
+            yield MotorFault(kind="offset", start=start, motor=motor, size=float(size), robot=task.asked.robot)
+
+
+def _with_disturbance(result: LoopResult) -> LoopResult:
+    """Return a result whose outputs are what the sensor tells: those of the draw with disturbance and noise."""
+    own = {}
+    for name in result.robot.outputs.names:
+        seen = next(key for key in result.signals if key.endswith(f"{name}_measured_seen"))
+        own[name] = result.signals[seen]
+    return replace(result, signals={**result.signals, **own})
+
+
+def _rows(result: LoopResult, first: int, stop: int) -> LoopResult:
+    return replace(
+        result, time=result.time[first:stop],
+        signals={name: values[first:stop] for name, values in result.signals.items()},
+    )  # fmt: skip
+
+
+def _load_rms(result: LoopResult, first: int, asked: Requirements) -> float:
+    """Return the rms error of the worst output under the load, in the display unit."""
+    errors = [
+        float(np.sqrt(np.mean((result[name][first:] - result[f"{name}_reference"][first:]) ** 2)))
+        for name in result.robot.outputs.names
+    ]
+    return float(asked.scale.shown(max(errors)))
+
+
+def _margins(task: _Task, number: int) -> list[_Margin]:
+    """Run a draw at each required margin: of each axis at the lightest payload, of all at once at the heaviest too."""
+    plant, asked, found = task.plants[number], task.asked, []
+    names, kg = asked.robot.outputs.names, _payloads(plant, asked)
+    whole = names if len(names) == 1 else (*names, "both")
+    for weight in kg:
+        test = replace(
+            _under_test(task.draws, asked), name=f"{plant.name}, {weight:g} kg" if plant.payload else plant.name,
+            plant=lambda: plant.quiet(task.controller.sample_time), controller=task.controller, observer=task.observer,
+            order=task.order, constants=plant.carrying(weight),
+        )  # fmt: skip
+        # Postures take turns: the draws are many.
+        posture = tuple(test.size * angle for angle in test.postures()[number % 3])
+        for amplitude in task.amplitudes:
+            floor = Experiment(test, whole[-1], "gain_up", amplitude, posture).floor()
+            for axes in whole if weight == kg[0] else whole[-1:]:
+                for metric, limit in task.limits.items():
+                    found += _at_limit(Experiment(test, axes, "", amplitude, posture), floor, metric, limit, number)
+    return found
+
+
+def _at_limit(case: Experiment, floor: float, metric: str, limit: float, number: int) -> list[_Margin]:
+    """Return one axis at a required margin; a gain margin is one up and, of all axes at once, one down."""
+    kinds = ("delay",) if metric == _MARGINS[1] else ("gain_up", "gain_down") if case.axes == "both" else ("gain_up",)
+    value, found = limit / 1e3 if metric == _MARGINS[1] else limit, []
+    for kind in kinds:
+        tried = replace(case, what=kind)
+        if not tried.comes_to_rest(floor):
+            found.append(_Margin(number, metric, tried, floor, limit, math.inf, True))
+            continue
+        oscillates, swing = tried.try_at(value, floor)
+        found.append(_Margin(number, metric, tried, floor, limit, swing / case.amplitude, oscillates))
+    return found
+
+
+def _severity(item: _Margin) -> tuple[bool, float]:
+    return not item.oscillates, -item.swing
+
+
+def _least_margin(item: _Margin) -> float:
+    """Return the margin of one experiment, in the unit of its metric; inf where the scan finds none."""
+    case, delay = item.experiment, item.experiment.what == "delay"
+    factor, none = (1e3, 0.0) if delay else (1.0, 1.0)
+    if not case.comes_to_rest(item.floor):
+        return none
+    value, unit = item.limit / factor, case.loop.samples * case.sample_time
+    if item.oscillates:
+        return factor * bisect(case, none, value, item.floor)
+    scan: Sequence[float] = [unit * samples for samples in DELAY_SCAN] if delay else GAIN_SCAN
+    calm = value
+    for tried in (v for v in scan if v > value):
+        if case.try_at(tried, item.floor)[0]:
+            return factor * bisect(case, calm, tried, item.floor)
+        calm = tried
+    return math.inf
+
+
+def _margin_facts(item: _Margin, name: str, asked: Requirements) -> dict[str, Any]:
+    unit, factor = error_unit(asked.robot)
+    per = math.radians(1.0) if factor is None else factor
+    case = item.experiment
+    return {
+        "name": name, "axis": case.axes, "raised": case.what, f"kick_{unit}": case.amplitude / per,
+        f"posture_{unit}": [x / per for x in case.posture], "worst_of": _BISECTED,
+    }  # fmt: skip
+
+
+def _unreached(draws: Draws, asked: Requirements) -> dict[str, str]:
+    """Return "sim" -> why the recordings do not reach the steps, and what to record."""
+    size, most = asked.scale.si(float(asked.sim["size_deg"])), min(draws.conditions["motion"])
+    shown, unit = asked.scale.shown, error_unit(asked.robot)[0]
+    found: dict[str, str] = {}
+    if size > _BEYOND * most:
+        found["sim"] = (
+            f"not supported by the data: steps of {shown(size):.3g} {unit}, the recordings move {shown(most):.3g} "
+            f"{unit}; record larger motions (`softneck record eq22`, or `multisine` with a larger --amplitude), or set "
+            f"`[sim] {asked.scale.name_of('size_deg')}`"
+        )
+    heavy = max(draws.conditions["payload_kg"])
+    if asked.own.get("sim", {}).get("payloads_kg") and max(asked.sim["payloads_kg"]) > heavy + 1e-9:
+        found["sim"] = (
+            f"not supported by the data: a payload of {max(asked.sim['payloads_kg']):g} kg, recorded up to {heavy:g} "
+            f"kg; record with it (`softneck record eq22 --payload {max(asked.sim['payloads_kg']):g}`)"
+        )
+    return found
+
+
+def draws_of(families: Mapping[str, Any]) -> dict[str, Draws]:
+    """Return name -> draws of the families that have them."""
+    return {name: thing.draws for name, thing in families.items() if getattr(thing, "draws", None) is not None}
