@@ -41,7 +41,7 @@ from softneck.verification import (
 )
 
 from ._requirements import TuneRequirements, can_follow_circle
-from ._task import Judgement, Task, has_observer
+from ._task import MARGINS, Judgement, Task, has_observer
 
 # Time to reach the circle [s], and turns, of which the last is judged.
 _LEAD_IN_S, _TURN_COUNT = 2.0, 2.0
@@ -298,13 +298,16 @@ def linear_metrics(task: Task, ready: Ready, controller: Any) -> dict[str, float
             keep_worse(found, name, value)
             if last in (*LARGE, *SMALL) and axis != "mimo":
                 keep_worse(found, f"axes.{last}", value)
-        for item in data_margins(task.linear, law, plants.axes, judged_one.extra, steep):
+        # Where draws decide, margins are found on them.
+        for item in () if task.drawn else data_margins(task.linear, law, plants.axes, judged_one.extra, steep):
             # A loop that may cross outside the recorded band has no certified margin.
             values = item.margins or {**dict.fromkeys(LARGE, 0.0), "sensitivity": math.inf}
             for last, value in values.items():
                 for group in (item.axis, "axes", *(("mimo",) if last == "disk_margin" else ())):
                     keep_worse(found, f"{group}.{last}", float(value))
             keep_worse(found, "robust.mu", item.mu)
+    for name in MARGINS if task.drawn else ():
+        found.pop(name, None)
     steps = run_steps(
         plants, judged_one.block, asked.step_test(task.seed), workers=1, robot=task.robot, weights=ready.weights
     )

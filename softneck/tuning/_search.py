@@ -23,7 +23,7 @@ from softneck.verification import Requirement
 
 from ._judge import LEVELS, judge_candidate
 from ._space import COSTLY, Space
-from ._task import Job, Judgement, Log, Task
+from ._task import MARGINS, Job, Judgement, Log, Task
 
 # 4 + 3 ln n, the default of CMA-ES, for two to four settings, made even.
 _POPULATION_SIZE = 6
@@ -41,7 +41,6 @@ _HALVING_RATE = 3
 _TIE_WEIGHT = 0.02
 # Largest penalty of one requirement, so that an unknown or unreachable one does not outweigh the rest.
 _MAX_PENALTY = 4.0
-_MARGIN_METRICS = ("axes.gain_margin", "axes.delay_margin_ms")
 # Groups that need a linear form of the controller.
 _LINEAR_GROUPS = ("axes.", "mimo.", "robust.")
 
@@ -69,7 +68,7 @@ class Candidate:
         self.level = level
         # The smaller of the margins by linear methods and by experiment counts.
         self.metrics |= {
-            name: min(value, self.metrics.get(name, math.inf)) if name in _MARGIN_METRICS else value
+            name: min(value, self.metrics.get(name, math.inf)) if name in MARGINS else value
             for name, value in judgement.metrics.items()
         }
 
@@ -168,7 +167,7 @@ class Search:
 
     def cost(self, item: Candidate) -> float:
         """Return the cost of a candidate."""
-        return item.cost(self.task.asked.bounds, tested=self.task.tested)
+        return item.cost(self.task.bounds, tested=self.task.tested)
 
     def _candidates_of(self, kind: str) -> list[Candidate]:
         return [item for item in self.candidates.values() if item.kind == kind]
@@ -217,7 +216,7 @@ class Search:
 
     def _is_robust(self, item: Candidate) -> bool:
         """Return whether all known margins hold."""
-        found = item.ratios(self.task.asked.bounds, tested=self.task.tested)
+        found = item.ratios(self.task.bounds, tested=self.task.tested)
         return all(value <= 1.0 for name, value in found.items() if name.startswith(_LINEAR_GROUPS))
 
     def _start_rank(self, item: Candidate, k: int) -> tuple[bool, bool, float]:

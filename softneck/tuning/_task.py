@@ -26,8 +26,12 @@ from softneck.core import (
 from softneck.design import uncertain_plant
 from softneck.identification import Model
 from softneck.robot import Robot
+from softneck.verification import Requirement
 
 from ._requirements import TuneRequirements
+
+#: Margins by experiment.
+MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
 
 
 def has_observer(kind: str) -> bool:
@@ -48,6 +52,7 @@ class Task:
         cocontraction: in the loops [SI unit of the motors]; None: by the controller's own rule.
         seed: of the noise.
         observer: in the loops of `mpc` and `nmpc`; None for none.
+        drawn: names of those in `own` that are draws of a family; certificates have others.
     """
 
     digest: str
@@ -58,6 +63,16 @@ class Task:
     cocontraction: float | None = None
     seed: int = 0
     observer: Any = None
+    drawn: tuple[str, ...] = ()
+
+    @property
+    def bounds(self) -> tuple[Requirement, ...]:
+        """Requirements of the search: where draws decide, linear margins only where they are stated."""
+        linear = ("axes.", "mimo.", "robust.", "stability.")
+        return tuple(
+            item for item in self.asked.bounds
+            if not self.drawn or item.asked or item.metric in MARGINS or not item.metric.startswith(linear)
+        )  # fmt: skip
 
     @property
     def said_cocontraction(self) -> float | None:
@@ -67,8 +82,8 @@ class Task:
 
     @property
     def tested(self) -> bool:
-        """Whether a family was tested against its recordings."""
-        return any(getattr(thing, "measured", {}) for thing in self.linear.values())
+        """Whether a family that was tested against its recordings decides by its weight, and not by draws."""
+        return not self.drawn and any(getattr(thing, "measured", {}) for thing in self.linear.values())
 
     @property
     def models(self) -> list[Model]:

@@ -62,6 +62,8 @@ from ._task import Log, Task, digest_of
 
 #: Default number of judgements of candidates.
 BUDGET = 160
+# Draws of a family among the plants of a search; its certificates have others.
+_SEARCHED_DRAWS = 2
 # Number of the best candidates that are verified until one holds.
 _MAX_VERIFICATIONS = 2
 _UNCERTIFIED_REASON = "beside recordings nothing is certified of it; name it in --kinds to search it all the same"
@@ -203,6 +205,11 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
         if hasattr(thing, "robot"):
             require_same_robot(robot_of(thing), robot, f"{first} and {name}")
     own = {name: with_robot(thing, robot) for name, thing in own.items()}
+    drawn = {
+        f"{name}, draw {k + 1}": model for name, thing in linear.items() if getattr(thing, "draws", None) is not None
+        for k, model in enumerate(thing.draws.for_search(_SEARCHED_DRAWS))
+    } if loops_start(robot) else {}  # fmt: skip
+    own |= drawn
     if own and not loops_start(robot):
         name = next(iter(own))
         raise SettingsError(
@@ -211,7 +218,7 @@ def task_of(plants: Any, requirements: TuneRequirements | Mapping[str, Any] | st
     asked = _read_requirements(requirements, robot, list(linear.values()), stepping=bool(own))
     return Task(
         digest="", linear=linear, own=own, asked=asked, robot=robot, seed=seed,
-        cocontraction=_recorded_cocontraction(linear, robot),
+        cocontraction=_recorded_cocontraction(linear, robot), drawn=tuple(drawn),
     )  # fmt: skip
 
 
@@ -263,7 +270,7 @@ def _make_result(search: Search, files: Mapping[str, tuple[str, str]] | None, pr
         raise SettingsError(f"no candidate controller could be designed ({why}).")
     compared = [item for item in ranked if LEVELS.index(item.level) >= 1] or ranked
     best, verification, controller = _verify_best(search, compared, files, progress)
-    bounds = task.asked.bounds
+    bounds = task.bounds
     names = objectives(compared)
     # Loops of tuning have noise and additional delay, those of `verify` do not.
     looped = [b for b in bounds if b.metric.startswith(("sim.", "track."))]
@@ -299,7 +306,9 @@ def _relax(found: Tuned, files: Mapping[str, tuple[str, str]] | None, progress: 
         return found
     asked = relax_limits(task.asked, {metric: one.limit for metric, one in kept.items()})
     progress(0.9, "verify what holds")
-    verification = _verify_candidate(replace(task, asked=asked), found.controller, found.best.kind, files)
+    # Its draws are none that an attempt of `_verify_best` has seen.
+    attempt = _MAX_VERIFICATIONS + 1
+    verification = _verify_candidate(replace(task, asked=asked), found.controller, found.best.kind, files, attempt)
     if not verification.holds:
         return found
     return replace(found, task=replace(task, asked=asked), verification=verification, holds=True, loosened=kept)
@@ -315,7 +324,7 @@ def _verify_best(
     for number, item in enumerate(promising):
         controller = design_candidate(task, ready, item.kind, item.settings)
         progress(number / len(promising), f"verify {item.kind}")
-        verification = _verify_candidate(task, controller, item.kind, files)
+        verification = _verify_candidate(task, controller, item.kind, files, number + 1)
         if verification.holds:
             return item, verification, controller
         found.append((item, verification, controller))
@@ -323,11 +332,13 @@ def _verify_best(
 
 
 def _verify_candidate(
-    task: Task, controller: Any, kind: str, files: Mapping[str, tuple[str, str]] | None
+    task: Task, controller: Any, kind: str, files: Mapping[str, tuple[str, str]] | None, attempt: int
 ) -> Verification:
     observer = task.observer if make_observer(task, kind) is not None else None
-    plants = {**task.linear, **task.own}
-    return verify(controller, plants, task.asked.certificate, files=files, progress=silent, observer=observer)
+    plants = {**task.linear, **{name: thing for name, thing in task.own.items() if name not in task.drawn}}
+    return verify(
+        controller, plants, task.asked.certificate, files=files, progress=silent, observer=observer, attempt=attempt
+    )
 
 
 def _observer(task: Task) -> Any:

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterable
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ from softneck.tuning._tune import Tuned, active_requirement, front
 from softneck.verification import make_simulation_model
 from softneck.verification._requirements import Requirement
 
+from ..verification.necks import family, small_draws
 from .test_requirements import neck
 
 # As quick as a verification can be; margins that a nominal plant within 20 % allows.
@@ -344,3 +346,20 @@ def test_what_is_known_twice_counts_by_the_worse() -> None:
     assert item.metrics["axes.gain_margin"] == 1.8
     item.update("margins", Judgement({"axes.gain_margin": 4.0}))
     assert item.metrics["axes.gain_margin"] == 1.8
+
+
+@pytest.mark.slow
+def test_draws_that_a_search_sees_are_in_no_certificate_and_decide_for_linear_margins() -> None:
+    draws = small_draws()
+    asked = {"sampling": {"plants": 30, "search_generations": 0},
+             "sim": {"payloads_kg": [0.0], "orientations_deg": [0.0], "size_deg": 10.0},
+             "require": {"sim.rise_s": {"max": 0.9}}}  # fmt: skip
+    found = tune({"neck": replace(family(), draws=draws)}, asked, kinds=("pi",), budget=6, workers=0)
+    assert found.task.drawn == ("neck, draw 1", "neck, draw 2")
+    assert "axes.sensitivity" not in {bound.metric for bound in found.task.bounds}
+    [part] = found.verification.evidence.drawn
+    assert part.count == draws.count
+    told = [item["name"] for rows in part.conditions.values() for item in rows]
+    assert not [name for name in told if "neck, draw" in name]
+    seen = {model.arrays["weights"].tobytes() for model in draws.for_search()}
+    assert not seen & {model.arrays["weights"].tobytes() for model in draws.for_certificate(part.attempt)}

@@ -10,9 +10,13 @@ import numpy as np
 from softneck.core import Vector
 from softneck.design import LinearController, PiSettings
 from softneck.estimation import LinearNeck
-from softneck.identification import Family
+from softneck.identification import Draws, Family
+from softneck.identification.structured._play import Play
+from softneck.identification.structured._play_draws import PlayDraws
+from softneck.identification.uncertainty._draws import SEARCH_DRAWS
 from softneck.identification.uncertainty._family import AxisFamily
 
+from ..data import neck_recording
 from ..oracles.bake_off import exact
 
 TS = 0.02
@@ -63,4 +67,20 @@ def controller_of(numerator: Vector, denominator: Vector) -> control.StateSpace:
     return control.StateSpace(
         both.A, np.hstack([np.zeros((n, 2)), both.B]), both.C, np.hstack([np.zeros((2, 2)), both.D]), TS,
         inputs=["pitch_reference", "roll_reference", "pitch", "roll"], outputs=["theta_i", "phi_i"],
+    )  # fmt: skip
+
+
+# Draws of one certificate, where 59 would take a minute.
+COUNT = 4
+
+
+def small_draws() -> Draws:
+    """Draws of a linear neck: what they are drawn from is tested elsewhere."""
+    source = PlayDraws.fit(neck_recording(2000, seed=3), settings=Play(rate=6.0, order=5, widths=(), degree=1))
+    rng = np.random.default_rng(0)
+    rows = [source.arrays(source.draw(rng), 1.0) for _ in range(SEARCH_DRAWS + 2 * COUNT)]
+    return Draws(
+        model=source.model, arrays={"weights": np.array([row["weights"] for row in rows])}, count=COUNT, seed=0,
+        factor=1.0, share=np.full(2, 0.01), keep=0.9, level=0.95, coverage=[],
+        conditions={"payload_kg": [0.0, 0.0], "cocontraction": [0.0, 0.0], "motion": [0.3, 0.3]},
     )  # fmt: skip

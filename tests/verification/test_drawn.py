@@ -2,41 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from softneck.identification import Draws, Family
-from softneck.identification.structured._play import Play
-from softneck.identification.structured._play_draws import PlayDraws
 from softneck.identification.uncertainty import _draws
 from softneck.verification import make_requirements, verify
 from softneck.verification._drawn import certified_content
 from softneck.verification._experiments import crossing_values, crossings
 from softneck.verification._neck_loops import loops_under_test, make_simulation_model
 
-from ..data import Truth, neck_recording
-from .necks import PAPER, QUICK, family, pi
+from .necks import COUNT, QUICK, family, pi, small_draws
 
-COUNT = 4
-# The paper's neck of `necks`: the same gain, pole and dead time as the controller is designed on.
-TRUTH = Truth(gain=(PAPER[0] * (1.0 - math.exp(-PAPER[1] * 0.02)),) * 2)
 ASKED = {**QUICK, "sim": {**QUICK["sim"], "size_deg": 10.0}}
 
 
 @pytest.fixture(scope="module")
 def drawn() -> Draws:
-    """Draws of a linear neck, made small: what they are drawn from is tested elsewhere."""
-    source = PlayDraws.fit(neck_recording(2000, seed=3), settings=Play(rate=6.0, order=5, widths=(), degree=1))
-    rng = np.random.default_rng(0)
-    rows = [source.arrays(source.draw(rng), 1.0) for _ in range(_draws.SEARCH_DRAWS + 2 * COUNT)]
-    return Draws(
-        model=source.model, arrays={"weights": np.array([row["weights"] for row in rows])}, count=COUNT, seed=0,
-        factor=1.0, share=np.full(2, 0.01), keep=0.9, level=0.95, coverage=[],
-        conditions={"payload_kg": [0.0, 0.0], "cocontraction": [0.0, 0.0], "motion": [0.3, 0.3]},
-    )  # fmt: skip
+    return small_draws()
 
 
 def with_draws(draws: Draws, bad: int | None = None) -> Family:
