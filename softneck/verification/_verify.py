@@ -304,8 +304,8 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
     value = float(values.values[row])
     worst = to_json(values.describe(row))
     why = unsupported_reason(item, evidence, elsewhere)
-    linear = bool(evidence.drawn) and all(item.metric not in part.values for part in evidence.drawn)
-    if linear and not item.asked:
+    beside = bool(evidence.drawn) and not any(item.metric in part.values for part in evidence.drawn)
+    if beside and not item.asked and not item.metric.startswith("sim.") and (why or not item.holds(value)):
         return Verdict(item, value, None, worst, _LINEAR_NOTE)
     if why:
         return Verdict(item, value, False, worst, why)
