@@ -297,8 +297,9 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
         group = item.metric.partition(".")[0]
         group = "axes" if group in evidence.plants.axes else group
         why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
-        # No model may show it (a tension, a virtual plant), which decides nothing; any other does not hold.
-        open_ = group == "sim" and not item.asked
+        # No model may show it (a tension, a virtual plant, a linear form beside draws), which decides nothing; any other
+        # does not hold.
+        open_ = (group == "sim" or bool(evidence.drawn)) and not item.asked
         return Verdict(item, None, None if open_ else False, {}, f"not computed: {why}")
     row = worst_row(evidence.metrics, item.metric, item.bound)
     value = float(values.values[row])
