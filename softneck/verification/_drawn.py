@@ -35,8 +35,8 @@ from ._neck_loops import SimulationModel, direction, make_simulation_model, step
 from ._requirements import Requirements
 
 _CONFIDENCE = 0.95
-# Draws whose margin is searched beyond the required one: those that swing most at it.
-_BISECTED = 3
+# Draws whose margin is searched beyond the required one: those that swing most at this multiple of it.
+_BISECTED, _PROBED = 3, 2.0
 # Steps may be so much larger than the largest recorded motion.
 _BEYOND = 1.1
 _MARGINS = ("axes.gain_margin", "axes.delay_margin_ms")
@@ -115,7 +115,7 @@ class _Task:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Margin:
-    """One experiment at a required margin: its swing there over the step, and whether it oscillates."""
+    """One experiment at a required margin: its swing there over the step, whether it oscillates, the swing beyond."""
 
     number: int
     metric: str
@@ -124,6 +124,7 @@ class _Margin:
     limit: float
     swing: float
     oscillates: bool
+    beyond: float = 0.0
 
 
 def run_drawn(
@@ -166,13 +167,14 @@ def run_drawn(
                 conditions.setdefault(metric, []).append({"name": f"{plants[number].name}, {condition}"})
                 if not all(item.holds(value) for item in bounds):
                     failed.add(number)
-    every = [item for _, margins in results for item in margins]
     # A gain raised and one lowered are two margins: the slow loop of a lower gain swings longer, and may never fail.
-    for metric, kind in sorted({(item.metric, item.experiment.what) for item in every}):
-        alike = [item for item in every if (item.metric, item.experiment.what) == (metric, kind)]
-        for item in sorted(alike, key=_severity)[:_BISECTED]:
+    kinds = dict.fromkeys((item.metric, item.experiment.what) for _, margins in results for item in margins)
+    for metric, kind in kinds:
+        alike = [[m for m in margins if (m.metric, m.experiment.what) == (metric, kind)] for _, margins in results]
+        for items in sorted(alike, key=_severity)[:_BISECTED]:
             progress(0.95, f"bisect {metric}")
-            values.setdefault(metric, []).append(_least_margin(item))
+            value, item = _least_margin(items)
+            values.setdefault(metric, []).append(value)
             conditions.setdefault(metric, []).append(_margin_facts(item, plants[item.number].name, asked))
     return Drawn(
         name, draws, attempt, len(plants), {metric: np.array(found) for metric, found in values.items()}, conditions,
@@ -310,13 +312,18 @@ def _margins(task: _Task, number: int) -> list[_Margin]:
             floor = Experiment(test, whole[-1], "gain_up", amplitude, posture).floor()
             for axes in whole if weight == kg[0] else whole[-1:]:
                 for metric, limit in task.limits.items():
-                    found += _at_limit(Experiment(test, axes, "", amplitude, posture), floor, metric, limit, number)
+                    found += _at_limit(
+                        Experiment(test, axes, "", amplitude, posture), floor, metric, limit, number,
+                        whole=axes == whole[-1], ranks=axes == whole[-1] and amplitude != task.amplitudes[0],
+                    )  # fmt: skip
     return found
 
 
-def _at_limit(case: Experiment, floor: float, metric: str, limit: float, number: int) -> list[_Margin]:
+def _at_limit(
+    case: Experiment, floor: float, metric: str, limit: float, number: int, *, whole: bool, ranks: bool
+) -> list[_Margin]:
     """Return one axis at a required margin; a gain margin is one up and, of all axes at once, one down."""
-    kinds = ("delay",) if metric == _MARGINS[1] else ("gain_up", "gain_down") if case.axes == "both" else ("gain_up",)
+    kinds = ("delay",) if metric == _MARGINS[1] else ("gain_up", "gain_down") if whole else ("gain_up",)
     value, found = limit / 1e3 if metric == _MARGINS[1] else limit, []
     for kind in kinds:
         tried = replace(case, what=kind)
@@ -324,28 +331,45 @@ def _at_limit(case: Experiment, floor: float, metric: str, limit: float, number:
             found.append(_Margin(number, metric, tried, floor, limit, math.inf, True))
             continue
         oscillates, swing = tried.try_at(value, floor)
-        found.append(_Margin(number, metric, tried, floor, limit, swing / case.amplitude, oscillates))
+        # What ranks the draws: at the required margin most are calm, and alike.
+        beyond = tried.try_at(_PROBED * value, floor)[1] / case.amplitude if ranks else 0.0
+        found.append(_Margin(number, metric, tried, floor, limit, swing / case.amplitude, oscillates, beyond))
     return found
 
 
-def _severity(item: _Margin) -> tuple[bool, float]:
-    return not item.oscillates, -item.swing
+def _severity(items: Sequence[_Margin]) -> tuple[bool, float]:
+    """Return the rank of a draw: those that fail first, then those that swing most at twice the required margin."""
+    return not any(item.oscillates for item in items), -max(item.beyond for item in items)
 
 
-def _least_margin(item: _Margin) -> float:
-    """Return the margin of one experiment, in the unit of its metric; inf where the scan finds none."""
+def _least_margin(items: Sequence[_Margin]) -> tuple[float, _Margin]:
+    """Return the least margin of a draw over its experiments, in the unit of its metric, and which has it.
+
+    It is inf where the scan of none finds an end. An experiment that is calm at the least margin so far is done.
+    """
+    least, found = math.inf, items[0]
+    for item in sorted(items, key=lambda item: (not item.oscillates, -item.beyond, -item.swing)):
+        value = _margin(item, least)
+        if value < least:
+            least, found = value, item
+    return least * (1e3 if found.experiment.what == "delay" else 1.0), found
+
+
+def _margin(item: _Margin, least: float) -> float:
+    """Return the margin of one experiment [s or 1]; inf where it is not below `least`."""
     case, delay = item.experiment, item.experiment.what == "delay"
-    factor, none = (1e3, 0.0) if delay else (1.0, 1.0)
+    none, limit = (0.0, item.limit / 1e3) if delay else (1.0, item.limit)
     if not case.comes_to_rest(item.floor):
         return none
-    value, unit = item.limit / factor, case.loop.samples * case.sample_time
     if item.oscillates:
-        return factor * bisect(case, none, value, item.floor)
+        return bisect(case, none, limit, item.floor)
+    unit = case.loop.samples * case.sample_time
     scan: Sequence[float] = [unit * samples for samples in DELAY_SCAN] if delay else GAIN_SCAN
-    calm = value
-    for tried in (v for v in scan if v > value):
+    scan = [v for v in scan if limit < v < least] if math.isinf(least) else [least]
+    calm = limit
+    for tried in scan:
         if case.try_at(tried, item.floor)[0]:
-            return factor * bisect(case, calm, tried, item.floor)
+            return bisect(case, calm, tried, item.floor)
         calm = tried
     return math.inf
 
