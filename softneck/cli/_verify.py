@@ -91,13 +91,15 @@ def command(
     tried = _tried(path.parent, families) if any(getattr(t, "draws", None) is not None for t in things.values()) else []
     this = _attempt_of(hashed)
     earlier = tried if this not in tried else tried[: tried.index(this)]
+    attempt = max(len(earlier) + 1, _attempt_of_tune(controller))
     with progress("verify", quiet=as_json) as report:
         found = verification.verify(
-            judged, things, asked, order=order, observer=eyes, progress=report, attempt=len(earlier) + 1, files=hashed
+            judged, things, asked, order=order, observer=eyes, progress=report, attempt=attempt, files=hashed
         )
     folder = path.with_name(f"{path.name.removesuffix('.json').removesuffix('.certificate')}_worst")
     loops = found.write_worst(folder, controller=controller, observer=observer, force=True)
-    contents = {**found.contents(loops), "attempts": {"plants": families, "tried": [*earlier, this]}}
+    counted = {"plants": families, "tried": [*earlier, this]} if found.evidence.drawn else None
+    contents = found.contents(loops, counted)
     write_certificate(path, contents, force=replace)
     if html is not None:
         from softneck.plots import write_page
@@ -117,6 +119,16 @@ def _attempt_of(files: Mapping[str, tuple[str, str]]) -> str:
     """Return what tells an attempt at a certificate from another one: its controller, observer and requirements."""
     told = [f"{role} {digest}" for role, (_, digest) in files.items() if not role.startswith("plant ")]
     return hashlib.sha256("\n".join(sorted(told)).encode()).hexdigest()
+
+
+def _attempt_of_tune(controller: Path) -> int:
+    """Return which attempt at a certificate `softneck tune` counted for its controller; 1 without one."""
+    beside = controller.with_name(controller.stem + CERTIFICATE_ENDING)
+    try:
+        said = read_certificate(beside).contents.get("draws") if beside.is_file() else None
+        return max((int(part["attempt"]) for part in said), default=1) if isinstance(said, list) else 1
+    except (SoftneckError, KeyError, TypeError, ValueError):
+        return 1
 
 
 def _tried(folder: Path, families: list[str]) -> list[str]:

@@ -114,8 +114,13 @@ class Verification(ReprMixin):
             f"{self.order_words()}; {self.wall_time:.1f} s"
         )
 
-    def contents(self, loops: Mapping[int, Path] | None = None) -> dict[str, Any]:
-        """Return the certificate's JSON values; `loops` maps a verdict's number to the loop file of its worst plant."""
+    def contents(
+        self, loops: Mapping[int, Path] | None = None, attempts: Mapping[str, Any] | None = None
+    ) -> dict[str, Any]:
+        """Return the certificate's JSON values.
+
+        `loops` maps a verdict's number to the loop file of its worst plant; `attempts` are those made so far.
+        """
         rows = []
         for number, verdict in enumerate(self.verdicts):
             item = verdict.requirement
@@ -147,6 +152,8 @@ class Verification(ReprMixin):
             "draws": [part.facts() for part in evidence.drawn],
             "settings": {name: self.requirements.table(name) for name in ("uncertainty", "sampling", "step", "sim")},
         }
+        if attempts is not None:
+            more["attempts"] = dict(attempts)
         if robot.in_header():
             more["robot"] = {"name": robot.name, "hash": robot.hash}
             more["scale"] = {"time": scale.time, "size": scale.size}
@@ -297,8 +304,8 @@ def _verdict(item: Requirement, evidence: Evidence, elsewhere: Mapping[str, str]
         group = item.metric.partition(".")[0]
         group = "axes" if group in evidence.plants.axes else group
         why = evidence.not_computed.get(item.metric, evidence.not_computed.get(group, "it was not computed"))
-        # No model may show it (a tension, a virtual plant, a linear form beside draws), which decides nothing; any other
-        # does not hold.
+        # No model may show it (a tension, a virtual plant, a linear form beside draws), which decides nothing; any
+        # other does not hold.
         open_ = (group == "sim" or bool(evidence.drawn)) and not item.asked
         return Verdict(item, None, None if open_ else False, {}, f"not computed: {why}")
     row = worst_row(evidence.metrics, item.metric, item.bound)

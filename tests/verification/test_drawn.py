@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from softneck.cli._verify import _attempt_of, _tried
+from softneck.core import certificate_contents, write_certificate
 from softneck.identification import Draws, Family
 from softneck.identification.uncertainty import _draws
 from softneck.verification import make_requirements, verify
@@ -95,3 +98,25 @@ def test_steps_larger_than_any_recorded_motion_are_refused(drawn: Draws) -> None
     found = verify(pi(), {"family": with_draws(small)}, make_requirements(ASKED))
     notes = {v.requirement.metric: v.note for v in found.failed}
     assert "steps of 10 deg, the recordings move 4.58 deg; record larger motions" in notes["sim.overshoot_pct"]
+
+
+def test_attempts_over_a_family_are_counted_from_the_certificates_of_a_folder(tmp_path: Path) -> None:
+    def attempt(controller: str, family: str, name: str) -> tuple[int, list[str]]:
+        files = {"controller": (f"{name}.npz", controller), "plant 1": ("f.npz", family)}
+        this, tried = _attempt_of(files), _tried(tmp_path, [family])
+        earlier = tried[: tried.index(this)] if this in tried else tried
+        kept = {"requirements": [], "attempts": {"plants": [family], "tried": [*earlier, this]}}
+        path = tmp_path / f"{name}.certificate.json"
+        write_certificate(path, certificate_contents("verify", holds=False, files=files, more=kept), force=True)
+        return len(earlier) + 1, [*earlier, this]
+
+    assert attempt("a" * 64, "f" * 64, "one")[0] == 1
+    assert attempt("b" * 64, "f" * 64, "two")[0] == 2
+    # The same controller again is the same attempt; another family begins anew.
+    assert attempt("a" * 64, "f" * 64, "one")[0] == 1
+    assert attempt("b" * 64, "e" * 64, "other")[0] == 1
+    # A certificate that replaces the only file of an earlier attempt still tells of it.
+    assert attempt("c" * 64, "f" * 64, "two")[0] == 3
+    assert attempt("d" * 64, "f" * 64, "two")[0] == 4
+    (tmp_path / "note.json").write_text("{}", encoding="utf-8")
+    assert attempt("d" * 64, "f" * 64, "two")[0] == 4
