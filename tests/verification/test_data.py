@@ -21,7 +21,7 @@ from softneck.loop import BlockPart
 from softneck.plant import NeckParameters, VirtualNeck
 from softneck.verification import Verification, make_requirements, verify
 from softneck.verification._evidence import Values, worst_row
-from softneck.verification._experiments import Crossing, LoopUnderTest, _Case
+from softneck.verification._experiments import Crossing, Experiment, LoopUnderTest
 from softneck.verification._linear import AxisMargins, LinearLaw, axis_margins, margins
 from softneck.verification._metrics import Scale
 from softneck.verification._neck_loops import (
@@ -353,7 +353,7 @@ def test_an_fmu_stands_as_much_as_the_plant_that_it_is_made_of(tmp_path: Path, m
     # Loading an FMU changes the folder for a moment: another thread's relative path was "no such file".
     monkeypatch.chdir(Path("/"))
     swings = [
-        _Case(
+        Experiment(
             LoopUnderTest(
                 name="p", plant=part, controller=pi().block(), compiled=False,
                 constants={"plant_inputs": {"payload": 0.0}},

@@ -16,8 +16,8 @@ from softneck.verification import linear_plant
 from softneck.verification._experiments import (
     _SMALL_RAD,
     Crossing,
+    Experiment,
     LoopUnderTest,
-    _Case,
     _first_crossing,
     _oscillation,
     _scan_group,
@@ -47,7 +47,7 @@ def over(plants: Plants, row: int, *, cross: float = 0.0) -> LoopUnderTest:
 
 def first(loop: LoopUnderTest, axes: str, what: str) -> float:
     """The first crossing of a small kick from upright."""
-    case = _Case(loop, axes, what, _SMALL_RAD, (0.0, 0.0))
+    case = Experiment(loop, axes, what, _SMALL_RAD, (0.0, 0.0))
     return _first_crossing(case, case.floor(), math.inf, False)
 
 
@@ -89,12 +89,12 @@ def test_an_unstable_loop_has_no_margin_and_an_overflow_is_an_oscillation() -> N
 def test_the_first_crossing_is_found_where_stability_is_not_monotone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loud between 1.5 and 2 and beyond 6: 1.5 is the margin."""
 
-    def windows(case: _Case, gain: float, delay: float) -> tuple[float, float]:
+    def windows(case: Experiment, gain: float, delay: float) -> tuple[float, float]:
         del case, delay
         loud = 1.5 < gain < 2.0 or gain > 6.0
         return (1.0, 1.0) if loud else (1.0, 0.0)
 
-    monkeypatch.setattr(_Case, "_windows", windows)
+    monkeypatch.setattr(Experiment, "_windows", windows)
     found = _scan_group(over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "pitch", "gain_up", False)
     assert found[0].value == pytest.approx(1.5, rel=0.005)
     # Later cases look no further than the least so far.
@@ -153,14 +153,14 @@ def test_the_least_of_all_is_the_same_where_only_that_is_looked_for(monkeypatch:
     loops = [replace(over(plants, row), name=f"p{row}") for row in (0, 1)]
     runs = 0
 
-    def windows(case: _Case, gain: float, delay: float) -> tuple[float, float]:
+    def windows(case: Experiment, gain: float, delay: float) -> tuple[float, float]:
         nonlocal runs
         runs += 1
         border = {"pitch": 1.9, "roll": 2.3, "both": 2.1}[case.axes] + 0.3 * (case.loop.name == "p0")
         loud = max(gain, 1.0 / gain) > border + case.amplitude or delay > 3.0 * border
         return (1.0, 1.0) if loud else (1.0, 0.0)
 
-    monkeypatch.setattr(_Case, "_windows", windows)
+    monkeypatch.setattr(Experiment, "_windows", windows)
 
     def least(overall: bool) -> dict[str, float]:
         nonlocal runs
@@ -180,12 +180,12 @@ def test_a_loop_that_feeds_a_kick_oscillates_though_slow_parts_of_its_plant_let_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Seen on a foreign neck: 3.5 deg from a kick of 1, then 3.1; it was called calm."""
-    case = _Case(
+    case = Experiment(
         over(all_plants([source_of_family(family(), "f")], 2, 0), 0), "both", "gain_up", _SMALL_RAD, (0.0, 0.0)
     )
-    monkeypatch.setattr(_Case, "_windows", lambda *_: (3.5 * _SMALL_RAD, 3.1 * _SMALL_RAD))
+    monkeypatch.setattr(Experiment, "_windows", lambda *_: (3.5 * _SMALL_RAD, 3.1 * _SMALL_RAD))
     assert case.oscillates(1.6, 0.0)
-    monkeypatch.setattr(_Case, "_windows", lambda *_: (2.5 * _SMALL_RAD, 2.1 * _SMALL_RAD))
+    monkeypatch.setattr(Experiment, "_windows", lambda *_: (2.5 * _SMALL_RAD, 2.1 * _SMALL_RAD))
     assert not case.oscillates(1.6, 0.0)
 
 
@@ -202,7 +202,7 @@ def test_what_sticks_and_comes_late_is_no_oscillation_and_what_runs_away_is_one(
 
 def test_where_a_loop_hunts_at_gain_1_there_is_no_less_to_look_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """It hunts after the small kick and not after the large one: the second divided by a delay of zero."""
-    monkeypatch.setattr(_Case, "_windows", lambda case, *_: (1.0, 1.0 if case.amplitude == _SMALL_RAD else 0.0))
+    monkeypatch.setattr(Experiment, "_windows", lambda case, *_: (1.0, 1.0 if case.amplitude == _SMALL_RAD else 0.0))
     loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for overall in (False, True):
         found = crossings([loop], overall=overall)
@@ -217,6 +217,6 @@ def test_a_quieter_loop_oscillates_by_more_than_what_late_axes_do_to_each_other(
     """Seen on a foreign neck: a dip of 0.2 deg as the other axis came late was a gain margin of 1.4."""
     loop = over(all_plants([source_of_family(family(), "f")], 2, 0), 0)
     for size, loud in ((0.2, False), (1.5, True)):
-        monkeypatch.setattr(_Case, "_windows", lambda *_, size=size: (size * _SMALL_RAD, size * _SMALL_RAD))
-        assert _Case(loop, "both", "gain_down", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0) is loud
-        assert _Case(loop, "both", "gain_up", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0)
+        monkeypatch.setattr(Experiment, "_windows", lambda *_, size=size: (size * _SMALL_RAD, size * _SMALL_RAD))
+        assert Experiment(loop, "both", "gain_down", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0) is loud
+        assert Experiment(loop, "both", "gain_up", _SMALL_RAD, (0.0, 0.0)).oscillates(1.4, 0.0)
