@@ -78,7 +78,7 @@ def small_draws() -> Draws:
     """Draws of a linear neck: what they are drawn from is tested elsewhere."""
     source = PlayDraws.fit(neck_recording(2000, seed=3), settings=Play(rate=6.0, order=5, widths=(), degree=1))
     rng = np.random.default_rng(0)
-    rows = [source.arrays(source.draw(rng), 1.0) for _ in range(SEARCH_DRAWS + 2 * COUNT)]
+    rows = [source.arrays(source.draw(rng), 1.0) for _ in range(SEARCH_DRAWS + 4 * COUNT)]
     return Draws(
         model=source.model, arrays={"weights": np.array([row["weights"] for row in rows])}, count=COUNT, seed=0,
         factor=1.0, share=np.full(2, 0.01), keep=0.9, level=0.95, coverage=[],

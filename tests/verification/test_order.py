@@ -52,7 +52,13 @@ def test_a_verdict_is_that_of_the_worst_and_no_number_holds_nothing(name: str) -
     def verdict(values: list[float], limit: float) -> Any:
         table = {name: Values(np.array(values), lambda row: {"row": row})}
         evidence: Any = SimpleNamespace(
-            metrics=table, not_computed={}, foreign=False, tested=[], crossings=[], plants=SimpleNamespace(axes=())
+            metrics=table,
+            not_computed={},
+            foreign=False,
+            tested=[],
+            drawn=[],
+            crossings=[],
+            plants=SimpleNamespace(axes=()),
         )
         return _verdict(Requirement(name, _bound(name), limit, True), evidence, {})
 
