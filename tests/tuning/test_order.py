@@ -44,7 +44,9 @@ def _task(**more: Any) -> Any:
     certificate = SimpleNamespace(
         uncertainty={"rolloff_db_per_decade": -1.0}, scale=Scale(), step_test=lambda seed: seed, **more
     )
-    return SimpleNamespace(asked=SimpleNamespace(certificate=certificate), linear={}, seed=1, robot=Robot.preset())
+    return SimpleNamespace(
+        asked=SimpleNamespace(certificate=certificate), linear={}, drawn=(), seed=1, robot=Robot.preset()
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in LOOPED if not name.startswith("track.c") and "ahead" not in name])
