@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from softneck.core import DataError, FileFormatError, OutputFileError, SoftneckError
 from softneck.identification.models._fitting import row_hashes
 from softneck.signals import SET_POINTS, Recording, concatenate, read_recording, write_recording
+from softneck.signals.recording import _files
 from softneck.signals.recording._channels import known_channels
 from softneck.signals.recording._files import read_plain_csv
 
@@ -84,6 +85,16 @@ def test_a_recording_survives_its_file(tmp_path: Path, suffix: str, recording: R
     for name, values in recording.channels.items():
         # Degrees in the file: one quotient and one product, half an ulp each. NaN stays NaN.
         np.testing.assert_allclose(back.channels[name], values, rtol=2.3e-16, atol=1e-300)
+
+
+def test_blocks_of_rows_make_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = concatenate([neck_recording(300), neck_recording(200, seed=7)])
+    write_recording(tmp_path / "whole.csv", recording)
+    # The last block is not full, and one ends inside a run.
+    monkeypatch.setattr(_files, "_ROWS_AT_ONCE", len(recording) // 3 + 1)
+    write_recording(tmp_path / "blocks.csv", recording)
+    assert (tmp_path / "blocks.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+    assert len(recording) < 4096  # `whole` is one block
 
 
 def test_a_models_memory_of_rows_survives_the_file(tmp_path: Path) -> None:

@@ -135,6 +135,8 @@ def run_command(
                     deployed, chosen.file, link, sensor, override=asked.override, report=report, operator=end.keyboard,
                     log=log, files=files,
                 )  # fmt: skip
+        for text in result.notes[len(deployed.notes) :]:
+            note(text)
         where = None
         if len(result.signals.time) > 1:
             where = end.write(path, lambda to: signals.write_recording(to, result.recording(), force=replace))

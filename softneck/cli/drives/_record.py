@@ -65,6 +65,8 @@ def record_command(
                 replace(session, facts={"record": experiment.facts()}),
                 report=lambda done: tell(done, signal_name),
             )
+        for text in recorded.notes:
+            note(text)
         recording, where = recorded.recording, None
         if recording is not None:
             where = end.write(output, lambda path: write_recording(path, recording, force=force))

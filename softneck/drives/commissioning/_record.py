@@ -46,12 +46,13 @@ class ExperimentResult:
     """An experiment that is over.
 
     `recording`: what was logged, None if it ended before the second sample. `planned`: rows that were asked for.
-    `ended`: how the run on the drives ended.
+    `ended`: how the run on the drives ended. `notes`: on a full disk.
     """
 
     recording: Recording | None
     planned: int
     ended: RunEnd
+    notes: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -138,8 +139,10 @@ def record_signal(
 
     session = replace(session, watches=(log, tell, *session.watches))
     ended = run_session(session, SignalPilot(set_points), sample_time=sample_time, most=len(run) * sample_time)
-    recording = experiment_recording(log.columns(), run[: log.rows], sample_time, session.file.moves)
-    return ExperimentResult(recording, int(np.count_nonzero(run)), ended)
+    columns, notes = log.finish()
+    rows = len(columns[session.file.moves.set_points[0]])
+    recording = experiment_recording(columns, run[:rows], sample_time, session.file.moves)
+    return ExperimentResult(recording, int(np.count_nonzero(run)), ended, notes)
 
 
 def join_runs(excitations: Sequence[Excitation], sample_time: float) -> tuple[np.ndarray, Vector]:

@@ -96,7 +96,7 @@ def recording_of(signals: LoopResult, speeds: Matrix, robot: Robot = NECK) -> Re
         if not np.isfinite(channels.get(rate, np.nan)).any():
             channels.pop(rate, None)
     if np.isfinite(speeds).any():
-        channels |= dict(zip(robot.motor_velocities, speeds.T.copy(), strict=True))
+        channels |= dict(zip(robot.motor_velocities, speeds.T, strict=True))
     return Recording(signals.time, signals.sample_time, channels, robot=robot)
 
 

@@ -8,8 +8,9 @@ Speeds (606Ch) are not mapped: they would need three more frames in each cycle, 
 from __future__ import annotations
 
 import math
-from array import array
+from collections import deque
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -17,26 +18,57 @@ from softneck.core import Matrix, Vector
 from softneck.robot import Robot
 from softneck.signals import NECK, Recording
 
+from ._spool import Spool
 
-class Motion:
-    """Times and positions of all bus cycles so far."""
 
-    def __init__(self, motors: int = 3) -> None:
-        """Start empty."""
-        self._times, self._positions, self._motors = array("d"), array("d"), motors
+class Rows:
+    """Rows of a run, each with the positions and speeds of the motors at its time, which the next two cycles tell.
 
-    def __len__(self) -> int:
-        """Number of cycles."""
-        return len(self._times)
+    `motors`: how many there are.
+    """
+
+    def __init__(self, columns: int, motors: int, folder: Path | None = None) -> None:
+        """Start with no row of `columns` numbers; the file is in `folder`."""
+        self._spool, self._motors = Spool(columns + 2 * motors, folder), motors
+        self._unfinished: deque[tuple[int, list[float]]] = deque()
+        self._recent: deque[tuple[float, Sequence[float]]] = deque(maxlen=4)
+        self._cycle = -1
 
     def take(self, now: float, positions: Sequence[float]) -> None:
-        """Add the positions [rad] read in the cycle at `now` [s]."""
-        self._times.append(now)
-        self._positions.extend(positions)
+        """Take the positions [rad] read in the cycle at `now` [s]; `motion_at` has the equations."""
+        self._cycle += 1
+        self._recent.append((now, positions))
+        m = self._motors
+        for cycle, row in self._unfinished:
+            if self._cycle == cycle + 1:
+                row[-2 * m : -m] = positions
+            elif self._cycle == cycle + 2 and cycle >= 1:
+                (first, _), (_, before), (last, _), _ = self._recent
+                if last > first:
+                    row[-m:] = [(p - q) / (last - first) for p, q in zip(positions, before, strict=True)]
+        # The last row may still change.
+        while len(self._unfinished) > 1 and self._unfinished[0][0] + 2 <= self._cycle:
+            self._spool.append(self._unfinished.popleft()[1])
 
-    def at(self, cycles: Sequence[int]) -> tuple[Matrix, Matrix]:
-        """Return `motion_at` of these cycles."""
-        return motion_at(np.array(self._times), np.array(self._positions).reshape(-1, self._motors), cycles)
+    def add(self, row: Sequence[float]) -> list[float]:
+        """Add a row of this cycle; return it, which may be changed until the next one."""
+        added = [*row, *[math.nan] * (2 * self._motors)]
+        self._unfinished.append((self._cycle, added))
+        return added
+
+    def finish(self) -> tuple[Matrix, Matrix, Matrix]:
+        """Return the rows (rows, columns), positions [rad] and speeds [rad/s] (rows, motors)."""
+        while self._unfinished:
+            self._spool.append(self._unfinished.popleft()[1])
+        table, m = self._spool.columns().T, self._motors
+        return table[:, : -2 * m], table[:, -2 * m : -m], table[:, -m:]
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what to say of a full disk."""
+        spool = self._spool
+        if spool.lost:
+            return (f"the disk took no more rows ({spool.problem}): the last {spool.lost} are lost",)
+        return (f"the disk took no more rows ({spool.problem}); they were kept in memory",) if spool.problem else ()
 
 
 def motion_at(times: Vector, positions: Matrix, cycles: Sequence[int]) -> tuple[Matrix, Matrix]:
@@ -73,9 +105,9 @@ def experiment_channels(
     table: Matrix, positions: Matrix, speeds: Matrix, robot: Robot = NECK
 ) -> dict[str, Vector]:  # fmt: skip
     """Return the channels of an experiment: rows of a `SignalLog`, positions and speeds at their times."""
-    columns = dict(zip(columns_of(robot), table.T.copy(), strict=True))
-    moved = dict(zip(robot.motor_positions, positions.T.copy(), strict=True))
-    moved |= dict(zip(robot.motor_velocities, speeds.T.copy(), strict=True))
+    columns = dict(zip(columns_of(robot), table.T, strict=True))
+    moved = dict(zip(robot.motor_positions, positions.T, strict=True))
+    moved |= dict(zip(robot.motor_velocities, speeds.T, strict=True))
     maybe = {"compression", *(f"{name}_rate" for name in robot.outputs.names), *robot.motor_velocities}
     return {
         name: values

@@ -73,6 +73,11 @@ class Session:
         """Whether time is virtual."""
         return isinstance(self.link, VirtualLink)
 
+    @property
+    def folder(self) -> Path | None:
+        """Where rows are kept during the run: beside the log; None: where temporary files are."""
+        return None if self.log is None else self.log.path.parent
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunEnd:

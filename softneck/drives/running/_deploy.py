@@ -152,7 +152,7 @@ def run_on_bus(
 def _run(
     deployed: Deployment, pilot: LoopPilot, session: Session, report: Callable[[float], None] | None
 ) -> DrivesResult:
-    log = RunLog(pilot)
+    log = RunLog(pilot, truth=session.simulated, folder=session.folder)
     rows = max(1, round(deployed.loop.duration / pilot.sample_time))
     neck = session.link.neck if isinstance(session.link, VirtualLink) else None
 
@@ -174,9 +174,9 @@ def _run(
         )
     finally:
         pilot.close()
-    master = ended.master
+    master, (found, speeds, notes) = ended.master, log.finish(pilot.sample_time)
     return DrivesResult(
-        signals=log.result(pilot.sample_time, truth=session.simulated),
+        signals=found,
         phase=str(master.supervisor.phase),
         fault=master.supervisor.fault,
         counts=dict(master.counts),
@@ -187,9 +187,9 @@ def _run(
         wall_time=ended.wall_time,
         simulated=session.simulated,
         times=ended.times,
-        notes=deployed.notes,
+        notes=(*deployed.notes, *notes),
         terminated=ended.terminated,
-        speeds=log.speeds(),
+        speeds=speeds,
         robot=session.file.moves,
         error=ended.error,
     )

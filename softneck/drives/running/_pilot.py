@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from softneck.signals import NECK, require_same_robot
 from ..bus._link import VirtualLink
 from ..bus._robot import count_word
 from ..logs._result import signal_units
-from ..logs._rows import Motion, columns_of, experiment_channels, truths
+from ..logs._rows import Rows, columns_of, experiment_channels, truths
 from ..master import Frame, Master, Phase
 from ..master._gate import Reading, sample_of
 from ..master._master import Measurement, Motors
@@ -151,8 +152,8 @@ class LoopPilot:
 class RunLog:
     """Collects one row for each sample while the controller runs."""
 
-    def __init__(self, pilot: LoopPilot) -> None:
-        """Prepare the columns."""
+    def __init__(self, pilot: LoopPilot, *, truth: bool, folder: Path | None = None) -> None:
+        """Prepare the columns, with those of simulated drives where `truth`; rows are kept on disk in `folder`."""
         self._pilot, self._robot = pilot, pilot.robot
         outputs = pilot.robot.outputs.names
         places = {}
@@ -164,17 +165,17 @@ class RunLog:
             places[f"{name}_estimate"] = pilot.slot("observer", name)
         places["healthy"] = pilot.slot("observer", "healthy")
         self._places = {name: place for name, place in places.items() if place is not None}
-        self._rows: list[list[float]] = []
+        self._truths = self._true_names() if truth else ()
+        self._names = self._column_names()
+        self._rows = Rows(len(self._names), len(pilot.robot.motors.names), folder)
         self._index = -1
-        self._motion, self._cycles = Motion(len(pilot.robot.motors.names)), list[int]()
 
     def take(self, now: float, master: Master, truth: Mapping[str, float] | None) -> dict[str, float] | None:
         """Take the cycle at `now` [s]; add the row of its sample, once, and return it by name."""
-        self._motion.take(now, master.positions)
+        self._rows.take(now, master.positions)
         if not master.ran or master.index <= self._index:
             return None
         self._index = master.index
-        self._cycles.append(len(self._motion) - 1)
         signals = self._pilot.signals
         row = [float(signals[place]) for place in self._places.values()]
         tilt = master.tilt
@@ -183,32 +184,27 @@ class RunLog:
         row += nothing if tilt is None else [*tilt.values, *tilt.rates]
         if truth is not None:
             row += [truth.get(name, math.nan) for name in self._truths]
-        self._rows.append(row)
-        return dict(zip(self._names(truth is not None), row, strict=True))
+        self._rows.add(row)
+        return dict(zip(self._names, row, strict=True))
 
-    def _names(self, truth: bool) -> list[str]:
+    def _column_names(self) -> list[str]:
         robot = self._robot
         names = [*self._places, *robot.motor_positions]
         names += [f"tension_estimate_{j}" for j in range(1, len(robot.motors.names) + 1)]
         names += [f"{name}{what}_measured" for what in ("", "_rate") for name in robot.outputs.names]
-        return names + (list(self._truths) if truth else [])
+        return [*names, *self._truths]
 
-    @property
-    def _truths(self) -> tuple[str, ...]:
+    def _true_names(self) -> tuple[str, ...]:
         names = (*self._robot.outputs.names, *truths(self._robot))
         return names if self._robot.neck is not None else names[:-1]
 
-    def speeds(self) -> Matrix:
-        """Return the motors' speeds at all rows, (rows, motors) [rad/s]."""
-        return self._motion.at(self._cycles)[1]
-
-    def result(self, sample_time: float, *, truth: bool) -> LoopResult:
-        """Return all rows."""
-        names = self._names(truth)
-        table = np.array(self._rows) if self._rows else np.zeros((0, len(names)))
-        signals: dict[str, Vector] = {name: table[:, i].copy() for i, name in enumerate(names)}
+    def finish(self, sample_time: float) -> tuple[LoopResult, Matrix, tuple[str, ...]]:
+        """Return all rows, the motors' speeds at them, (rows, motors) [rad/s], and notes on the disk."""
+        table, _, speeds = self._rows.finish()
+        signals = dict(zip(self._names, table.T, strict=True))
         time = np.arange(len(table)) * sample_time
-        return LoopResult(time, signals, signal_units(names), sample_time, self._robot)
+        units = signal_units(self._names)
+        return LoopResult(time, signals, units, sample_time, self._robot), speeds, self._rows.notes()
 
 
 class SignalPilot:
@@ -216,14 +212,14 @@ class SignalPilot:
 
     def __init__(self, set_points: Matrix) -> None:
         """Play `set_points` from the first row on."""
-        self._rows = [tuple(row) for row in np.asarray(set_points, dtype=np.float64).tolist()]
+        self._rows = np.asarray(set_points, dtype=np.float64)
 
     def start(self) -> None:
         """Do nothing: there is no state between samples."""
 
     def step(self, measured: Measurement) -> Motors | None:
         """Return the set-points of this sample."""
-        return self._rows[measured.index]
+        return tuple(self._rows[measured.index].tolist())
 
     def is_finished(self, index: int) -> bool:
         """Return whether all rows were played."""
@@ -242,11 +238,10 @@ class SignalLog:
         self._robot = NECK if session is None else session.file.moves
         self._names = columns_of(self._robot)
         self._motors, self._outputs = len(self._robot.motors.names), len(self._robot.outputs.names)
-        self._table = np.full((rows, len(self._names)), np.nan)
-        self._first: list[int] = []
-        self._motion = Motion(self._motors)
-        self._run = run
+        self._planned, self._run = rows, run
         self._log = None if session is None else session.log
+        self._rows = Rows(len(self._names), self._motors, None if session is None else session.folder)
+        self._row: list[float] = []
         link = None if session is None else session.link
         self._truth = link.neck.truth if isinstance(link, VirtualLink) else None
         self._cycles = 0
@@ -259,21 +254,21 @@ class SignalLog:
     ) -> None:  # fmt: skip
         """Store the measurements and set-points of this cycle."""
         del frames_in, frames_out
-        self._motion.take(now, master.positions)
-        if master.supervisor.phase is not Phase.RUNNING or master.index >= len(self._table):
+        self._rows.take(now, master.positions)
+        if master.supervisor.phase is not Phase.RUNNING or master.index >= self._planned:
             return
         if master.index != self.index:
             self.index, self._cycles = master.index, 0
-            self._first.append(len(self._motion) - 1)
-            self._measure(self._table[self.index], tilt, master)
+            self._row = self._rows.add([math.nan] * len(self._names))
+            self._measure(self._row, tilt, master)
         self._cycles += 1
         self._complete = self._cycles == master.settings.sample_cycles
-        self._table[self.index, : self._motors] = master.setpoints
+        self._row[: self._motors] = master.setpoints
         if self._complete and self._log is not None:
-            row = dict(zip(self._names, self._table[self.index].tolist(), strict=True))
+            row = dict(zip(self._names, self._row, strict=False))  # without what later cycles tell
             self._log.signals({**row, "run": 1.0 if self._run is None else float(self._run[self.index])})
 
-    def _measure(self, row: Vector, tilt: Reading | None, master: Master) -> None:
+    def _measure(self, row: list[float], tilt: Reading | None, master: Master) -> None:
         known = self._motors + 2 * self._outputs
         if tilt is not None and master.tilt is tilt:
             row[self._motors : known] = (*tilt.values, *tilt.rates)
@@ -281,16 +276,17 @@ class SignalLog:
             row[known : known + self._motors] = master.tensions
         else:
             truth = self._truth()
-            row[known:] = [truth.get(name, math.nan) for name in self._names[known:]]
+            row[known : len(self._names)] = [truth.get(name, math.nan) for name in self._names[known:]]
 
     @property
     def rows(self) -> int:
         """Samples whose set-points were sent to their end."""
         return self.index + 1 if self._complete or self.index < 0 else self.index
 
-    def columns(self) -> dict[str, Vector]:
-        """Return the channels of a recording; those only that were measured."""
-        return experiment_channels(self._table[: self.rows], *self._motion.at(self._first[: self.rows]), self._robot)
+    def finish(self) -> tuple[dict[str, Vector], tuple[str, ...]]:
+        """Return the channels of a recording, those only that were measured, and notes on the disk."""
+        table, positions, speeds = (part[: self.rows] for part in self._rows.finish())
+        return experiment_channels(table, positions, speeds, self._robot), self._rows.notes()
 
 
 def raised_cosine(rows: int) -> Vector:

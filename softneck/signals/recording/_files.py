@@ -43,6 +43,9 @@ if TYPE_CHECKING:
 _CSV_CHARACTERS = "0123456789+-.eE,\n"
 # [bytes] pandas is faster on larger files, its import included.
 _MAX_PLAIN_BYTES = 20_000_000
+# Rows of a file written at once, so that memory does not grow with its length.
+_ROWS_AT_ONCE = 4096
+_ALL = slice(None)
 
 
 def read_plain_csv(source: Path) -> dict[str, Vector] | None:
@@ -96,17 +99,20 @@ def write_recording(path: str | Path, recording: Recording, *, force: bool = Fal
         if suffix == ".csv":
             robot = recording.robot  # the preset `neck` needs no line
             line = f"{ROBOT_LINE}{json.dumps(robot.as_dict())}\n" if robot.in_header() else ""
-            _write_csv(_columns_by_title(recording), temporary, line)
+            _write_csv(recording, temporary, line)
         else:
             recording_frame(recording).to_parquet(temporary, index=False)
 
 
-def _write_csv(columns: Mapping[str, np.ndarray], path: Path, before: str) -> None:
+def _write_csv(recording: Recording, path: Path, before: str) -> None:
     """Write a table with the shortest digits that read back to the same number; NaN is an empty cell."""
-    head = before + ",".join(columns) + "\n"
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
-    lines = (",".join("" if cell != cell else repr(cell) for cell in row) + "\n" for row in rows)
-    path.write_text(head + "".join(lines), encoding="utf-8")
+    with path.open("w", encoding="utf-8") as file:
+        for start in range(0, len(recording), _ROWS_AT_ONCE):
+            columns = _columns_by_title(recording, slice(start, start + _ROWS_AT_ONCE))
+            if start == 0:
+                file.write(before + ",".join(columns) + "\n")
+            rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+            file.writelines(",".join("" if cell != cell else repr(cell) for cell in row) + "\n" for row in rows)
 
 
 def recording_frame(recording: Recording) -> pd.DataFrame:
@@ -119,15 +125,15 @@ def recording_frame(recording: Recording) -> pd.DataFrame:
     return frame
 
 
-def _columns_by_title(recording: Recording) -> dict[str, np.ndarray]:
-    """Return title with unit -> column in that unit."""
+def _columns_by_title(recording: Recording, part: slice = _ALL) -> dict[str, np.ndarray]:
+    """Return title with unit -> column in that unit, of the rows in `part`."""
     robot = recording.robot
-    columns: dict[str, np.ndarray] = {column_name("time"): recording.time}
+    columns: dict[str, np.ndarray] = {column_name("time"): recording.time[part]}
     for name in known_channels(robot):
         if name in recording.channels:
-            columns[column_name(name, robot)] = recording.channels[name] / to_si(file_unit(name, robot))[0]
+            columns[column_name(name, robot)] = recording.channels[name][part] / to_si(file_unit(name, robot))[0]
     if recording.run.any():
-        columns["run"] = recording.run
+        columns["run"] = recording.run[part]
     return columns
 
 
