@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import DataError, ReprMixin, Vector, require_one_of, to_si
-from softneck.robot import Robot
+from softneck.robot import MOTOR_RANGE, OUTPUT_RANGE, Robot, Scaling
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,6 +28,22 @@ ALL_MOTOR_COLOURS = (*MOTOR_COLOURS, RED, PURPLE, SKY, GREY, "black")
 def in_display_unit(values: np.ndarray, robot: Robot) -> np.ndarray:
     """Convert outputs from SI to the robot's display unit."""
     return values * (1.0 / to_si(robot.outputs.display_unit)[0])
+
+
+# Share of the scaled range, 0.01 deg and 0.0012 rad of the neck: less is rounding, or below what its sensor resolves.
+_LEAST_SHARE = 1e-4
+
+
+def least_spans(scaling: Scaling, robot: Robot) -> dict[str, float]:
+    """Return the least span of a panel of each output [display unit], set-point and motor position [motors' unit].
+
+    `scaling`: of the robot, by the data that are drawn where it gives no ranges.
+    """
+    sizes = in_display_unit(2.0 * OUTPUT_RANGE * _LEAST_SHARE * scaling.output_unit, robot)
+    motor = 2.0 * MOTOR_RANGE * _LEAST_SHARE * scaling.motor_unit / to_si(robot.motors.unit)[0]
+    return dict(zip(robot.outputs.names, sizes.tolist(), strict=True)) | dict.fromkeys(
+        (*robot.set_points, *robot.motor_positions), motor
+    )
 
 
 def curve_styles() -> Iterator[tuple[str, str]]:
@@ -106,6 +122,7 @@ class Panel(ReprMixin):
         y_label: with its unit, such as "pitch [deg]".
         x_label: with its unit; if empty, that of the chart under its lowest panels.
         y_range: initial limits of y; None fits the curves.
+        least_span: the curves are fitted to no smaller range of y, so that rounding does not fill a panel.
         equal: one unit has the same length on both axes, as for a path over pitch and roll.
         ticks: names at x = 0, 1, ... instead of numbers.
     """
@@ -117,10 +134,23 @@ class Panel(ReprMixin):
     title: str = ""
     legend: bool = True
     y_range: tuple[float, float] | None = None
+    least_span: float = 0.0
     log_x: bool = False
     log_y: bool = False
     equal: bool = False
     ticks: Sequence[str] = ()
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """Initial limits of y: `y_range`, or `least_span` around curves that span less; None fits the curves."""
+        if self.y_range is not None or self.least_span <= 0.0 or not self.curves:
+            return self.y_range
+        y = np.concatenate([edge for curve in self.curves for edge in (curve.y, curve.upper_edge)])
+        y = np.append(y[np.isfinite(y)], [level.value for level in self.levels if not level.vertical])
+        if y.size == 0 or np.ptp(y) >= self.least_span:
+            return None
+        middle = 0.5 * float(y.min() + y.max())
+        return middle - 0.5 * self.least_span, middle + 0.5 * self.least_span
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -198,8 +228,8 @@ def _draw(ax: Axes, panel: Panel) -> None:
         ax.set_yscale("log")
     if panel.equal:
         ax.set_aspect("equal", adjustable="datalim")
-    if panel.y_range is not None:
-        ax.set_ylim(*panel.y_range)
+    if panel.limits is not None:
+        ax.set_ylim(*panel.limits)
     if panel.ticks:
         ax.set_xticks(range(len(panel.ticks)), panel.ticks, rotation=30, ha="right")
     ax.set_ylabel(panel.y_label)

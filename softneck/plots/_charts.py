@@ -28,6 +28,7 @@ from ._chart import (
     chart_figure,
     curve_styles,
     in_display_unit,
+    least_spans,
 )
 
 if TYPE_CHECKING:
@@ -115,7 +116,11 @@ def recording_chart(recording: Recording, title: str) -> Chart:
     ]
     borders = [Level(float(x), colour=GREY, vertical=True) for x in line.starts]
     what = "angle" if drawn == "deg" else "output"
-    panels = [Panel(motors, f"set-point [{unit}]", levels=borders), Panel(angles, f"{what} [{drawn}]", levels=borders)]
+    least = least_spans(Scaling.of(robot, set_points=recording.set_points, outputs=outputs), robot)
+    panels = [
+        Panel(motors, f"set-point [{unit}]", levels=borders, least_span=least[robot.set_points[0]]),
+        Panel(angles, f"{what} [{drawn}]", levels=borders, least_span=least[robot.outputs.names[0]]),
+    ]
     return Chart(title, panels, line.x_label)
 
 
@@ -138,7 +143,9 @@ def validation_chart(
     """
     line = timeline(time, run)
     panels, unit, there = [], robot.outputs.display_unit, np.where(np.isfinite(measured).any(axis=0), measured, 0.0)
-    least = in_display_unit(_LEAST_RANGE * Scaling.of(robot, outputs=there).output_unit, robot)
+    scaling = Scaling.of(robot, outputs=there)
+    least = in_display_unit(_LEAST_RANGE * scaling.output_unit, robot)
+    spans = least_spans(scaling, robot)
     for i, axis in enumerate(robot.outputs.names):
         y = line.spread(in_display_unit(measured[:, i], robot))
         curves, errors = [], []
@@ -150,8 +157,9 @@ def validation_chart(
             yhat = line.spread(in_display_unit(values[:, i], robot))
             curves.append(Curve(line.x, yhat, name, colour, style, 0.9))
             errors.append(Curve(line.x, y - yhat, name, colour, style, 0.8))
-        panels.append(Panel(curves, f"{axis} [{unit}]", y_range=_range_for(y, curves, float(least[i]))))
-        panels.append(Panel(errors, f"error [{unit}]", levels=(_ZERO,), legend=False))
+        limits = _range_for(y, curves, float(least[i]))
+        panels.append(Panel(curves, f"{axis} [{unit}]", y_range=limits, least_span=spans[axis]))
+        panels.append(Panel(errors, f"error [{unit}]", levels=(_ZERO,), legend=False, least_span=spans[axis]))
     return Chart(title, panels, line.x_label, caption=caption, row_height=1.9)
 
 
@@ -181,7 +189,10 @@ def loop_chart(
     motor_setpoint_1..n, motor_position_1..n, tension_1..n [N]. `limits`: metric -> limit; those of overshoot and
     settling time are drawn for a step.
     """
-    panels = [_output_panel(time, signals, name, limits or {}, robot) for name in robot.outputs.names]
+    outputs = [signals.get(name, signals.get(f"{name}_measured", np.zeros(time.size))) for name in robot.outputs.names]
+    sent = np.column_stack([signals[name] for name in robot.set_points])
+    least = least_spans(Scaling.of(robot, set_points=sent, outputs=np.column_stack(outputs)), robot)
+    panels = [_output_panel(time, signals, name, limits or {}, robot, least[name]) for name in robot.outputs.names]
     motors, unit = [], robot.motors.unit
     for j, (name, position) in enumerate(zip(robot.set_points, robot.motor_positions, strict=True)):
         called = _motor(robot, j)
@@ -189,7 +200,7 @@ def loop_chart(
         if position in signals:
             measured = signals[position] / to_si(unit)[0]
             motors.append(Curve(time, measured, f"position {called}", ALL_MOTOR_COLOURS[j], "dashed", 0.8))
-    panels.append(Panel(motors, f"motor [{unit}]"))
+    panels.append(Panel(motors, f"motor [{unit}]", least_span=least[robot.set_points[0]]))
     if "tension_1" in signals:
         pulls = [
             Curve(time, signals[f"tension_{j}"], f"tendon {j}", ALL_MOTOR_COLOURS[j - 1])
@@ -206,7 +217,7 @@ def _motor(robot: Robot, number: int) -> str:
 
 
 def _output_panel(
-    time: Vector, signals: Mapping[str, Vector], name: str, limits: Mapping[str, float], robot: Robot
+    time: Vector, signals: Mapping[str, Vector], name: str, limits: Mapping[str, float], robot: Robot, least: float
 ) -> Panel:
     looks_of = (
         ("_lower", GREY, 0.7), ("_upper", GREY, 0.7), ("_measured", GREEN, 0.6), ("", BLUE, 1.4),
@@ -219,7 +230,8 @@ def _output_panel(
     ]
     levels = _step_limits(time, signals.get(f"{name}_reference"), name, limits, robot)
     flat = [level.value for level in levels if not level.vertical]
-    return Panel(curves, f"{name} [{robot.outputs.display_unit}]", levels=levels, y_range=_around(curves, flat))
+    label = f"{name} [{robot.outputs.display_unit}]"
+    return Panel(curves, label, levels=levels, y_range=_around(curves, flat), least_span=least)
 
 
 def _around(curves: list[Curve], values: list[float]) -> tuple[float, float] | None:

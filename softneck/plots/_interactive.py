@@ -118,10 +118,10 @@ def _plot(panel: Panel, chart: Chart, number: int) -> Plot:
     plot.toolbar.active_drag = next(tool for tool in plot.tools if isinstance(tool, BoxZoomTool))
     # The wheel scrolls the page; with Ctrl (a pinch on a touchpad) it zooms along x.
     plot.add_tools(WheelZoomTool(dimensions="both" if panel.equal else "width", modifiers={"ctrl": True}))
-    if panel.y_range is None:
+    if (limits := panel.limits) is None:
         plot.y_range.update(only_visible=True)  # the range follows the visible curves
     else:
-        plot.y_range = Range1d(start=panel.y_range[0], end=panel.y_range[1])
+        plot.y_range = Range1d(start=limits[0], end=limits[1])
     plot.x_range.update(range_padding=0.01)
     plot.grid.grid_line_alpha = 0.4
     for axis in plot.axis:

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softneck.core import Vector, to_si
+from softneck.robot import Scaling
 from softneck.signals import Doubt, Layout, Quality, Recording, Source, file_unit, is_held
 
-from ._chart import ALL_MOTOR_COLOURS, GREEN, GREY, ORANGE, PURPLE, RED, Chart, Curve, Panel
+from ._chart import ALL_MOTOR_COLOURS, GREEN, GREY, ORANGE, PURPLE, RED, Chart, Curve, Panel, least_spans
 from ._page import Section, Table, cell, page
 
 if TYPE_CHECKING:
@@ -148,6 +149,11 @@ def _raw_panel(frame: pd.DataFrame, sources: dict[str, Source]) -> Panel:
     return Panel(curves, f"as logged [{'/'.join(sorted(units)) or '?'}]", x_label="row", title="raw")
 
 
+def _least_spans(recording: Recording) -> dict[str, float]:
+    robot = recording.robot
+    return least_spans(Scaling.of(robot, set_points=recording.set_points, outputs=recording.outputs), robot)
+
+
 def _made_panel(recording: Recording, names: Sequence[str]) -> Panel:
     every = max(1, len(recording) // _MAX_POINTS)
     unit = file_unit(names[0], recording.robot)
@@ -160,7 +166,9 @@ def _made_panel(recording: Recording, names: Sequence[str]) -> Panel:
         for k, name in enumerate(names)
     ]  # fmt: skip
     # Colours and order are those of the columns beside it; a phone has no room for a second legend.
-    return Panel(curves, f"in the recording [{unit}]", x_label="time [s]", title="recording", legend=False)
+    least = _least_spans(recording).get(names[0], 0.0)
+    label = f"in the recording [{unit}]"
+    return Panel(curves, label, x_label="time [s]", title="recording", legend=False, least_span=least)
 
 
 _FAULTS = (("missed", RED), ("frozen", PURPLE), ("clipped", ORANGE), ("outliers", GREEN))
@@ -175,6 +183,7 @@ def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
     t = np.arange(len(recording)) * recording.sample_time
     border = np.flatnonzero(np.diff(recording.run)) + 1
     panels = []
+    least = _least_spans(recording)
     measured = (*recording.robot.motor_positions, *recording.robot.outputs.names)
     for name in [name for name in measured if name in recording.channels]:
         y = _values(recording, name)
@@ -184,7 +193,8 @@ def faults_chart(recording: Recording, quality: Quality, title: str) -> Chart:
             if segments := getattr(quality.channels[name], sort)[:_MAX_MARKS]:
                 rows = [np.arange(one.start, one.stop) for one in segments]
                 curves.append(_fault_curve(t, _values(recording, name), rows, sort, colour))
-        panels.append(Panel(curves, f"{name.replace('_', ' ')} [{quality.channels[name].unit}]"))
+        label = f"{name.replace('_', ' ')} [{quality.channels[name].unit}]"
+        panels.append(Panel(curves, label, least_span=least[name]))
     return Chart(title, panels, "time from the first row [s]", row_height=2.0)
 
 

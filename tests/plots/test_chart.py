@@ -8,8 +8,9 @@ from matplotlib.patches import Rectangle
 
 from softneck.core import DataError, SettingsError
 from softneck.plots import Chart, Curve, Level, Panel, chart_figure
-from softneck.plots._charts import recording_chart, timeline, validation_chart
-from softneck.signals import Recording
+from softneck.plots._charts import loop_chart, recording_chart, timeline, validation_chart
+from softneck.plots._recording_pages import faults_chart
+from softneck.signals import SET_POINTS, Recording, assess_quality
 
 
 def _wave(columns: int, rows: int = 100) -> np.ndarray:
@@ -123,3 +124,29 @@ def test_a_run_that_goes_far_off_does_not_squeeze_what_was_measured() -> None:
     assert near.panels[0].y_range is None
     assert far.panels[0].y_range is not None
     assert far.panels[0].y_range[1] < np.degrees(0.5)
+
+
+def _drawn_spans(chart: Chart) -> list[float]:
+    return [float(np.ptp(ax.get_ylim())) for ax in chart_figure(chart).axes]
+
+
+def test_rounding_does_not_fill_a_panel_and_a_small_motion_does() -> None:
+    """5e-16 deg is flat in every chart of measured channels; 0.1 deg is fitted as before."""
+    time, wave = np.arange(100) * 0.02, np.sin(np.arange(100.0))
+    signals = dict.fromkeys(SET_POINTS, wave)
+    least = np.degrees(2 * 0.8 * 1e-4)  # of the outputs of the neck
+    for size, flat in ((5e-16, True), (0.1, False)):
+        y = np.radians(size) * wave
+        measured = np.column_stack([wave, y])
+        recording = Recording(time, 0.02, {**signals, "pitch": y, "roll": y})
+        charts = {
+            "loop": loop_chart(time, {**signals, "pitch": np.radians(wave), "roll": y}, "loop").panels[1],
+            "recording": recording_chart(recording, "r").panels[1],
+            "validation": validation_chart(time, measured, {"m": measured}, "v").panels[2],
+            "error": validation_chart(time, measured, {"m": measured - y[:, None]}, "v").panels[1],
+            "faults": faults_chart(recording, assess_quality(recording), "f").panels[-1],
+        }
+        for name, panel in charts.items():
+            (drawn,) = _drawn_spans(Chart("one", [panel]))
+            # Matplotlib adds 5 % of the range at each end; the wave misses its peaks by less than 1 %.
+            assert drawn == pytest.approx(least if flat else 2.2 * size, rel=0.01), name

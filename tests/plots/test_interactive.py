@@ -16,6 +16,7 @@ from PIL import Image
 
 from softneck.plots import Chart, Curve, Level, Panel, Section, page
 from softneck.plots._chart import BLUE, GREEN, ORANGE, PURPLE, RED, SKY
+from softneck.plots._interactive import _plot
 from softneck.plots._page import thin_charts
 
 from ..browser import Shown, own_text, shown
@@ -132,6 +133,14 @@ def test_a_page_of_too_many_samples_keeps_the_least_and_the_most_of_each_piece_a
     assert np.isnan(curve.y[inside]).all()
     assert (np.diff(curve.x) > 0).all()
     assert thin_charts(charts)[0] is charts[0]
+
+
+def test_curves_within_rounding_are_drawn_in_their_least_span() -> None:
+    for size, limits in ((1e-16, (-0.5, 0.5)), (1.0, None)):
+        panel = Panel([Curve(X, size * np.sin(X))], "y", least_span=1.0)
+        made = _plot(panel, Chart("c", [panel]), 0).y_range
+        start, end = (getattr(made, edge) for edge in ("start", "end"))
+        assert (pytest.approx((start, end)) == limits) if limits else np.isnan([start, end]).all()  # fitted by Bokeh
 
 
 def test_the_command_line_starts_without_the_drawing_library() -> None:
