@@ -25,6 +25,8 @@ _ACTIONS = {
 }  # fmt: skip
 # Tolerance, as a share of a step, for a delay or an edge of a window that should be on a sample: rounding of k * step.
 _SAME_TIME = 1e-6
+# Row of a time without end, and of any beyond it.
+_LAST_ROW = 2.0**62
 
 
 class ActiveFault:
@@ -37,9 +39,9 @@ class ActiveFault:
     def __init__(self, fault: Fault, slots: list[int], flags: list[int], scale: Vector, step: float) -> None:
         """Prepare `fault` for a loop with this `step` [s]; `scale` (n,) converts SI to the unit of each signal."""
         self.fault, self.slots, self.flags = fault, slots, flags
-        self.first = math.ceil(fault.start / step - _SAME_TIME)
-        end = fault.start + fault.duration
-        self.last = math.ceil(end / step - _SAME_TIME) if math.isfinite(end) else 2**62
+        self.first, self.last = (
+            math.ceil(min(time / step, _LAST_ROW) - _SAME_TIME) for time in (fault.start, fault.start + fault.duration)
+        )
         self._scale, self._step = scale, step
         kind = "add" if isinstance(fault, NeckFault) else fault.kind
         self.what, self.drawn = _ACTIONS.get(kind, FAULT_ADD), kind in ("noise", "outlier")

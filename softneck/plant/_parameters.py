@@ -183,7 +183,7 @@ class NeckParameters(ReprMixin):
         except (ValueError, RecursionError) as error:
             raise FileFormatError(f"{source}: is not valid TOML ({error}).") from error
         preset = content.pop("preset", "paper")
-        if preset not in PRESETS:
+        if not isinstance(preset, str) or preset not in PRESETS:
             raise FileFormatError(f"{source}: `preset` must be one of {', '.join(PRESETS)}; got {preset!r}.")
         names = cls.names()
         unknown = [name for name in content if name not in names]

@@ -172,6 +172,8 @@ def _numbers(given: Any, defaults: Mapping[str, float], scale: Scale) -> dict[st
     """Return the table [track] under the neck's names of its keys, which files up to 0.2 use for every robot."""
     inside = {key: key for key in defaults} | {scale.name_of(key): key for key in defaults}
     found = dict(zip(defaults, scale.table(defaults).values(), strict=True))
+    if not isinstance(given, Mapping):
+        raise SettingsError("`track` must be a table: [track].")
     for key, value in given.items():
         if key not in inside:
             raise SettingsError(f"unknown key `{key}` of [track]; it takes {', '.join(map(scale.name_of, defaults))}.")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from softneck.core import SettingsError, require_between, require_whole
+from softneck.core import SettingsError, require_between, require_one_of, require_whole
 
 from ..master._gate import Reading, sample_of
 
@@ -52,8 +52,9 @@ def make_source(kind: str, table: Mapping[str, Any], folder: Path) -> SensorSour
     """Return the source that the keys `SOURCE_KEYS` of a table [sensor] describe.
 
     Raises:
-        SettingsError: a key of another type, or one that the kind needs is missing.
+        SettingsError: an unknown kind, a key of another type, or one that the kind needs is missing.
     """
+    require_one_of("[sensor] kind", kind, SENSORS)
     values: dict[str, Any] = {}
     for key, value in table.items():
         name, wanted = SOURCE_KEYS[key]

@@ -25,7 +25,7 @@ def fed(cycles: int, every: int, folder: Path) -> tuple[Rows, np.ndarray, np.nda
     rng = np.random.default_rng(cycles + every)
     times, positions = np.cumsum(rng.uniform(0.005, 0.02, cycles)), rng.normal(size=(cycles, 2))
     rows, table, first = Rows(3, 2, folder), rng.normal(size=(cycles // every + 1, 3)), list[int]()
-    row = [0.0] * 7
+    row = [0.0] * 7  # there is none before the first cycle
     for k in range(cycles):
         rows.take(times[k], tuple(positions[k].tolist()))
         if k % every == 0:
