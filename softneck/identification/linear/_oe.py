@@ -6,7 +6,7 @@ run, are projected out (Golub and Pereyra 2003; Ljung 1999, sec. 10.2). Derivati
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from softneck.core import (
     require_whole,
     silent,
 )
-from softneck.signals import Recording
+from softneck.signals import Recording, assess_quality
 
 from ..models._drive import fit_drive
 from ..models._fitting import ScaledData, delay_samples, free_run_fit, training_recording
@@ -43,6 +43,8 @@ from ._srivc_fit import Runs, SrivcFitOptions, deviations
 
 # Time constants are at most a third of the longest run; slower poles only fit a drift.
 _RUNS_PER_TIME_CONSTANT = 3.0
+# Turns within the longest run from which a pole is a mode, and its smallest decay within that run [log].
+_FEW_TURNS, _RINGING_DECAY = 3.0, 0.01
 _MAX_ITERATIONS = 50
 # Relative decrease of the sum of squares at which the search ends: far below the noise.
 _COST_TOLERANCE = 1e-10
@@ -99,6 +101,20 @@ def largest_radius(runs: Runs) -> float:
     return float(np.exp(-_RUNS_PER_TIME_CONSTANT / max(u.size for u, _ in runs)))
 
 
+def _exceeds(f: Vector, radius: float) -> bool:
+    """Return whether a pole is larger than its bound; one that turns several times in a run may decay hardly at all."""
+    poles = np.roots(np.concatenate([[1.0], f]))
+    return bool((np.abs(poles) > _bounds(poles, radius)).any())
+
+
+def _bounds(poles: np.ndarray, radius: float) -> Vector:
+    """Return the bound on the size of each pole: `radius`, and of a mode nearly one."""
+    decay = -np.log(radius)
+    turns = np.abs(np.angle(poles)) * _RUNS_PER_TIME_CONSTANT > 2.0 * np.pi * _FEW_TURNS * decay
+    # A negative real pole alternates with each sample: it is no mode.
+    return np.where(turns & (poles.imag != 0.0), radius ** (_RINGING_DECAY / _RUNS_PER_TIME_CONSTANT), radius)
+
+
 def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[float, Vector]:
     """Minimise the projected cost over f by Levenberg and Marquardt, with Kaufman's derivative."""
     cost, r, J = _project_linear(runs, f, nb, d)
@@ -109,7 +125,7 @@ def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[floa
         while damping < 1e8:
             step = np.linalg.solve(H + damping * np.diag(np.maximum(np.diag(H), 1e-300)), g)
             trial = f + step
-            if pole_radius(trial) <= radius:
+            if not _exceeds(trial, radius):
                 new = _project_linear(runs, trial, nb, d)
                 if new[0] < cost:
                     gained = cost - new[0]
@@ -223,9 +239,11 @@ def _limit_poles(f: Vector, radius: float) -> Vector:
     """Return `f` with its poles moved within `radius`."""
     poles = np.roots(np.concatenate([[1.0], f]))
     size = np.abs(poles)
-    if size.max(initial=0.0) <= radius:
+    bounds = _bounds(poles, radius)
+    if (size <= bounds).all():
         return f
-    return np.real(np.poly(np.where(size <= radius, poles, 0.99 * radius * poles / np.maximum(size, 1e-300))))[1:]
+    inside = np.where(bounds == radius, 0.99 * radius, bounds) * poles / np.maximum(size, 1e-300)
+    return np.real(np.poly(np.where(size <= bounds, poles, inside)))[1:]
 
 
 SOURCES = ("set_points", "positions")
@@ -246,7 +264,8 @@ class OutputError:
     the measured outputs.
 
     Attributes:
-        nf, nb: poles, and coefficients of the numerator.
+        nf, nb: poles, and coefficients of the numerator. None: one pole, or two where the motors excite a lightly
+            damped mode of an output (`assess_quality` finds it on held-out rows); as many coefficients as poles.
         delay: dead time [s]; None takes the one of the smallest cost.
         max_delay: end of that search [s]; None: one and a half time constants of the robot (of a neck 0.3 s).
         source: input of the model: "set_points", or "positions" of the motors, which the drive model simulates from
@@ -254,19 +273,21 @@ class OutputError:
         intervals: add 95 % intervals of K, pole, dead time and static gain to the findings (one pole only).
     """
 
-    nf: int = 1
-    nb: int = 1
+    nf: int | None = None
+    nb: int | None = None
     delay: float | None = None
     max_delay: float | None = None
     source: str = "set_points"
     intervals: bool = False
 
     def __post_init__(self) -> None:
-        require_whole("nf", self.nf, 1, 10)
-        require_whole("nb", self.nb, 1, 100)
+        if self.nf is not None:
+            require_whole("nf", self.nf, 1, 10)
+        if self.nb is not None:
+            require_whole("nb", self.nb, 1, 100)
         check_delays(self.delay, self.max_delay)
         require_one_of("source", self.source, SOURCES)
-        if self.intervals and (self.nf, self.nb) != (1, 1):
+        if self.intervals and not {self.nf, self.nb} <= {None, 1}:
             raise SettingsError("`intervals` are those of one pole; set `nf` and `nb` to 1 with it.")
 
     @one_blas_thread
@@ -276,14 +297,32 @@ class OutputError:
         Raises:
             DataError: too short, constant, not enough excitation, or no stable model.
         """
-        scaled = ScaledData.of(training_recording(recordings))
+        recording = training_recording(recordings)
+        modes = {}
+        if not self.intervals and self.nf != 1:
+            found = assess_quality(recording, bandwidth=1.0).modes
+            modes = {name: (mode.frequency, mode.damping) for name, mode in found.items()}
+        nf = self.nf or (2 if modes else 1)
+        return replace(self, nf=nf, nb=self.nb or (nf if self.nf is None else 1))._fit(recording, modes, progress)
+
+    @property
+    def _poles(self) -> int:
+        return self.nf or 1
+
+    @property
+    def _numerator(self) -> int:
+        return self.nb or 1
+
+    def _fit(self, recording: Recording, modes: Mapping[str, tuple[float, float]], progress: Progress) -> Model:
+        scaled = ScaledData.of(recording)
         settings = replace(self, delay=scaled.seconds(self.delay), max_delay=scaled.seconds(self.max_delay, MAX_DELAY))
         names, Ts, inputs = scaled.directions.names, scaled.data.sample_time, _axis_runs(scaled, self.source)
         found: list[OutputErrorFit] = []
         delays, curves, beside = [], {}, {}
         for axis, name in enumerate(names):
             progress(axis / len(inputs), name)
-            fit, d, curves[name], beside[name] = settings._fit_axis(Ts, inputs[axis], name)
+            start = _mode_start(modes.get(name), self._poles, recording.sample_time)
+            fit, d, curves[name], beside[name] = settings._fit_axis(Ts, inputs[axis], name, start)
             found.append(fit)
             delays.append(d)
         arrays, functions = self._arrays(scaled, found, delays)
@@ -295,7 +334,7 @@ class OutputError:
         warnings = [
             f"{name}: {text}"
             for name, bound, fit in zip(names, map(largest_radius, inputs), found, strict=True)
-            if pole_radius(fit.f) > bound - 1e-3 * (1.0 - bound)
+            if _exceeds(fit.f, bound - 1e-3 * (1.0 - bound))
         ]
         findings = {
             **functions,
@@ -307,7 +346,7 @@ class OutputError:
             **intervals,
         }
         progress(1.0, "done")
-        return scaled.model("oe", self, linear_in_si, arrays=arrays, findings=_in_si(findings, scaled, self.nf))
+        return scaled.model("oe", self, linear_in_si, arrays=arrays, findings=_in_si(findings, scaled, self._poles))
 
     def _arrays(
         self, scaled: ScaledData, found: list[OutputErrorFit], delays: list[int]
@@ -320,7 +359,7 @@ class OutputError:
         drive = fit_drive(scaled.data)
         a, b = [fit.f for fit in found], [fit.b for fit in found]
         source = int(self.source == "positions")
-        if self.nf == 1 and not scaled.has_offset:
+        if self._poles == 1 and not scaled.has_offset:
             arrays = axis_arrays(scaled.directions.redefinition, drive, np.array(a), np.array(b), delays)
             return {**arrays, "source": np.array([float(source)])}, {}
         common = min(delays)
@@ -332,7 +371,7 @@ class OutputError:
         return arrays, functions_found(scaled, a, b, delays)
 
     def _fit_axis(
-        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str
+        self, sample_time: float, runs: list[tuple[Vector, Vector]], name: str, start: list[Vector]
     ) -> tuple[OutputErrorFit, int, list[list[float]], dict[str, Any]]:
         """Return the best fit, its dead time, the cost curve (delay [s], fit [%], one-step rms) and ARX findings."""
         columns = [(y[:, None], u[:, None]) for u, y in runs]
@@ -342,12 +381,13 @@ class OutputError:
         curve: list[list[float]] = []
         last: list[Vector] = []
         for d in delay_samples(self.delay, self.max_delay or MAX_DELAY, sample_time, columns):
-            Phi, Y = arx_rows(columns, self.nf, self.nb, d)
+            Phi, Y = arx_rows(columns, self._poles, self._numerator, d)
             require_excitation(name, Phi)
             arx = np.linalg.lstsq(Phi, Y[:, 0])[0]
             # The optimum of one dead time is a good start for the next.
-            starts = [*last, arx[: self.nf]] if last else default_starts(self.nf, sample_time, arx[: self.nf])
-            fit = fit_output_error(runs, self.nf, self.nb, d, starts)
+            others = [*start, *default_starts(self._poles, sample_time, arx[: self._poles])]
+            starts = [*last, arx[: self._poles]] if last else others
+            fit = fit_output_error(runs, self._poles, self._numerator, d, starts)
             if fit is None:
                 continue
             last = [fit.f]
@@ -359,9 +399,11 @@ class OutputError:
         if best is None:
             raise DataError(f"no dead time gives a stable model of {name}; record with more excitation.")
         d = best[1]
-        again = fit_output_error(runs, self.nf, self.nb, d, [best[0].f, *default_starts(self.nf, sample_time, None)])
+        again = fit_output_error(
+            runs, self._poles, self._numerator, d, [best[0].f, *start, *default_starts(self._poles, sample_time, None)]
+        )
         fit = again if again is not None and again.cost < best[0].cost else best[0]
-        return fit, d, curve, _least_squares_findings(columns, self.nf, self.nb, d, sample_time)
+        return fit, d, curve, _least_squares_findings(columns, self._poles, self._numerator, d, sample_time)
 
     def _intervals(
         self, sample_time: float, runs: list[tuple[Vector, Vector]], fit: OutputErrorFit, delay: int
@@ -384,6 +426,15 @@ class OutputError:
         gain, a, late, b = _NORMAL_QUANTILE * deviations(search, runs, best)[0]
         found = {"K": [K - b, K + b], "pole": [p - a, p + a], "static_gain": [K / p - gain, K / p + gain]}
         return found if self.delay is not None else {**found, "delay_s": [max(L - late, 0.0), L + late]}
+
+
+def _mode_start(mode: tuple[float, float] | None, nf: int, sample_time: float) -> list[Vector]:
+    """Return the denominator of a mode, further poles at zero, to start from; empty without a mode or for one pole."""
+    if mode is None or nf < 2:
+        return []
+    frequency, damping = mode
+    turn = frequency * sample_time * (-damping + 1j * np.sqrt(1.0 - damping**2))
+    return [np.real(np.poly([np.exp(turn), np.exp(np.conj(turn)), *np.zeros(nf - 2)]))[1:]]
 
 
 def _axis_runs(scaled: ScaledData, source: str) -> list[list[tuple[Vector, Vector]]]:

@@ -242,7 +242,7 @@ def _hints(train: Recording, drive: LoadedDrive) -> Recording | None:
     They constrain the network where nothing was recorded, where the networks of different starts differ.
     """
     try:
-        linear = OutputError().fit(train)
+        linear = OutputError(nf=1, nb=1).fit(train)
     except DataError:
         return None
     seconds = float(np.clip(_HINT_SHARE * len(train) * train.sample_time, *_HINT_LIMITS_S))

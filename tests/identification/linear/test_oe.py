@@ -8,6 +8,7 @@ from typing import Any, cast
 import control
 import numpy as np
 import pytest
+import scipy.signal as dsp
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -15,6 +16,7 @@ from softneck.core import DataError, SettingsError
 from softneck.identification import OutputError, Rls, load_model, validate
 from softneck.identification.linear._oe import fit_output_error
 from softneck.identification.models._linear_systems import continuous_parameters
+from softneck.robot import Robot
 from softneck.signals import Recording, concatenate, import_log, read_layout, redefine, signal
 
 from ...data import LAYOUTS, TRUTH, TS, first_order, neck_recording, recording_from
@@ -206,3 +208,23 @@ def test_concatenated_and_listed_recordings_are_the_same() -> None:
     one, two = neck_recording(400), neck_recording(400, seed=5)
     a = OutputError(delay=0.06).fit([one, two]).arrays["a"]
     np.testing.assert_array_equal(a, OutputError(delay=0.06).fit(concatenate([one, two])).arrays["a"])
+
+
+@pytest.mark.parametrize(("sample_time", "unit"), [(0.001, "kPa"), (0.02, "rad"), (4.0, "V")])
+def test_a_lightly_damped_mode_has_two_poles_by_default(sample_time: float, unit: str) -> None:
+    """Its decay lasts longer than the run, which bounds the poles of a drift and not those of a mode."""
+    robot = Robot.from_dict({
+        "name": "arm", "motors": {"names": ["m"], "unit": unit}, "outputs": {"names": ["tip"], "unit": "mm"},
+        "directions": {"kind": "matrix", "matrix": [[1.0]]},
+    })  # fmt: skip
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-2.0, 2.0, 60), rng.integers(20, 60, 60))[:2000, None]
+    pole = np.exp(0.24 * (-0.003 + 1j))
+    y = dsp.lfilter([0.0, 1e-3], np.poly([pole, pole.conj()]).real, u[:, 0])
+    y += 0.05 * y.std() * rng.standard_normal(y.size)
+    r = Recording.from_arrays(u, y[:, None], sample_time=sample_time, robot=robot)
+    model = OutputError(delay=0.0).fit(r)
+    assert (model.settings["nf"], model.settings["nb"]) == (2, 2)
+    # Noise of a twentieth of the motion leaves a fit of 95 %.
+    assert validate(model, r, include_training=True).fits["inf"]["tip"] > 90.0
+    assert OutputError(delay=0.0, nf=1).fit(r).settings["nf"] == 1
