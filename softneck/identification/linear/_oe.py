@@ -112,7 +112,7 @@ def _bounds(poles: np.ndarray, radius: float) -> Vector:
     decay = -np.log(radius)
     turns = np.abs(np.angle(poles)) * _RUNS_PER_TIME_CONSTANT > 2.0 * np.pi * _FEW_TURNS * decay
     # A negative real pole alternates with each sample: it is no mode.
-    return np.where(turns & (poles.imag != 0.0), radius ** (_RINGING_DECAY / _RUNS_PER_TIME_CONSTANT), radius)
+    return np.where(turns & (np.imag(poles) != 0.0), radius ** (_RINGING_DECAY / _RUNS_PER_TIME_CONSTANT), radius)
 
 
 def _search(runs: Runs, nb: int, d: int, f: Vector, radius: float) -> tuple[float, Vector]:
