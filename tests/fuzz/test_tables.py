@@ -12,7 +12,7 @@ import random
 import tomllib
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield from places(item, (*path, key))
 
 
-def put(table: Any, path: tuple[Any, ...], value: Any) -> Any:
+def put(table: Any, path: Sequence[Any], value: Any) -> Any:
     """Return a table with another value at `path`; lists and tables are copied."""
     made = dict(table) if isinstance(table, dict) else list(table)
     if len(path) > 1:

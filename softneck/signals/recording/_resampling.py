@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softneck.core import DataError, Vector, require_positive
+from softneck.core import DataError, Vector, require_positive, require_steps
 
 from ._channels import is_held
 from ._recording import Recording
@@ -201,7 +201,9 @@ def resample(samples: Samples, sample_time: float) -> tuple[Samples, float]:
     shift = 0.0
     for rows in samples.runs():
         t = samples.time[rows]
-        count = int(np.floor((t[-1] - t[0]) / sample_time + _TIME_TOLERANCE)) + 1
+        span = float(t[-1] - t[0])
+        require_steps("time", span, sample_time, 1 + len(samples.channels))
+        count = int(np.floor(span / sample_time + _TIME_TOLERANCE)) + 1
         grid = t[0] + sample_time * np.arange(count)
         before = np.clip(np.searchsorted(t, grid + _TIME_TOLERANCE * sample_time, side="right") - 1, 0, t.size - 1)
         after = np.minimum(before + (np.abs(grid - t[before]) > _TIME_TOLERANCE * sample_time), t.size - 1)

@@ -175,8 +175,11 @@ def seconds(column: pd.Series, name: str) -> Vector:
         row = int(np.argmax(moments.isna()))
         raise DataError(f"column `{name}` holds no date at row {row} (the first is 0).")
     # Whole nanoseconds: seconds since 1970 in a double are off by 1e-7 s.
-    ns = np.asarray(moments.as_unit("ns").asi8, dtype=np.int64)
-    t = (ns - ns[0]) / 1e9
+    try:
+        ns = np.asarray((moments - moments[0]).as_unit("ns").asi8, dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise DataError(f"column `{name}` spans more than 292 years; is one of its dates damaged?") from error
+    t = ns / 1e9
     if column.dtype.kind != "M" and ":" in str(column.iloc[0])[:3]:
         t = t + 86_400.0 * np.concatenate([[0], np.cumsum(np.diff(t) < -43_200.0)])
     return t
