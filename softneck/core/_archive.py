@@ -14,7 +14,7 @@ from ._errors import FileFormatError, error_reason
 from ._files import MOST_JSON, as_path, atomic_write, open_zip, require_file
 
 FORMAT_VERSION = 1
-_HEADER_KEY = "header"
+_HEADER_KEY, _SHAPES_KEY = "header", "shapes"
 # Allowed `dtype.kind` of arrays: real numbers. Reading a complex array as float would drop its imaginary part.
 _NUMBER_KINDS = "fiub"
 
@@ -27,7 +27,8 @@ def write_archive(
     Raises:
         OutputFileError: the file exists (and not `force`) or cannot be written.
     """
-    text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header})
+    shapes = {name: list(np.shape(array)) for name, array in arrays.items()}
+    text = json.dumps({"format": "softneck", "format_version": FORMAT_VERSION, **header, _SHAPES_KEY: shapes})
     contents = {_HEADER_KEY: np.frombuffer(text.encode(), dtype=np.uint8), **arrays}
     with atomic_write(path, force=force) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **contents)
@@ -61,7 +62,21 @@ def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray
     except Exception as error:  # damaged bytes raise all kinds of errors in zipfile, its decompressors, numpy and json
         raise FileFormatError(f"{source}: is not a softneck file or is damaged ({error_reason(error)}).") from error
     _check_header(source, header)
+    # Files of versions before 0.3 do not tell their shapes.
+    _check_shapes(source, header.pop(_SHAPES_KEY, None), contents)
     return header, contents
+
+
+def _check_shapes(source: Path, shapes: object, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise FileFormatError for an array that was written with another shape, or that was not written."""
+    found = {name: list(array.shape) for name, array in arrays.items()}
+    if shapes is None or shapes == found:
+        return
+    told = shapes if isinstance(shapes, dict) else {}
+    name = next((name for name in (*told, *found) if told.get(name) != found.get(name)), "shapes")
+    raise FileFormatError(
+        f"{source}: is damaged: its array `{name}` has shape {found.get(name)} and was written with {told.get(name)}."
+    )
 
 
 def _check_header(source: Path, header: object) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from ._archive import read_archive
 from ._errors import FileFormatError, SettingsError, did_you_mean
+from ._header import require_header
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +135,11 @@ _OF_ROBOT = {
 }
 
 
+# What the file of every kind holds; a kind's own values are checked by its `from_archive`.
+_EVERY_HEADER = {"kind": str, "sample_time": float, "order": str, "robot": {}, "settings": {}, "findings": {}}
+_LONGEST_SAMPLE_TIME = 1e6
+
+
 def removed_kind(name: str) -> str:
     """Return a sentence on a removed kind; empty if `name` is none."""
     if name not in REMOVED:
@@ -224,6 +230,9 @@ def load(path: str | Path, *, role: str | None = None) -> Any:
         is_a, wanted = (f"{'an' if word[0] in 'aeiou' else 'a'} {word}" for word in (kind.role, role))
         raise FileFormatError(f"{path}: is {is_a} ({kind.name}), not {wanted}.")
     with fitting(path):
+        require_header(header, _EVERY_HEADER)
+        if not 0.0 < header.get("sample_time", 1.0) <= _LONGEST_SAMPLE_TIME:
+            raise FileFormatError(f"its sample time is {header['sample_time']} s.")
         return resolve(kind.result).from_archive(header, arrays)
 
 

@@ -14,13 +14,14 @@ The layout determines the order in the file, the checks of shapes, the ranks in 
 reference page. The arrays stay a tuple and the state stays one vector: a bundle replaces names by indices (see
 `_names`), so that numba and C see plain indices. A subclass adds its fields after those of its base.
 
-Shapes are written in symbols: `n` takes the length of the array, `2 * n + 1` must fit it, and `value` defines a symbol
-by an entry that holds a whole number.
+Shapes are written in symbols: `n` takes the length of the array, `2 * n + 1` must fit it, `n = 1 | 3` takes it if it is
+one of these, and `value` defines a symbol by an entry that holds a whole number.
 """
 
 from __future__ import annotations
 
 import ast
+import dataclasses
 import math
 import operator
 import threading
@@ -47,11 +48,13 @@ class Field:
         shape: the length along each dimension, in symbols; empty for a single number of a state.
         meaning: one line with the unit, for the reference page.
         open: the rest of the state, of any length.
+        allowed: symbol of `shape` -> the lengths that it may have.
     """
 
     shape: tuple[str, ...]
     meaning: str
     open: bool = False
+    allowed: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,11 @@ class Symbol:
 
 def array(shape: str, meaning: str) -> Any:
     """Declare an array of `shape`, such as `"2, hidden, n"`."""
-    return Field(_split(shape), meaning)
+    pairs = [text.partition("=") for text in _split(shape)]
+    allowed = {
+        name.strip(): tuple(text.strip() for text in lengths.split("|")) for name, equals, lengths in pairs if equals
+    }
+    return Field(tuple(name.strip() for name, _, _ in pairs), meaning, allowed=allowed)
 
 
 def cells(shape: str, meaning: str) -> Any:
@@ -164,7 +171,17 @@ class Arrays(_Layout):
             for symbol, source in cls.symbols.items():
                 if source.array == name:
                     known[symbol] = _found(source, arrays[name])
+        cls._check_allowed(known)
         return known
+
+    @classmethod
+    def _check_allowed(cls, known: Mapping[str, int]) -> None:
+        for name, item in cls.fields.items():
+            for symbol, texts in item.allowed.items():
+                lengths = [evaluate(text, known) for text in texts]
+                if known[symbol] not in lengths:
+                    wanted = " or ".join(map(str, lengths))
+                    raise FileFormatError(f"its array `{name}` has the length {known[symbol]}; {wanted} is needed.")
 
 
 class StateVector(_Layout):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import Matrix, ReprMixin, SettingsError, Vector, atomic_write, to_si, write_archive
+from softneck.core import Matrix, ReprMixin, SettingsError, Vector, atomic_write, require_header, to_si, write_archive
 from softneck.identification import redefined_input
 from softneck.robot import Robot
 from softneck.runtime import Block, State, sized_name
@@ -287,14 +287,28 @@ class LinearController(ReprMixin):
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> LinearController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        robot = robot_in(header)
+        require_header(header, {"design": design_schema(robot)})
         return cls(
             kind=str(header["kind"]),
             sample_time=float(header["sample_time"]),
             arrays=tuple(LinearArrays.read(arrays).values()),
-            limits=ControllerLimits.from_header(header, robot_in(header)),
+            limits=ControllerLimits.from_header(header, robot),
             order=str(header["order"]),
             design=dict(header["design"]),
         )
+
+
+def design_schema(robot: Robot) -> dict[str, Any]:
+    """Return the types of `design` in a header, as far as a summary reads it (see `require_header`)."""
+    margins = {str: (float, None)}
+    axis = {
+        "gains": {str: float}, "dead_time_s": float, "margins": margins, "margins_small_moves": margins,
+        "samples": int, "samples_unstable": int, "worst_sensitivity": (float, None), "gamma": float, "remark": str,
+    }  # fmt: skip
+    settings = {"sample_time": (float, None)}
+    common = {"extra_delay": int, "assumed": {str: float}, "held_s": (float, None), "settings": settings}
+    return common | dict.fromkeys(robot.outputs.names, axis)
 
 
 def robot_in(header: Mapping[str, Any]) -> Robot:

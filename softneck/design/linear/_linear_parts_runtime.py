@@ -54,7 +54,7 @@ class LinearArrays(FilterArrays):
     T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
     T_inverse = array("motors, references", "redefined inputs to motors")
     constants = array(
-        "numbers",
+        "numbers = 1 | 1 + 2 * motors + 2 * references",
         "sample time [s]; of other robots than the neck also the lowest and highest set-points, and references",
     )
     motors = value("T_inverse", function=linear_motors, written=True)

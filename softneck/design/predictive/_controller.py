@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, to_si, write_archive
+from softneck.core import FileFormatError, Matrix, ReprMixin, Vector, require_header, to_si, write_archive
 from softneck.estimation import AXES
 from softneck.loop import BlockPart
 from softneck.robot import Robot
@@ -299,6 +299,7 @@ class MpcController(ReprMixin):
     @classmethod
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> MpcController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
+        require_header(header, {"design": _DESIGN})
         items = {name: np.ascontiguousarray(arrays[name], dtype=np.float64) for name in rt.MpcArrays.names()}
         if not all(np.isfinite(item).all() for item in items.values()):
             raise FileFormatError("the controller's arrays are not finite; design it again.")
@@ -317,6 +318,15 @@ class MpcController(ReprMixin):
             design=dict(header["design"]),
             robot=robot_in(header),
         )
+
+
+# Types of `design` in a header, as far as a summary reads it.
+_DESIGN = {
+    "extra_delay": int, "bandwidth_rad_s": float, "observer_bandwidth_rad_s": float, "reference_time_s": float,
+    "sensitivity": [float], "worst_sensitivity": (float, None), "spectral_radius": float, "assumed": {str: float},
+    "held_s": (float, None),
+    "settings": {"look_ahead": float, "payload_tautness": float, "sample_time": (float, None)},
+}  # fmt: skip
 
 
 def _removed_option(arrays: Mapping[str, np.ndarray]) -> str:
@@ -346,7 +356,7 @@ _LIMIT_NAMES = ("position_limit", "slew_limit", "lead_limit", "least_position", 
 def _review(controller: MpcController) -> list[str]:
     """Return one line for each finding."""
     c, lines = controller, _limits(controller)
-    Ms = max(c.design.get("sensitivity", [1.0]))
+    Ms = max(c.design.get("sensitivity", [1.0]), default=1.0)
     if Ms > 2.0:
         lines.append(f"Ms is {Ms:.2f}: not robust. Ask for less `max_sensitivity`.")
     if c.design.get("spectral_radius", 0.0) >= 1.0:

@@ -65,14 +65,15 @@ class MpcArrays(Arrays):
 
     _z, _m = "motors * moves + slacks", "(references - 1)"
     _theta = f"{_m} * (n + 2) + {_m} * L + motors + 2"
-    constants = array("numbers", "see MPC_TS to MPC_NUMBERS")
+    constants = array("numbers = 17 | 17 + 2 * motors + 3 * references", "see MPC_TS to MPC_NUMBERS")
     model_A = array(f"{_m} * n, n", "A of each model, below each other")
     model_B = array(f"{_m}, entries", "B of each model, one input behind the other")
     observer = array(f"{_m}, 3", "gains on o and r, and the pole a")
     rest = array(f"{_m}, entries", "x at rest under inputs of one")
     delays = array(_m, "d, dead times [samples]")
     disturbances = array(
-        "1, columns", "zero for each output, the pole of its filter, where told the tautness that it wants"
+        f"1, columns = {_m} + 1 | {_m} + 2",
+        "zero for each output, the pole of its filter, where told the tautness",
     )
     filters = array("references", "poles of the reference filters")
     T = array("references, motors", "of Eq. 9-11: motors to redefined inputs")

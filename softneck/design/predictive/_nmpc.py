@@ -20,6 +20,7 @@ from softneck.core import (
     Vector,
     require_between,
     require_finite,
+    require_header,
     require_whole,
     to_si,
     write_archive,
@@ -145,6 +146,11 @@ class NmpcNumbers(NmpcSettings):
     reference_time: float | None = None
     look_ahead: float | None = None
 
+    def __post_init__(self) -> None:
+        NmpcSettings.__post_init__(self)
+        if self.window is not None:
+            require_whole("window", self.window, 2, _MAX_SAMPLES)
+
     @classmethod
     def of(cls, settings: NmpcSettings) -> Self:
         """Return the settings with these numbers."""
@@ -163,6 +169,13 @@ class NmpcNumbers(NmpcSettings):
             "window": min(max(round(_WINDOW_S / Ts), 2), _MAX_SAMPLES),
         }  # fmt: skip
         return replace(self, **{name: value for name, value in usual.items() if getattr(self, name) is None})
+
+
+_COUNTS = ("window", "horizon", "moves")
+_HEADER = {
+    "settings": {one.name: (int if one.name in _COUNTS else float, None) for one in fields(NmpcNumbers)},
+    "found": {str: {"static_gain": float, "pole": float, "delay": int}},
+}
 
 
 def near_rest(model: Model, found: Mapping[str, Mapping[str, float]]) -> ScaledPlant:
@@ -369,6 +382,7 @@ class NmpcController(ReprMixin):
     def from_archive(cls, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> NmpcController:
         """Return the controller that `save` wrote; `softneck.core.load` calls this."""
         model = embedded_model(header["model"], arrays)
+        require_header(header, _HEADER)
         settings, robot = dict(header["settings"]), model.robot
         for name, usual in _REMOVED_SETTINGS.items():
             if (value := settings.pop(name, usual)) != usual:
@@ -378,6 +392,8 @@ class NmpcController(ReprMixin):
         per_motor, given = to_si(robot.motors.unit)[0], header
         if "position_limit" in settings:  # of versions before 0.3, in the unit of the motors
             given = {name: per_motor * settings.pop(name) for name in LIMITS[:4]}
+        for axis in header["found"].values():
+            require_whole("delay", axis["delay"], 0, _MAX_SAMPLES)
         plant = near_rest(model, header["found"])
         return cls(
             # A file of an earlier version may not say all.

@@ -62,7 +62,7 @@ class AdaptiveArrays(FilterArrays):
     rest = array("m, references", "from r to the filter's state at rest")
     T = array("references, motors", "of Eq. 9-11: motors to (theta_i, phi_i, delta_i)")
     T_inverse = array("motors, references", "redefined inputs to motors")
-    constants = array("numbers", "as of the linear controller")
+    constants = array("numbers = 1 | 1 + 2 * motors + 2 * references", "as of the linear controller")
     nominal = array("outputs, 2", "a and b of each axis")
     box = array("outputs, 4", "least and largest a, least and largest static gain of each axis")
     delays = array("outputs", "d of each axis [samples]")

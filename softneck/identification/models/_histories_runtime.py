@@ -21,7 +21,7 @@ def narx_motors(drive: np.ndarray) -> int:
 class NarxArrays(GroundArrays):
     """The first arrays of every plant."""
 
-    history = array("sizes", "H: how many samples of each signal are kept; and how many outputs there are, if not two")
+    history = array("sizes = 1 | 2", "H, samples of each signal that are kept; and the number of outputs if not two")
     drive = array("motors, 2", "a, d of each motor: m(k+1) = a m(k) + (1 - a) u(k+1-d); d = 0: it is where it is sent")
     H = value("history", 0)
     outputs = value("history", function=narx_outputs, written=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -292,6 +292,7 @@ class Family(ReprMixin):
         }
         for name, axis in axes.items():
             _check(name, axis, arrays["frequency"].size)
+        _check_cross_gains(arrays, len(axes))
         weights = arrays.get("directions", robot.weights())
         if weights is None or weights.shape != (len(axes), len(robot.motors.names)):
             raise FileFormatError("its array `directions` is not of outputs x motors.")
@@ -350,11 +351,19 @@ def relative_errors(samples: Matrix, nominal: Vector, frequency: Vector, sample_
     return np.array([np.abs(response_of(one_pole(row), frequency, sample_time) / G0 - 1.0) for row in samples])
 
 
+def _check_cross_gains(arrays: Mapping[str, np.ndarray], outputs: int) -> None:
+    """Raise FileFormatError for cross gains of other inputs than each output's own, and maybe the co-contraction."""
+    inputs = min(max(arrays["cross"].shape[-1], outputs), outputs + 1)
+    for name, shape in (("cross", (outputs, inputs)), ("cross_std", (outputs, inputs)), ("compression", (3,))):
+        if arrays[name].shape != shape:
+            raise FileFormatError(f"its array `{name}` has shape {arrays[name].shape}; {shape} is needed.")
+
+
 def _check(name: str, axis: AxisFamily, frequencies: int) -> None:
     n = axis.samples.shape[0]
     shapes = {
         "samples": (n, 3), "std": (n, 4), "where": (n, 5), "used": (n,), "nominal": (3,), "box": (2, 3),
-        "weight": (2, axis.weight.shape[-1]), "envelope": (frequencies,),
+        "weight": (2, min(max(axis.weight.shape[-1], 2), 4)), "envelope": (frequencies,),
     }  # fmt: skip
     for key, shape in shapes.items():
         if getattr(axis, key).shape != shape:

@@ -27,7 +27,7 @@ def guarded_motors(history: np.ndarray) -> int:
 class GuardedArrays(GroundArrays):
     """Those of the base follow, then those of the members."""
 
-    history = array("sizes", "H: how many samples of each signal are kept; and outputs and motors, if not 2 and 3")
+    history = array("sizes = 1 | 3", "H, samples of each signal that are kept; and outputs and motors, if not 2 and 3")
     memory = array("1", "samples after which a held start has settled")
     sigma = array("outputs", "the base's error on rows that it was not trained on [rad]")
     slope = array("outputs", "how the members' error grows with the distance from what was seen [rad/rad]")
