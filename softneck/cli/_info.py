@@ -20,6 +20,7 @@ from softneck.core import (
     SettingsError,
     file_hash,
     fitting,
+    is_archive,
     load,
     open_zip,
     read_archive,
@@ -125,7 +126,7 @@ def _describe(file: Path, html: Path | None, *, force: bool, quiet: bool) -> dic
                 if robot_in_file(file, file.suffix.lower()) is not None:
                     raise
                 return _log(file, html, error)
-        case ".npz":
+        case ".npz" if is_archive(file):
             header, _ = read_archive(file)
             thing = load(file)
             with fitting(file):

@@ -31,6 +31,7 @@ from ._kinds import resolve as resolve
 
 # isort: split
 # Shared with other subpackages of softneck; not in the reference, and may change.
+from ._archive import is_archive as is_archive
 from ._blas_threads import one_blas_thread as one_blas_thread
 from ._certificate import CERTIFICATE_ENDING as CERTIFICATE_ENDING
 from ._certificate import CERTIFICATE_KINDS as CERTIFICATE_KINDS

@@ -34,6 +34,18 @@ def write_archive(
         np.savez_compressed(file, allow_pickle=False, **contents)
 
 
+def is_archive(path: str | Path) -> bool:
+    """Return whether a file claims to be one that `write_archive` wrote: a ZIP archive with our header, or no ZIP."""
+    source = as_path(path)
+    if not source.is_file() or not zipfile.is_zipfile(source):
+        return True
+    try:
+        with zipfile.ZipFile(source) as file:
+            return f"{_HEADER_KEY}.npy" in file.namelist()
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+        return True
+
+
 def read_archive(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Return the header and the arrays of a file that `write_archive` wrote.
 

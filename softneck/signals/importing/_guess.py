@@ -227,14 +227,16 @@ def _guess(path: Path, neck: Robot) -> Guess:
     layout, clock_lines, clock_doubts = _choose_clock(draft, found, _layout(draft, found, robot))
     missing = _missing(draft, layout)
     other_doubts = list(sign_doubts)
+    if sniffed.doubt:
+        other_doubts.append(Doubt("rows and columns", ("file",), "transposed", 0.8, sniffed.doubt))
     if robot is not neck:  # a log of one angle, although a neck has two
         axis, other = robot.outputs.names[0], "roll" if robot.outputs.names[0] == "pitch" else "pitch"
         why = f"no column is {other} or follows the motors like it, so the robot has one output; log {other} too if it"
         other_doubts.append(Doubt(ONE_AXIS, (axis,), f"{axis} only", 0.8, f"{why} tilts"))
     doubts = sorted([*doubts_of(draft, found), *clock_doubts, *other_doubts], key=lambda doubt: doubt.confidence)
     remarks = {name: _why(draft, found, name) for name in draft.picks}
-    remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in other_doubts}
     remarks["file"] = "; ".join(line.removeprefix("file: ") for line in draft.sniffed.lines)
+    remarks |= {doubt.channels[0]: f"{remarks[doubt.channels[0]]}; NOT SURE: {doubt}" for doubt in other_doubts}
     remarks["sample_time"] = "; ".join([*clock_lines, *(f"NOT SURE: {doubt}" for doubt in clock_doubts)])
     remarks["quaternion"] = _mark(draft.quaternion_sure) + draft.quaternion_why
     lines = [*draft.sniffed.lines, *(_line(draft, found, name) for name in draft.picks), *clock_lines]

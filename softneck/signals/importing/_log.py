@@ -28,9 +28,10 @@ from ._clocks import (
 )
 from ._layout import Column, Layout, Source
 from ._robot_guess import NamedColumns, guess_robot
-from ._table_format import without_remarks
+from ._table_format import WITHIN, self_described_table, without_remarks
 from .formats._mat import mat_arrays, table_of
 from .formats._mcap import mcap_table
+from .formats._shapes import reshaped
 from .formats._sheets import sheet_cells, sheet_table
 from .formats._text import format_of
 
@@ -115,6 +116,10 @@ def import_log(
 
 def read_log(source: Path, layout: Layout) -> pd.DataFrame:
     """Return the table of a log, by its file format."""
+    return reshaped(_raw_log(source, layout)).frame
+
+
+def _raw_log(source: Path, layout: Layout) -> pd.DataFrame:
     kind, form = format_of(source), layout.form
     if layout.variable is not None and kind != "mat":
         raise DataError(f"{source}: the layout's `variable` is for a `.mat` file.")
@@ -127,6 +132,8 @@ def read_log(source: Path, layout: Layout) -> pd.DataFrame:
     if kind == "sheet":
         _, cells = sheet_cells(source, layout.sheet)
         return sheet_table(cells, header=form.header, skip=form.skip, unit_row=form.unit_row)
+    if kind in WITHIN:
+        return self_described_table(source, kind, form.encoding)
     frame = without_remarks(read_table(source, ".parquet" if kind == "parquet" else ".csv", form))
     frame.columns = [name.strip() if isinstance(name, str) else name for name in frame.columns]
     return frame

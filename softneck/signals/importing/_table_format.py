@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -18,6 +19,8 @@ from ._clocks import last_values
 from ._layout import Column, Layout
 from .formats._mat import mat_arrays, table_of
 from .formats._mcap import mcap_table
+from .formats._records import json_table, labview_table
+from .formats._shapes import reshaped
 from .formats._sheets import sheet_cells, sheet_table
 from .formats._text import encoding_of, format_of, is_date, seconds
 
@@ -32,6 +35,8 @@ _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 # Three motors and an angle; a recording of a neck has five channels and a time.
 _MIN_COLUMNS = 4
+# Time, name and value of a table in long form.
+_LONG_COLUMNS = 3
 _NAMES = {"\t": "a tab", ";": "`;`", ",": "`,`", WHITESPACE: "blanks"}
 # Share of complete rows below which rows are messages of several clocks.
 _WHOLE_ROWS = 0.5
@@ -46,7 +51,7 @@ class SniffResult:
     `columns`: name, or index without a header -> (time,) numbers; NaN for empty cells. Dates are seconds; with several
     clocks each column holds its last value. `words`: columns without numbers. `form`: a layout without channels: the
     format of the file; `merge` if rows may be of several clocks. `units`: column -> unit in a line of units, if there
-    is one. `dates`: columns of dates or times of day.
+    is one. `dates`: columns of dates or times of day. `doubt`: what may be wrong about rows and columns, "".
     """
 
     columns: dict[Column, Vector]
@@ -56,6 +61,7 @@ class SniffResult:
     units: dict[Column, str]
     dates: frozenset[Column]
     frame: pd.DataFrame
+    doubt: str = ""
 
     def lacks(self, column: Column) -> bool:
         """Return whether a column has empty cells."""
@@ -66,7 +72,11 @@ class SniffResult:
 def sniff(path: str | Path, *, fewest: int = _MIN_COLUMNS) -> SniffResult:
     """Detect the format of a log and read it; a recording of its robot needs at least `fewest` columns."""
     source = Path(path)
-    frame, form, lines, units = _form(source, fewest)
+    raw, form, lines, units = _form(source, fewest)
+    named = {name: unit for name, unit in zip(raw.columns, units, strict=False) if unit}
+    shape = reshaped(raw)
+    frame, lines = shape.frame, (*lines, *shape.lines)
+    named |= dict(shape.units)
     columns: dict[Column, Vector] = {}
     words: list[Column] = []
     dates: set[Column] = set()
@@ -89,8 +99,7 @@ def sniff(path: str | Path, *, fewest: int = _MIN_COLUMNS) -> SniffResult:
     if form.merge or _is_sparse(columns):
         form = replace(form, merge=True)
         columns = {name: last_values(values) for name, values in columns.items()}
-    named = {name: unit for name, unit in zip(frame.columns, units, strict=False) if unit}
-    return SniffResult(columns, tuple(words), form, lines, named, frozenset(dates), frame)
+    return SniffResult(columns, tuple(words), form, lines, named, frozenset(dates), frame, shape.doubt)
 
 
 def _form(source: Path, fewest: int) -> Form:
@@ -106,6 +115,10 @@ def _form(source: Path, fewest: int) -> Form:
         return mcap_table(source), Layout(channels={}, merge=True), (line,), []
     if kind == "sheet":
         return _sheet(source)
+    if kind in WITHIN:
+        encoding, said = encoding_of(source)
+        lines = (f"file: {WITHIN[kind]}", *([] if said is None else [f"file: {said}"]))
+        return self_described_table(source, kind, encoding), Layout(channels={}, encoding=encoding), lines, []
     form, lines, units = _text_form(source, fewest)
     whole = read_table(source, ".csv", form.form)
     frame = without_remarks(whole)
@@ -114,6 +127,15 @@ def _form(source: Path, fewest: int) -> Form:
     if form.header:
         frame.columns = [str(name).strip() for name in frame.columns]
     return frame, form, lines, units
+
+
+#: Formats whose content says how to read them.
+WITHIN = {"labview": "a LabVIEW measurement file", "json": "JSON: a row for each object"}
+
+
+def self_described_table(source: Path, kind: str, encoding: str) -> pd.DataFrame:
+    """Return the table of a file in one of the formats of `WITHIN`."""
+    return labview_table(source, encoding) if kind == "labview" else json_table(source, encoding)
 
 
 def without_remarks(frame: pd.DataFrame) -> pd.DataFrame:
@@ -254,7 +276,11 @@ def _unit_row(lines: Sequence[Sequence[str]]) -> list[str]:
 
 
 def _cells(line: str, delimiter: str) -> list[str]:
-    return line.split() if delimiter == WHITESPACE else [cell.strip('"') for cell in line.split(delimiter)]
+    if delimiter == WHITESPACE:
+        return line.split()
+    if '"' not in line:
+        return line.split(delimiter)
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
 
 
 def _delimiter(lines: list[str], fewest: int) -> tuple[str, int]:
@@ -262,9 +288,10 @@ def _delimiter(lines: list[str], fewest: int) -> tuple[str, int]:
 
     The comma comes late, since it may be a decimal mark.
     """
-    for delimiter in ("\t", ";", ",", WHITESPACE):
-        counts = Counter(len(_cells(line, delimiter)) for line in lines)
-        cells, often = counts.most_common(1)[0]
-        if cells >= fewest and often >= 0.9 * len(lines):
-            return delimiter, cells
+    for least in (fewest, min(fewest, _LONG_COLUMNS)):
+        for delimiter in ("\t", ";", ",", WHITESPACE):
+            counts = Counter(len(_cells(line, delimiter)) for line in lines)
+            cells, often = counts.most_common(1)[0]
+            if cells >= least and often >= 0.9 * len(lines):
+                return delimiter, cells
     return ",", len(_cells(lines[0], ","))

@@ -1,4 +1,4 @@
-"""MATLAB files as arrays: v5, and v7.3 (HDF5) through h5py; numbers only, no code, no links to other files.
+"""Files of arrays: MATLAB v5, v7.3 (HDF5) through h5py, and NumPy; numbers only, no code, no links to other files.
 
 `scipy.io.loadmat` follows nested cells without a limit: 10 MB of them crash the process (segmentation fault).
 """
@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softneck.core import DataError, FileFormatError, SoftneckError, error_reason, largest_unpacked, require_package
+from softneck.core import (
+    DataError,
+    FileFormatError,
+    SoftneckError,
+    error_reason,
+    largest_unpacked,
+    open_zip,
+    require_package,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -142,7 +150,9 @@ _MAX_ELEMENTS = 10_000
 
 
 def mat_arrays(source: Path) -> dict[str, np.ndarray]:
-    """Return name -> array (rows, columns) of all numbers in a MAT file."""
+    """Return name -> array (rows, columns) of all numbers in a MAT file, or in a `.npz` or `.npy` of NumPy."""
+    if (found := _numpy_arrays(source)) is not None:
+        return found
     try:
         hdf5 = _is_hdf5(source)
         if hdf5:
@@ -154,6 +164,25 @@ def mat_arrays(source: Path) -> dict[str, np.ndarray]:
     except Exception as error:  # the parsers raise whatever the damaged bytes lead to
         raise FileFormatError(f"{source}: cannot be read as a MAT file ({error_reason(error)}).") from error
     return {name: array for name, array in found.items() if array.ndim == 2 and array.size}
+
+
+def _numpy_arrays(source: Path) -> dict[str, np.ndarray] | None:
+    """Return the arrays of a `.npz` or `.npy` file as those of a MAT file; None for another file."""
+    with source.open("rb") as file:
+        start = file.read(6)
+    if start != b"\x93NUMPY" and not start.startswith(b"PK"):
+        return None
+    try:
+        if start.startswith(b"PK"):
+            open_zip(source).close()
+        loaded = np.load(source, allow_pickle=False)
+        arrays = {name: loaded[name] for name in loaded.files} if hasattr(loaded, "files") else {"array": loaded}
+    except SoftneckError:
+        raise
+    except Exception as error:  # damaged bytes raise all kinds of errors in zipfile, its decompressors and numpy
+        raise FileFormatError(f"{source}: cannot be read as arrays of NumPy ({error_reason(error)}).") from error
+    kept = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf" and array.ndim in (1, 2)}
+    return {name: np.atleast_2d(array).astype(np.float64) for name, array in kept.items() if array.size}
 
 
 def _by_name(arrays: Iterator[tuple[str, np.ndarray]], left: int) -> dict[str, np.ndarray]:

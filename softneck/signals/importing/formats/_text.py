@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 #: Formats of logs; `text` is any file without a mark.
-FORMATS = ("text", "parquet", "mat", "sheet", "mcap")
+FORMATS = ("text", "parquet", "mat", "sheet", "mcap", "labview", "json")
 _HEAD_BYTES = 2**16
 _FORMAT_MARKS = (
     (b"PAR1", "parquet"),
@@ -25,6 +25,8 @@ _FORMAT_MARKS = (
     (b"MATLAB 5.0", "mat"),
     (b"MATLAB 7.3", "mat"),
     (b"\x89MCAP0\r\n", "mcap"),
+    (b"\x93NUMPY", "mat"),
+    (b"LabVIEW Measurement", "labview"),
     (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1", "sheet"),
 )
 # Messages for files in other formats, each with a remedy.
@@ -74,7 +76,15 @@ def format_of(source: Path) -> str:
         # A text may begin with the letters of a mark, but holds no zeros.
         if head.startswith(mark) and (b"\0" in head[:512] or not mark.isalpha()):
             raise FileFormatError(f"{source}: is {what}, not a log; {remedy}.")
+    if _is_json(head):
+        return "json"
     return {".mat": "mat", ".parquet": "parquet"}.get(source.suffix.lower(), "text")
+
+
+def _is_json(head: bytes) -> bool:
+    """Return whether a text begins as a JSON object, or a list of some."""
+    start = re.sub(rb"\s", b"", head.removeprefix(codecs.BOM_UTF8)[:512])
+    return start.startswith((b'{"', b'[{"'))
 
 
 def _zip_format(source: Path) -> str:
@@ -87,6 +97,8 @@ def _zip_format(source: Path) -> str:
         names = set()
     if names & {"xl/workbook.xml", "xl/workbook.bin", "content.xml"}:
         return "sheet"
+    if names and all(name.endswith(".npy") for name in names):
+        return "mat"
     raise FileFormatError(f"{source}: is a ZIP archive that holds no spreadsheet; unpack it and name the log in it.")
 
 
