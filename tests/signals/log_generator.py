@@ -155,6 +155,18 @@ def clocks() -> Iterator[Log]:
     coarse = whole.rename(columns={"time [s]": "time"})
     coarse["time"] = np.floor(t).astype(int)
     yield Log("whole seconds of 50 rows each", ".csv", as_csv(coarse), U, Y)
+    for count in (20, 100):
+        slow = np.arange(ROWS) / count
+        coarse = whole.rename(columns={"time [s]": "time [s]"}).assign(**{"time [s]": np.floor(slow).astype(int)})
+        yield Log(f"whole seconds of {count} rows each, [s]", ".csv", as_csv(coarse), U, Y, 1.0 / count)
+    for unit, size in (("ms", 1e-3), ("s", 1.0)):
+        step = whole.drop(columns="time [s]").assign(**{f"dt [{unit}]": SAMPLE_TIME / size})
+        yield Log(f"a column dt [{unit}]", ".csv", as_csv(step), U, Y)
+    sheet = whole.rename(columns={"time [s]": "time"}).assign(time=45_000.25 + t / 86400.0)
+    yield Log("days of a spreadsheet", ".csv", as_text(sheet.to_csv(index=False, float_format="%.17g")), U, Y)
+    uneven = np.cumsum(np.random.default_rng(3).uniform(0.5, 1.5, ROWS)) * SAMPLE_TIME
+    yield Log("an uneven clock without titles", ".csv",
+              as_csv(whole.assign(**{"time [s]": uneven}), titles=False), U, Y, named=("uneven",))  # fmt: skip
     double = whole.copy()
     double.loc[200, "time [s]"] = double.loc[199, "time [s]"]
     yield Log("a double stamp", ".csv", as_csv(double), U, Y)
@@ -186,6 +198,23 @@ def wraps() -> Iterator[Log]:
                       positions=reached)  # fmt: skip
 
 
+def encoders() -> Iterator[Log]:
+    """Yield logs with positions that follow their set-points and wrap within a turn."""
+    U, Y = neck()
+    t = np.arange(ROWS) * SAMPLE_TIME
+    P = np.zeros_like(U)
+    P[0] = U[0]
+    for k in range(1, ROWS):
+        P[k] = P[k - 1] + 0.3 * (U[k - 1] - P[k - 1])
+    for unit, turn in (("deg", 360.0), ("rad", 2.0 * np.pi), ("turns", 1.0)):
+        for low in (0.0, -0.5):
+            whole = (2.0 * P / ANGLES[unit] - low * turn) % turn + low * turn
+            frame = table(t, 2.0 * U / ANGLES[unit], Y / ANGLES["deg"], motor=unit)
+            for j in range(3):
+                frame[f"motor_position_{j + 1} [{unit}]"] = whole[:, j]
+            yield Log(f"encoders in {unit} from {low} turns", ".csv", as_csv(frame), 2.0 * U, Y)
+
+
 def formats() -> Iterator[Log]:
     """Yield one log in many formats."""
     U, Y = neck()
@@ -214,19 +243,41 @@ def formats() -> Iterator[Log]:
     yield Log("units in cells", ".csv", as_csv(units_in_cells), U, Y, named=("rad",))
     yield Log("spreadsheet", ".xlsx", lambda path: frame.to_excel(path, index=False), U, Y)
     yield Log("LabVIEW", ".lvm", _labview(frame), U, Y)
+    yield Log("LabVIEW without times", ".lvm", _labview(frame, times=False), U, Y)
+    nested = [
+        {"stamp": row["time [s]"], "cmd": list(u), "imu": {name: row[name] for name in ("pitch [deg]", "roll [deg]")}}
+        for row, u in zip(rows, U.tolist(), strict=True)
+    ]
+    yield Log("nested JSON lines", ".ndjson", as_text("\n".join(map(json.dumps, nested))), U, Y)
+    yield Log("JSON list", ".json", as_text(json.dumps(rows)), U, Y)
+    lists = frame.drop(columns=[f"motor_setpoint_{j} [rad]" for j in (1, 2, 3)])
+    lists["command"] = [json.dumps([round(x, 8) for x in row]) for row in U.tolist()]
+    yield Log("lists in cells", ".csv", as_csv(lists), U, Y)
+    for mark, decimal, sep in ((",", ".", ";"), (".", ",", ";")):
+        grouped = frame.map("{:.6f}".format).apply(lambda column, mark=decimal: column.str.replace(".", mark))
+        cells = [f"{x:,.3f}".translate(str.maketrans(",.", mark + decimal)) for x in 1e3 * t]
+        grouped.insert(0, "time [ms]", cells)
+        yield Log(f"thousands by {mark!r}", ".csv", as_csv(grouped.drop(columns="time [s]"), sep=sep), U, Y)
+    can = "\n".join(f"({1e9 + x:.6f}) can0 181#0011223344556677" for x in t)
+    yield Log("candump", ".log", as_text(can), U, Y, named=("CAN",))
+    yield Log("TDMS", ".tdms", lambda path: path.write_bytes(b"TDSm" + bytes(600)), U, Y, named=("TDMS",))  # type: ignore[arg-type,return-value]
 
 
-def _labview(frame: pd.DataFrame) -> Callable[[Path], None]:
+def _labview(frame: pd.DataFrame, *, times: bool = True) -> Callable[[Path], None]:
     """Return what writes a measurement file of LabVIEW: two headers, tabs, decimal commas."""
     head = ["LabVIEW Measurement", "Writer_Version\t2", "Separator\tTab", "Decimal_Separator\t,", "Multi_Headings\tNo",
             "X_Columns\tOne", "***End_of_Header***", "", f"Channels\t{frame.shape[1] - 1}", f"Samples\t{ROWS}",
             "***End_of_Header***"]  # fmt: skip
     titles = "\t".join(["X_Value", *frame.columns[1:], "Comment"])
-    body = "\n".join("\t".join(f"{x:.6f}".replace(".", ",") for x in row) for row in frame.to_numpy())
+    if not times:
+        head[5] = "X_Columns\tNo"
+        head.insert(-1, f"Delta_X\t{SAMPLE_TIME:.6f}\t{SAMPLE_TIME:.6f}".replace(".", ","))
+    rows = [[f"{x:.6f}".replace(".", ",") for x in row] for row in frame.to_numpy()]
+    body = "\n".join("\t".join(row if times else ["", *row[1:]]) for row in rows)
     return as_text("\n".join([*head, titles, body, ""]))
 
 
 def logs() -> Iterator[Log]:
     """Yield all logs."""
-    for make in (units, clocks, wraps, formats):
+    for make in (units, clocks, wraps, encoders, formats):
         yield from make()

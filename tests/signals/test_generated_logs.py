@@ -12,10 +12,13 @@ import pytest
 
 from softneck.cli._main import run
 
-from .log_generator import Log, clocks, formats, units, wraps
+from .log_generator import Log, clocks, encoders, formats, units, wraps
 
 #: Groups, and how many of each are imported as they were measured; the others are doubted or refused.
-GROUPS = {"units": (units, 64), "clocks": (clocks, 80), "wraps": (wraps, 40), "formats": (formats, 6)}
+GROUPS = {
+    "units": (units, 64), "clocks": (clocks, 100), "wraps": (wraps, 40), "encoders": (encoders, 6),
+    "formats": (formats, 13),
+}  # fmt: skip
 
 
 def outcome(log: Log, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
@@ -76,6 +79,10 @@ def test_what_cannot_be_taken_is_refused_or_doubted_by_its_name(
         ("setpoints_in_turns.csv", 0.02, False),
         ("pitch_in_mrad.csv", 0.02, False),
         ("roll_wraps_at_180.csv", 0.02, False),
+        ("ros2_topic_echo.csv", 0.02, True),
+        ("labview.lvm", 0.02, False),
+        ("long_format.csv", 0.02, False),
+        ("arrays.npz", 0.02, False),
     ],
 )
 def test_a_reported_log_is_imported_as_its_title_says(

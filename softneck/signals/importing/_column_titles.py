@@ -115,7 +115,7 @@ _INDEX = re.compile(r":?,?\s*\d+")
 
 _TIME_WORDS = {
     "time", "t", "timestamp", "stamp", "ts", "seconds", "sec", "s", "ms", "millis", "milliseconds", "micros", "us",
-    "ns", "clock", "elapsed", "nanosec", "nsec", "segundos", "sekunden",
+    "ns", "clock", "elapsed", "datenum", "nanosec", "nsec", "segundos", "sekunden",
 }  # fmt: skip
 _RUN_WORDS = {"run", "trial", "experiment", "segment", "repetition"}
 _COUNTER_WORDS = {"index", "idx", "sample", "samples", "row", "k", "n", "count", "counter", "unnamed", "id"}

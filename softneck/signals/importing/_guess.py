@@ -19,6 +19,7 @@ from ._guess_names import by_names, drop_or_turn_quaternion, one_axis, use_posit
 from ._guess_shapes import by_shapes, max_correlation
 from ._guess_units import Unit, nominal_step, units
 from ._layout import ONE_AXIS, Column, Layout, Source, Term, layout_toml
+from ._odd_clocks import double_stamps, mean_of_steps, rows_of_stamp
 from ._table_format import sniff
 
 #: Below this confidence a decision is asked about, or marked.
@@ -282,6 +283,12 @@ def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple
     """Return the layout with its sample time, restarts and duplicates, lines with reasons, and doubts."""
     lines: list[str] = []
     doubts: list[Doubt] = []
+    if (counted := _counted_rows(draft, found)) is not None:
+        step, why, sure = counted
+        lines.append(f"sample time {1e3 * step:.6g} ms, because {why}")
+        why = f"{why}; the rows are counted, {1e3 * step:.6g} ms each"
+        doubts.append(Doubt("sample time", ("sample_time",), f"{1e3 * step:.6g} ms", sure, why))
+        return replace(layout, time=None, sample_time=step), lines, doubts
     if "time" in draft.picks:
         column = draft.picks["time"].terms[0].column
         step = np.diff(draft.sniffed.columns[column])
@@ -289,7 +296,10 @@ def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple
         if "run" not in draft.picks and one and (step < 0).any():
             layout = replace(layout, new_run_at_restart=True)
             lines.append(f"runs: a new one at each restart, because time goes back {(step < 0).sum()} time(s)")
-        if one and (step == 0).any():
+        values = draft.sniffed.columns[column]
+        if one and double_stamps(values, np.zeros(values.size)).sum() == (np.diff(values) == 0).sum() > 0:
+            lines.append("time: a stamp that occurs twice, with a step of two behind it, is set between its neighbours")
+        elif one and (step == 0).any():
             layout = replace(layout, duplicates="first")
             if not layout.merge:
                 why = f"time stands still at {(step == 0).sum()} row(s), first at row {np.argmax(step == 0) + 1}"
@@ -311,6 +321,40 @@ def _choose_clock(draft: Draft, found: dict[str, Unit], layout: Layout) -> tuple
                      f"not at the {1e3 * nominal:g} ms of the time column")  # fmt: skip
         return replace(layout, estimate=True), lines, doubts
     return layout, lines, doubts
+
+
+_STEP_TITLES = {"dt", "delta t", "deltat", "ts", "sample time", "time step", "timestep", "step s", "period", "interval"}
+_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+
+
+def _counted_rows(draft: Draft, found: dict[str, Unit]) -> tuple[float, str, float] | None:
+    """Return the sample time [s] of a log without a time in each row, the reason, and the confidence."""
+    if "time" in draft.picks:
+        column = draft.picks["time"].terms[0].column
+        count = rows_of_stamp(draft.sniffed.columns[column]) if len(draft.picks["time"].terms) == 1 else None
+        if count is None or draft.sniffed.form.merge:
+            return None
+        return (
+            nominal_step(draft, found) / count,
+            f"{column_label(column)} stands still for {count} rows at a time",
+            0.8,
+        )
+    for column, title in draft.titles.items():
+        values = draft.sniffed.columns[column]
+        scale = _SECONDS.get(title.unit or "s", 1.0)
+        if (title.family in _STEP_TITLES or str(column).lower() in _STEP_TITLES) and (mean := mean_of_steps(values)):
+            if title.unit is None and not _FASTEST_S < mean < _SLOWEST_S:
+                scale = 1e-3
+            return scale * mean, f"{column_label(column)} holds the time since the row before", 0.85
+        if title.role == "time" and (count := rows_of_stamp(values)) is not None:
+            steps = np.diff(values)
+            stamp = float(np.median(steps[steps > 0.0]))
+            return scale * stamp / count, f"{column_label(column)} stands still for {count} rows at a time", 0.8
+    return None
+
+
+# Mean steps outside of these are no seconds.
+_FASTEST_S, _SLOWEST_S = 1e-5, 2.0
 
 
 def _estimate_from_rates(draft: Draft, found: dict[str, Unit]) -> SampleTime | None:

@@ -13,6 +13,7 @@ from ..recording._channels import MOTOR_POSITIONS, MOTOR_VELOCITIES, SET_POINTS,
 from ._clocks import velocity_period
 from ._draft import Draft, Pick
 from ._layout import Column, Term
+from ._odd_clocks import find_split_stamp, find_uneven_clock
 
 # Enough rows for a decision, whatever the length of the log.
 _MAX_ROWS = 20_000
@@ -267,8 +268,20 @@ def _clock(draft: Draft) -> None:
     if "time" in draft.picks:
         return
     free = {name: draft.moving[name] for name in draft.free()}
+    whole = {name: draft.sniffed.columns[name] for name in draft.free()}
+    if (stamp := find_split_stamp({n: v for n, v in whole.items() if np.isfinite(v).all()})) is not None:
+        terms = (Term(stamp[0]), Term(stamp[1], 1e-9))
+        draft.picks["time"] = Pick(
+            terms, "whole seconds and the nanoseconds behind them, as in ROS 2", "s", confidence=0.85
+        )
+        return
     column = find_clock(free)
     if column is None:
+        column = find_uneven_clock({name: values for name, values in whole.items() if np.isfinite(values).all()})
+        if column is not None:
+            draft.pick(
+                "time", column, "it rises in every row, by uneven steps, as no other column does", confidence=0.7
+            )
         return
     step = np.diff(free[column])
     draft.pick("time", column, f"it rises by equal steps of {np.median(step):.4g}", confidence=0.85)

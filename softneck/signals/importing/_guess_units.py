@@ -13,6 +13,7 @@ import numpy as np
 from ..recording._channels import MOTOR_POSITIONS, MOTOR_TURNS, MOTOR_VELOCITIES, OUTPUTS, SET_POINTS, file_unit
 from ._clocks import velocity_period
 from ._draft import Draft
+from ._odd_clocks import is_serial_days
 from .formats._text import DATE
 
 _DEGREE = pi / 180.0
@@ -114,6 +115,7 @@ _TITLED_ANGLES = {"mrad": ("rad", 1e-3), "turns": ("rad", 2.0 * pi), "gon": ("ra
 _MAX_CONFIDENCE, _SEPARATE_CONFIDENCE = 0.99, 0.85
 # Ratio of pitch to roll that makes their unit doubtful, and its confidence.
 _DOUBTFUL_RATIO, _DOUBTFUL_CONFIDENCE = 20.0, 0.6
+_DAYS_CONFIDENCE = 0.95
 # References and angles have two units if they differ by more than half of the factor 57, in logarithms. Positions that
 # follow set-points this well and are so many times larger or smaller are counts, turns, or before a gear, unless the
 # ratio is near 57.
@@ -177,6 +179,10 @@ def _time(draft: Draft, found: dict[str, Unit]) -> None:
     if unit is not None:
         found["time"] = Unit(*_TITLED_CLOCKS.get(unit, (unit, 1.0)), f"its title says {unit}")
         _doubt_clock(found, nominal_step(draft, found))
+        return
+    if is_serial_days(draft.values("time")):
+        why = "it counts days, as a spreadsheet or `datenum` does (a day has 86,400 s)"
+        found["time"] = Unit("s", 86400.0, why, _DAYS_CONFIDENCE)
         return
     step = np.diff(draft.values("time"))
     typical = float(np.median(step[step > 0])) if (step > 0).any() else 0.0

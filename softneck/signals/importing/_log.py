@@ -27,6 +27,7 @@ from ._clocks import (
     read_times,
 )
 from ._layout import Column, Layout, Source
+from ._odd_clocks import spread_double_stamps
 from ._robot_guess import NamedColumns, guess_robot
 from ._table_format import WITHIN, self_described_table, without_remarks
 from .formats._mat import mat_arrays, table_of
@@ -222,7 +223,8 @@ def _make_equidistant(
         notes += (f"{run[-1] + 1} run(s), by restarts of the time column",)
     check_rising(time, run, may_stand=True)
     samples, jumps = _unwrapped(Samples(time, run, channels), layout.robot)
-    notes += jumps
+    samples, spread = spread_double_stamps(samples)
+    notes += jumps + spread
     if layout.merge:
         samples, note = merge_clocks(samples, layout.robot.outputs.names)
         notes += (note,)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _HEAD_BYTES = 2**16
 _HEAD_ROWS = 500
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE)
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
 _COMMA_NUMBER = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 # Three motors and an angle; a recording of a neck has five channels and a time.
 _MIN_COLUMNS = 4
@@ -232,7 +233,7 @@ def _text_form(source: Path, fewest: int) -> tuple[Layout, tuple[str, ...], list
     lines = [line for line in raw[skip:] if line.strip()]
     body = [cell.strip() for line in lines[1:] for cell in _cells(line, delimiter)]
     comma = delimiter != "," and any(map(_COMMA_NUMBER.fullmatch, body)) and not any(
-        "." in cell for cell in body if not is_date(cell)
+        "." in cell for cell in body if not is_date(cell) and not _THOUSANDS.fullmatch(cell)
     )  # fmt: skip
     first = [cell.strip().replace(",", ".") if comma else cell.strip() for cell in _cells(lines[0], delimiter)]
     header = any(cell and not _NUMBER.fullmatch(cell) and not is_date(cell) for cell in first)

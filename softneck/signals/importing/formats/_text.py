@@ -39,6 +39,11 @@ _OTHER_FORMATS = (
     (b"BM", "a BMP picture", _EXPORT_HINT),
     (b"RIFF", "a sound, film or picture", _EXPORT_HINT),
     (b"%PDF", "a PDF document", _EXPORT_HINT),
+    (
+        b"TDSm",
+        "a TDMS file of LabVIEW",
+        "export it as .lvm or CSV (in Python npTDMS reads it)",
+    ),
     (b"\x1f\x8b", "compressed by gzip", "unpack it with gunzip"),
     (b"7z\xbc\xaf", "a 7z archive", "unpack it"),
     (b"SQLite format 3", "a SQLite database", "a ROS 2 bag of this kind becomes MCAP by `ros2 bag convert`"),
@@ -76,9 +81,17 @@ def format_of(source: Path) -> str:
         # A text may begin with the letters of a mark, but holds no zeros.
         if head.startswith(mark) and (b"\0" in head[:512] or not mark.isalpha()):
             raise FileFormatError(f"{source}: is {what}, not a log; {remedy}.")
+    if _CAN_LOG.match(head.lstrip()):
+        raise FileFormatError(
+            f"{source}: is a log of CAN frames, not of signals; decode it to CSV with the bus's DBC file."
+        )
     if _is_json(head):
         return "json"
     return {".mat": "mat", ".parquet": "parquet"}.get(source.suffix.lower(), "text")
+
+
+# Lines of `candump -l` and `-ta`, and the head of Vector's .asc.
+_CAN_LOG = re.compile(rb"\(\d+\.\d+\)\s+\w+\s+[0-9A-Fa-f]{3,8}(#|\s+\[\d\])|date \w{3} \w{3} .*\r?\nbase (hex|dec)")
 
 
 def _is_json(head: bytes) -> bool:
@@ -147,7 +160,10 @@ def _is_utf8(head: bytes, rest: BinaryIO) -> bool:
 
 # ISO 8601 (year first) is unambiguous; of the other orders the first that fits is taken.
 _DAY_PATTERN = r"\d{1,2}"
-_TIME_PATTERN = r"\d{1,2}:\d{2}(:\d{2}([.,]\d+)?)?(\s?[AaPp][Mm])?"
+_TIME_PATTERN = r"\d{1,2}:\d{2}(:\d{2}([.,:]\d+)?)?(\s?[AaPp][Mm])?"
+# A time of day with `:` before its milliseconds, and minutes with seconds of an hour, `mm:ss.mmm`.
+_COLON_FRACTION = re.compile(r"(\d{1,2}:\d{2}:\d{2}):(\d{1,3})$")
+_MINUTES = re.compile(r"(\d{1,4}):(\d{2}[.,]\d+)")
 _ISO = re.compile(rf"\d{{4}}-\d{{2}}-\d{{2}}([T ]+{_TIME_PATTERN})?\s?(Z|[+-]\d{{2}}:?\d{{2}})?")
 _SPLIT = re.compile(
     rf"({_DAY_PATTERN})([./-])({_DAY_PATTERN})\2(\d{{4}}|\d{{2}})(,?\s+{_TIME_PATTERN})?|{_TIME_PATTERN}"
@@ -161,7 +177,7 @@ EPOCH = 1e8
 def is_date(cell: object) -> bool:
     """Return whether a cell looks like a date or a time of day."""
     text = str(cell).strip()
-    return _ISO.fullmatch(text) is not None or _SPLIT.fullmatch(text) is not None
+    return any(pattern.fullmatch(text) is not None for pattern in (_ISO, _SPLIT, _MINUTES))
 
 
 def seconds(column: pd.Series, name: str) -> Vector:
@@ -176,6 +192,9 @@ def seconds(column: pd.Series, name: str) -> Vector:
         moments = pd.DatetimeIndex(column)
     else:
         text = column.astype(str).str.strip().str.replace(r"(\d),(\d)", r"\1.\2", regex=True)
+        if text.str.fullmatch(_MINUTES.pattern).all():
+            return _minutes(text)
+        text = text.str.replace(_COLON_FRACTION, lambda found: f"{found[1]}.{found[2].zfill(3)}", regex=True)
         bad = ~text.map(is_date).to_numpy(dtype=bool)
         if bad.any():
             row = int(np.argmax(bad))
@@ -195,6 +214,14 @@ def seconds(column: pd.Series, name: str) -> Vector:
     if column.dtype.kind != "M" and ":" in str(column.iloc[0])[:3]:
         t = t + 86_400.0 * np.concatenate([[0], np.cumsum(np.diff(t) < -43_200.0)])
     return t
+
+
+def _minutes(text: pd.Series) -> Vector:
+    """Return the seconds of `mm:ss.mmm`, from the first on; minutes that begin again are those of the next hour."""
+    parts = text.str.extract(_MINUTES.pattern).astype(float).to_numpy()
+    t = 60.0 * parts[:, 0] + parts[:, 1]
+    t = t + 3600.0 * np.concatenate([[0], np.cumsum(np.diff(t) < -1800.0)])
+    return t - t[0]
 
 
 def _moments(text: pd.Series, name: str) -> pd.DatetimeIndex:
