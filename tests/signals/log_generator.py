@@ -254,13 +254,17 @@ def formats() -> Iterator[Log]:
     lists["command"] = [json.dumps([round(x, 8) for x in row]) for row in U.tolist()]
     yield Log("lists in cells", ".csv", as_csv(lists), U, Y)
     for mark, decimal, sep in ((",", ".", ";"), (".", ",", ";")):
-        grouped = frame.map("{:.6f}".format).apply(lambda column, mark=decimal: column.str.replace(".", mark))
+        grouped = pd.DataFrame({name: [f"{x:.6f}".replace(".", decimal) for x in frame[name]] for name in frame})
         cells = [f"{x:,.3f}".translate(str.maketrans(",.", mark + decimal)) for x in 1e3 * t]
         grouped.insert(0, "time [ms]", cells)
         yield Log(f"thousands by {mark!r}", ".csv", as_csv(grouped.drop(columns="time [s]"), sep=sep), U, Y)
     can = "\n".join(f"({1e9 + x:.6f}) can0 181#0011223344556677" for x in t)
     yield Log("candump", ".log", as_text(can), U, Y, named=("CAN",))
-    yield Log("TDMS", ".tdms", lambda path: path.write_bytes(b"TDSm" + bytes(600)), U, Y, named=("TDMS",))  # type: ignore[arg-type,return-value]
+    yield Log("TDMS", ".tdms", _tdms, U, Y, named=("TDMS",))
+
+
+def _tdms(path: Path) -> None:
+    path.write_bytes(b"TDSm" + bytes(600))
 
 
 def _labview(frame: pd.DataFrame, *, times: bool = True) -> Callable[[Path], None]:

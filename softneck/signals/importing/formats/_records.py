@@ -68,17 +68,19 @@ def _labview_segment(rows: list[list[str]], head: dict[str, str], decimal: str) 
     width = len([title for title in titles if title.strip() and title.strip() != "Comment"])
     cells = [[cell.strip().replace(decimal, ".") for cell in row[:width]] for row in body]
     cells = [row + [""] * (width - len(row)) for row in cells]
-    frame = pd.DataFrame(cells, columns=[title.strip() for title in titles[:width]])
-    frame = frame.apply(lambda column: pd.to_numeric(column, errors="coerce"))
+    names = [title.strip() for title in titles[:width]]
+    columns: dict[str, np.ndarray] = {
+        name: np.asarray(pd.to_numeric(pd.Series([row[j] for row in cells]), errors="coerce"), dtype=np.float64)
+        for j, name in enumerate(names)
+    }
     step = next((text.split()[0].replace(decimal, ".") for key, text in head.items() if key == "Delta_X" and text), "")
-    first = str(frame.columns[0])
-    if frame[first].isna().all() or first not in ("X_Value", "Time"):
+    first = columns.get("X_Value")
+    if first is None or np.isnan(first).all():
         if not step:
             raise DataError("the LabVIEW file has neither times nor Delta_X; write its time column.")
-        frame = frame.drop(columns=first) if frame[first].isna().all() else frame
-        frame.insert(0, "X_Value", float(step) * np.arange(len(frame)))
+        columns["X_Value"] = np.arange(len(cells), dtype=np.float64) * float(step)
     # LabVIEW calls the time X_Value.
-    return frame.rename(columns={"X_Value": "time [s]"})
+    return pd.DataFrame({"time [s]": columns.pop("X_Value"), **columns})
 
 
 def json_table(source: Path, encoding: str) -> pd.DataFrame:

@@ -60,7 +60,8 @@ def _transposed(frame: pd.DataFrame) -> pd.DataFrame:
     if frame.iloc[:, 0].map(lambda cell: isinstance(cell, str)).all():
         turned.columns = [str(cell) for cell in frame.iloc[:, 0]]
         turned = turned.iloc[1:].reset_index(drop=True)
-    return turned.apply(lambda column: pd.to_numeric(column, errors="coerce"))
+    numbers = [pd.Series(pd.to_numeric(turned.iloc[:, j], errors="coerce")) for j in range(turned.shape[1])]
+    return pd.DataFrame(dict(zip(turned.columns, numbers, strict=True)))
 
 
 def _long_form(frame: pd.DataFrame) -> tuple[str, str, str] | None:
@@ -143,11 +144,11 @@ def _plain_numbers(
             text = (
                 column.astype(str).str.strip().str.replace(mark, "", regex=False).str.replace(decimal, ".", regex=False)
             )
-            changed[place] = pd.to_numeric(text, errors="coerce")
+            changed[place] = pd.Series(pd.to_numeric(text, errors="coerce"))
             lines.append(f"file: `{mark}` separates thousands in column '{name}'")
     if not changed:
         return frame, (), []
-    parts = [changed.get(place, frame.iloc[:, place]) for place in range(frame.shape[1])]
+    parts = [changed[place] if place in changed else frame.iloc[:, place] for place in range(frame.shape[1])]
     table = pd.concat(parts, axis=1)
     table.columns = frame.columns
     return table, tuple(units), lines
