@@ -12,7 +12,7 @@ import pytest
 
 from softneck.cli._main import run
 
-from .log_generator import Log, clocks, encoders, formats, units, wraps
+from .log_generator import OTHERS, Log, clocks, encoders, formats, units, wraps
 
 #: Groups, and how many of each are imported as they were measured; the others are doubted or refused.
 GROUPS = {
@@ -33,7 +33,14 @@ def outcome(log: Log, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
     if code == 2:
         return "refused by name" if any(name in said.err for name in log.named) else "refused"
     facts, frame = json.loads(said.out), pd.read_csv(out, comment="#")
-    outputs = [next(column for column in frame if column.startswith(f"{name} ")) for name in ("pitch", "roll")]
+    outputs = [next((column for column in frame if column.startswith(name)), "") for name in ("pitch", "roll")]
+    # In a unit of no angle a robot of its own is proposed: its columns or a line name the unit, and its numbers stay.
+    own = [column for column in frame if column.startswith(("motor_setpoint", "cmd", "ref", "setpoint"))]
+    if log.named and not all(column.endswith("[rad]") for column in own):
+        unit = log.named[0]
+        named = all(f"[{unit}]" in column for column in own) or f"`{unit}` is unknown" in said.out + said.err
+        numbers = np.allclose(frame[own].to_numpy(), log.set_points * OTHERS[unit], atol=1e-6)
+        return "right, by the unit's name" if named and len(own) == 3 and numbers else "wrong, sure"
     U = frame[[f"motor_setpoint_{j} [rad]" for j in (1, 2, 3)]].to_numpy()
     Y = frame[outputs].to_numpy() * [np.pi / 180.0 if "deg" in column else 1.0 for column in outputs]
     n = min(len(U), len(log.set_points))

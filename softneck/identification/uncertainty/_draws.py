@@ -14,6 +14,7 @@ from softneck.core import (
     FileFormatError,
     Matrix,
     Progress,
+    ReprMixin,
     SettingsError,
     Vector,
     one_blas_thread,
@@ -58,8 +59,8 @@ class Source(Protocol):
     def arrays(self, draw: Vector, factor: float) -> dict[str, Matrix]: ...
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Draws:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True, repr=False)
+class Draws(ReprMixin):
     """Nonlinear models of a robot, drawn independently of each other.
 
     Attributes:

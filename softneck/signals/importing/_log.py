@@ -50,6 +50,8 @@ _WRONG_UNIT_RATIO = 1.5
 _MIN_PLACEHOLDER, _PLACEHOLDER_RATIO, _MIN_VALUES = 90.0, 10.0, 20
 # [turns] Positions this close to whole turns from their set-points are of an encoder of one turn.
 _WHOLE_TURN_TOLERANCE = 0.02
+# A position more turns away from its set-point is in another unit.
+_MOST_TURNS = 4.5
 # [turns] Larger numbers are in no unit of angles.
 _MAX_TURNS = 60.0
 
@@ -261,8 +263,11 @@ def _unwrapped(samples: Samples, robot: Robot) -> tuple[Samples, tuple[str, ...]
         if name not in channels or asked not in channels or si_unit(name, robot) != "rad":
             continue
         # An encoder of one turn does not count turns: its set-point does.
-        ahead = np.nanmedian(channels[asked] - channels[name]) / (2.0 * np.pi)
-        if np.round(ahead) and (turned or abs(ahead - np.round(ahead)) < _WHOLE_TURN_TOLERANCE):
+        behind = channels[asked] - channels[name]
+        # Messages of several clocks never have both.
+        ahead = float(np.median(behind[np.isfinite(behind)])) / (2.0 * np.pi) if np.isfinite(behind).any() else 0.0
+        whole = turned or abs(ahead - np.round(ahead)) < _WHOLE_TURN_TOLERANCE
+        if np.round(ahead) and whole and abs(ahead) < _MOST_TURNS:
             channels[name] = channels[name] + 2.0 * np.pi * np.round(ahead)
             notes.append(f"`{name}` is {ahead:.0f} turn(s) behind its set-point: shifted")
     return Samples(samples.time, samples.run, channels), tuple(notes)
